@@ -62,7 +62,13 @@ def embodiment(robot: str) -> Embodiment:
 
 
 def episode(
-    robot: str, frames: int, stride: int, seed: int, number: int, drawn: Collection[int] | None = None
+    robot: str,
+    frames: int,
+    stride: int,
+    seed: int,
+    number: int,
+    drawn: Collection[int] | None = None,
+    commands: Floats | None = None,
 ) -> Episode:
     """Simulate an episode; the same seed and number give the same one, and a longer one begins like it.
 
@@ -72,20 +78,22 @@ def episode(
         stride: control steps a frame.
         seed, number: as the recorders take them.
         drawn: frames of which the picture is drawn; by default all.
+        commands: (T * stride, A) to give it; by default its own driver's.
     """
     simulator = LabSimulator(robot)
     wandering = pusht.STARTS.index("random")
     simulator.reset(seed, number * len(pusht.STARTS) + wandering if robot in PUSHERS else number)
-    pictures, parts, commands, driven = [], [], [], 0
+    pictures, parts, given, driven = [], [], [], 0
     for step in range(frames * stride):
         if step % stride == 0:
             driven, places = _parts(simulator.simulation)
             parts.append(places)
             if drawn is None or step // stride in drawn:
                 pictures.append(simulator.simulation.picture())
-        commands.append(simulator.recorded())
-        simulator.advance(commands[-1])
-    chunks = np.stack(commands).reshape(frames, -1)
+        own = simulator.recorded() if commands is None else commands[step].astype(np.float32)
+        given.append(own)
+        simulator.advance(own)
+    chunks = np.stack(given).reshape(frames, -1)
     return Episode(np.stack(pictures), chunks, np.stack(parts), driven)
 
 

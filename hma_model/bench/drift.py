@@ -50,7 +50,6 @@ SHEETS = 2  # rollouts of a robot on it
 LIMIT = 2.0  # of the error at the end over that at EARLY
 LOST = 0.5  # share of the spread from which a robot is somewhere else
 WHOLE = 0.8  # of the wholeness at the end over the copy's
-RESAMPLES = 1000
 OWN = ("model", "embodiment", "batch", "generator", "self")  # arguments of a rollout that are no options
 
 
@@ -220,6 +219,7 @@ def rows(found: Found, seed: int) -> list[dict[str, Any]]:
 
 def _row(found: Found, case: Case, mark: int, seed: int) -> dict[str, Any]:
     from hma_model.evaluation.evaluate import PSNR_LIMIT
+    from hma_model.evaluation.intervals import interval
     from hma_model.evaluation.metrics import psnr
 
     window = [found.frames.index(frame) for frame in range(mark - SPAN + 1, mark + 1)]
@@ -231,13 +231,13 @@ def _row(found: Found, case: Case, mark: int, seed: int) -> dict[str, Any]:
     far = np.linalg.norm(read - parts, axis=-1)
     if len(own):
         errors = far[..., own].mean(axis=(1, 2))
-        low, high = _interval(errors, seed)
+        low, high = interval(errors, seed)
         motion = _correlation(np.diff(read[:, :, own], axis=1), np.diff(parts[:, :, own], axis=1))
         row |= {
             "error_px": round(float(errors.mean()), 2),
             "median_px": round(float(np.median(errors)), 2),
-            "low_px": round(low, 2),
-            "high_px": round(high, 2),
+            "low_px": round(float(low), 2),
+            "high_px": round(float(high), 2),
             "share": round(float(errors.mean() / probe.spread[own].mean()), 3),
             "motion": None if motion is None else round(motion, 2),
         }
@@ -249,13 +249,6 @@ def _row(found: Found, case: Case, mark: int, seed: int) -> dict[str, Any]:
         "psnr_db": round(float(signal.mean()), 2),
         "probe_px": round(float(probe.error[own].mean()), 2) if len(own) else None,
     }
-
-
-def _interval(errors: NDArray[np.float64], seed: int) -> tuple[float, float]:
-    """Return the 95 % interval of the mean of errors (B,), by bootstrap."""
-    chosen = np.random.default_rng(seed).integers(len(errors), size=(RESAMPLES, len(errors)))
-    low, high = np.percentile(errors[chosen].mean(axis=1), (2.5, 97.5))
-    return float(low), float(high)
 
 
 def _correlation(one: NDArray[np.float64], other: NDArray[np.float64]) -> float | None:

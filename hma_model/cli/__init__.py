@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -16,12 +16,25 @@ from typer.core import TyperGroup
 from hma_data import __version__
 from hma_data.bench import BENCHES
 from hma_data.cli import mount
-from hma_data.console import interruptible, print_json, print_table
+from hma_data.console import interruptible
 from hma_data.cpu import bound_spinning, take_ordinary_priority
 from hma_data.errors import HMAError, UsageError
 from hma_model.cli import train as cli_train
-from hma_model.cli.hub import Json, hub_app
-from hma_model.cli.play import play, require_checkpoint
+from hma_model.cli.evaluate import evaluate
+from hma_model.cli.hub import hub_app
+from hma_model.cli.options import (
+    Cameras,
+    Checkpoint,
+    Compile,
+    Data,
+    Precision,
+    SampleSteps,
+    Split,
+    UnmaskSteps,
+    camera_names,
+    require_checkpoint,
+)
+from hma_model.cli.play import play
 from hma_model.cli.train import MODELS
 
 
@@ -118,45 +131,6 @@ def _fail(text: str, code: int) -> int:
     return code
 
 
-FIGURES = {  # figures of `hma evaluate` as its table names them; the others have their names in the JSON
-    "against": "compared with",
-    "draws": "draws of shuffled actions",
-    "loss": "loss, nats a token",
-    "shuffled_loss": "loss with shuffled actions",
-    "baseline_loss": "loss of token frequencies alone",
-    "accuracy": "accuracy, share of tokens",
-    "psnr_action_gain_last": "last frame, true less shuffled, dB",
-}
-Checkpoint = Annotated[
-    str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
-]
-Data = Annotated[Path, typer.Argument(help="A shard set.")]
-Split = Annotated[Literal["train", "val"], typer.Option("--split", help="Split to take windows from.")]
-UnmaskSteps = Annotated[
-    int, typer.Option("--unmask-steps", min=1, help="Passes in which a discrete model decodes a frame.")
-]
-SampleSteps = Annotated[
-    int | None,
-    typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own."),
-]
-Precision = Annotated[
-    Literal["float32", "bf16"],
-    typer.Option(
-        "--precision", help="Of the products in rollouts; bf16 wants a processor or GPU that has it."
-    ),
-]
-Compile = Annotated[
-    bool,
-    typer.Option("--compile", help="Compile the trunk for rollouts; pays on a GPU, after a minute or more."),
-]
-Cameras = Annotated[
-    str | None,
-    typer.Option(
-        "--cameras", metavar="NAME[,NAME…]", help="Cameras to show the model; default: those of its training."
-    ),
-]
-
-
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for everything the demo makes.")] = Path(
@@ -188,52 +162,7 @@ mount(app)
 cli_train.mount(app)
 
 
-@app.command(rich_help_panel=MODELS)
-def evaluate(
-    checkpoint: Checkpoint,
-    data: Data,
-    split: Split = "val",
-    windows: Annotated[int, typer.Option("--windows", min=1, help="Number of windows, evenly spaced.")] = 64,
-    frames: Annotated[
-        int | None, typer.Option("--frames", min=2, help="Frames of a window; by default the model's.")
-    ] = None,
-    prompt: Annotated[
-        int | None, typer.Option("--prompt", min=1, help="Number of true frames to start from.")
-    ] = None,
-    unmask_steps: UnmaskSteps = 2,
-    sample_steps: SampleSteps = None,
-    precision: Precision = "float32",
-    compile: Compile = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollouts.")] = 0,
-    cameras: Cameras = None,
-    json: Json = False,
-) -> None:
-    """Measure the loss, and how well rollouts predict: with the true actions and with another window's.
-
-    Example: hma evaluate runs/first shards/my_arm
-    """
-    opened = _opened(checkpoint, data)
-    from hma_model.evaluation.evaluate import evaluate as run
-    from hma_model.evaluation.evaluate import verdict
-
-    found = run(
-        *opened, split=split, count=windows, frames=frames, prompt=prompt, seed=seed,
-        unmask_steps=unmask_steps, sample_steps=sample_steps, cameras=_names(cameras), precision=precision,
-        compile=compile,
-    )  # fmt: skip
-    if json:
-        print_json(found)
-        return
-    plain = [[FIGURES.get(key, key), value] for key, value in found.items() if not isinstance(value, dict)]
-    print_table(["figure", "value"], plain)
-    columns = ["psnr", "psnr_last", "ssim"]
-    rows = [[name, *(found[name][column] for column in columns)] for name in ("true", "shuffled", "copy")]
-    print_table(["rollout", "PSNR dB", "last frame dB", "SSIM"], rows)
-    print(
-        f"true: the window's actions; shuffled: another window's, mean of {found['draws']} draws; "
-        "copy: the prompt's last frame, repeated"
-    )
-    print(f"{checkpoint} {verdict(found)}")
+app.command("evaluate", rich_help_panel=MODELS)(evaluate)
 
 
 @app.command(rich_help_panel=MODELS)
@@ -271,16 +200,11 @@ def generate(
     film = rollout_video(
         *opened, split=split, window=window, frames=frames, prompt=prompt, seed=seed,
         unmask_steps=unmask_steps, sample_steps=sample_steps, temperature=temperature,
-        cameras=_names(cameras), precision=precision, compile=compile,
+        cameras=camera_names(cameras), precision=precision, compile=compile,
     )  # fmt: skip
     write_video(out, film)
     about = f"{len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
     print(f"wrote {out}: {about}")
-
-
-def _names(cameras: str | None) -> str | list[str] | None:
-    names = [name.strip() for name in cameras.split(",")] if cameras else []
-    return names if len(names) > 1 else cameras
 
 
 def _opened(checkpoint: str, data: Path) -> tuple[Any, Any, Any]:

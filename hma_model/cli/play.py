@@ -13,6 +13,7 @@ from urllib.parse import quote
 import typer
 
 from hma_data.errors import UsageError
+from hma_model.cli.options import require_checkpoint
 
 
 def play(
@@ -84,18 +85,6 @@ def play(
         asyncio.run(serve(opened, name, robots, tokenizer(), listener, host, token, ready))
     except KeyboardInterrupt:
         print("stopped; what was not saved is lost")
-
-
-def require_checkpoint(checkpoint: str) -> None:
-    """Refuse a folder of this machine that holds no checkpoint; a name in a folder is not one of the hub."""
-    from hma_data.storage.paths import is_repository
-    from hma_model.checkpoint.folder import resolve
-
-    if "://" in checkpoint or "@" in checkpoint:
-        return
-    folder = Path(checkpoint).expanduser()
-    if folder.parent.is_dir() or not is_repository(checkpoint):
-        resolve(folder)
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -1,299 +1,79 @@
-"""Measure how well a model predicts: its loss, a baseline that ignores all input, and its rollouts.
+"""Measure how well a model predicts one shard set: its losses, and its rollouts beside baselines.
 
-The loss is the cross-entropy in nats a token of each fully masked frame, given the true frames and actions
-before it. It is averaged over the frames from the second on. The baseline is the same cross-entropy for the
-frequencies of the training tokens: a model that ignores its input would reach it. A rollout continues from
-its own predictions. Rollouts are made with the true actions and with shuffled ones, those of another window;
-the difference shows how much the model uses the actions. Which window gets which actions is drawn several
-times, and the figures of shuffled actions are means over the draws.
+A rollout continues from its own predictions. Rollouts are made with the true actions, with shuffled ones
+(those of another window) and with none; `copy` repeats the last frame of the prompt. The difference shows how
+much the model uses the actions. Which window gets which actions is drawn several times, and the figures of
+shuffled actions are means over the draws. `KEY_95` is the 95 % interval of the mean KEY over windows.
 
-B batch, T frames, P frames of the prompt, h,w grid, F digits, V values a digit, S pixels a side, C cameras.
+The protocol of the paper's evaluation, on request: the last frame alone is predicted, from all true frames
+before it, once with the true actions and in several draws with Gaussian ones.
+
+B batch, T frames, P predicted frames, N windows.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
-from hma_data.loading.views import FIRST, Cameras, Views, view_count
+from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
-from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
-from hma_model.config import OBJECTIVES
-from hma_model.evaluation.metrics import perplexity, psnr, ssim, teacher_forced
+from hma_model.checkpoint.folder import require_tokenizer
+from hma_model.evaluation.commands import gaussian, shuffled, shuffled_actions, without_commands
+from hma_model.evaluation.intervals import interval, rounded, summary
+from hma_model.evaluation.losses import (
+    Means,
+    digit_frequencies,
+    masked_val_loss,
+    opened,
+    unconditional_baseline,
+    validation_losses,
+    windows,
+)
+from hma_model.evaluation.metrics import masked_scores, perplexity, psnr, ssim, teacher_forced
+from hma_model.evaluation.perceptual import Judge, Networks
+from hma_model.evaluation.rollouts import Pictures, Sampling, cameras_for, decode, default_prompt, rollout
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
-BASELINE_FRAMES = 200_000
-DRAWS = 5  # of other windows' actions
+__all__ = [
+    "Means", "Pictures", "Sampling", "cameras_for", "decode", "default_prompt", "digit_frequencies",
+    "evaluate", "masked_val_loss", "measure", "rollout", "shuffled", "shuffled_actions",
+    "unconditional_baseline", "validation_losses", "verdict", "windows",
+]  # fmt: skip
+
+DRAWS = 5  # of other windows' actions, and of Gaussian ones
 FOLLOWS_DB = 0.5  # gain of the last frame's PSNR from which a model is said to follow its actions
 PSNR_LIMIT = 60.0  # dB; the PSNR of equal pictures, and with it a mean over frames, would be infinite
-
-
-class Sampling(TypedDict, total=False):
-    """Options of `HMA.generate` that a rollout passes on to it."""
-
-    unmask_steps: int
-    temperature: float
-    order: str
-    sample_steps: int | None
-    guidance: float
-    noise_level: float
-    precision: str
-    compile: bool
+PAPER_BATCH = 4  # the paper's perplexity is a mean over batches of so many windows
+ROLLOUTS = ("true", "shuffled", "none", "copy")
+Floats = NDArray[np.float64]
 
 
 @dataclass
-class Means:
-    """Sums and counts of sample values by embodiment."""
+class Measured:
+    """The result of `measure`.
 
-    sums: dict[str, float] = field(default_factory=dict)
-    counts: dict[str, int] = field(default_factory=dict)
-
-    def add(self, names: Sequence[str], values: Tensor | NDArray[Any]) -> None:
-        """Add one value a sample, (B,)."""
-        for name, value in zip(names, values.tolist()):
-            self.sums[name] = self.sums.get(name, 0.0) + value
-            self.counts[name] = self.counts.get(name, 0) + 1
-
-    def by_embodiment(self) -> dict[str, float]:
-        """Return the mean of each embodiment, sorted by id."""
-        return {name: self.sums[name] / self.counts[name] for name in sorted(self.sums)}
-
-    def mean(self) -> float:
-        """Return the mean over all samples; NaN if there are none."""
-        return sum(self.sums.values()) / max(sum(self.counts.values()), 1) if self.counts else float("nan")
-
-
-def windows(
-    data: StrPath | ShardSet,
-    split: str,
-    frames: int,
-    count: int,
-    batch_size: int = 8,
-    cameras: Cameras = FIRST,
-) -> Iterator[Batch]:
-    """Yield up to `count` windows of a split in batches; they are evenly spaced and always the same."""
-    dataset = WindowDataset(data, split, frames, cameras=cameras)
-    chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(np.int64))
-    for start in range(0, len(chosen) if len(dataset) else 0, batch_size):
-        yield dataset.batch(chosen[start : start + batch_size])
-
-
-@torch.no_grad()
-def validation_losses(
-    model: "HMA", batches: Iterable[Batch], seed: int = 0, objective: str = "forward"
-) -> tuple[Means, Means]:
-    """Return the losses and accuracies of the windows, by embodiment.
-
-    Where a discrete model predicts video from actions, the loss is that of `teacher_forced`. Any other loss
-    is the training loss of the objective, under masks and noise drawn from `seed`; it has no accuracy.
+    Attributes:
+        found: the figures, plain values.
+        by_window: values (N,) of each window, by the name of the figure.
+        batches: the windows.
+        predicted: the predicted tokens or latents of each batch, by the kind of rollout.
     """
-    losses, accuracy, training = Means(), Means(), model.training
-    drawn = OBJECTIVES[objective]
-    exact = model.config.kind == "discrete" and drawn.predicts_video and drawn.sees_actions
-    model.eval()
-    for number, batch in enumerate(batches):
-        batch = batch.to(model.device)
-        if exact:
-            nats, hits = teacher_forced(model, batch)
-            losses.add(batch.embodiment, nats.mean(dim=1))
-            accuracy.add(batch.embodiment, hits.mean(dim=1))
-        else:
-            generator = torch.Generator().manual_seed(seed * 1_000_003 + number)
-            losses.add(batch.embodiment, model(batch, objective, generator).per_sample)
-    model.train(training)
-    return losses, accuracy
 
-
-def masked_val_loss(model: "HMA", batches: Iterable[Batch]) -> float:
-    """Return the mean loss over windows: nats a token of each fully masked frame given the true past."""
-    return validation_losses(model, batches)[0].mean()
-
-
-def digit_frequencies(
-    shards: ShardSet,
-    max_frames: int = BASELINE_FRAMES,
-    cameras: Cameras = FIRST,
-    factored: Sequence[int] | None = None,
-) -> list[NDArray[np.float64]]:
-    """Return the frequency of each value of each digit in train: F arrays (V,), add-one smoothed.
-
-    `factored` states the values of each digit, low digit first; by default it is the tokenizer's.
-
-    Of more than `max_frames` frames, only row groups spread evenly over them are counted, about `max_frames`
-    frames at most.
-    """
-    factored = factored or shards.spec.factored or (shards.spec.vocab_size or 1,)
-    counts = [np.ones(values) for values in factored]
-    files = list(zip(shards.shards("train"), shards.row_groups("train")))
-    groups = [(name, group) for name, rows in files for group in range(len(rows))]
-    stride = max(1, -(-sum(sum(rows) for _, rows in files) // max_frames))
-    columns = Views.of(shards, cameras).columns
-    for name, group in groups[::stride]:
-        read = shards.read(name, [group], columns)
-        tokens = np.concatenate([read[column].astype(np.int64).ravel() for column in columns])
-        for digit, values in enumerate(factored):
-            counts[digit] += np.bincount(tokens % values, minlength=values)
-            tokens //= values
-    return [count / count.sum() for count in counts]
-
-
-def unconditional_baseline(
-    train: Mapping[str, ShardSet] | Sequence[StrPath | ShardSet],
-    batches: Iterable[Batch],
-    cameras: Cameras = FIRST,
-    factored: Sequence[int] | None = None,
-    merge: int = 1,
-) -> Means:
-    """Return the cross-entropy of each embodiment's training frequencies, which ignores all input.
-
-    Args:
-        train: shard sets (or the str or path of each), whose train frames are counted, digit by digit.
-        batches: validation windows of discrete tokens.
-        cameras: as `WindowDataset` takes them.
-        factored: values of each digit, low digit first; by default the tokenizer's.
-        merge: the side of a square of tokens that counts as one, as `HMAConfig.merge`.
-
-    Returns:
-        Nats a token by embodiment, over the frames from the second on, as in `masked_val_loss`.
-    """
-    sets = train.values() if isinstance(train, Mapping) else [_opened(item) for item in train]
-    scores = {
-        s.embodiment.id: [np.log(p) for p in digit_frequencies(s, cameras=cameras, factored=factored)]
-        for s in sets
-    }
-    means = Means()
-    for batch in batches:
-        assert batch.tokens is not None
-        for name, tokens in zip(batch.embodiment, batch.tokens[:, 1:].numpy()):
-            nats, rest = np.zeros(tokens.shape), tokens.copy()
-            for digit in scores[name]:
-                nats -= digit[rest % len(digit)]
-                rest //= len(digit)
-            means.add([name], np.array([nats.mean() * merge**2]))
-    return means
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """A rollout and the truth, both uint8 (B, T, S, C·S, 3); the first P frames are the prompt."""
-
-    prompt: int
-    predicted: NDArray[np.uint8]
-    truth: NDArray[np.uint8]
-
-
-def rollout(
-    model: "HMA",
-    tokenizer: "Tokenizer",
-    batch: Batch,
-    frames: int | None = None,
-    *,
-    prompt: int | None = None,
-    seed: int = 0,
-    truth: NDArray[np.uint8] | None = None,
-    **sampling: Unpack[Sampling],
-) -> Pictures:
-    """Predict the frames that follow the first frames of each window, given its actions.
-
-    Args:
-        model: in eval mode.
-        tokenizer: the tokenizer that the model was trained on.
-        batch: windows of T frames; their tokens are the truth, and their unknown chunks are masked.
-        frames: how many to predict; by default all after the prompt.
-        prompt: P true frames to start from; by default a third of the window, at least one.
-        seed: of every random draw.
-        truth: the decoded frames of another rollout of the same windows, which are then not decoded again.
-        sampling: options of `HMA.generate`.
-
-    Raises:
-        UsageError: the prompt and the frames do not fit the windows, or one of them is empty.
-    """
-    length = batch.actions.shape[1]
-    first = default_prompt(length) if prompt is None else prompt
-    count = length - first if frames is None else frames
-    if first < 1 or count < 1 or first + count > length:
-        raise UsageError("rollout", f"{first} + {count} frames do not fit windows of {length}")
-    stored = batch.tokens if model.config.kind == "discrete" else batch.latents
-    assert stored is not None
-    given, chunks = stored[:, :first].to(model.device), batch.actions
-    chunks = chunks[:, : first + count].to(model.device)
-    generator = torch.Generator().manual_seed(seed)
-    known = batch.action_mask[:, : first + count].to(model.device)
-    predicted = model.generate(
-        given, chunks, batch.embodiment, count, generator=generator, known=known, **sampling
-    )
-    if truth is None:
-        truth = decode(tokenizer, stored[:, : first + count])
-    made = decode(tokenizer, predicted)
-    return Pictures(first, np.concatenate([truth[:, :first], made], axis=1), truth)
-
-
-def default_prompt(length: int) -> int:
-    """Return how many frames of a window of this length a rollout starts from."""
-    return max(1, length // 3)
-
-
-def decode(tokenizer: "Tokenizer", stored: Tensor) -> NDArray[np.uint8]:
-    """Decode ids (B, T, C·h, w) or latents (B, T, c, C·H, W) to pictures (B, T, S, C·S, 3), side by side."""
-    views = stored.flatten(0, 1).cpu().numpy()
-    dtype = np.uint32 if tokenizer.spec.kind == "discrete" else np.dtype(tokenizer.spec.dtype)
-    cameras = np.split(views.astype(dtype), views.shape[-2] // tokenizer.spec.grid[0], axis=-2)
-    pictures = np.concatenate([tokenizer.decode(view) for view in cameras], axis=2)
-    return pictures.reshape(*stored.shape[:2], *pictures.shape[1:])
-
-
-def cameras_for(model: "HMA", shards: ShardSet, cameras: Cameras | None = None) -> Cameras:
-    """Return the cameras that a model sees: those given, or those that it was trained on.
-
-    Raises:
-        UsageError: these are more or fewer than the views of the model.
-    """
-    if cameras is None and "origin" in vars(model):
-        card = Checkpoint.open(vars(model)["origin"]).card(shards.embodiment.id)
-        cameras = card.get("data", {}).get("cameras")
-    cameras = FIRST if cameras is None else cameras
-    if (count := view_count(cameras)) != model.config.views:
-        fault = f"are {count} in a frame, but the model takes {model.config.views}"
-        raise UsageError(
-            "cameras", fault, f"name {model.config.views} of {', '.join(shards.manifest.cameras)}"
-        )
-    return cameras
-
-
-def shuffled_actions(batch: Batch, begin: int = 0, seed: int = 0, draw: int = 0) -> Tensor:
-    """Replace each window's chunks from `begin` on by those of another window of the same embodiment.
-
-    Every `draw` pairs the windows anew. A window that is the only one of its embodiment gets its own chunks
-    in reverse. Return (B, T, K).
-    """
-    actions = batch.actions.clone()
-    source = batch.actions[:, begin:]
-    rng = np.random.default_rng([seed, 1 + draw])
-    for name in dict.fromkeys(batch.embodiment):
-        own = rng.permutation([i for i, other in enumerate(batch.embodiment) if other == name])
-        if len(own) == 1:
-            actions[own, begin:] = source[own].flip(1)
-        else:
-            actions[own, begin:] = source[np.roll(own, 1)]
-    return actions
-
-
-def shuffled(batch: Batch, begin: int = 0, seed: int = 0, draw: int = 0) -> Batch:
-    """Return the windows with the chunks of `shuffled_actions`, which are known where they were."""
-    masks = replace(batch, actions=batch.action_mask)
-    known = shuffled_actions(masks, begin, seed, draw)
-    return replace(batch, actions=shuffled_actions(batch, begin, seed, draw), action_mask=known)
+    found: dict[str, Any]
+    by_window: dict[str, Floats]
+    batches: list[Batch] = field(default_factory=list)
+    predicted: dict[str, list[torch.Tensor]] = field(default_factory=dict)
 
 
 def evaluate(
@@ -328,43 +108,103 @@ def evaluate(
 
     Returns:
         `loss` (nats a token); for discrete models also `shuffled_loss` (given another window's actions),
-        `baseline_loss`, `perplexity` and `accuracy`. For rollouts with the `true` actions, with `shuffled`
-        actions, and for `copy`, which repeats the last frame of the prompt: `psnr` and `ssim` over the
-        horizon, `psnr_last` and `psnr_by_frame`. `psnr_action_gain_last` is `psnr_last` of true minus that of
-        shuffled.
+        `baseline_loss`, `perplexity`, `accuracy`, and both of `masked_scores`. For rollouts with the `true`
+        actions, with `shuffled` ones, with `none`, and for `copy`: `psnr` and `ssim` over the horizon,
+        `psnr_last`, `psnr_by_frame` and `ssim_by_frame`. `psnr_action_gain_last` is `psnr_last` of true minus
+        that of shuffled. `notes` says in words what else must be known, and `missing` why a metric is absent.
 
     Raises:
         CheckpointError: the model was trained on another tokenizer.
         UsageError: the split has no window.
     """
-    shards = _opened(data)
+    return measure(
+        model, tokenizer, data, split=split, count=count, frames=frames, prompt=prompt, batch_size=batch_size,
+        draws=draws, seed=seed, cameras=cameras, **sampling,
+    ).found  # fmt: skip
+
+
+def measure(
+    model: "HMA",
+    tokenizer: "Tokenizer",
+    data: StrPath | ShardSet,
+    *,
+    split: str = "val",
+    count: int = 32,
+    frames: int | None = None,
+    prompt: int | None = None,
+    batch_size: int = 16,
+    draws: int = DRAWS,
+    seed: int = 0,
+    cameras: Cameras | None = None,
+    paper: bool = False,
+    networks: Networks | None = None,
+    on_frames: Callable[[int], None] = lambda frames: None,
+    **sampling: Unpack[Sampling],
+) -> Measured:
+    """Compute the figures of `evaluate`, and keep what pictures are drawn from.
+
+    Args:
+        paper: also follow the paper's protocol.
+        networks: what measures LPIPS, FID and FVD.
+        on_frames: is told after each batch of rollouts how many frames it predicted.
+
+    The other arguments and the errors are those of `evaluate`.
+    """
+    shards = opened(data)
     require_tokenizer(model.config, shards.spec, shards.folder)
     length = frames or model.config.frames
     first = default_prompt(length) if prompt is None else prompt
     cameras = cameras_for(model, shards, cameras)
     if not len(WindowDataset(shards, split, length, cameras=cameras)):
-        raise UsageError(shards.folder, f"has no window of {length} frames in {split}", "use another split")
+        fault = f"has no window of {length} frames in {split}"
+        raise UsageError(shards.folder, fault, "give another --split or fewer --frames")
+    batches = list(windows(shards, split, length, count, batch_size, cameras))
+    table, by_window = _losses(model, shards, batches, cameras, draws, seed)
+    roll = partial(rollout, model, tokenizer, **sampling)
+    scores: dict[str, list[_Scores]] = {name: [] for name in ROLLOUTS}
+    predicted: dict[str, list[torch.Tensor]] = {"true": [], "shuffled": [], "none": []}
+    judge, still = Judge(networks or Networks()), 0
+    for number, batch in enumerate(batches):
+        own = _counted(partial(roll, prompt=first, seed=seed + number), on_frames)
+        true = own(batch)
+        judge.add("truth", true.truth[:, first:])
+        still += int((true.truth[:, first:] == true.truth[:, first - 1 : first]).all(axis=(1, 2, 3, 4)).sum())
 
-    def chosen() -> Iterator[Batch]:
-        return windows(shards, split, length, count, batch_size, cameras)
+        def keep(name: str, pictures: Pictures, judge: Judge = judge) -> "_Scores":
+            judge.add(name, pictures.predicted[:, first:])
+            return _Scores.of(pictures, judge)
 
-    table = _losses(model, shards, chosen, cameras, draws)
-    scores: dict[str, list[_Scores]] = {"true": [], "shuffled": [], "copy": []}
-    for number, batch in enumerate(chosen()):
-        roll = partial(rollout, model, tokenizer, prompt=first, seed=seed + number, **sampling)
-        true = roll(batch)
-        still = true.predicted.copy()
-        still[:, first:] = still[:, first - 1 : first]
-        scores["true"].append(_Scores.of(true))
-        scores["copy"].append(_Scores.of(replace(true, predicted=still)))
-        for draw in range(draws):
-            other = shuffled(batch, first - 1, seed, draw)
-            scores["shuffled"].append(_Scores.of(roll(other, truth=true.truth)))
-    figures = {name: _Scores.means(parts) for name, parts in scores.items()}
-    return {
+        scores["true"].append(keep("true", true))
+        copied = true.predicted.copy()
+        copied[:, first:] = copied[:, first - 1 : first]
+        everywhere = np.ones_like(true.finite)
+        scores["copy"].append(keep("copy", replace(true, predicted=copied, finite=everywhere)))
+        others = [own(shuffled(batch, first - 1, seed, draw), truth=true.truth) for draw in range(draws)]
+        pairs = [keep("shuffled", others[0]), *(_Scores.of(other, judge) for other in others[1:])]
+        scores["shuffled"].append(_Scores.mean(pairs))
+        none = own(without_commands(batch), truth=true.truth)
+        scores["none"].append(keep("none", none))
+        for name, made in (("true", true), ("shuffled", others[0]), ("none", none)):
+            predicted[name].append(made.stored)
+    joined = {name: _Scores.join(parts) for name, parts in scores.items()}
+    figures = {name: joined[name].figures(seed) for name in ROLLOUTS}
+    for name, part in joined.items():
+        by_window |= {f"{name}.psnr": part.psnr.mean(axis=1), f"{name}.psnr_last": part.psnr[:, -1]}
+        by_window |= {f"{name}.ssim": part.ssim.mean(axis=1)}
+        if part.lpips is not None:
+            by_window[f"{name}.lpips"] = part.lpips.mean(axis=1)
+    gain = by_window["true.psnr_last"] - by_window["shuffled.psnr_last"]
+    by_window["psnr_action_gain_last"] = gain
+    frechet, missing = judge.figures(length - first)
+    for name in ROLLOUTS:
+        figures[name] |= frechet.get(name, {})
+    extra: dict[str, Any] = {}
+    if paper:
+        extra["paper"] = _paper(roll, batches, shards, by_window, draws, seed, on_frames)
+    found = {
         "embodiment": shards.embodiment.id,
         "split": split,
-        "windows": sum(len(part.psnr) for part in scores["true"]),
+        "windows": len(gain),
         "frames": length,
         "prompt": first,
         "draws": draws,
@@ -372,61 +212,181 @@ def evaluate(
         "cameras": cameras if isinstance(cameras, str) else ", ".join(cameras),
         **table,
         **figures,
-        "psnr_action_gain_last": figures["true"]["psnr_last"] - figures["shuffled"]["psnr_last"],
+        **summary("psnr_action_gain_last", gain, seed, digits=6),
+        **extra,
+        "missing": missing
+        | ({} if paper else {"paper": "not measured: --paper follows the paper's protocol"}),
+        "notes": _notes(model, joined, table, still, len(gain)),
+        "seconds_a_frame": round(1 / shards.embodiment.effective_hz, 6),
     }
+    return Measured(found, by_window, batches, predicted)
+
+
+def _counted(roll: Callable[..., Pictures], on_frames: Callable[[int], None]) -> Callable[..., Pictures]:
+    """Return a function that rolls out, and then tells how many frames it predicted."""
+
+    def counting(batch: Batch, **options: Any) -> Pictures:
+        made = roll(batch, **options)
+        on_frames(made.finite.size)
+        return made
+
+    return counting
 
 
 def verdict(found: Mapping[str, Any]) -> str:
     """Return a sentence about the result of `evaluate`: whether the model follows its actions."""
-    said = f"{found['psnr_action_gain_last']:+.1f} dB on the last frame, true less shuffled actions"
-    if found["psnr_action_gain_last"] >= FOLLOWS_DB:
+    gain = found["psnr_action_gain_last"]
+    if gain is None:
+        return "cannot be judged: its predictions are not finite"
+    said = f"{gain:+.1f} dB on the last frame, true less shuffled actions"
+    if gain >= FOLLOWS_DB:
         return f"follows its actions: {said}"
     return f"does not follow its actions yet ({said})"
 
 
 def _losses(
-    model: "HMA", shards: ShardSet, chosen: Callable[[], Iterator[Batch]], cameras: Cameras, draws: int
-) -> dict[str, Any]:
-    losses, accuracy = validation_losses(model, chosen())
+    model: "HMA", shards: ShardSet, batches: list[Batch], cameras: Cameras, draws: int, seed: int
+) -> tuple[dict[str, Any], dict[str, Floats]]:
+    """Return the losses, and by the name of each the values (N,) of the windows."""
     if model.config.kind == "continuous":
-        return {"loss": losses.mean()}
-    other = (shuffled(batch, draw=draw) for draw in range(draws) for batch in chosen())
-    return {
-        "loss": losses.mean(),
+        loss = np.array(validation_losses(model, batches)[0].samples)
+        return summary("loss", loss, digits=6), {"loss": loss}
+    forced = [teacher_forced(model, batch.to(model.device)) for batch in batches]
+    nats, hits = (torch.cat(part).double().cpu().numpy() for part in zip(*forced, strict=True))
+    other = (shuffled(batch, draw=draw) for draw in range(draws) for batch in batches)
+    drawn = [torch.Generator().manual_seed(seed * 1_000_003 + number) for number in range(len(batches))]
+    masked = [masked_scores(model, batch.to(model.device), g) for batch, g in zip(batches, drawn)]
+    masked_nats, masked_hits = (torch.cat(part).double().cpu().numpy() for part in zip(*masked, strict=True))
+    by_window = {"loss": nats.mean(axis=1), "accuracy": hits.mean(axis=1)}
+    by_window |= {"masked_loss": masked_nats, "masked_accuracy": masked_hits}
+    table: dict[str, Any] = summary("loss", by_window["loss"], seed, digits=6) | {
         "shuffled_loss": masked_val_loss(model, other),
         "baseline_loss": unconditional_baseline(
-            [shards], chosen(), cameras, model.config.factored, model.config.merge
+            [shards], batches, cameras, model.config.factored, model.config.merge
         ).mean(),
-        "perplexity": perplexity(losses.mean()),
-        "accuracy": accuracy.mean(),
     }
+    table |= _perplexity("perplexity", by_window["loss"], seed)
+    table |= summary("accuracy", by_window["accuracy"], seed, digits=6)
+    table |= _perplexity("masked_perplexity", masked_nats, seed)
+    table |= summary("masked_accuracy", masked_hits[np.isfinite(masked_hits)], seed, digits=6)
+    table |= {"loss_by_frame": rounded(nats.mean(axis=0)), "accuracy_by_frame": rounded(hits.mean(axis=0))}
+    return table, by_window
+
+
+def _perplexity(name: str, nats: Floats, seed: int) -> dict[str, Any]:
+    """Return exp of the mean of losses (N,), with its interval."""
+    nats = nats[np.isfinite(nats)]
+    if not len(nats):
+        return {name: None, f"{name}_95": None}
+    ends = [perplexity(float(end)) for end in interval(nats, seed)]
+    return {name: perplexity(float(nats.mean())), f"{name}_95": [round(end, 4) for end in ends]}
+
+
+def _paper(
+    roll: Callable[..., Pictures],
+    batches: list[Batch],
+    shards: ShardSet,
+    by_window: dict[str, Floats],
+    draws: int,
+    seed: int,
+    on_frames: Callable[[int], None],
+) -> dict[str, Any]:
+    """Follow the paper's protocol: its perplexity, and ΔPSNR of a last frame under Gaussian actions."""
+    scores: dict[str, list[_Scores]] = {"true": [], "gaussian": []}
+    for number, batch in enumerate(batches):
+        last = _counted(partial(roll, prompt=batch.actions.shape[1] - 1, seed=seed + number), on_frames)
+        true = last(batch)
+        scores["true"].append(_Scores.of(true))
+        drawn = (
+            gaussian(batch, shards.manifest.stats["action"], (seed * 1_009 + number) * 101 + draw)
+            for draw in range(draws)
+        )
+        scores["gaussian"].append(
+            _Scores.mean([_Scores.of(last(other, truth=true.truth)) for other in drawn])
+        )
+    true_db, gaussian_db = (_Scores.join(scores[name]).psnr[:, 0] for name in ("true", "gaussian"))
+    by_window["paper.delta_psnr"] = true_db - gaussian_db
+    found = summary("psnr_last", true_db, seed) | summary("gaussian_psnr_last", gaussian_db, seed)
+    found |= summary("delta_psnr", true_db - gaussian_db, seed) | {"draws": draws}
+    if "accuracy" in by_window:  # exp of each batch's mean, then the mean: above the exp of the mean
+        nats = by_window["loss"]
+        parts = np.array_split(nats, range(PAPER_BATCH, len(nats), PAPER_BATCH))
+        found["perplexity"] = rounded(np.mean([perplexity(float(part.mean())) for part in parts]))
+    return found
+
+
+def _notes(
+    model: "HMA", joined: "Mapping[str, _Scores]", table: Mapping[str, Any], still: int, count: int
+) -> list[str]:
+    """Return what must be known to read the figures."""
+    notes, config = [], model.config
+    if wrong := sum(int((~part.finite).sum()) for part in joined.values()):
+        total = sum(part.finite.size for part in joined.values())
+        notes.append(f"{wrong} of {total} predicted frames are NaN or infinite: the checkpoint has diverged")
+    if table["loss"] is None:
+        notes.append("the loss is not finite: the checkpoint has diverged")
+    if 2 * still > count:
+        notes.append(
+            f"the true pictures of {still} of {count} windows never change: a copy of the prompt is perfect "
+            "there, and the figures say nothing about the actions"
+        )
+    if not config.drop_commands and "passive" not in config.objectives:
+        notes.append("the model was not trained without commands, so its rollouts with none may be poor")
+    return notes
 
 
 @dataclass(frozen=True)
 class _Scores:
-    """PSNR (B, P) in dB and SSIM (B, P) of predicted frames."""
+    """PSNR (B, P) in dB, SSIM (B, P) and LPIPS (B, P) of predicted frames; NaN where one is not finite."""
 
-    psnr: NDArray[np.float64]
-    ssim: NDArray[np.float64]
+    psnr: Floats
+    ssim: Floats
+    lpips: Floats | None
+    finite: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, pictures: Pictures) -> "_Scores":
+    def of(cls, pictures: Pictures, judge: Judge | None = None) -> "_Scores":
         truth, predicted = (part[:, pictures.prompt :] for part in (pictures.truth, pictures.predicted))
         size, shape = truth.shape[:2], (-1, *truth.shape[2:])
         truth, predicted = truth.reshape(shape), predicted.reshape(shape)
         signal = np.minimum(psnr(truth, predicted), PSNR_LIMIT)
-        return cls(signal.reshape(size), ssim(truth, predicted).reshape(size))
+        parts = [signal, ssim(truth, predicted)]
+        if judge and judge.networks.lpips:
+            parts.append(judge.networks.lpips(truth, predicted))
+        parts = [np.where(pictures.finite, part.reshape(size), np.nan) for part in parts]
+        return cls(parts[0], parts[1], parts[2] if len(parts) > 2 else None, pictures.finite)
 
-    @staticmethod
-    def means(parts: "list[_Scores]") -> dict[str, Any]:
-        by_frame = np.concatenate([part.psnr for part in parts]).mean(axis=0)
-        return {
-            "psnr": float(by_frame.mean()),
-            "psnr_last": float(by_frame[-1]),
-            "psnr_by_frame": [round(float(value), 3) for value in by_frame],
-            "ssim": float(np.concatenate([part.ssim for part in parts]).mean()),
-        }
+    @classmethod
+    def mean(cls, draws: "list[_Scores]") -> "_Scores":
+        """Return the means over draws."""
+        return cls._combined(draws, partial(np.mean, axis=0), partial(np.all, axis=0))
+
+    @classmethod
+    def join(cls, batches: "list[_Scores]") -> "_Scores":
+        return cls._combined(batches, np.concatenate, np.concatenate)
+
+    @classmethod
+    def _combined(
+        cls, parts: "list[_Scores]", rule: Callable[..., Any], of_finite: Callable[..., Any]
+    ) -> "_Scores":
+        far = None if parts[0].lpips is None else rule([part.lpips for part in parts])
+        psnrs, ssims = rule([part.psnr for part in parts]), rule([part.ssim for part in parts])
+        return cls(psnrs, ssims, far, of_finite([part.finite for part in parts]))
+
+    def figures(self, seed: int) -> dict[str, Any]:
+        """Return the means over windows, with their intervals."""
+        found = summary("psnr", self.psnr.mean(axis=1), seed, digits=6)
+        found |= summary("psnr_last", self.psnr[:, -1], seed, digits=6)
+        found |= _by_frame("psnr", self.psnr, seed) | summary("ssim", self.ssim.mean(axis=1), seed, digits=6)
+        found |= _by_frame("ssim", self.ssim, seed)
+        if self.lpips is not None:
+            found |= summary("lpips", self.lpips.mean(axis=1), seed) | _by_frame("lpips", self.lpips, seed)
+        return found
 
 
-def _opened(item: StrPath | ShardSet) -> ShardSet:
-    return item if isinstance(item, ShardSet) else ShardSet(item)
+def _by_frame(name: str, values: Floats, seed: int) -> dict[str, Any]:
+    """Return the means of values (N, P) over windows and their intervals: P pairs."""
+    return {
+        f"{name}_by_frame": rounded(values.mean(axis=0), 3 if name == "psnr" else 4),
+        f"{name}_by_frame_95": rounded(interval(values, seed).T),
+    }

@@ -155,6 +155,32 @@ def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
     return nats, hits
 
 
+@torch.no_grad()
+def masked_scores(
+    model: "HMA", batch: "Batch", generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Score the tokens that training would mask, among its masks and replaced digits (paper section 3).
+
+    Args:
+        model: a discrete model in eval mode, which predicts video from actions.
+        batch: a batch on the model's device; of longer windows the first frames that the model holds.
+        generator: of the masks and the replaced digits.
+
+    Returns:
+        nats (B,) float32 a masked token, without label smoothing, and accuracy (B,) of whole tokens; NaN for
+        a window without a masked token.
+    """
+    batch, config = _part(batch, slice(model.config.frames)), model.config
+    assert batch.tokens is not None
+    output = model(batch, "forward", generator)
+    true = model.frame_values(batch.tokens).unflatten(2, config.token_grid)
+    masked = output.masked.flatten(1)
+    counts = masked.sum(dim=1)
+    scores = (rule(output.video_logits, true, config.digits) for rule in (token_nats, token_hits))
+    nats, hits = ((score.flatten(1) * masked).sum(dim=1) / counts for score in scores)
+    return nats, hits
+
+
 def _at_once(model: "HMA", batch: "Batch") -> Tensor:
     """Return scores (B, T-1, h, w, F, V) of the masked frames, computed in one pass."""
     assert batch.tokens is not None

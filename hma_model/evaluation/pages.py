@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D")
+SIX = (*COLOURS, "#56b4e9", "#555555")  # of plots with more curves
 
 _STYLE = """
 :root { --ink:#1d2430; --soft:#5b6675; --paper:#ffffff; --card:#f5f7fa; --line:#d9dfe7; --accent:#0072b2 }
@@ -40,10 +41,20 @@ p { max-width:48rem } .soft, figcaption, th { color:var(--soft) } a { color:var(
 table { border-collapse:collapse; margin:.6rem 0; font-variant-numeric:tabular-nums }
 th, td { text-align:left; padding:.34rem .9rem .34rem 0; border-bottom:1px solid var(--line);
   white-space:nowrap }
-td.n, th.n { text-align:right } th { font-weight:600; font-size:.86rem }
+td.n, th.n { text-align:right } td { vertical-align:top }
+td small { color:var(--soft) }
+.dense { font-size:.8rem } .dense th { font-size:.76rem } .dense th, .dense td { padding-right:.55rem }
+.dense small { font-size:.66rem } th { font-weight:600; font-size:.86rem }
 figure { margin:1rem 0 } figcaption { font-size:.9rem; margin-top:.3rem; max-width:48rem }
 img { max-width:100%; height:auto; border-radius:8px; border:1px solid var(--line) }
 .plot img { background:#fff; padding:.5rem }
+dl { display:grid; grid-template-columns:minmax(8rem, max-content) 1fr; gap:.2rem 1rem; font-size:.9rem }
+dt { font-weight:600 } dd { margin:0; color:var(--soft); overflow-wrap:anywhere }
+h3 { font-size:1rem; margin:1.6rem 0 0 } h3 + p { margin:.1rem 0 .5rem }
+.strips { display:grid; grid-template-columns:8.5rem 1fr; gap:.3rem .8rem; align-items:center }
+.strips span { color:var(--soft); font-size:.86rem } .strips img { display:block; border-radius:4px }
+@media (max-width:640px) { .strips, dl { grid-template-columns:1fr; gap:.15rem } .strips img, dd
+  { margin-bottom:.5rem } }
 pre { background:var(--card); border:1px solid var(--line); border-radius:10px; padding:.8rem 1rem;
   overflow-x:auto; font:13.5px/1.5 ui-monospace, monospace }
 """
@@ -75,14 +86,15 @@ class Page:
         self._parts.append(f"<p>{_text(text)}</p>")
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-        """Add a table; columns of numbers are aligned to the right."""
+        """Add a table; columns of numbers are aligned to the right. A second line of a cell is small."""
         numeric = [all(isinstance(row[i], int | float) for row in rows) for i in range(len(columns))]
         styles = [" class=n" if right else "" for right in numeric]
         lines = ["".join(f"<th{s}>{_text(name)}</th>" for name, s in zip(columns, styles, strict=True))]
         for row in rows:
             lines.append("".join(f"<td{s}>{_cell(v)}</td>" for v, s in zip(row, styles, strict=True)))
         body = "".join(f"<tr>{line}</tr>" for line in lines)
-        self._parts.append(f"<div class=scroll><table>{body}</table></div>")
+        style = " class=dense" if len(columns) > 10 else ""
+        self._parts.append(f"<div class=scroll><table{style}>{body}</table></div>")
 
     def picture(self, data: bytes, kind: str, caption: str) -> None:
         """Add an embedded picture.
@@ -98,6 +110,21 @@ class Page:
             f'<figure{style}><img src="{source}" alt="{html.escape(caption)}">'
             f"<figcaption>{_text(caption)}</figcaption></figure>"
         )
+
+    def definitions(self, pairs: Sequence[tuple[str, str]]) -> None:
+        """Add a list of terms with what they mean."""
+        items = "".join(f"<dt>{_text(name)}</dt><dd>{_text(words)}</dd>" for name, words in pairs)
+        self._parts.append(f"<dl>{items}</dl>")
+
+    def strips(self, title: str, text: str, rows: Sequence[tuple[str, bytes]]) -> None:
+        """Add wide WebP pictures below each other, each beside its name."""
+        lines = [
+            f'<span>{_text(name)}</span><img loading=lazy alt="{html.escape(f"{title}: {name}")}" '
+            f'src="data:image/webp;base64,{base64.b64encode(data).decode()}">'
+            for name, data in rows
+        ]
+        head = f"<h3>{_text(title)}</h3><p class=soft>{_text(text)}</p>"
+        self._parts.append(f"{head}<div class=strips>{''.join(lines)}</div>")
 
     def commands(self, text: str) -> None:
         """Add lines for a shell."""
@@ -123,7 +150,10 @@ def _cell(value: Any) -> str:
         return "–"
     if isinstance(value, float):
         return f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
-    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else _text(str(value))
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{value:,}"
+    figure, _, below = _text(str(value)).partition("\n")
+    return f"{figure}<br><small>{below}</small>" if below else figure
 
 
 def loss_curves(
@@ -191,6 +221,30 @@ def psnr_over_horizon(curves: Mapping[str, Sequence[float]], seconds_per_frame: 
         time = seconds_per_frame * np.arange(1, len(values) + 1)
         axes.plot(time, values, color=COLOURS[i], ls=STYLES[i], marker=MARKERS[i], ms=5, label=name)
     axes.legend(frameon=False, fontsize=9)
+    return svg_bytes(figure)
+
+
+def over_horizon(
+    curves: Mapping[str, tuple[Sequence[float], Sequence[Sequence[float]]]],
+    seconds_per_frame: float,
+    unit: str,
+) -> bytes:
+    """Plot means of each predicted frame, with a band for their intervals.
+
+    Args:
+        curves: name -> (the mean, and the ends of its interval, of each frame after the prompt).
+        seconds_per_frame: seconds between frames of the model.
+        unit: the label of the values' axis.
+    """
+    figure, axes = _axes("seconds after the prompt", unit)
+    for i, (name, (values, ends)) in enumerate(curves.items()):
+        time = seconds_per_frame * np.arange(1, len(values) + 1)
+        colour, (low, high) = SIX[i % len(SIX)], np.array(ends, float).T
+        style, marker = STYLES[i % len(STYLES)], MARKERS[i % len(MARKERS)]
+        axes.plot(time, values, color=colour, ls=style, marker=marker, ms=5, label=name)
+        axes.fill_between(time, low, high, color=colour, alpha=0.15, lw=0)
+    handles = axes.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper left", frameon=False, fontsize=9, ncols=2)
     return svg_bytes(figure)
 
 

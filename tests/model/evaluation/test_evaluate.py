@@ -1,6 +1,7 @@
 """Evaluation: losses by their definition, the baseline by hand, and rollouts of models that are known."""
 
 import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,13 @@ import torch
 from hma_data.errors import CheckpointError, UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.shards.reader import ShardSet
-from hma_model.evaluation import evaluate as module
+from hma_model.evaluation import commands
+from hma_model.evaluation.commands import gaussian, without_commands
 from hma_model.evaluation.evaluate import (
     digit_frequencies,
     evaluate,
     masked_val_loss,
+    measure,
     rollout,
     shuffled,
     shuffled_actions,
@@ -25,7 +28,8 @@ from hma_model.evaluation.evaluate import (
     verdict,
     windows,
 )
-from hma_model.evaluation.metrics import teacher_forced, token_hits, token_nats
+from hma_model.evaluation.intervals import interval, over_datasets
+from hma_model.evaluation.metrics import masked_scores, teacher_forced, token_hits, token_nats
 from hma_model.network.model import HMA
 from tests.model.robots import CONFIG, SPEC, make_model
 from tests.model.shards import make_shards
@@ -238,7 +242,7 @@ def test_each_picture_is_decoded_once(data, model):
     tokenizer = Counting()
     found = evaluate(model, tokenizer, data, count=5, prompt=1, batch_size=2, draws=3)
     truth, predicted = found["windows"] * 4, found["windows"] * 3
-    assert tokenizer.decoded == truth + (1 + 3) * predicted  # with the true actions and with three others
+    assert tokenizer.decoded == truth + (1 + 3 + 1) * predicted  # true, three others, none
 
 
 def test_a_rollout_over_a_truth_that_is_known_is_the_same(model, batch):
@@ -267,12 +271,14 @@ def test_every_draw_shuffles_anew(batch):
 
 
 def test_figures_of_shuffled_actions_are_means_over_the_draws(data, model, monkeypatch):
-    real = module.shuffled_actions
+    real = commands.shuffled_actions
     one = []
     for draw in range(3):
-        monkeypatch.setattr(module, "shuffled_actions", lambda *a, draw=0, only=draw: real(*a[:3], draw=only))
+        monkeypatch.setattr(
+            commands, "shuffled_actions", lambda *a, draw=0, only=draw: real(*a[:3], draw=only)
+        )
         one.append(evaluate(model, Blocks(), data, count=5, prompt=1, batch_size=2, draws=1))
-    monkeypatch.setattr(module, "shuffled_actions", real)
+    monkeypatch.setattr(commands, "shuffled_actions", real)
     found = evaluate(model, Blocks(), data, count=5, prompt=1, batch_size=2, draws=3)
     assert found["true"] == one[0]["true"] and found["draws"] == 3
     for key in ("psnr_last", "ssim"):
@@ -313,3 +319,109 @@ def test_the_verdict_says_whether_the_model_follows_its_actions() -> None:
         "follows its actions: +2.1 dB on the last frame"
     )
     assert verdict({"psnr_action_gain_last": 0.1}).startswith("does not follow its actions yet (+0.1 dB")
+
+
+# -- intervals, other commands, words
+
+
+def test_intervals_are_the_middle_of_resampled_means(data, model):
+    found = evaluate(model, Blocks(), data, count=5, prompt=1)
+    for part in (found, *(found[name] for name in ("true", "shuffled", "none", "copy"))):
+        for key in [key for key in part if f"{key}_95" in part and not key.endswith("by_frame")]:
+            low, high = part[f"{key}_95"]
+            assert low <= part[key] + 1e-3 and part[key] <= high + 1e-3
+    values = np.random.default_rng(0).normal(3, 2, 400)
+    low, high = interval(values)
+    error = values.std() / 20
+    assert (low, high) == pytest.approx(
+        (values.mean() - 1.96 * error, values.mean() + 1.96 * error), abs=0.06
+    )
+    assert np.allclose(interval(values[:, None].repeat(2, axis=1))[:, 0], interval(values))
+
+
+def test_over_datasets_each_set_counts_once():
+    rng = np.random.default_rng(0)
+    sets = [rng.normal(1, 1, 300), rng.normal(5, 1, 30)]
+    mean, (low, high) = over_datasets(sets)
+    assert mean == pytest.approx(np.mean([part.mean() for part in sets]))
+    error = np.sqrt(sets[0].var() / 300 + sets[1].var() / 30) / 2
+    assert high - low == pytest.approx(2 * 1.96 * error, rel=0.12)
+
+
+def test_gaussian_commands_have_the_embodiments_statistics(batch):
+    many = replace(batch, actions=torch.zeros(2000, 4, 4), action_mask=torch.zeros(2000, 4, dtype=torch.bool))
+    drawn = gaussian(many, {"mean": [3.0, -1.0], "std": [0.5, 0.0]}, seed=1)
+    steps = drawn.actions.unflatten(2, (2, 2))  # of a chunk, then dims
+    assert steps.mean(dim=(0, 1, 2)).tolist() == pytest.approx([3, -1], abs=0.02)
+    assert steps.std(dim=(0, 1, 2)).tolist() == pytest.approx([0.5, 0], abs=0.02)
+    assert drawn.action_mask.all() and torch.equal(
+        gaussian(many, STATS, 1).actions, gaussian(many, STATS, 1).actions
+    )
+
+
+STATS = {"mean": [0.0, 0.0], "std": [1.0, 1.0]}
+
+
+def test_without_commands_no_command_reaches_the_model(data, model, batch):
+    other = replace(batch, actions=torch.randn_like(batch.actions))
+    one, same = (rollout(model, Blocks(), without_commands(windows), prompt=2) for windows in (batch, other))
+    assert (one.predicted == same.predicted).all()
+    assert "not trained without commands" in " ".join(evaluate(model, Blocks(), data, count=2)["notes"])
+
+
+def test_masked_scores_are_those_of_the_training_loss(batch):
+    plain = make_model({"arm": 2}, config=CONFIG.replace(label_smoothing=0.0, training_pass="pairs"))
+    for model in (plain, make_model({"arm": 2}, config=CONFIG.replace(label_smoothing=0.0))):
+        nats, hits = masked_scores(model, batch, torch.Generator().manual_seed(3))
+        expected = model(batch, "forward", torch.Generator().manual_seed(3)).per_sample
+        drawn = expected > 0  # a window in which no token is masked has no scores
+        assert torch.allclose(nats[drawn], expected[drawn], atol=1e-5) and drawn.sum() >= 3
+        assert torch.equal(nats.isnan(), ~drawn) and ((hits[drawn] >= 0) & (hits[drawn] <= 1)).all()
+
+
+def test_the_papers_protocol_predicts_the_last_frame_from_the_true_past(data):
+    oracle = Oracle(CONFIG)
+    oracle.add_embodiment(make_model({"arm": 2}).embodiments["arm"])
+    oracle.truth = list(windows(data, "val", 4, 6, batch_size=3))
+    found = measure(oracle.eval(), Blocks(), data, count=6, batch_size=3, prompt=1, paper=True).found
+    paper = found["paper"]
+    assert paper["psnr_last"] == 60.0 and paper["gaussian_psnr_last"] < 30
+    assert paper["delta_psnr"] == pytest.approx(60 - paper["gaussian_psnr_last"])
+    assert "paper" not in found["missing"]
+
+
+def test_the_papers_perplexity_is_a_mean_over_batches_of_four(data, model):
+    measured = measure(model, Blocks(), data, count=6, paper=True, draws=1)
+    nats = measured.by_window["loss"]
+    expected = np.mean([np.exp(nats[:4].mean()), np.exp(nats[4:].mean())])
+    assert measured.found["paper"]["perplexity"] == pytest.approx(expected, abs=1e-3)
+
+
+def test_predictions_that_are_not_finite_are_said_in_words(data, model, monkeypatch):
+    def generate(prompt: Any, actions: Any, embodiment: Any, frames: int, **_: Any) -> torch.Tensor:
+        return torch.full((len(prompt), frames, *prompt.shape[2:]), math.nan)
+
+    monkeypatch.setattr(model, "generate", generate)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = evaluate(model, Blocks(), data, count=5)
+    assert found["true"]["psnr_last"] is None and found["copy"]["psnr_last"] is not None
+    assert "predicted frames are NaN or infinite" in found["notes"][0]
+    assert verdict(found) == "cannot be judged: its predictions are not finite"
+
+
+def test_pictures_that_never_change_are_said_in_words(model, data):
+    class Dark(Blocks):
+        def decode(self, tokens: np.ndarray) -> np.ndarray:
+            return np.zeros_like(super().decode(tokens))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = evaluate(model, Dark(), data, count=5)
+    assert found["true"]["psnr_last"] == found["copy"]["psnr_last"] == 60
+    assert "the true pictures of 5 of 5 windows never change" in found["notes"][0]
+
+
+def test_a_metric_without_weights_is_a_row_of_words(model, data):
+    missing = evaluate(model, Blocks(), data, count=2)["missing"]
+    assert all(f"--{name} FILE" in missing[name] for name in ("lpips", "fid", "fvd"))

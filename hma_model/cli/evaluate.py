@@ -1,0 +1,202 @@
+"""Define the verb `hma evaluate`: the table of metrics, and the page."""
+
+import json as json_text
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hma_data.console import interruptible, print_lines, print_table
+from hma_model.cli.options import (
+    Cameras,
+    Checkpoint,
+    Compile,
+    Precision,
+    SampleSteps,
+    Split,
+    UnmaskSteps,
+    camera_names,
+    require_checkpoint,
+)
+
+if TYPE_CHECKING:
+    from hma_model.evaluation.suite import Part
+
+FIGURES = {  # figures of `hma evaluate` as its table names them; the others have their names in the JSON
+    "against": "compared with",
+    "draws": "draws of shuffled actions",
+    "loss": "loss, nats a token",
+    "shuffled_loss": "loss with shuffled actions",
+    "baseline_loss": "loss of token frequencies alone",
+    "accuracy": "accuracy, share of tokens",
+    "masked_perplexity": "perplexity of tokens masked as in training",
+    "masked_accuracy": "accuracy of these",
+    "psnr_action_gain_last": "last frame, true less shuffled, dB",
+}
+ROLLOUTS = ("true", "shuffled", "none", "copy")
+HIDDEN = ("checkpoint", "data", "seconds_a_frame")  # of the readable form
+MEASURES = {"lpips": "LPIPS", "fid": "FID", "fvd": "FVD", "fvd_videogpt": "FVD (VideoGPT)"}
+LPIPS_HELP = "Weights of LPIPS, with their hash."
+
+
+def evaluate(
+    checkpoint: Checkpoint,
+    data: Annotated[list[Path], typer.Argument(help="Shard sets.")],
+    beside: Annotated[
+        list[str] | None, typer.Option("--beside", help="Another checkpoint to compare; repeat for more.")
+    ] = None,
+    split: Split = "val",
+    windows: Annotated[int, typer.Option("--windows", min=1, help="Number of windows, evenly spaced.")] = 64,
+    frames: Annotated[
+        int | None, typer.Option("--frames", min=2, help="Frames of a window; by default the model's.")
+    ] = None,
+    prompt: Annotated[
+        int | None, typer.Option("--prompt", min=1, help="Number of true frames to start from.")
+    ] = None,
+    unmask_steps: UnmaskSteps = 2,
+    sample_steps: SampleSteps = None,
+    precision: Precision = "float32",
+    compile: Compile = False,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollouts.")] = 0,
+    cameras: Cameras = None,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="Also follow the paper's protocol: Gaussian actions, true past.")
+    ] = False,
+    state: Annotated[
+        bool, typer.Option("--state", help="Of a laboratory robot: measure what it does in the pictures.")
+    ] = False,
+    episodes: Annotated[int, typer.Option("--episodes", min=2, help="Episodes that --state simulates.")] = 32,
+    lpips: Annotated[str | None, typer.Option("--lpips", metavar="FILE#SHA256", help=LPIPS_HELP)] = None,
+    fid: Annotated[
+        str | None, typer.Option("--fid", metavar="FILE#SHA256", help="Weights of FID's Inception.")
+    ] = None,
+    fvd: Annotated[
+        list[str] | None,
+        typer.Option("--fvd", metavar="FILE#SHA256", help="Weights of FVD's I3D; repeat for two."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for results.json, results.md and report.html.")
+    ] = None,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object a line, for each checkpoint and set.")
+    ] = False,
+) -> None:
+    """Measure how well rollouts predict: with the true actions, another window's, none, and beside a copy.
+
+    With --out, what is finished is kept, and the same command continues.
+
+    Example: hma evaluate runs/first shards/my_arm --out evaluation
+    """
+    from hma_data.shards.reader import ShardSet
+
+    checkpoints = [checkpoint, *(beside or [])]
+    for folder in data:
+        ShardSet(folder)  # it and the checkpoints are refused before torch is imported
+    for name in checkpoints:
+        require_checkpoint(name)
+    with interruptible(lambda: _kept(out)):
+        from hma_model.evaluation.perceptual import open_networks
+        from hma_model.evaluation.suite import Settings, evaluate_all
+
+        sampling: dict[str, Any] = {"unmask_steps": unmask_steps, "sample_steps": sample_steps}
+        sampling |= {"precision": precision, "compile": compile}
+        settings = Settings(
+            split, windows, frames, prompt, seed=seed, cameras=camera_names(cameras), paper=paper,
+            state=episodes if state else 0, sampling=sampling,
+        )  # fmt: skip
+        parts = evaluate_all(checkpoints, data, settings, open_networks(lpips, fid, fvd or []), out)
+        if out is not None:
+            from hma_model.evaluation.report import write_results
+
+            page = write_results(parts, out, " ".join(["hma", *sys.argv[1:]]))
+    if json:
+        for part in parts:
+            print(json_text.dumps(part.found, ensure_ascii=False))
+    elif len(parts) == 1:
+        _print_one(parts[0])
+    else:
+        _print_table(parts)
+    if out is not None and not json:
+        print(f"open {page}")
+
+
+def _kept(out: Path | None) -> str:
+    if out is None:
+        return "nothing is kept; with --out, finished parts are"
+    return f"finished parts are kept in {out}; run the same command again to continue"
+
+
+def _print_one(part: "Part") -> None:
+    found = part.found
+    plain = [
+        [FIGURES.get(key, key), value, _ends(found.get(f"{key}_95"))]
+        for key, value in found.items()
+        if not isinstance(value, dict | list) and key not in HIDDEN
+    ]
+    print_table(["figure", "value", "95 %"], plain)
+    columns = {"psnr": "PSNR dB", "psnr_last": "last frame dB", "ssim": "SSIM"}
+    columns |= {key: name for key, name in MEASURES.items() if key in found["true"]}
+    rows = [
+        [name, *(found[name].get(key) for key in columns), _ends(found[name]["psnr_last_95"])]
+        for name in ROLLOUTS
+    ]
+    print_table(["rollout", *columns.values(), "last frame, 95 %"], rows)
+    print(
+        f"true: the window's actions; shuffled: another window's, mean of {found['draws']} draws; "
+        "none: without actions; copy: the prompt's last frame, repeated"
+    )
+    if paper := found.get("paper"):
+        said = [[key, value, _ends(paper.get(f"{key}_95"))] for key, value in paper.items()]
+        print_table(["the paper's protocol", "value", "95 %"], [row for row in said if row[0][-3:] != "_95"])
+    _print_state(found.get("state"))
+    _print_absences([part])
+    from hma_model.evaluation.evaluate import verdict
+
+    print(f"{part.checkpoint} {verdict(found)}")
+
+
+def _print_state(state: dict[str, Any] | None) -> None:
+    if not state or "true" not in state:
+        return
+    rows = [
+        [name, state[name]["error_px"], state[name]["error_px_last"], _ends(state[name]["error_px_last_95"])]
+        for name in (*ROLLOUTS, "reconstruction")
+    ]
+    print_table(["robot's place", "error px of 128", "last frame", "95 %"], rows)
+    noisy = state["perturbed"]
+    rows = [
+        [words, noisy[f"psnr{mark}"], noisy[f"psnr{mark}_last"], noisy.get(f"perplexity{mark}")]
+        for words, mark in (("true", ""), (f"perturbed by {noisy['scale']:g} standard deviations", "_star"))
+    ]
+    print_table(["commands", "PSNR dB", "last frame dB", "perplexity"], rows)
+    print(f"{state['episodes']} simulated episodes; the probe errs by {state['probe_px']:.2f} px")
+
+
+def _ends(ends: Sequence[float] | None) -> str | None:
+    return None if not ends or None in ends else f"{ends[0]:.4g} to {ends[1]:.4g}"
+
+
+def _print_table(parts: "Sequence[Part]") -> None:
+    from hma_model.evaluation.evaluate import verdict
+    from hma_model.evaluation.tables import rows
+
+    names, lines = rows(parts, intervals=False)
+    print_table(names, [[_number(cell) for cell in line] for line in lines])
+    _print_absences(parts)
+    for part in parts:
+        print(f"{part.checkpoint} on {part.found['embodiment']} {verdict(part.found)}")
+
+
+def _number(cell: Any) -> Any:
+    try:
+        return float(cell) if isinstance(cell, str) else cell
+    except ValueError:
+        return cell
+
+
+def _print_absences(parts: "Sequence[Part]") -> None:
+    from hma_model.evaluation.tables import absences
+
+    print_lines(absences(parts))

@@ -1,0 +1,53 @@
+"""Define the arguments and options that several model verbs share."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+Checkpoint = Annotated[
+    str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
+]
+Data = Annotated[Path, typer.Argument(help="A shard set.")]
+Split = Annotated[Literal["train", "val"], typer.Option("--split", help="Split to take windows from.")]
+UnmaskSteps = Annotated[
+    int, typer.Option("--unmask-steps", min=1, help="Passes in which a discrete model decodes a frame.")
+]
+SampleSteps = Annotated[
+    int | None,
+    typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own."),
+]
+Precision = Annotated[
+    Literal["float32", "bf16"],
+    typer.Option(
+        "--precision", help="Of the products in rollouts; bf16 wants a processor or GPU that has it."
+    ),
+]
+Compile = Annotated[
+    bool,
+    typer.Option("--compile", help="Compile the trunk for rollouts; pays on a GPU, after a minute or more."),
+]
+Cameras = Annotated[
+    str | None,
+    typer.Option(
+        "--cameras", metavar="NAME[,NAME…]", help="Cameras to show the model; default: those of its training."
+    ),
+]
+
+
+def camera_names(cameras: str | None) -> str | list[str] | None:
+    """Return the cameras of the option: one name, or a list of several."""
+    names = [name.strip() for name in cameras.split(",")] if cameras else []
+    return names if len(names) > 1 else cameras
+
+
+def require_checkpoint(checkpoint: str) -> None:
+    """Refuse a folder of this machine that holds no checkpoint; a name in a folder is not one of the hub."""
+    from hma_data.storage.paths import is_repository
+    from hma_model.checkpoint.folder import resolve
+
+    if "://" in checkpoint or "@" in checkpoint:
+        return
+    folder = Path(checkpoint).expanduser()
+    if folder.parent.is_dir() or not is_repository(checkpoint):
+        resolve(folder)

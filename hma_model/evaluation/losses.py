@@ -1,0 +1,168 @@
+"""Measure a model's loss on windows, and a baseline that ignores all input.
+
+The loss is the cross-entropy in nats a token of each fully masked frame, given the true frames and actions
+before it. It is averaged over the frames from the second on. The baseline is the same cross-entropy for the
+frequencies of the training tokens: a model that ignores its input would reach it.
+
+B batch, T frames, F digits, V values a digit.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hma_data.loading.dataset import Batch, WindowDataset
+from hma_data.loading.views import FIRST, Cameras, Views
+from hma_data.shards.reader import ShardSet
+from hma_data.storage.paths import StrPath
+from hma_model.config import OBJECTIVES
+from hma_model.evaluation.metrics import teacher_forced
+
+if TYPE_CHECKING:
+    from hma_model.network.model import HMA
+
+BASELINE_FRAMES = 200_000
+
+
+@dataclass
+class Means:
+    """Sums and counts of sample values by embodiment, and the values in their order."""
+
+    sums: dict[str, float] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+    samples: list[float] = field(default_factory=list)
+
+    def add(self, names: Sequence[str], values: Tensor | NDArray[Any]) -> None:
+        """Add one value a sample, (B,)."""
+        self.samples += values.tolist()
+        for name, value in zip(names, values.tolist()):
+            self.sums[name] = self.sums.get(name, 0.0) + value
+            self.counts[name] = self.counts.get(name, 0) + 1
+
+    def by_embodiment(self) -> dict[str, float]:
+        """Return the mean of each embodiment, sorted by id."""
+        return {name: self.sums[name] / self.counts[name] for name in sorted(self.sums)}
+
+    def mean(self) -> float:
+        """Return the mean over all samples; NaN if there are none."""
+        return sum(self.sums.values()) / max(sum(self.counts.values()), 1) if self.counts else float("nan")
+
+
+def windows(
+    data: StrPath | ShardSet,
+    split: str,
+    frames: int,
+    count: int,
+    batch_size: int = 8,
+    cameras: Cameras = FIRST,
+) -> Iterator[Batch]:
+    """Yield up to `count` windows of a split in batches; they are evenly spaced and always the same."""
+    dataset = WindowDataset(data, split, frames, cameras=cameras)
+    chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(np.int64))
+    for start in range(0, len(chosen) if len(dataset) else 0, batch_size):
+        yield dataset.batch(chosen[start : start + batch_size])
+
+
+@torch.no_grad()
+def validation_losses(
+    model: "HMA", batches: Iterable[Batch], seed: int = 0, objective: str = "forward"
+) -> tuple[Means, Means]:
+    """Return the losses and accuracies of the windows, by embodiment.
+
+    Where a discrete model predicts video from actions, the loss is that of `teacher_forced`. Any other loss
+    is the training loss of the objective, under masks and noise drawn from `seed`; it has no accuracy.
+    """
+    losses, accuracy, training = Means(), Means(), model.training
+    drawn = OBJECTIVES[objective]
+    exact = model.config.kind == "discrete" and drawn.predicts_video and drawn.sees_actions
+    model.eval()
+    for number, batch in enumerate(batches):
+        batch = batch.to(model.device)
+        if exact:
+            nats, hits = teacher_forced(model, batch)
+            losses.add(batch.embodiment, nats.mean(dim=1))
+            accuracy.add(batch.embodiment, hits.mean(dim=1))
+        else:
+            generator = torch.Generator().manual_seed(seed * 1_000_003 + number)
+            losses.add(batch.embodiment, model(batch, objective, generator).per_sample)
+    model.train(training)
+    return losses, accuracy
+
+
+def masked_val_loss(model: "HMA", batches: Iterable[Batch]) -> float:
+    """Return the mean loss over windows: nats a token of each fully masked frame given the true past."""
+    return validation_losses(model, batches)[0].mean()
+
+
+def digit_frequencies(
+    shards: ShardSet,
+    max_frames: int = BASELINE_FRAMES,
+    cameras: Cameras = FIRST,
+    factored: Sequence[int] | None = None,
+) -> list[NDArray[np.float64]]:
+    """Return the frequency of each value of each digit in train: F arrays (V,), add-one smoothed.
+
+    `factored` states the values of each digit, low digit first; by default it is the tokenizer's.
+
+    Of more than `max_frames` frames, only row groups spread evenly over them are counted, about `max_frames`
+    frames at most.
+    """
+    factored = factored or shards.spec.factored or (shards.spec.vocab_size or 1,)
+    counts = [np.ones(values) for values in factored]
+    files = list(zip(shards.shards("train"), shards.row_groups("train")))
+    groups = [(name, group) for name, rows in files for group in range(len(rows))]
+    stride = max(1, -(-sum(sum(rows) for _, rows in files) // max_frames))
+    columns = Views.of(shards, cameras).columns
+    for name, group in groups[::stride]:
+        read = shards.read(name, [group], columns)
+        tokens = np.concatenate([read[column].astype(np.int64).ravel() for column in columns])
+        for digit, values in enumerate(factored):
+            counts[digit] += np.bincount(tokens % values, minlength=values)
+            tokens //= values
+    return [count / count.sum() for count in counts]
+
+
+def unconditional_baseline(
+    train: Mapping[str, ShardSet] | Sequence[StrPath | ShardSet],
+    batches: Iterable[Batch],
+    cameras: Cameras = FIRST,
+    factored: Sequence[int] | None = None,
+    merge: int = 1,
+) -> Means:
+    """Return the cross-entropy of each embodiment's training frequencies, which ignores all input.
+
+    Args:
+        train: shard sets (or the str or path of each), whose train frames are counted, digit by digit.
+        batches: validation windows of discrete tokens.
+        cameras: as `WindowDataset` takes them.
+        factored: values of each digit, low digit first; by default the tokenizer's.
+        merge: the side of a square of tokens that counts as one, as `HMAConfig.merge`.
+
+    Returns:
+        Nats a token by embodiment, over the frames from the second on, as in `masked_val_loss`.
+    """
+    sets = train.values() if isinstance(train, Mapping) else [opened(item) for item in train]
+    scores = {
+        s.embodiment.id: [np.log(p) for p in digit_frequencies(s, cameras=cameras, factored=factored)]
+        for s in sets
+    }
+    means = Means()
+    for batch in batches:
+        assert batch.tokens is not None
+        for name, tokens in zip(batch.embodiment, batch.tokens[:, 1:].numpy()):
+            nats, rest = np.zeros(tokens.shape), tokens.copy()
+            for digit in scores[name]:
+                nats -= digit[rest % len(digit)]
+                rest //= len(digit)
+            means.add([name], np.array([nats.mean() * merge**2]))
+    return means
+
+
+def opened(item: StrPath | ShardSet) -> ShardSet:
+    """Return a shard set, opened if it is not yet."""
+    return item if isinstance(item, ShardSet) else ShardSet(item)

@@ -1,0 +1,151 @@
+"""Measure on a laboratory robot whether the model does what its commands say: `hma evaluate --state`.
+
+The simulator makes true episodes with states, and the model rolls out from their first frames. A probe reads
+where the robot's parts are in its pictures, and the distance from the truth is the error, in px of a picture
+of 128, at each step of the horizon. Beside it stand the probe's own error and the same error of the true
+pictures as the tokenizer shows them.
+
+PSNR* and perplexity* are the paper's (table 4): the commands after the prompt are perturbed, the simulator
+answers the perturbed commands, and the model is compared with that answer.
+
+B episodes, T frames, P predicted frames, S pixels a side, K = stride·A.
+"""
+
+from functools import partial
+from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hma_data.lab import truth
+from hma_data.loading.dataset import Batch
+from hma_model.evaluation.commands import shuffled, without_commands
+from hma_model.evaluation.evaluate import PSNR_LIMIT
+from hma_model.evaluation.intervals import interval, rounded, summary
+from hma_model.evaluation.metrics import perplexity, psnr, teacher_forced
+from hma_model.evaluation.probe import Probe, as_seen, state_errors, train_probe
+from hma_model.evaluation.rollouts import Pictures, Sampling, rollout
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.network.model import HMA
+
+PERTURBATION = 0.1  # standard deviations of the commands, as the paper's
+FIRST = 500_000  # the number of the first episode; drift's count from 0, those of probes from a million
+Floats = NDArray[np.float64]
+Images = NDArray[np.uint8]
+
+
+def measure_state(
+    model: "HMA",
+    tokenizer: "Tokenizer",
+    robot: str,
+    *,
+    frames: int,
+    prompt: int,
+    episodes: int,
+    seed: int = 0,
+    **sampling: Unpack[Sampling],
+) -> dict[str, Any]:
+    """Compute the figures of a laboratory robot from its state.
+
+    Args:
+        model: in eval mode, with the robot.
+        tokenizer: the model's.
+        robot: its id.
+        frames, prompt: T, and how many of them are true.
+        episodes: how many are simulated.
+        seed: of the episodes, the probe and the rollouts.
+        sampling: options of `HMA.generate`.
+
+    Returns:
+        `error_px` of the rollouts `true`, `shuffled`, `none` and `copy`, and of the true pictures as the
+        tokenizer shows them (`reconstruction`): the mean over the horizon, at its last step, and by frame.
+        `probe_px` is the probe's own error, `spread_px` what knows nothing would have. `perturbed` has
+        `psnr_star` and `perplexity_star`, beside `psnr` and `perplexity` of the true commands.
+
+    Raises:
+        UsageError: it is no robot of the laboratory.
+    """
+    truth.embodiment(robot)
+    stride = model.embodiments[robot].stride
+    probe = train_probe(robot, tokenizer, stride, seed)
+    simulate = partial(truth.episode, robot, frames, stride, seed)
+    made = [simulate(FIRST + number) for number in range(episodes)]
+    chunks = np.stack([one.chunks for one in made])
+    batch = _batch(model, tokenizer, robot, made)
+    roll = partial(rollout, model, tokenizer, prompt=prompt, seed=seed, **sampling)
+    true = roll(batch)
+    copied = true.truth[:, prompt - 1 : prompt].repeat(frames - prompt, axis=1)
+    ways = {
+        "true": true.predicted[:, prompt:],
+        "shuffled": roll(shuffled(batch, prompt - 1, seed), truth=true.truth).predicted[:, prompt:],
+        "none": roll(without_commands(batch), truth=true.truth).predicted[:, prompt:],
+        "copy": copied,
+        "reconstruction": true.truth[:, prompt:],
+    }
+    parts = np.stack([one.parts[prompt:] for one in made])
+    found: dict[str, Any] = {"episodes": episodes, "picture_px": truth.SIZE}
+    found |= _controllability(probe, ways, parts, seed)
+    wish = perturbed(chunks, model.embodiments[robot].action_dim, prompt, seed)
+    commands = wish.reshape(episodes, -1, model.embodiments[robot].action_dim)
+    answers = [simulate(FIRST + number, commands=commands[number]) for number in range(episodes)]
+    other = _batch(model, tokenizer, robot, answers)
+    return found | {"perturbed": _perturbed(model, true, roll(other), batch, other, seed)}
+
+
+def perturbed(chunks: NDArray[np.float32], dims: int, prompt: int, seed: int) -> NDArray[np.float32]:
+    """Return chunks (B, T, K) with noise of PERTURBATION standard deviations, after the prompt."""
+    steps = chunks.reshape(*chunks.shape[:2], -1, dims)
+    noise = np.random.default_rng([seed, 3]).normal(size=steps.shape) * steps.std(axis=(0, 1, 2))
+    noise[:, : prompt - 1] = 0
+    return (steps + PERTURBATION * noise).reshape(chunks.shape).astype(np.float32)
+
+
+def _batch(model: "HMA", tokenizer: "Tokenizer", robot: str, made: list[truth.Episode]) -> Batch:
+    """Return simulated episodes as windows."""
+    stored = np.stack([tokenizer.encode(as_seen(robot, tokenizer, one.pictures)) for one in made])
+    actions = torch.from_numpy(np.stack([one.chunks for one in made]))
+    known = torch.ones(actions.shape[:2], dtype=torch.bool)
+    if model.config.kind == "discrete":
+        return Batch([robot] * len(made), actions, known, tokens=torch.from_numpy(stored.astype(np.int64)))
+    return Batch([robot] * len(made), actions, known, latents=torch.from_numpy(stored.astype(np.float32)))
+
+
+def _controllability(probe: Probe, ways: dict[str, Images], parts: Floats, seed: int) -> dict[str, Any]:
+    """Return the errors of the robot's own parts, of pictures (B, P, S, S, 3) by the kind of rollout."""
+    own = probe.own
+    if not len(own):
+        return {"missing": "no part of the robot can be read off the pictures of this tokenizer"}
+    found: dict[str, Any] = {
+        "probe_px": rounded(probe.error[own].mean()),
+        "spread_px": rounded(probe.spread[own].mean()),
+    }
+    for name, pictures in ways.items():
+        errors = state_errors(probe, pictures, parts)[..., own].mean(axis=-1)
+        found[name] = summary("error_px", errors.mean(axis=1), seed) | {
+            **summary("error_px_last", errors[:, -1], seed),
+            "error_px_by_frame": rounded(errors.mean(axis=0)),
+            "error_px_by_frame_95": rounded(interval(errors, seed).T),
+        }
+    return found
+
+
+def _perturbed(
+    model: "HMA", true: Pictures, made: Pictures, batch: Batch, other: Batch, seed: int
+) -> dict[str, Any]:
+    """Return PSNR and perplexity under the true commands, and under the perturbed ones."""
+    found: dict[str, Any] = {"scale": PERTURBATION}
+    for mark, pictures, windows in (("", true, batch), ("_star", made, other)):
+        given, predicted = (part[:, pictures.prompt :] for part in (pictures.truth, pictures.predicted))
+        flat = [part.reshape(-1, *part.shape[2:]) for part in (given, predicted)]
+        signal = np.minimum(psnr(*flat), PSNR_LIMIT).reshape(given.shape[:2])
+        found |= summary(f"psnr{mark}", signal.mean(axis=1), seed)
+        found |= summary(f"psnr{mark}_last", signal[:, -1], seed)
+        if model.config.kind == "discrete":
+            nats = teacher_forced(model, windows.to(model.device))[0].double().cpu().numpy().mean(axis=1)
+            ends = [perplexity(float(end)) for end in interval(nats, seed)]
+            found[f"perplexity{mark}"] = rounded(perplexity(float(nats.mean())))
+            found[f"perplexity{mark}_95"] = rounded(np.array(ends))
+    return found

@@ -1,0 +1,272 @@
+"""Evaluate several checkpoints on several shard sets, and keep what is done.
+
+A part is a checkpoint and a shard set. With a folder, each finished part is a file of `parts/`, named by its
+fingerprint: the digests of the checkpoint and of the set, and all settings. A part whose file is there is not
+computed again, so the same command continues an interrupted one. The same settings and seed give the same
+bytes of results.json.
+
+    results.json    the figures of every part, and their means over the sets
+    results.md      the table, and what is not measured
+    report.html     the same with pictures and curves
+"""
+
+import hashlib
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hma_data.console import Update, progress
+from hma_data.errors import OutputError, UsageError
+from hma_data.lab.simulator import simulated
+from hma_data.loading.dataset import WindowDataset
+from hma_data.loading.views import Cameras
+from hma_data.shards.manifest import MANIFEST
+from hma_data.shards.preview import tokenizer_of
+from hma_data.shards.reader import ShardSet
+from hma_data.storage.files import finite, read_json, to_json, write_atomic
+from hma_data.storage.paths import StrPath, as_path, as_text
+from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
+from hma_model.evaluation.evaluate import DRAWS, measure
+from hma_model.evaluation.perceptual import Networks
+from hma_model.evaluation.rollouts import cameras_for, default_prompt
+from hma_model.evaluation.simulated import measure_state
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.network.model import HMA
+
+VERSION = 1  # raise it when the same part gives other figures
+PARTS, RESULTS = "parts", "results.json"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides the figures, beside the checkpoint and the shard set; `measure` explains the options."""
+
+    split: str = "val"
+    windows: int = 64
+    frames: int | None = None
+    prompt: int | None = None
+    draws: int = DRAWS
+    seed: int = 0
+    cameras: Cameras | None = None
+    paper: bool = False
+    state: int = 0  # simulated episodes of a laboratory robot; 0 measures no state
+    sampling: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Part:
+    """The result of a checkpoint on a shard set.
+
+    Attributes:
+        found: the figures.
+        by_window: values (N,) of the windows, by the figure's name.
+        predicted: the predicted tokens or latents (N, P, …) of the windows, by the kind of rollout.
+    """
+
+    checkpoint: str
+    data: str
+    found: dict[str, Any]
+    by_window: dict[str, NDArray[np.float64]]
+    predicted: dict[str, NDArray[Any]]
+
+
+def evaluate_all(
+    checkpoints: Sequence[StrPath],
+    data: Sequence[StrPath],
+    settings: Settings = Settings(),
+    networks: Networks | None = None,
+    out: StrPath | None = None,
+) -> list[Part]:
+    """Evaluate each checkpoint on each shard set.
+
+    Args:
+        checkpoints: a str or path each, as `HMA.from_pretrained` takes them.
+        data: the str or path of each shard set, or its URI; each of another embodiment.
+        settings: options.
+        networks: what measures LPIPS, FID and FVD.
+        out: the folder that keeps finished parts; None keeps nothing.
+
+    Raises:
+        CheckpointError: a checkpoint was trained on another tokenizer, or lacks an embodiment.
+        UsageError: a split has no window, cameras do not fit, or a set of a checkpoint comes twice.
+        OutputError: the folder holds something else.
+    """
+    networks, folder = networks or Networks(), None if out is None else _folder(as_path(out))
+    sets = [ShardSet(item) for item in data]
+    _once([as_text(item) for item in checkpoints], "checkpoint")
+    _once([shards.embodiment.id for shards in sets], "embodiment")
+    names = [shards.embodiment.id for shards in sets]
+    from hma_model.network.model import HMA
+
+    models: dict[str, HMA] = {}
+    for checkpoint in checkpoints:  # what is wrong with any of them is said before the first is computed
+        model = HMA.from_pretrained(checkpoint, embodiments=names).eval()
+        models[as_text(checkpoint)] = model
+        for shards in sets:
+            _check(model, shards, settings)
+    parts, done = [], 0
+    work = [(label, model, shards) for label, model in models.items() for shards in sets]
+    total = sum(_frames(model, shards, settings) for _, model, shards in work)
+    with progress("evaluate", total) as update:
+        for label, model, shards in work:
+            mark = fingerprint(model, shards, settings, networks)
+            part = folder and _kept(folder, mark, label, shards)
+            about = f"{label}, {shards.embodiment.id}"
+            if part is None:
+                update(done, about)
+                counter = _Counter(update, done, about)
+                part = _measured(label, model, shards, settings, networks, counter)
+                if folder:
+                    _keep(folder, mark, part)
+            parts.append(part)
+            done += _frames(model, shards, settings)
+            update(done, about)
+    return parts
+
+
+@dataclass
+class _Counter:
+    """Adds predicted frames up, and shows them."""
+
+    update: Update
+    done: int
+    about: str
+
+    def __call__(self, frames: int) -> None:
+        self.done += frames
+        self.update(self.done, self.about)
+
+
+def _once(names: Sequence[str], what: str) -> None:
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise UsageError(twice, f"is the {what} of two arguments", "give each once")
+
+
+def _check(model: "HMA", shards: ShardSet, settings: Settings) -> None:
+    """Raise if a shard set cannot be evaluated on a model."""
+    require_tokenizer(model.config, shards.spec, shards.folder)
+    cameras = cameras_for(model, shards, settings.cameras)
+    length = settings.frames or model.config.frames
+    if (settings.prompt or 1) >= length:
+        fault = f"{settings.prompt} true frames leave none to predict in windows of {length}"
+        raise UsageError("--prompt", fault, "give fewer, or more --frames")
+    if not len(WindowDataset(shards, settings.split, length, cameras=cameras)):
+        fault = f"has no window of {length} frames in {settings.split}"
+        raise UsageError(shards.folder, fault, "give another --split or fewer --frames")
+    if settings.state and not simulated(shards.embodiment.id):
+        fault = "is no robot of the laboratory, so its state is not known"
+        raise UsageError(shards.embodiment.id, fault, "leave --state out")
+
+
+def _frames(model: "HMA", shards: ShardSet, settings: Settings) -> int:
+    """Return how many frames are predicted for a part, without those of its state."""
+    length = settings.frames or model.config.frames
+    first = default_prompt(length) if settings.prompt is None else settings.prompt
+    cameras = cameras_for(model, shards, settings.cameras)
+    count = min(settings.windows, len(WindowDataset(shards, settings.split, length, cameras=cameras)))
+    last = (1 + settings.draws) if settings.paper else 0
+    return count * ((length - first) * (2 + settings.draws) + last)
+
+
+def fingerprint(model: "HMA", shards: ShardSet, settings: Settings, networks: Networks) -> str:
+    """Return sixteen hex digits that stand for a part: its checkpoint, set and settings."""
+    robot, origin = shards.embodiment.id, Checkpoint.open(vars(model)["origin"])
+    facts = {
+        "version": VERSION,
+        "trunk": origin.trunk_sha256,
+        "embodiment": origin.card(robot).get("files"),
+        "stats": origin.card(robot).get("stats_sha256"),
+        "config": model.config.to_json(),
+        "set": hashlib.sha256((shards.folder / MANIFEST).read_bytes()).hexdigest(),
+        "settings": asdict(settings),
+        "networks": networks.facts,
+    }
+    text = json.dumps(facts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@lru_cache(maxsize=1)
+def _tokenizer(folder: str) -> "Tokenizer":
+    return tokenizer_of(ShardSet(folder))
+
+
+def _measured(
+    label: str,
+    model: "HMA",
+    shards: ShardSet,
+    settings: Settings,
+    networks: Networks,
+    on_frames: Callable[[int], None],
+) -> Part:
+    tokenizer = _tokenizer(str(shards.folder))
+    sampling: Any = dict(settings.sampling)
+    measured = measure(
+        model, tokenizer, shards, split=settings.split, count=settings.windows, frames=settings.frames,
+        prompt=settings.prompt, draws=settings.draws, seed=settings.seed, cameras=settings.cameras,
+        paper=settings.paper, networks=networks, on_frames=on_frames, **sampling,
+    )  # fmt: skip
+    found, robot = measured.found, shards.embodiment.id
+    if settings.state:
+        found["state"] = measure_state(
+            model, tokenizer, robot, frames=found["frames"], prompt=found["prompt"], episodes=settings.state,
+            seed=settings.seed, **sampling,
+        )  # fmt: skip
+    else:
+        found["missing"]["state"] = (
+            "not measured: --state reads what the robot does off its pictures"
+            if simulated(robot)
+            else "not measured: the true state is known of the laboratory's robots only"
+        )
+    found = {"checkpoint": label, "data": str(shards.folder), **found}
+    if networks.facts:
+        found["networks"] = networks.facts
+    rows = {name: values.round(6) for name, values in measured.by_window.items()}
+    predicted = {kind: torch.cat(made).cpu().numpy() for kind, made in measured.predicted.items()}
+    if model.config.kind == "discrete":
+        predicted = {kind: values.astype(np.uint32) for kind, values in predicted.items()}
+    return Part(label, str(shards.folder), finite(found), rows, predicted)
+
+
+# -- the folder
+
+
+def _folder(out: Path) -> Path:
+    if out.is_dir() and any(out.iterdir()) and not (out / PARTS).is_dir():
+        raise OutputError(out, "holds something else than an evaluation", "name a new folder")
+    (out / PARTS).mkdir(parents=True, exist_ok=True)
+    return out
+
+
+def _keep(folder: Path, mark: str, part: Part) -> None:
+    """Write a part: its predictions first, so that the figures' file says that it is whole."""
+    stem = folder / PARTS / f"{part.found['embodiment']}-{mark}"
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **part.predicted)  # type: ignore[arg-type]
+    write_atomic(stem.with_suffix(".npz"), buffer.getvalue())
+    rows = {name: values.tolist() for name, values in part.by_window.items()}
+    content = {"fingerprint": mark, "found": part.found, "by_window": finite(rows)}
+    write_atomic(stem.with_suffix(".json"), to_json(content))
+
+
+def _kept(folder: Path, mark: str, label: str, shards: ShardSet) -> Part | None:
+    """Return a part that is done, under the names of this command; None if it is not done."""
+    stem = folder / PARTS / f"{shards.embodiment.id}-{mark}"
+    if not stem.with_suffix(".json").is_file():
+        return None
+    content = read_json(stem.with_suffix(".json"), OutputError)
+    with np.load(stem.with_suffix(".npz")) as arrays:
+        predicted = dict(arrays)
+    rows = {name: np.array(values, float) for name, values in content["by_window"].items()}
+    found = content["found"] | {"checkpoint": label, "data": str(shards.folder)}
+    return Part(label, str(shards.folder), found, rows, predicted)

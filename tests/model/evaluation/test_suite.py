@@ -1,0 +1,223 @@
+"""Several checkpoints on several sets: parts that are kept, results that repeat, the page, refusals."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hma_data.lab import record
+from hma_data.lab.truth import episode
+from hma_data.registry.embodiment import find
+from hma_model.cli import main
+from hma_model.evaluation import showcase, suite
+from hma_model.evaluation.report import difference, write_results
+from hma_model.evaluation.simulated import PERTURBATION, perturbed
+from hma_model.evaluation.suite import Settings, evaluate_all
+from hma_model.evaluation.tables import means, results, rows
+from tests.model.evaluation.test_evaluate import Blocks
+from tests.model.robots import CONFIG, SPEC, make_model, save
+from tests.model.shards import make_shards
+
+SETTINGS = Settings(windows=3, draws=1)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two checkpoints, `one` and `other`, and shard sets of two robots."""
+    folder = tmp_path_factory.mktemp("made")
+    for name, seed in (("one", 0), ("other", 1)):
+        save(folder / name, {"arm": 2, "hand": 3}, seed)
+    make_shards(folder / "arm", "arm")
+    make_shards(folder / "hand", "hand", dims=3, seed=4)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (suite, showcase):
+        monkeypatch.setattr(module, "tokenizer_of", lambda shards: Blocks())
+    suite._tokenizer.cache_clear()
+
+
+def run(
+    made: Path,
+    out: Path | None = None,
+    settings: Settings = SETTINGS,
+    checkpoints: tuple[str, ...] = ("one",),
+) -> list[suite.Part]:
+    folders = [made / name for name in checkpoints]
+    return evaluate_all(folders, [made / "arm", made / "hand"], settings, out=out)
+
+
+BOTH = ("one", "other")
+
+
+def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_once(made: Path) -> None:
+    parts = run(made, checkpoints=BOTH)
+    assert [(Path(p.checkpoint).name, p.found["embodiment"]) for p in parts] == [
+        ("one", "arm"), ("one", "hand"), ("other", "arm"), ("other", "hand"),
+    ]  # fmt: skip
+    first, _ = means(parts)
+    assert first["true.psnr"] == pytest.approx(
+        np.mean([p.found["true"]["psnr"] for p in parts[:2]]), abs=1e-4
+    )
+    low, high = first["true.psnr_95"]
+    assert low < first["true.psnr"] < high
+    names, lines = rows(parts)
+    assert [line[1] for line in lines] == ["arm", "hand", "mean over sets"] * 2 and len(lines[0]) == len(
+        names
+    )
+
+
+def test_parts_that_are_done_are_not_computed_again(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+    real = suite.measure
+
+    def counted(model: Any, tokenizer: Any, shards: Any, **given: Any) -> Any:
+        calls.append(shards.embodiment.id)
+        return real(model, tokenizer, shards, **given)
+
+    monkeypatch.setattr(suite, "measure", counted)
+    whole = results(run(made, tmp_path))
+    assert calls == ["arm", "hand"]
+    assert results(run(made, tmp_path)) == whole and len(calls) == 2
+    lost = sorted((tmp_path / "parts").glob("hand-*.json"))[0]
+    lost.unlink()
+    assert results(run(made, tmp_path)) == whole and calls[2:] == ["hand"]
+    run(made, tmp_path, replace(SETTINGS, seed=1))
+    assert len(calls) == 5
+
+
+def test_the_same_seed_gives_the_same_bytes(made: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_results(run(made, tmp_path / name), tmp_path / name, "hma evaluate")
+    assert (tmp_path / "a/results.json").read_bytes() == (tmp_path / "b/results.json").read_bytes()
+    assert (tmp_path / "a/report.html").read_bytes() == (tmp_path / "b/report.html").read_bytes()
+
+
+def test_the_page_is_one_file_that_shows_each_robot_and_checkpoint(made: Path, tmp_path: Path) -> None:
+    page = write_results(run(made, tmp_path, checkpoints=BOTH), tmp_path, "hma evaluate").read_text()
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
+    strips = re.findall(r'alt="(The \w+ window[^"]*)"', page)
+    assert len(strips) == 2 * 3 * (1 + 2 * 3)  # robots, windows, and from the tokens and three a checkpoint
+    assert "recorded pictures are not shown" in page and "--lpips FILE" in page
+    table = (tmp_path / "results.md").read_text()
+    assert table.count("mean over sets") == 2 and "ΔPSNR" in table
+
+
+def test_the_difference_is_black_where_pictures_are_equal() -> None:
+    one = np.full((2, 4, 4, 3), 100, np.uint8)
+    other = one.copy()
+    other[1] = 255
+    found = difference(one, other)
+    assert found[0].max() < 10 and found[1].min() > 100
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["{made}/one", "{made}/arm", "--frames", "40"], "arm: has no window of 40 frames in val"),
+        (["{made}/one", "{made}/arm", "--prompt", "4"], "--prompt: 4 true frames leave none to predict"),
+        (["{made}/one", "{made}/arm", "{made}/arm"], "arm: is the embodiment of two arguments"),
+        (["{made}/one", "{made}/arm", "--beside", "{made}/one"], "is the checkpoint of two arguments"),
+        (["{made}/narrow", "{made}/hand"], "hand"),
+        (["{made}/one", "{made}/arm", "--beside", "{made}/foreign"], "was trained on tokenizer"),
+        (
+            ["{made}/one", "{made}/arm", "--cameras", "top,wrist"],
+            "cameras: are 2 in a frame, but the model takes 1",
+        ),
+        (["{made}/one", "{made}/arm", "--state"], "arm: is no robot of the laboratory"),
+        (["{made}/one", "{made}/arm", "--fid", "nowhere.pt"], "--fid: nowhere.pt: no such file"),
+        (["{made}/one", "{made}/arm", "--out", "{made}"], "holds something else than an evaluation"),
+    ],
+)
+def test_wrong_input_is_one_line(
+    made: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    if not (made / "narrow").exists():
+        save(made / "narrow", {"arm": 2})
+        other = CONFIG.replace(tokenizer={**SPEC.to_json(), "version": 2})
+        save(made / "foreign", {"arm": 2}, model=make_model({"arm": 2}, config=other))
+    code = main(["evaluate", *(word.format(made=made) for word in words)])
+    said = capsys.readouterr()
+    assert code and not said.out and message in said.err and said.err.count("\n") == 1, said.err
+
+
+def test_json_is_one_object_a_line(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one, arm, hand = (str(made / name) for name in ("one", "arm", "hand"))
+    assert main(["evaluate", one, arm, hand, "--windows", "3", "--json"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["embodiment"] for line in lines] == ["arm", "hand"]
+    kept = {"split", "windows", "frames", "prompt", "draws", "against", "cameras", "loss", "shuffled_loss"}
+    kept |= {"baseline_loss", "perplexity", "accuracy", "true", "shuffled", "copy", "psnr_action_gain_last"}
+    assert kept <= set(lines[0])
+    assert main(["evaluate", one, arm, "--windows", "3"]) == 0
+    shown = capsys.readouterr().out
+    assert "loss, nats a token" in shown and "not measured" in shown and "none: without actions" in shown
+
+
+# -- the laboratory
+
+
+def test_the_simulator_answers_commands_that_are_given() -> None:
+    robot, frames, stride = "rails_03", 5, 2
+    own = episode(robot, frames, stride, 0, 3)
+    steps = own.chunks.reshape(frames * stride, -1)
+    same = episode(robot, frames, stride, 0, 3, commands=steps)
+    assert (same.pictures == own.pictures).all() and (same.chunks == own.chunks).all()
+    other = steps.copy()
+    other[2 * stride :] *= -1
+    moved = episode(robot, frames, stride, 0, 3, commands=other)
+    assert (moved.pictures[:3] == own.pictures[:3]).all() and (moved.parts[3:] != own.parts[3:]).any()
+
+
+def test_perturbed_commands_keep_the_prompt() -> None:
+    chunks = np.random.default_rng(0).normal(0, 4, (300, 6, 4)).astype(np.float32)
+    noisy = perturbed(chunks, 2, 3, seed=0)
+    assert (noisy[:, :2] == chunks[:, :2]).all()
+    assert (noisy - chunks)[:, 2:].std() == pytest.approx(4 * PERTURBATION, rel=0.05)
+
+
+@pytest.mark.slow
+def test_recorded_pictures_are_those_of_the_windows_frames(tmp_path: Path) -> None:
+    from hma_data.conversion.job import convert
+    from hma_data.loading.dataset import WindowDataset
+    from hma_data.shards.preview import tokenizer_of
+    from hma_data.shards.reader import ShardSet
+    from hma_model.evaluation.rollouts import decode
+
+    recording = record("pendulum", tmp_path / "rec", 4, seed=1)
+    convert(find("pendulum"), recording, "fsq-8", tmp_path / "shards")
+    shards = ShardSet(tmp_path / "shards")
+    batch = WindowDataset(shards, "train", 4).batch([7])
+    seen = showcase.recorded_frames(shards, batch, 0)
+    assert batch.tokens is not None
+    shown = decode(tokenizer_of(shards), batch.tokens)[0]
+    errors = [[np.abs(a.astype(int) - b).mean() for b in shown] for a in seen]
+    assert np.argmin(errors, axis=1).tolist() == [0, 1, 2, 3] and np.diag(errors).max() < 12
+
+
+@pytest.mark.slow
+def test_the_state_of_a_laboratory_robot_is_read_beside_the_probes_error() -> None:
+    from hma_data.tokenizers.base import get_tokenizer
+    from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+    from hma_model.evaluation.simulated import measure_state
+    from hma_model.network.model import HMA
+
+    if not EMBEDDED.is_dir():
+        pytest.skip("the package has no embedded model")
+    robot = "rails_03" if "rails_03" in Checkpoint.open("embedded").embodiments else "planar_arm"
+    model = HMA.from_pretrained("embedded", embodiments=[robot]).eval()
+    tokenizer = get_tokenizer(str(model.config.tokenizer["name"]))
+    found = measure_state(model, tokenizer, robot, frames=6, prompt=2, episodes=4)
+    assert len(found["true"]["error_px_by_frame"]) == 4
+    errors = {kind: found[kind]["error_px_last"] for kind in ("reconstruction", "true", "shuffled", "copy")}
+    assert errors["reconstruction"] < errors["true"] < min(errors["shuffled"], errors["copy"])
+    assert found["reconstruction"]["error_px"] < 3 * found["probe_px"] + 1
+    assert found["perturbed"]["psnr_star"] == pytest.approx(found["perturbed"]["psnr"], abs=3)
