@@ -66,12 +66,13 @@ def record(
 
 
 @contextmanager
-def whole(final: Path) -> Iterator[Path]:
+def whole(final: StrPath) -> Iterator[Path]:
     """Give a path to write a recording to, a file or a folder; it becomes `final` when the block ends.
 
     Raises:
         OutputError: it cannot be written.
     """
+    final = as_path(final)
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=final.parent, prefix=f".{final.name}-") as folder:

@@ -26,7 +26,7 @@ class Sampling(TypedDict, total=False):
     """Options of `HMA.generate` that a rollout passes on to it."""
 
     unmask_steps: int
-    temperature: float
+    temperature: float | None
     order: str
     sample_steps: int | None
     guidance: float

@@ -139,7 +139,7 @@ def _perturbed(
     found: dict[str, Any] = {"scale": PERTURBATION}
     for mark, pictures, windows in (("", true, batch), ("_star", made, other)):
         given, predicted = (part[:, pictures.prompt :] for part in (pictures.truth, pictures.predicted))
-        flat = [part.reshape(-1, *part.shape[2:]) for part in (given, predicted)]
+        flat = given.reshape(-1, *given.shape[2:]), predicted.reshape(-1, *given.shape[2:])
         signal = np.minimum(psnr(*flat), PSNR_LIMIT).reshape(given.shape[:2])
         found |= summary(f"psnr{mark}", signal.mean(axis=1), seed)
         found |= summary(f"psnr{mark}_last", signal[:, -1], seed)

@@ -120,7 +120,7 @@ def evaluate_all(
     with progress("evaluate", total) as update:
         for label, model, shards in work:
             mark = fingerprint(model, shards, settings, networks)
-            part = folder and _kept(folder, mark, label, shards)
+            part = _kept(folder, mark, label, shards) if folder else None
             about = f"{label}, {shards.embodiment.id}"
             if part is None:
                 update(done, about)

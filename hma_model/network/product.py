@@ -36,7 +36,7 @@ class Linear(nn.Linear):
     def forward(self, x: Tensor) -> Tensor:
         """Map (..., I) to (..., O)."""
         if _quick(self, x):
-            made: Tensor = _Product.apply(x, self.weight, self.bias)  # type: ignore[no-untyped-call]
+            made: Tensor = _Product.apply(x, self.weight, self.bias)
             return made
         return super().forward(x)
 
@@ -44,7 +44,7 @@ class Linear(nn.Linear):
 def after_norm(norm: nn.Module, linear: nn.Module, x: Tensor) -> Tensor:
     """Apply a norm and a linear map to (..., I); the backward pass recomputes the norm."""
     if isinstance(norm, nn.LayerNorm) and _quick(linear, x):
-        made: Tensor = _NormProduct.apply(x, norm.weight, norm.bias, norm.eps, linear.weight, linear.bias)  # type: ignore[no-untyped-call]
+        made: Tensor = _NormProduct.apply(x, norm.weight, norm.bias, norm.eps, linear.weight, linear.bias)
         return made
     return light(linear, lambda x: linear(norm(x)), x)
 
@@ -52,7 +52,7 @@ def after_norm(norm: nn.Module, linear: nn.Module, x: Tensor) -> Tensor:
 def after_gelu(linear: nn.Module, x: Tensor) -> Tensor:
     """Apply a GELU and a linear map to (..., I); the backward pass recomputes the GELU."""
     if _quick(linear, x):
-        made: Tensor = _GeluProduct.apply(x, linear.weight, linear.bias)  # type: ignore[no-untyped-call]
+        made: Tensor = _GeluProduct.apply(x, linear.weight, linear.bias)
         return made
     return light(linear, lambda x: linear(F.gelu(x)), x)
 
@@ -102,7 +102,7 @@ class _Product(torch.autograd.Function):
         return _product(x, weight, bias)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:
         x, weight = ctx.saved_tensors
         grad = grad.contiguous()
@@ -120,7 +120,7 @@ class _GeluProduct(torch.autograd.Function):
         return _product(F.gelu(x), weight, bias)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:
         x, weight = ctx.saved_tensors
         grad = grad.contiguous()
@@ -141,7 +141,7 @@ class _NormProduct(torch.autograd.Function):
         return _product(normed, weight, bias)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:
         x, gain, shift, mean, inverse, weight = ctx.saved_tensors
         grad, needs = grad.contiguous(), ctx.needs_input_grad
