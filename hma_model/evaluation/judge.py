@@ -1,0 +1,205 @@
+"""Judge from pictures alone whether an episode of a laboratory robot is a success.
+
+A task is a score of the places of the parts over an episode, and the least score of a success. The simulator
+knows the places; a judge reads them off pictures with a probe. Reading blurs the score, so the judge's own
+limit is set on recorded episodes whose outcome is known. Its accuracy is measured on others.
+
+N episodes, T frames, S pixels a side, P parts. Places are px of a picture of 128 by 128.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import HMAError, UsageError
+from hma_data.lab import truth
+from hma_model.evaluation.agreement import Accuracy, Bools, accuracy
+from hma_model.evaluation.probe import EPISODES, FIRST, Probe, as_seen, as_shown, train_probe
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+
+Floats = NDArray[np.float64]
+Images = NDArray[np.uint8]
+Score = Callable[[Floats, int], Floats]
+
+SPAN = 3  # last frames over which a place is the median
+EXAMPLES = 96  # recorded episodes, of which half set the judge's limit and half test it
+MOVED = {"pusht_fast": 10.0, "pusht_slow": 10.0}  # px; the T wanders further than a small block
+BLOCK_MOVED, NEAR = 5.0, 12.0  # px
+
+
+def moved(parts: Floats, driven: int) -> Floats:
+    """Return how far the loose part that moved furthest ends from its first place.
+
+    Args:
+        parts: (N, T, P, 2).
+        driven: how many of the parts, the first ones, are the robot's own.
+
+    Returns:
+        (N,) px.
+    """
+    ends = np.median(parts[:, -SPAN:, driven:], axis=1)
+    far: Floats = np.linalg.norm(ends - parts[:, 0, driven:], axis=-1).max(axis=-1)
+    return far
+
+
+def reached(parts: Floats, driven: int) -> Floats:
+    """Return how near the last own part comes to the first place of a loose part, negative; (N,) px."""
+    gap = parts[:, 1:, driven - 1, None] - parts[:, :1, driven:]
+    near: Floats = np.linalg.norm(gap, axis=-1).min(axis=(1, 2))
+    return -near
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a robot is to do.
+
+    Attributes:
+        name: a key of TASKS.
+        limit: the least score of a success; of `reached` negative.
+    """
+
+    name: str
+    limit: float
+
+    @property
+    def text(self) -> str:
+        """Return the task in words."""
+        return TASKS[self.name][1].format(abs(self.limit))
+
+    def score(self, parts: Floats, driven: int) -> Floats:
+        """Return the scores (N,) of the places (N, T, P, 2) of an episode's parts."""
+        return TASKS[self.name][0](parts, driven)
+
+
+TASKS: dict[str, tuple[Score, str]] = {
+    "moved": (moved, "some loose part ends {:g} px or more from where it lay"),
+    "reached": (reached, "the robot's last part comes within {:g} px of where a loose part lay"),
+}
+
+
+def task_of(robot: str, words: str = "moved") -> Task:
+    """Return the task of a robot from words: `moved`, `moved=8`, `reached` or `reached=15`.
+
+    Raises:
+        UsageError: the words name no task.
+    """
+    name, given, number = words.partition("=")
+    try:
+        if name not in TASKS:
+            raise ValueError
+        limit = float(number) if given else {"moved": MOVED.get(robot, BLOCK_MOVED), "reached": NEAR}[name]
+        if not 0 < limit < truth.SIZE:
+            raise ValueError
+    except ValueError:
+        remedy = f"give {' or '.join(TASKS)}, if wanted with px: moved={BLOCK_MOVED:g}"
+        raise UsageError("judge", f"{words!r} is no task", remedy) from None
+    return Task(name, -limit if name == "reached" else limit)
+
+
+@dataclass(frozen=True)
+class StateJudge:
+    """A judge of one robot and one task, for pictures as its tokenizer shows them.
+
+    It is also a `Judge` of `WorldModelEnv`: the reward is the score so far, and it never ends an episode.
+
+    Attributes:
+        probe: reads the places.
+        limit: the least score, as read, of a success.
+        held_out: its accuracy on true episodes that neither the probe nor the limit has seen.
+    """
+
+    robot: str
+    task: Task
+    probe: Probe
+    limit: float
+    held_out: Accuracy
+
+    def score(self, pictures: Images) -> Floats:
+        """Return the scores (N,) of episodes (N, T, S, S, 3)."""
+        return self.score_places(self.probe.read(pictures))
+
+    def score_places(self, places: Floats) -> Floats:
+        """Return the scores (N,) of the places (N, T, P, 2) that the probe has read."""
+        return _readable_score(self.task, self.probe, places)
+
+    def success(self, scores: Floats) -> Bools:
+        """Return which scores are judged a success."""
+        judged: Bools = scores >= self.limit
+        return judged
+
+    def __call__(self, pictures: Images, commands: Any) -> tuple[float, bool]:
+        return float(self.score(pictures[None])[0]), False
+
+
+def train_judge(
+    robot: str,
+    tokenizer: "Tokenizer",
+    stride: int,
+    frames: int,
+    task: Task | None = None,
+    *,
+    seed: int = 0,
+    examples: int = EXAMPLES,
+    probe: Probe | None = None,
+) -> StateJudge:
+    """Train a judge on recorded episodes of a laboratory robot.
+
+    Args:
+        robot: a laboratory robot.
+        tokenizer: whose pictures it is to judge.
+        stride: control steps a frame.
+        frames: T of the episodes to judge.
+        task: by default `moved`.
+        seed: of the probe, the episodes and the intervals.
+        examples: recorded episodes for the limit and its test.
+        probe: one that is trained already.
+
+    Raises:
+        HMAError: the robot has no loose parts that can be read, or the judge is no better than chance.
+    """
+    task = task or task_of(robot)
+    probe = probe or train_probe(robot, tokenizer, stride, seed)
+    if not len(probe.loose) or (task.name == "reached" and probe.driven - 1 not in probe.own):
+        fault = f"cannot tell whether {task.text}: the probe does not read these parts"
+        raise HMAError(f"judge of {robot}", fault, "judge another task or robot")
+    looked = {0, *range(max(frames - SPAN, 1), frames)} if task.name == "moved" else set(range(frames))
+    numbers = range(FIRST + EPISODES, FIRST + EPISODES + examples)
+    true, read = np.empty(examples), np.empty(examples)
+    for row, number in enumerate(numbers):
+        made = truth.episode(robot, frames, stride, seed, number, looked)
+        shown = as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures))
+        true[row] = task.score(made.parts[None], made.driven)[0]
+        read[row] = _readable_score(task, probe, probe.read(shown)[None])[0]
+    half, success = examples // 2, true >= task.limit
+    limit = best_limit(read[:half], success[:half], task.limit)
+    found = accuracy(success[half:], read[half:] >= limit, seed)
+    if not found.better_than_chance:
+        remedy = f"try another task or limit, such as --judge {task.name}={2 * abs(task.limit):g}"
+        raise HMAError(f"judge of {robot}", f"is no better than chance: {found}", remedy)
+    return StateJudge(robot, task, probe, limit, found)
+
+
+def best_limit(read: Floats, success: Bools, limit: float) -> float:
+    """Return the limit of scores (N,) that best tells successes; of several, the one nearest to the true one.
+
+    Best has the highest balanced accuracy. If all episodes end alike, the true limit stays.
+    """
+    if success.all() or not success.any():
+        return limit
+    ordered = np.unique(read)
+    tried = np.concatenate([[limit], (ordered[1:] + ordered[:-1]) / 2])
+    said = read >= tried[:, None]
+    balanced = (said[:, success].mean(axis=1) + (~said[:, ~success]).mean(axis=1)) / 2
+    best = tried[balanced >= balanced.max() - 1e-12]
+    return float(best[np.abs(best - limit).argmin()])
+
+
+def _readable_score(task: Task, probe: Probe, places: Floats) -> Floats:
+    """Return the score of the own parts and of the loose ones that a probe can read."""
+    kept = np.concatenate([np.arange(probe.driven), probe.loose])
+    return task.score(places[..., kept, :], probe.driven)
