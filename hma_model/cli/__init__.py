@@ -22,6 +22,7 @@ from hma_data.errors import HMAError, UsageError
 from hma_model.cli import train as cli_train
 from hma_model.cli.hub import Json, hub_app
 from hma_model.cli.play import play
+from hma_model.cli.policy import policy_eval
 from hma_model.cli.train import MODELS
 
 
@@ -307,6 +308,7 @@ def _require_checkpoint(checkpoint: str) -> None:
         resolve(folder)
 
 
+app.command("policy-eval", rich_help_panel=MODELS)(policy_eval)
 BENCHES |= {
     "drift": "hma_model.bench.drift:BENCH",
     "generate": "hma_model.bench.generation:GENERATE",

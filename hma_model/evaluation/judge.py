@@ -1,8 +1,10 @@
 """Judge from pictures alone whether an episode of a laboratory robot is a success.
 
 A task is a score of the places of the parts over an episode, and the least score of a success. The simulator
-knows the places; a judge reads them off pictures with a probe. Reading blurs the score, so the judge's own
-limit is set on recorded episodes whose outcome is known. Its accuracy is measured on others.
+knows the places; a judge reads them off pictures with a probe. A probe finds a place even for what is gone,
+so a loose part of which less than half the pixels are left counts as where it was last seen. Reading blurs
+the score, so the judge's own limit is set on recorded episodes whose outcome is known. Its accuracy is that
+on others.
 
 N episodes, T frames, S pixels a side, P parts. Places are px of a picture of 128 by 128.
 """
@@ -30,6 +32,7 @@ SPAN = 3  # last frames over which a place is the median
 EXAMPLES = 96  # recorded episodes, of which half set the judge's limit and half test it
 MOVED = {"pusht_fast": 10.0, "pusht_slow": 10.0}  # px; the T wanders further than a small block
 BLOCK_MOVED, NEAR = 5.0, 12.0  # px
+SEEN = 0.5  # share of a loose part's first pixels up to which it is there
 
 
 def moved(parts: Floats, driven: int) -> Floats:
@@ -121,11 +124,7 @@ class StateJudge:
 
     def score(self, pictures: Images) -> Floats:
         """Return the scores (N,) of episodes (N, T, S, S, 3)."""
-        return self.score_places(self.probe.read(pictures))
-
-    def score_places(self, places: Floats) -> Floats:
-        """Return the scores (N,) of the places (N, T, P, 2) that the probe has read."""
-        return _readable_score(self.task, self.probe, places)
+        return _read_score(self.task, self.probe, pictures)
 
     def success(self, scores: Floats) -> Bools:
         """Return which scores are judged a success."""
@@ -174,7 +173,7 @@ def train_judge(
         made = truth.episode(robot, frames, stride, seed, number, looked)
         shown = as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures))
         true[row] = task.score(made.parts[None], made.driven)[0]
-        read[row] = _readable_score(task, probe, probe.read(shown)[None])[0]
+        read[row] = _read_score(task, probe, shown[None])[0]
     half, success = examples // 2, true >= task.limit
     limit = best_limit(read[:half], success[:half], task.limit)
     found = accuracy(success[half:], read[half:] >= limit, seed)
@@ -199,7 +198,16 @@ def best_limit(read: Floats, success: Bools, limit: float) -> float:
     return float(best[np.abs(best - limit).argmin()])
 
 
-def _readable_score(task: Task, probe: Probe, places: Floats) -> Floats:
-    """Return the score of the own parts and of the loose ones that a probe can read."""
-    kept = np.concatenate([np.arange(probe.driven), probe.loose])
-    return task.score(places[..., kept, :], probe.driven)
+def _read_score(task: Task, probe: Probe, pictures: Images) -> Floats:
+    """Return the scores (N,) of episodes (N, T, S, S, 3), by the parts that a probe can read."""
+    places = probe.read(pictures)
+    loose = last_seen(places[..., probe.loose, :], probe.areas(pictures)[..., probe.loose])
+    return task.score(np.concatenate([places[..., : probe.driven, :], loose], axis=-2), probe.driven)
+
+
+def last_seen(places: Floats, areas: Floats) -> Floats:
+    """Return places (N, T, P, 2), where a part stays as long as its area (N, T, P) is small."""
+    seen = areas >= SEEN * areas[:, :1]
+    seen[:, 0] = True
+    times = np.where(seen, np.arange(seen.shape[1])[:, None], 0)
+    return np.take_along_axis(places, np.maximum.accumulate(times, axis=1)[..., None], axis=1)

@@ -8,7 +8,8 @@ N scenes, S pixels a side, A action dims, S' values of a state.
 import copy
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -173,6 +174,12 @@ class Called:
         return np.stack(commands)
 
 
+def begin(name: str, policy: Policy, arena: Arena) -> None:
+    """Begin a policy's episodes; an HMAError names the policy if it raises."""
+    with _named_errors(name):
+        policy.begin(arena)
+
+
 def checked(name: str, policy: Policy, arena: Arena) -> Floats:
     """Return the next commands (N, A) of a policy.
 
@@ -180,12 +187,8 @@ def checked(name: str, policy: Policy, arena: Arena) -> Floats:
         HMAError: it raises, or returns another shape or values that are not finite.
     """
     where, width = f"policy {name}", len(arena.scenes.dimensions)
-    try:
+    with _named_errors(name):
         commands = np.asarray(policy.act(arena), np.float32)
-    except HMAError:
-        raise
-    except Exception as fault:
-        raise HMAError(where, f"raised {type(fault).__name__}: {fault}", "mend it") from fault
     if commands.shape != (len(arena.pictures), width):
         names = ", ".join(dim.name for dim in arena.scenes.dimensions)
         fault = f"returns commands of the shape {commands.shape[1:]}"
@@ -195,3 +198,14 @@ def checked(name: str, policy: Policy, arena: Arena) -> Floats:
             where, "returns NaN or infinite values", "return a number for each value of the command"
         )
     return commands
+
+
+@contextmanager
+def _named_errors(name: str) -> Iterator[None]:
+    try:
+        yield
+    except HMAError:
+        raise
+    except Exception as fault:
+        remedy = "mend it; --debug shows where it happened"
+        raise HMAError(f"policy {name}", f"raised {type(fault).__name__}: {fault}", remedy) from fault

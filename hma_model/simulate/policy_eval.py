@@ -12,14 +12,14 @@ M policies, N episodes, T frames after the prompt, S pixels a side.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import HMAError, UsageError
+from hma_data.errors import UsageError
 from hma_data.storage.paths import StrPath
 from hma_model.evaluation.agreement import (
     Accuracy,
@@ -32,7 +32,7 @@ from hma_model.evaluation.agreement import (
 )
 from hma_model.evaluation.judge import StateJudge, task_of, train_judge
 from hma_model.simulate.arenas import Arena, Floats, ModelArena, Picture, Scenes, TrueArena
-from hma_model.simulate.policies import Policy, checked, read_policy
+from hma_model.simulate.policies import Policy, begin, checked, read_policy
 from hma_model.simulate.world import World, load_world
 
 Scores = NDArray[np.float64]
@@ -181,6 +181,8 @@ def evaluate_policies(
     world = world or load_world(checkpoint)
     scenes = Scenes.of(world, embodiment, episodes, seed)
     made = [(one, read_policy(one, scenes)) if isinstance(one, str) else one for one in policies]
+    for name, policy in made:  # what it returns is refused before minutes of work
+        _try(name, policy, TrueArena(replace(scenes, numbers=scenes.numbers[:1]), world.picture_shape[0]))
     if not isinstance(judge, StateJudge):
         task = task_of(embodiment, judge)
         tell(0, "training the judge")
@@ -203,6 +205,11 @@ def evaluate_policies(
         accuracy(success[2].ravel() > 0, success[1].ravel() > 0, seed),
         _correlation(scores[1].ravel(), scores[2].ravel()),
     )
+
+
+def _try(name: str, policy: Policy, arena: Arena) -> None:
+    begin(name, policy, arena)
+    checked(name, policy, arena)
 
 
 def _tell(tell: Progress, begun: float, name: str, done: float) -> None:
@@ -261,12 +268,7 @@ def run(
         HMAError: the policy fails.
     """
     pictures, commands = [arena.pictures], []
-    try:
-        policy.begin(arena)
-    except HMAError:
-        raise
-    except Exception as fault:
-        raise HMAError(f"policy {name}", f"raised {type(fault).__name__}: {fault}", "mend it") from fault
+    begin(name, policy, arena)
     for _ in range(frames * arena.scenes.stride):
         commands.append(checked(name, policy, arena))
         arena.step(commands[-1])
