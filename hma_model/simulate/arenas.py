@@ -16,7 +16,7 @@ from hma_data.episodes.images import resize
 from hma_data.errors import HMAError
 from hma_data.lab import truth
 from hma_data.lab.scripted import SeenState, State, state_of, steerable
-from hma_data.lab.simulator import simulated
+from hma_data.lab.simulator import LabSimulator, simulated
 from hma_model.simulate.commands import described
 from hma_model.simulate.scenes import Dimension, LabRobot, LabScene, Prompt
 
@@ -53,7 +53,7 @@ class Scenes:
             HMAError: the model lacks the robot, or it is none of the laboratory.
         """
         found, commands = described(world.model, embodiment), world.commands(embodiment)
-        if found is None or not simulated(embodiment):
+        if not simulated(embodiment):
             remedy = "choose a robot of the laboratory; hma play shows those of a checkpoint"
             raise HMAError(embodiment, "has no true simulator to compare with", remedy)
         space = world.model.embodiments[embodiment]
@@ -61,7 +61,8 @@ class Scenes:
         if commands.seen is not None:
             action |= {"min": commands.seen[0], "max": commands.seen[1]}
         numbers = tuple(range(seed * SEEDS, seed * SEEDS + count))
-        return cls(LabRobot(found, {"action": action}), numbers, seed)
+        robot = found or LabSimulator(embodiment).embodiment
+        return cls(LabRobot(robot, {"action": action}), numbers, seed)
 
     @property
     def name(self) -> str:

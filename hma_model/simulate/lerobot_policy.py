@@ -3,6 +3,8 @@
 N scenes, S pixels a side, S' values of a state.
 """
 
+import sys
+from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
@@ -31,13 +33,14 @@ class LeRobotPolicy:
             from lerobot.configs.policies import PreTrainedConfig
             from lerobot.policies.factory import get_policy_class, make_pre_post_processors
         try:
-            config = PreTrainedConfig.from_pretrained(source)
-            config.device, config.pretrained_path = "cpu", source
-            self._policy: Any = get_policy_class(config.type).from_pretrained(source, config=config)
-            on_cpu = {"device_processor": {"device": "cpu"}}
-            self._before, self._after = make_pre_post_processors(
-                config, source, preprocessor_overrides=on_cpu, postprocessor_overrides=on_cpu
-            )
+            with redirect_stdout(sys.stderr):  # it prints what it loads
+                config = PreTrainedConfig.from_pretrained(source)
+                config.device, config.pretrained_path = "cpu", source
+                self._policy: Any = get_policy_class(config.type).from_pretrained(source, config=config)
+                on_cpu = {"device_processor": {"device": "cpu"}}
+                self._before, self._after = make_pre_post_processors(
+                    config, source, preprocessor_overrides=on_cpu, postprocessor_overrides=on_cpu
+                )
         except Exception as fault:
             said = f"cannot be loaded: {type(fault).__name__}: {fault}"
             raise HMAError(
