@@ -22,7 +22,7 @@ from hma_data.errors import HMAError, UsageError
 from hma_model.cli import train as cli_train
 from hma_model.cli.hub import Json, hub_app
 from hma_model.cli.play import play
-from hma_model.cli.policy import policy_eval
+from hma_model.cli.policy import augment, policy_eval
 from hma_model.cli.train import MODELS
 
 
@@ -309,6 +309,7 @@ def _require_checkpoint(checkpoint: str) -> None:
 
 
 app.command("policy-eval", rich_help_panel=MODELS)(policy_eval)
+app.command(rich_help_panel=MODELS)(augment)
 BENCHES |= {
     "drift": "hma_model.bench.drift:BENCH",
     "generate": "hma_model.bench.generation:GENERATE",

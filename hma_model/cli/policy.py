@@ -1,11 +1,11 @@
-"""Define the verb `hma policy-eval`."""
+"""Define the verbs `hma policy-eval` and `hma augment`."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hma_data.console import print_json, progress
+from hma_data.console import human_count, interruptible, print_json, progress
 from hma_model.cli.hub import Json
 
 
@@ -50,3 +50,54 @@ def policy_eval(
     show(found)
     if page:
         print(f"open {page}")
+
+
+def augment(
+    embodiment: Annotated[str, typer.Argument(help="A robot that the checkpoint has.")],
+    out: Annotated[Path, typer.Argument(help="Folder for the shard set.")],
+    checkpoint: Annotated[
+        str, typer.Option("--checkpoint", help="A checkpoint, a run's folder, or a hub repo.")
+    ] = "embedded",
+    source: Annotated[
+        Path | None,
+        typer.Option("--from", help="Shard set of first frames and commands; else the simulator's."),
+    ] = None,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes to make.")] = 64,
+    frames: Annotated[int, typer.Option("--frames", min=4, help="Frames to generate of each.")] = 40,
+    commands: Annotated[
+        str,
+        typer.Option(
+            "--commands", help="replay, perturb=SHARE of their spread, or a policy as of hma policy-eval."
+        ),
+    ] = "replay",
+    keep: Annotated[
+        float, typer.Option("--keep", help="Share to keep: the episodes of which the model is surest.")
+    ] = 0.5,
+    judge: Annotated[
+        str, typer.Option("--judge", help="Keep only successes at this: moved, reached, moved=PX.")
+    ] = "",
+    lerobot: Annotated[
+        Path | None, typer.Option("--lerobot", help="Folder for them as a LeRobotDataset v3.0 as well.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
+    json: Json = False,
+) -> None:
+    """Make synthetic episodes with the world model, as shards and as a LeRobotDataset.
+
+    Example: hma augment rails_03 synthetic/rails_03 --episodes 64 --commands perturb=0.3
+    """
+    from hma_model.simulate.augment import Augmentation
+    from hma_model.simulate.augment import augment as run
+
+    name = source.resolve().name if source else ""
+    settings = Augmentation(embodiment, name, episodes, frames, commands, keep, judge, seed)
+    words = f"finished batches are kept in {out}; run the same command again to continue"
+    with interruptible(lambda: words), progress("episodes", episodes * frames) as update:
+        made = run(out, settings, checkpoint=checkpoint, shards=source, lerobot=lerobot, on_progress=update)
+    kept = sum(split["episodes"] for split in made.splits.values())
+    if json:
+        print_json({"out": str(out), "made": episodes, "kept": kept, "plan": made.plan})
+        return
+    print(f"kept {human_count(kept, 'episode')} of {episodes} in {out}; synthetic: true in every file")
+    if lerobot:
+        print(f"the same as a LeRobotDataset: {lerobot}")

@@ -55,6 +55,8 @@ class Rollout:
     Attributes:
         decoding: the settings of unmasking; they may be replaced between steps.
         state: the state of the rows.
+        entropy: (n,) of the rows of the last step, twins last: mean nats a token of the trunk, by what was
+            predicted when it was decided; if `decoding` measures it.
     """
 
     def __init__(
@@ -240,11 +242,13 @@ class Rollout:
             if count > 0:
                 self._unmask(frame, passes, count, first=left == tokens)
                 left -= count
+        if isinstance(frame, TokenFrame):
+            self.entropy = frame.nats / tokens
         return frame.values
 
     def _unmask(self, frame: TokenFrame | PatchFrame, passes: list[Pass], count: int, first: bool) -> None:
         """Predict and keep `count` more tokens of a frame."""
-        if self.engine.whole is not None and isinstance(frame, TokenFrame) and not self.decoding.temperature:
+        if self.engine.whole is not None and isinstance(frame, TokenFrame) and not self.drawing:
             (part,) = passes
             seen = frame.laid_out(part.lay_out)
             made = self.engine.whole(seen, count, *self._inputs(frame, part, first)).clone()
@@ -253,6 +257,11 @@ class Rollout:
         features, position = self._features(frame, passes, first)
         own = features[:, : self.config.tokens_per_frame]
         frame.unmask(self.engine.readout, own, position, count)  # type: ignore[arg-type]
+
+    @property
+    def drawing(self) -> bool:
+        """Return whether unmasking does more than take the likeliest tokens."""
+        return bool(self.decoding.temperature) or self.decoding.measure
 
     def _passes(self, rows: list[int]) -> list[Pass]:
         """Return the pass that all rows share; without a cache, one for the rows of each time."""

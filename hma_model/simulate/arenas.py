@@ -6,16 +6,17 @@ every `stride` of them, as the environments of the world model show it.
 N scenes, S pixels a side, A action dims, K = stride · A, P parts, T chunks of an episode.
 """
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError
-from hma_data.lab import truth
-from hma_data.lab.scripted import SeenState, State, state_of, steerable
+from hma_data.lab import FAMILY, truth
+from hma_data.lab.scripted import SeenState, State, state_of
 from hma_data.lab.simulator import LabSimulator, simulated
 from hma_model.simulate.commands import described
 from hma_model.simulate.scenes import Dimension, LabRobot, LabScene, Prompt
@@ -46,14 +47,19 @@ class Scenes:
     seed: int
 
     @classmethod
-    def of(cls, world: "World", embodiment: str, count: int, seed: int) -> "Scenes":
+    def of(
+        cls, world: "World", embodiment: str, count: int, seed: int, *, simulator: bool = True
+    ) -> "Scenes":
         """Return the first scenes of a seed.
+
+        Args:
+            simulator: whether the robot must have a simulator; `begin` needs it.
 
         Raises:
             HMAError: the model lacks the robot, or it is none of the laboratory.
         """
         found, commands = described(world.model, embodiment), world.commands(embodiment)
-        if not simulated(embodiment):
+        if simulator and not simulated(embodiment):
             remedy = "choose a robot of the laboratory; hma play shows those of a checkpoint"
             raise HMAError(embodiment, "has no true simulator to compare with", remedy)
         space = world.model.embodiments[embodiment]
@@ -61,7 +67,9 @@ class Scenes:
         if commands.seen is not None:
             action |= {"min": commands.seen[0], "max": commands.seen[1]}
         numbers = tuple(range(seed * SEEDS, seed * SEEDS + count))
-        robot = found or LabSimulator(embodiment).embodiment
+        robot = found or (LabSimulator(embodiment).embodiment if simulated(embodiment) else None)
+        if robot is None:
+            raise HMAError(embodiment, "has no YAML, which describes its commands", "load a checkpoint")
         return cls(LabRobot(robot, {"action": action}), numbers, seed)
 
     @property
@@ -78,6 +86,10 @@ class Scenes:
     def dimensions(self) -> tuple[Dimension, ...]:
         """Return the values of a command."""
         return self.robot.dimensions
+
+    def take(self, chosen: range) -> "Scenes":
+        """Return some of the scenes."""
+        return replace(self, numbers=tuple(self.numbers[i] for i in chosen))
 
     def begin(self) -> list[LabScene]:
         """Return the scenes after their prompts; each call gives new ones in the same state."""
@@ -163,16 +175,31 @@ class TrueArena:
         self.parts.append(np.stack([truth.parts_of(s.simulator.simulation)[1] for s in self._begun]))
 
 
+class Beginning(Protocol):
+    """What episodes in the model begin with, and what was commanded in the true ones.
+
+    Attributes:
+        prompts: N of them.
+        held: (N, A), as of `Arena`.
+        told: the commands (N, A) of each step by the recorder's driver.
+    """
+
+    scenes: Scenes
+    prompts: Sequence[Prompt]
+    held: Floats
+    told: Sequence[Floats]
+
+
 class ModelArena:
     """The world model, as a gymnasium vector environment.
 
     Args:
         world: with the robot.
-        true: the simulators that acted in the same scenes.
+        true: the simulators that acted in the same scenes, or other beginnings.
         probe: reads places for policies that ask for a state.
     """
 
-    def __init__(self, world: "World", true: TrueArena, probe: "Probe") -> None:
+    def __init__(self, world: "World", true: Beginning, probe: "Probe | None") -> None:
         from hma_model.simulate.env import WorldModelVectorEnv
 
         scenes, prompts = true.scenes, true.prompts
@@ -192,14 +219,20 @@ class ModelArena:
         return self._steps % self.scenes.stride == 0
 
     def states(self) -> list[State]:
-        """Return what the probe reads off the pictures, moved by the commands since the last one."""
+        """Return what the probe reads off the pictures, moved by the commands since the last one.
+
+        Raises:
+            HMAError: there is no probe.
+        """
+        if self._probe is None:
+            raise HMAError(self.scenes.name, "nothing reads its state off pictures", "give another policy")
         if self._seen is None:
             places = self._probe.read(self.pictures)
             self._seen = [SeenState(self.scenes.name, self._probe.own, one) for one in places]
         return [seen.state for seen in self._seen]
 
     def observed(self) -> Floats | None:
-        if not steerable(self.scenes.name) or self.scenes.name == "planar_arm":  # it records velocities too
+        if self._probe is None or not FAMILY.fullmatch(self.scenes.name):  # others record velocities too
             return None
         return np.stack([state.pose for state in self.states()]).astype(np.float32)
 
@@ -210,12 +243,24 @@ class ModelArena:
     def step(self, commands: Floats) -> None:
         self.pictures, *_ = self._env.step(commands)
         self._steps += 1
-        if self._seen is not None:
+        if self._seen is not None and self._probe is not None:
             places = self._probe.read(self.pictures) if self.fresh else None
             for row, seen in enumerate(self._seen):
                 seen.move(commands[row])
                 if places is not None:
                     seen.see(places[row])
+
+    def stored(self) -> NDArray[Any]:
+        """Return the newest frames (N, …) as shards store them."""
+        return np.stack([self._env.world.stored(session) for session in self._sessions])
+
+    def entropies(self) -> NDArray[np.float64]:
+        """Return how unsure the model was of the newest frames (N,), if its world measures it."""
+        return np.array([self._env.world.entropies.get(session, 0.0) for session in self._sessions])
+
+    @property
+    def _sessions(self) -> list[int]:
+        return [drive.session for drive in self._env.drives if drive.session is not None]
 
     def close(self) -> None:
         """End the sessions."""

@@ -10,11 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from hma_data.errors import HMAError, UsageError
-from hma_data.lab import family, truth
+from hma_data.lab import truth
 from hma_data.lab.simulator import LabSimulator
 from hma_data.tokenizers.base import get_tokenizer
-from hma_model.checkpoint.folder import action_stats
-from hma_model.config import ActionSpace, HMAConfig
 from hma_model.evaluation.agreement import Accuracy
 from hma_model.evaluation.judge import StateJudge, task_of
 from hma_model.network.model import HMA
@@ -23,7 +21,7 @@ from hma_model.simulate.arenas import Scenes, TrueArena
 from hma_model.simulate.policies import begin, checked, read_policy
 from hma_model.simulate.policy_eval import evaluate_policies
 from hma_model.simulate.policy_page import html, sentences, write_report
-from tests.model.simulate.worlds import TrueWorld
+from tests.model.simulate.worlds import TrueWorld, tiny_model
 
 ROBOT = "rails_03"
 POLICIES = ["scripted", "scripted:noise=0.5", "random", "still"]
@@ -31,16 +29,7 @@ POLICIES = ["scripted", "scripted:noise=0.5", "random", "still"]
 
 @pytest.fixture(scope="module")
 def model() -> HMA:
-    """A tiny model, which knows nothing."""
-    own, tokenizer = family.embodiment(ROBOT), get_tokenizer("fsq-8")
-    config = HMAConfig(
-        layers=1, width=32, heads=2, frames=4, grid=(8, 8), factored=(8,) * 6, training_pass="pairs",
-        tokenizer=tokenizer.spec.to_json(),
-    )  # fmt: skip
-    made = HMA(config)
-    stats = {"action": {"mean": [0.0] * own.action_dim, "std": [30.0] * own.action_dim}}
-    made.add_embodiment(ActionSpace.of(own, action_stats(stats, own.id)))
-    return made.eval()
+    return tiny_model(ROBOT)
 
 
 @pytest.fixture
