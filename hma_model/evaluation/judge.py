@@ -51,9 +51,9 @@ def moved(parts: Floats, driven: int) -> Floats:
 
 
 def reached(parts: Floats, driven: int) -> Floats:
-    """Return how near the last own part comes to the first place of a loose part, negative; (N,) px."""
-    gap = parts[:, 1:, driven - 1, None] - parts[:, :1, driven:]
-    near: Floats = np.linalg.norm(gap, axis=-1).min(axis=(1, 2))
+    """Return how near an own part comes to the first place of a loose part, negative; (N,) px."""
+    gap = parts[:, 1:, :driven, None] - parts[:, :1, None, driven:]
+    near: Floats = np.linalg.norm(gap, axis=-1).min(axis=(1, 2, 3))
     return -near
 
 
@@ -81,7 +81,7 @@ class Task:
 
 TASKS: dict[str, tuple[Score, str]] = {
     "moved": (moved, "some loose part ends {:g} px or more from where it lay"),
-    "reached": (reached, "the robot's last part comes within {:g} px of where a loose part lay"),
+    "reached": (reached, "a moving part of the robot comes within {:g} px of where a loose part lay"),
 }
 
 
@@ -126,6 +126,10 @@ class StateJudge:
         """Return the scores (N,) of episodes (N, T, S, S, 3)."""
         return _read_score(self.task, self.probe, pictures)
 
+    def true_score(self, parts: Floats) -> Floats:
+        """Return the scores (N,) of true places (N, T, P, 2)."""
+        return _true_score(self.task, self.probe, parts)
+
     def success(self, scores: Floats) -> Bools:
         """Return which scores are judged a success."""
         judged: Bools = scores >= self.limit
@@ -163,7 +167,7 @@ def train_judge(
     """
     task = task or task_of(robot)
     probe = probe or train_probe(robot, tokenizer, stride, seed)
-    if not len(probe.loose) or (task.name == "reached" and probe.driven - 1 not in probe.own):
+    if not len(probe.loose) or (task.name == "reached" and not len(probe.own)):
         fault = f"cannot tell whether {task.text}: the probe does not read these parts"
         raise HMAError(f"judge of {robot}", fault, "judge another task or robot")
     looked = {0, *range(max(frames - SPAN, 1), frames)} if task.name == "moved" else set(range(frames))
@@ -172,7 +176,7 @@ def train_judge(
     for row, number in enumerate(numbers):
         made = truth.episode(robot, frames, stride, seed, number, looked)
         shown = as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures))
-        true[row] = task.score(made.parts[None], made.driven)[0]
+        true[row] = _true_score(task, probe, made.parts[None])[0]
         read[row] = _read_score(task, probe, shown[None])[0]
     half, success = examples // 2, true >= task.limit
     limit = best_limit(read[:half], success[:half], task.limit)
@@ -202,7 +206,14 @@ def _read_score(task: Task, probe: Probe, pictures: Images) -> Floats:
     """Return the scores (N,) of episodes (N, T, S, S, 3), by the parts that a probe can read."""
     places = probe.read(pictures)
     loose = last_seen(places[..., probe.loose, :], probe.areas(pictures)[..., probe.loose])
-    return task.score(np.concatenate([places[..., : probe.driven, :], loose], axis=-2), probe.driven)
+    own = places[..., probe.own, :]
+    return task.score(np.concatenate([own, loose], axis=-2), len(probe.own))
+
+
+def _true_score(task: Task, probe: Probe, parts: Floats) -> Floats:
+    """Return the scores (N,) of true places, by the own parts that can be read and all loose ones."""
+    kept = np.concatenate([probe.own, np.arange(probe.driven, parts.shape[-2])])
+    return task.score(parts[..., kept, :], len(probe.own))
 
 
 def last_seen(places: Floats, areas: Floats) -> Floats:

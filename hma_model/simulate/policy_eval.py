@@ -231,7 +231,7 @@ def score_policy(
     tell: Callable[[float], None] = lambda done: None,
 ) -> Scored:
     """Return what comes of one policy in the simulator and in the model."""
-    size, task, driven = world.picture_shape[0], judge.task, judge.probe.driven
+    size, limit = world.picture_shape[0], judge.task.limit
     shown = tuple(sorted({round(frame) for frame in np.linspace(0, frames, SHOWN)}))
     true = TrueArena(scenes, size)
     true_pictures, _ = run(name, policy, true, frames)
@@ -243,13 +243,13 @@ def score_policy(
     again = TrueArena(scenes, size, drawn=False)
     for command in commands:
         again.step(command)
-    scores = [task.score(np.stack(arena.parts, axis=1), driven) for arena in (true, again)]
+    scores = [judge.true_score(np.stack(arena.parts, axis=1)) for arena in (true, again)]
     read = judge.score(np.stack(model_pictures, axis=1))
     return Scored(
         name,
-        Outcomes(scores[0], scores[0] >= task.limit),
+        Outcomes(scores[0], scores[0] >= limit),
         Outcomes(read, judge.success(read)),
-        Outcomes(scores[1], scores[1] >= task.limit),
+        Outcomes(scores[1], scores[1] >= limit),
         shown,
         np.stack([true_pictures[frame] for frame in shown], axis=1),
         np.stack([model_pictures[frame] for frame in shown], axis=1),

@@ -93,7 +93,11 @@ def write_shards(
             for index, ref in unit.episodes:
                 one, length = episodes[index], len(episodes[index].chunks)
                 times = np.arange(length) / own.effective_hz
-                counts = {"prompt_frames": length + 1 - generated, "generated_frames": generated - 1}
+                counts = {
+                    "prompt_frames": length + 1 - generated,
+                    "generated_frames": generated - 1,
+                    "millinats": round(1000 * one.nats),
+                }
                 rows.append(
                     EpisodeRow(
                         index, ref.id, unit.split, unit.name, writer.rows, length, length, "",
@@ -105,10 +109,6 @@ def write_shards(
                 stats["action"].merge(layout.stats({"action": one.chunks}, slice(None))["action"])
             writer.close(Footer(plan.facts, unit.name, unit.split, tuple(rows), (), stats))
     return finish(folder, [unit.name for unit in plan.units], own, spec, plan.facts, ORIGIN)
-
-
-def _id(episode: Synthetic) -> str:
-    return f"synthetic_{episode.number:06d}"
 
 
 def write_as_lerobot(folder: Path, shards: Path, tokenizer: "Tokenizer") -> None:

@@ -11,7 +11,7 @@ from hma_data.conversion.job import convert
 from hma_data.errors import HMAError, OutputError, UsageError
 from hma_data.lab import family, record
 from hma_data.shards.reader import EpisodeReader, ShardSet
-from hma_data.shards.schema import read_footer
+from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.network.model import HMA
@@ -53,7 +53,7 @@ def test_replayed_episodes_hold_the_recorders_commands_and_say_that_they_are_syn
     world: World, tmp_path: Path
 ) -> None:
     manifest = augment(tmp_path / "out", asked(), world=world)
-    assert verify(tmp_path / "out").problems == []
+    assert verify(tmp_path / "out") == []
     made_by = manifest.plan["made_by"]
     assert made_by["synthetic"] is True and made_by["seed"] == 0 and made_by["checkpoint"] == "in memory"
     for shard in manifest.shards:
@@ -81,9 +81,8 @@ def test_perturbed_commands_lie_around_the_recorded_ones(world: World, tmp_path:
     pairs = zip(episodes(tmp_path / "one"), episodes(tmp_path / "other"), strict=True)
     gaps = np.concatenate([(one["action"] - other["action"])[3:] for one, other in pairs])
     assert 0 < np.abs(gaps).mean() < 0.5 * 30
-    assert (
-        augment(tmp_path / "still", asked(commands="still"), world=world).stats["action"]["mean"] is not None
-    )
+    augment(tmp_path / "still", asked(commands="still"), world=world)
+    assert not any(one["action"][3:].any() for one in episodes(tmp_path / "still"))  # velocities
 
 
 def test_a_stopped_run_continues_and_gives_the_same_bytes(world: World, tmp_path: Path) -> None:
@@ -111,39 +110,33 @@ def test_a_stopped_run_continues_and_gives_the_same_bytes(world: World, tmp_path
 def test_the_surest_episodes_are_kept(world: World, tmp_path: Path) -> None:
     augment(tmp_path / "all", asked(), world=world)
     augment(tmp_path / "half", asked(keep=0.5), world=world)
-    rows = {
-        name: {
-            row["id"]: float(row["fingerprint"].split()[0])
-            for row in ShardSet(tmp_path / name).episodes.to_pylist()
-        }
-        for name in ("all", "half")
-    }
-    assert set(rows["half"]) == set(sorted(rows["all"], key=rows["all"].__getitem__)[:2])
+    unsure = {}
+    for name in ("all", "half"):
+        rows = ShardSet(tmp_path / name).episodes.to_pylist()
+        unsure[name] = sorted(flag_counts(row["flags"])["millinats"] for row in rows)
+    assert unsure["half"] == unsure["all"][:2] and unsure["all"][0] < unsure["all"][-1]
     with pytest.raises(UsageError, match="--keep: is 0"):
         asked(keep=0.0)
 
 
 def test_first_frames_and_commands_come_from_shards(world: World, tmp_path: Path) -> None:
-    recording = record(ROBOT, tmp_path, 2)
+    recording = record(ROBOT, tmp_path, 1)
     convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "real")
-    augment(tmp_path / "out", asked(source="real", episodes=3), world=world, shards=tmp_path / "real")
-    assert verify(tmp_path / "out").problems == []
+    augment(tmp_path / "out", asked(source="real", episodes=2), world=world, shards=tmp_path / "real")
+    assert verify(tmp_path / "out") == []
     real, made = episodes(tmp_path / "real"), ShardSet(tmp_path / "out").episodes.to_pylist()
-    assert {row["group"] for row in made} == {"demo_0", "demo_1"}
+    assert {row["group"] for row in made} == {"demo_0"}
     stride = world.model.embodiments[ROBOT].stride
-    for row, columns in zip(made, episodes(tmp_path / "out"), strict=True):
-        source = real[int(row["group"][-1])]
-        starts = [
-            at
-            for at in range(len(source["tokens"]))
-            if np.array_equal(source["tokens"][at], columns["tokens"][0])
-        ]
-        rows = [source["action"][at : at + len(columns["action"]) * stride].ravel() for at in starts]
+    for columns in episodes(tmp_path / "out"):
+        tokens, length = real[0]["tokens"], len(columns["action"])
+        starts = [at for at, frame in enumerate(tokens) if np.array_equal(frame, columns["tokens"][0])]
+        rows = [real[0]["action"][at : at + length * stride].ravel() for at in starts]
         assert any(np.array_equal(one, columns["action"].ravel()) for one in rows)
     with pytest.raises(UsageError, match="has no episode of 2 \\+ 900 frames"):
         augment(tmp_path / "no", asked(frames=900), world=world, shards=tmp_path / "real")
 
 
+@pytest.mark.slow
 def test_lerobot_loads_the_dataset(world: World, tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -154,10 +147,8 @@ def test_lerobot_loads_the_dataset(world: World, tmp_path: Path) -> None:
     assert loaded.num_episodes == 2 and len(loaded) == sum(len(one["action"]) for one in columns) * stride
     row = loaded[stride]
     np.testing.assert_allclose(row["action"], columns[0]["action"][1][: len(row["action"])])
-    assert (
-        "synthetic" in row["task"]
-        and json.loads((tmp_path / "rails/synthetic.json").read_text())["synthetic"]
-    )
+    assert "synthetic" in row["task"]
+    assert json.loads((tmp_path / "rails/synthetic.json").read_text())["synthetic"] is True
     with pytest.raises(OutputError, match="exists already"):
         augment(tmp_path / "more", asked(), world=world, lerobot=tmp_path / "rails")
 
