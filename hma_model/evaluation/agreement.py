@@ -135,13 +135,13 @@ def _too_little(one: Floats, other: Floats) -> str:
 def accuracy(true: Bools, judged: Bools, seed: int = 0) -> Accuracy:
     """Return how often judgements (N,) are right; `seed` is that of the resamples."""
     right = [(judged == true)[true == label].astype(np.float64) for label in (True, False)]
-    counts = {"share": float((judged == true).mean()), "count": true.size, "successes": int(true.sum())}
+    counts = float((judged == true).mean()), true.size, int(true.sum())
     if not all(map(len, right)):
-        return Accuracy(None, None, None, **counts)
+        return Accuracy(None, None, None, *counts)
     rng = np.random.default_rng(seed)
     drawn = [part[rng.integers(len(part), size=(RESAMPLES, len(part)))].mean(axis=1) for part in right]
-    low, high = np.percentile(sum(drawn) / 2, (2.5, 97.5))
-    return Accuracy(float(np.mean([part.mean() for part in right])), float(low), float(high), **counts)
+    low, high = np.percentile((drawn[0] + drawn[1]) / 2, (2.5, 97.5))
+    return Accuracy(float(np.mean([part.mean() for part in right])), float(low), float(high), *counts)
 
 
 def mean_interval(values: Floats, seed: int = 0) -> tuple[float, float]:

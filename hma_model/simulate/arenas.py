@@ -115,7 +115,7 @@ class Arena(Protocol):
         """Return the state of each scene; for robots that are steerable."""
 
     def observed(self) -> Floats | None:
-        """Return the robots' measurements of themselves (N, S'), as recorded; None if nobody knows them."""
+        """Return the robots' measurements of themselves (N, S'), as recorded; None if pictures do not tell."""
 
     def recorded(self) -> Floats:
         """Return the next commands (N, A) of the recorder's own driver; call it once a step."""
@@ -155,6 +155,8 @@ class TrueArena:
         return [state_of(scene.simulator.simulation) for scene in self._begun]
 
     def observed(self) -> Floats | None:
+        if not FAMILY.fullmatch(self.scenes.name):  # as in the model, which shows no velocities
+            return None
         return np.stack([scene.simulator.state for scene in self._begun])
 
     def recorded(self) -> Floats:
@@ -232,7 +234,7 @@ class ModelArena:
         return [seen.state for seen in self._seen]
 
     def observed(self) -> Floats | None:
-        if self._probe is None or not FAMILY.fullmatch(self.scenes.name):  # others record velocities too
+        if self._probe is None or not FAMILY.fullmatch(self.scenes.name):
             return None
         return np.stack([state.pose for state in self.states()]).astype(np.float32)
 

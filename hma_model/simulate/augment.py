@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from hma_data.conversion.output import locked
 from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.lab.simulator import simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST, Manifest
 from hma_data.shards.reader import ShardSet
@@ -248,7 +249,8 @@ class _Maker:
     def _train(self, on_progress: Callable[[float, str], None]) -> None:
         """Train the judge, or the probe alone, if they are asked for."""
         settings = self.settings
-        needed = bool(settings.judge) or settings.commands.startswith("scripted")
+        stateful = settings.commands.startswith(("scripted", "lerobot:")) and simulated(settings.embodiment)
+        needed = bool(settings.judge) or stateful
         if self.probe is not None or not needed:
             return
         on_progress(0, "training the judge")
