@@ -125,8 +125,8 @@ class TokenFrame:
             return digits if self.copies == 1 else digits.repeat(self.copies, 1, 1)
 
         tokens = readout.ids(readout.decide(features, choose).transpose(1, 2))
-        nothing = torch.zeros(())
-        return tokens, *(sum(some, nothing).repeat(self.copies, 1) for some in (sure, unsure))
+        confidence, entropy = (sum(some, torch.zeros(())) for some in (sure, unsure))
+        return tokens, confidence.repeat(self.copies, 1), entropy.repeat(self.copies, 1)
 
     def _noise(self, readout: TokenReadout, features: Tensor) -> Tensor:
         """Return Gumbel noise (n, F, k, V), times the temperature."""

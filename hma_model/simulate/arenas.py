@@ -115,7 +115,7 @@ class Arena(Protocol):
         """Return the state of each scene; for robots that are steerable."""
 
     def observed(self) -> Floats | None:
-        """Return the robots' measurements of themselves (N, S'), as recorded; None if pictures do not tell."""
+        """Return the robots' measurements of themselves (N, S'), as recorded; None if pictures tell none."""
 
     def recorded(self) -> Floats:
         """Return the next commands (N, A) of the recorder's own driver; call it once a step."""
@@ -178,18 +178,23 @@ class TrueArena:
 
 
 class Beginning(Protocol):
-    """What episodes in the model begin with, and what was commanded in the true ones.
+    """What episodes in the model begin with, and what was commanded in the true ones."""
 
-    Attributes:
-        prompts: N of them.
-        held: (N, A), as of `Arena`.
-        told: the commands (N, A) of each step by the recorder's driver.
-    """
+    @property
+    def scenes(self) -> Scenes:
+        """Return the N scenes."""
 
-    scenes: Scenes
-    prompts: Sequence[Prompt]
-    held: Floats
-    told: Sequence[Floats]
+    @property
+    def prompts(self) -> Sequence[Prompt]:
+        """Return the prompt of each."""
+
+    @property
+    def held(self) -> Floats:
+        """Return the commands (N, A) that leave the robots as they are, as of `Arena`."""
+
+    @property
+    def told(self) -> Sequence[Floats]:
+        """Return the commands (N, A) of each step by the recorder's driver."""
 
 
 class ModelArena:

@@ -110,7 +110,8 @@ class Replay:
 
     def begin(self, arena: Arena) -> None:
         self._rng = arena.scenes.rng(4)
-        self._ends = [[getattr(dim, end) for dim in arena.scenes.dimensions] for end in ("low", "high")]
+        dims = arena.scenes.dimensions
+        self._low, self._high = np.array([dim.low for dim in dims]), np.array([dim.high for dim in dims])
 
     def act(self, arena: Arena) -> Floats:
         if arena.fresh:
@@ -118,7 +119,7 @@ class Replay:
         commands = arena.recorded()
         if not self._std.any():
             return commands
-        return np.clip(commands + self._noise, *self._ends).astype(np.float32)
+        return np.clip(commands + self._noise, self._low, self._high).astype(np.float32)
 
 
 def augment(

@@ -200,8 +200,8 @@ def evaluate_policies(
         frames,
         judge,
         tuple(scored),
-        Correlation(**correlations(*success[:2], seed)),
-        Correlation(**correlations(*scores[:2], seed)),
+        Correlation(**correlations(success[0], success[1], seed)),
+        Correlation(**correlations(scores[0], scores[1], seed)),
         accuracy(success[2].ravel() > 0, success[1].ravel() > 0, seed),
         _correlation(scores[1].ravel(), scores[2].ravel()),
     )

@@ -146,7 +146,10 @@ def _plot(found: PolicyEvaluation) -> bytes:
         x, y = row["true_success"], row["model_success"]
         ends = ((x, row["true_success_interval"]), (y, row["model_success_interval"]))
         bars = [[[max(at - low, 0)], [max(high - at, 0)]] for at, (low, high) in ends]
-        look = {"color": COLOURS[i % len(COLOURS)], "fmt": MARKERS[i // len(COLOURS) % len(MARKERS)]}
+        look: dict[str, Any] = {
+            "color": COLOURS[i % len(COLOURS)],
+            "fmt": MARKERS[i // len(COLOURS) % len(MARKERS)],
+        }
         axes.errorbar([x], [y], xerr=bars[0], yerr=bars[1], label=row["policy"], ms=7, lw=1, **look)
     axes.set(xlim=(-0.05, 1.05), ylim=(-0.05, 1.05))
     axes.legend(frameon=False, fontsize=9)
