@@ -281,7 +281,7 @@ class _Maker:
             arena.close()
         count, width = len(numbers), self.robot.chunk_dim
         own = np.stack(commands, axis=1).reshape(count, -1, width)
-        success = np.ones(count, np.bool_)
+        success: NDArray[np.bool_] = np.ones(count, np.bool_)
         if self.judge is not None:
             success = self.judge.success(self.judge.score(np.stack(pictures, axis=1)))
         return Batch(
@@ -328,7 +328,7 @@ def _prompt_tokens(world: World, prompts: Sequence[Prompt]) -> NDArray[Any]:
     """Return the frames of prompts as shards store them (N, P, h, w)."""
     frames = [prompt.frames for prompt in prompts]
     if frames[0].ndim == 4:
-        frames = [world.tokenizer.encode(pictures) for pictures in frames]  # type: ignore[misc]
+        frames = [world.tokenizer.encode(pictures) for pictures in frames]
     return np.stack(frames).astype(world.tokenizer.spec.dtype)
 
 
