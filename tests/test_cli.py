@@ -36,6 +36,8 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
         "train",
         "evaluate",
         "generate",
+        "policy-eval",
+        "augment",
         "hub",
     ]
     for verb in verbs:
@@ -45,6 +47,8 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
         ["convert"],
         ["inspect"],
         ["train"],
+        ["policy-eval"],
+        ["augment"],
         ["hub", "push"],
         ["shards", "verify"],
         ["registry", "infer"],

@@ -10,7 +10,7 @@ it does not tell a hoist, a lift and a magnet.
 T frames a chunk apart, S pixels a side, K = stride * action dim, P parts.
 """
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,7 +86,7 @@ def episode(
     pictures, parts, given, driven = [], [], [], 0
     for step in range(frames * stride):
         if step % stride == 0:
-            driven, places = _parts(simulator.simulation)
+            driven, places = parts_of(simulator.simulation)
             parts.append(places)
             if drawn is None or step // stride in drawn:
                 pictures.append(simulator.simulation.picture())
@@ -97,18 +97,32 @@ def episode(
     return Episode(np.stack(pictures), chunks, np.stack(parts), driven)
 
 
-def _parts(robot: Simulation) -> tuple[int, Floats]:
-    """Return how many parts are driven, and the places (P, 2) of all."""
-    if isinstance(robot, World):
-        own = np.stack([shape.points.mean(axis=0) for shape in robot.body.mechanism.shapes(robot.pose)])
-        return len(own), np.concatenate([own, robot.blocks])
-    if isinstance(robot, planar_arm.Arm):
-        elbow, tip = planar_arm.elbow_and_tip(robot.joints)
-        own = np.stack([planar_arm.BASE + elbow, elbow + tip]) / 2
-        return 2, PX * np.concatenate([own, robot.blocks[:, :2]])
-    if isinstance(robot, pendulum.Pendulum):
-        return 1, SIZE / 2 - ROD * np.array([[np.sin(robot.angle), np.cos(robot.angle)]])
-    assert isinstance(robot, pusht.FastPusher | pusht.SlowPusher)
-    arena = robot.arena
+def own_places(robot: str) -> Callable[[Floats], Floats]:
+    """Return a function from a pose (Q,) to the places (P, 2) of a robot's own parts.
+
+    A pose is that of the family, or the joint angles of `planar_arm`.
+    """
+    if FAMILY.fullmatch(robot):
+        shapes = family.Body.of(robot).mechanism.shapes
+        return lambda pose: np.stack([shape.points.mean(axis=0) for shape in shapes(pose)])
+    return _links
+
+
+def parts_of(simulation: Simulation) -> tuple[int, Floats]:
+    """Return how many parts are driven, and the places (P, 2) of all, the driven ones first."""
+    if isinstance(simulation, World):
+        own = own_places(simulation.body.name)(simulation.pose)
+        return len(own), np.concatenate([own, simulation.blocks])
+    if isinstance(simulation, planar_arm.Arm):
+        return 2, np.concatenate([_links(simulation.joints), PX * simulation.blocks[:, :2]])
+    if isinstance(simulation, pendulum.Pendulum):
+        return 1, SIZE / 2 - ROD * np.array([[np.sin(simulation.angle), np.cos(simulation.angle)]])
+    assert isinstance(simulation, pusht.FastPusher | pusht.SlowPusher)
+    arena = simulation.arena
     stem = arena.pose[:2] + rotation(arena.pose[2]) @ STEM
     return 1, PX * np.stack([arena.agent, arena.pose[:2], stem])
+
+
+def _links(joints: Floats) -> Floats:
+    elbow, tip = planar_arm.elbow_and_tip(joints)
+    return PX * np.stack([planar_arm.BASE + elbow, elbow + tip]) / 2

@@ -35,6 +35,7 @@ from hma_model.cli.options import (
     require_checkpoint,
 )
 from hma_model.cli.play import play
+from hma_model.cli.policy import augment, policy_eval
 from hma_model.cli.train import MODELS
 
 
@@ -220,6 +221,8 @@ def _opened(checkpoint: str, data: Path) -> tuple[Any, Any, Any]:
     return model.eval(), tokenizer_of(shards), shards
 
 
+app.command("policy-eval", rich_help_panel=MODELS)(policy_eval)
+app.command(rich_help_panel=MODELS)(augment)
 BENCHES |= {
     "drift": "hma_model.bench.drift:BENCH",
     "generate": "hma_model.bench.generation:GENERATE",

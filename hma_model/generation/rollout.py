@@ -63,6 +63,8 @@ class Rollout:
     Attributes:
         decoding: the settings of unmasking; they may be replaced between steps.
         state: the state of the rows.
+        entropy: (n,) of the rows of the last step, twins last: mean nats a token of the trunk, by what was
+            predicted when it was decided; if `decoding` measures it.
     """
 
     def __init__(
@@ -249,11 +251,13 @@ class Rollout:
             if count > 0:
                 self._unmask(frame, passes, count, first=left == tokens)
                 left -= count
+        if isinstance(frame, TokenFrame):
+            self.entropy = frame.nats / tokens
         return frame.values
 
     def _unmask(self, frame: TokenFrame | PatchFrame, passes: list[Pass], count: int, first: bool) -> None:
         """Predict and keep `count` more tokens of a frame."""
-        if self.engine.whole is not None and isinstance(frame, TokenFrame):
+        if self.engine.whole is not None and isinstance(frame, TokenFrame) and not self.decoding.measure:
             (part,) = passes
             seen = frame.laid_out(part.lay_out, self.model.token_readout, count)
             made = self.engine.whole(seen, count, *self._inputs(frame, part, first)).clone()

@@ -40,6 +40,7 @@ class Decoding:
         sample_steps: sampling steps of the diffusion head; None for the configuration's.
         guidance: how much the commands change, times what they change; of rows with twins only.
         noise_level: the share of a generated frame's digits that the model is told to distrust.
+        measure: add up the entropy of the decided tokens' predictions; of discrete models.
     """
 
     steps: int = 2
@@ -48,6 +49,7 @@ class Decoding:
     sample_steps: int | None = None
     guidance: float = 1.0
     noise_level: float = 0.0
+    measure: bool = False
 
 
 def masked_after(step: int, steps: int, tokens: int) -> int:
@@ -66,6 +68,7 @@ class TokenFrame:
 
     Attributes:
         values: (B, S) int64 ids of the trunk's tokens; `mask_id` means masked.
+        nats: (B,) entropy of the predictions of the tokens decided so far, if it is measured.
     """
 
     def __init__(
@@ -82,6 +85,7 @@ class TokenFrame:
         self.generators, self.copies = generators, copies
         self.rank = _ranks(values, generators, copies) if rank is None else rank
         self.noise = noise
+        self.nats = torch.zeros(len(values), device=values.device)
 
     def laid_out(
         self, lay_out: Callable[[Tensor], Tensor], readout: TokenReadout, count: int
@@ -107,16 +111,19 @@ class TokenFrame:
         masked = self.masked
         if self.decoding.order == "random":
             chosen = _top(self.rank, masked, count)
-            tokens, _ = self._sample(readout, _gather(features, chosen))
+            tokens, _, entropy = self._sample(readout, _gather(features, chosen))
         else:
-            everything, confidence = self._sample(readout, features)
+            everything, confidence, entropy = self._sample(readout, features)
             chosen = _top(confidence, masked, count)
             tokens = everything.gather(1, chosen)
+            entropy = entropy.gather(1, chosen) if self.decoding.measure else entropy
+        if self.decoding.measure:
+            self.nats = self.nats + entropy.sum(1)
         return self.values.scatter(1, chosen, tokens)
 
-    def _sample(self, readout: TokenReadout, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return token ids (B, k) and, if the order asks for them, the log probabilities (B, k) of these."""
-        way, sure = self.decoding, []
+    def _sample(self, readout: TokenReadout, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return token ids (B, k); if asked for, their log probabilities and the entropies, both (B, k)."""
+        way, sure, unsure = self.decoding, [], []
         noise = self._noise(readout, features.shape[1]) if self.noise is None else self.noise
 
         def choose(scores: Tensor, first: int) -> Tensor:
@@ -128,12 +135,15 @@ class TokenFrame:
                 n, digits, _, values = scores.shape
                 drawn = scores + noise[:n, first : first + digits, :, :values]
             taken = drawn.argmax(-1)
+            if way.measure:
+                unsure.append(torch.special.entr(scores.softmax(-1)).sum((1, -1)))
             if way.order == "confidence":
                 sure.append(scores.log_softmax(-1).gather(-1, taken.unsqueeze(-1)).squeeze(-1).sum(1))
             return taken if self.copies == 1 else taken.repeat(self.copies, 1, 1)
 
         tokens = readout.ids(readout.decide(features, choose).transpose(1, 2))
-        return tokens, sum(sure, torch.zeros(())).repeat(self.copies, 1)
+        confidence, entropy = (sum(some, torch.zeros(())) for some in (sure, unsure))
+        return tokens, confidence.repeat(self.copies, 1), entropy.repeat(self.copies, 1)
 
     def _noise(self, readout: TokenReadout, tokens: int) -> Tensor | None:
         """Return Gumbel noise (n, F, k, V) for k tokens, times the temperature; None at 0."""

@@ -22,6 +22,7 @@ KINDS = {  # name -> media type and ending
     "gif": ("image/gif", ".gif"),
     "lerobot": ("application/zip", ".zip"),
 }
+DRIVEN = "driven in a world model by hma play; the pictures are the model's"
 SIDE, HEAD, GAP = 320, 26, 8  # pixels of a panel, of its title, between panels
 GIF_SIDE, GIF_FRAMES = 192, 600  # smaller and shorter: a GIF is large
 
@@ -98,7 +99,8 @@ def lerobot_episode(robot: Drivable, frames: Sequence[Frame]) -> tuple[LeRobotEp
     if all(frame.true is not None for frame in frames):
         cameras["_true"] = [decode_image(frame.true or b"", "a frame") for frame in frames]
     states = [frame.state for frame in frames if frame.state is not None]
-    own = _embodiment(robot.embodiment, list(cameras), cameras[""][0].shape[:2], len(states) == len(frames))
+    size = cameras[""][0].shape[:2]
+    own = embodiment_of(robot.embodiment, DRIVEN, size, list(cameras), len(states) == len(frames))
     pictures = {
         camera.key: np.stack(shown).repeat(stride, axis=0)
         for camera, shown in zip(own.cameras, cameras.values(), strict=True)
@@ -107,10 +109,22 @@ def lerobot_episode(robot: Drivable, frames: Sequence[Frame]) -> tuple[LeRobotEp
     return LeRobotEpisode(pictures, actions, state, "driven by hand in a world model"), own
 
 
-def _embodiment(
-    robot: Embodiment, cameras: Sequence[str], size: tuple[int, ...], with_state: bool
+def embodiment_of(
+    robot: Embodiment,
+    recording: str,
+    size: tuple[int, ...],
+    cameras: Sequence[str] = ("",),
+    with_state: bool = False,
 ) -> Embodiment:
-    """Return the embodiment of the saved dataset; LeRobot's rates are whole numbers."""
+    """Return the embodiment of a dataset that is saved of a model; LeRobot's rates are whole numbers.
+
+    Args:
+        robot: the robot.
+        recording: how it was made, for its provenance.
+        size: height and width of the pictures.
+        cameras: what is added to the name of the primary camera, for each camera.
+        with_state: whether there are states.
+    """
     values = robot.to_dict()
     name = robot.primary_camera.name
     hz = max(1, round(robot.rate_hz))
@@ -127,7 +141,7 @@ def _embodiment(
         ],
         "source": {"format": "lerobot"},
         "provenance": {
-            "recording": "driven in a world model by hma play; the pictures are the model's",
+            "recording": recording,
             "frequency_hz": f"the robot's control rate{rate}",
         },
     }

@@ -52,6 +52,8 @@ class World:
 
     Attributes:
         unmask_steps, temperature, order, sample_steps: may be set between steps; they count for all sessions.
+        measure: set it to know how unsure the model is, see `entropies`; of discrete models.
+        entropies: session → mean nats a token of the newest frame, if they are measured.
         picture_shape: (S, V·S, 3) of every picture.
     """
 
@@ -71,6 +73,7 @@ class World:
         self.unmask_steps = unmask_steps
         self.temperature = default_temperature(model.config) if temperature is None else temperature
         self.order, self.sample_steps = order, sample_steps
+        self.measure, self.entropies = False, dict[int, float]()
         self._decoding()
         self.picture_shape = picture_shape(model.config)
         self._rollout: Rollout | None = None
@@ -150,12 +153,18 @@ class World:
         known = torch.tensor([known for _, known in read])
         rows = [self._at(session).row for session in order]
         frames = rollout.step(torch.from_numpy(chunks), known=known, rows=rows)
+        if self.measure:
+            self.entropies |= dict(zip(order, rollout.entropy.tolist()))
         return dict(zip(order, decode(self.tokenizer, frames.unsqueeze(1))[:, 0]))
 
     def picture(self, session: int) -> Picture:
         """Return the newest picture of a session; after `open`, the last of its prompt."""
-        newest = self._running().newest([self._at(session).row])
-        return decode(self.tokenizer, newest.unsqueeze(1))[0, 0]
+        return decode(self.tokenizer, self._newest(session).unsqueeze(1))[0, 0]
+
+    def stored(self, session: int) -> NDArray[Any]:
+        """Return the newest frame of a session as shards store it: tokens (h, w) or latents (c, h, w)."""
+        frame = self._newest(session)[0].cpu().numpy()
+        return frame.astype(self.tokenizer.spec.dtype)
 
     def snapshot(self, session: int) -> Snapshot:
         """Return a copy of a session's state."""
@@ -175,12 +184,17 @@ class World:
             raise HMAError(f"session {session}", f"is not open; open are: {there}", "open one first")
         return self._sessions[session]
 
+    def _newest(self, session: int) -> torch.Tensor:
+        return self._running().newest([self._at(session).row])
+
     def _running(self) -> Rollout:
         assert self._rollout is not None
         return self._rollout
 
     def _decoding(self) -> Decoding:
-        decoding = Decoding(self.unmask_steps, self.temperature, self.order, self.sample_steps)
+        decoding = Decoding(
+            self.unmask_steps, self.temperature, self.order, self.sample_steps, measure=self.measure
+        )
         check(decoding, self.model.config)
         return decoding
 

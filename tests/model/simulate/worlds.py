@@ -4,11 +4,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from hma_data.lab import family
 from hma_data.lab.simulator import LabSimulator
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.checkpoint.folder import EMBEDDED, Checkpoint, action_stats
+from hma_model.config import ActionSpace, HMAConfig
+from hma_model.network.model import HMA
 from hma_model.simulate.scenes import PROMPT, SEED, Drivable, LabRobot
 from hma_model.simulate.session import Frame
 
@@ -81,6 +85,20 @@ class Watcher:
 
     def tell(self, message: dict[str, Any]) -> None:
         self.told.append(message)
+
+
+def tiny_model(robot: str) -> HMA:
+    """Return a model of the tokenizer fsq-8 that knows nothing of a robot of the family."""
+    torch.manual_seed(0)
+    own, tokenizer = family.embodiment(robot), get_tokenizer("fsq-8")
+    config = HMAConfig(
+        layers=1, width=32, heads=2, frames=4, grid=(8, 8), factored=(8,) * 6, training_pass="pairs",
+        tokenizer=tokenizer.spec.to_json(),
+    )  # fmt: skip
+    made = HMA(config)
+    stats = {"action": {"mean": [0.0] * own.action_dim, "std": [30.0] * own.action_dim}}
+    made.add_embodiment(ActionSpace.of(own, action_stats(stats, own.id)))
+    return made.eval()
 
 
 def lab_robots(*names: str) -> dict[str, Drivable]:

@@ -1,0 +1,131 @@
+"""Drive a laboratory robot by its recorder's manoeuvres, from its state in the simulator or off pictures.
+
+The driver of the family and of `planar_arm` needs a pose, and where the blocks lie. `SeenState` finds both
+from the places of the parts in a picture: it looks for the pose whose parts lie there, and between pictures
+lets the commands move it. What no place shows, such as a hoist or a magnet, only the commands move.
+
+Q values of a pose, A of a command, P own parts, B blocks; places are px of a picture of 128 by 128.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.lab import FAMILY, planar_arm, truth
+from hma_data.lab.family.bodies import Body
+from hma_data.lab.family.driver import Driver
+from hma_data.lab.family.world import REACH, World
+from hma_data.lab.simulator import Simulation
+
+Floats = NDArray[np.float64]
+STARTS, ROUNDS = 24, 8  # random poses that a first search begins from, and steps of a search
+DAMPING, NUDGE = 1.0, 1e-3  # px² of the search; of a pose whose axes are scaled to the width of their limits
+CLOSE = 1e-4  # step in that scale at which a search ends
+
+
+@dataclass(frozen=True)
+class State:
+    """What a driver needs: a pose (Q,), blocks (B, 2), and whether one of them is carried."""
+
+    pose: Floats
+    blocks: Floats
+    holding: bool
+
+
+def steerable(robot: str) -> bool:
+    """Check whether a robot can be driven from a state, rather than by its simulator alone."""
+    return robot == "planar_arm" or FAMILY.fullmatch(robot) is not None
+
+
+def state_of(simulation: Simulation) -> State:
+    """Return the true state of a robot that is steerable."""
+    if isinstance(simulation, World):
+        return State(simulation.pose, simulation.blocks, simulation.held >= 0)
+    assert isinstance(simulation, planar_arm.Arm)
+    return State(simulation.joints, truth.PX * simulation.blocks[:, :2], False)
+
+
+def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[State], NDArray[np.float32]]:
+    """Return a driver that begins at a pose (Q,): from a state it tells the next command (A,)."""
+    if FAMILY.fullmatch(robot):
+        drive = Driver(Body.of(robot), pose, rng)
+        return lambda state: drive(state.pose, state.blocks, state.holding).astype(np.float32)
+    arm = SimpleNamespace(joints=pose, blocks=np.zeros((1, 2)))
+    next_command = planar_arm.driver(arm, rng)  # type: ignore[arg-type]
+
+    def command(state: State) -> NDArray[np.float32]:
+        arm.joints, arm.blocks = state.pose, state.blocks / truth.PX
+        return next_command()
+
+    return command
+
+
+class SeenState:
+    """The state of a steerable robot, as places of parts tell it.
+
+    Args:
+        robot: its name.
+        own: numbers of the own parts whose places can be trusted.
+        places: (P + B, 2), as a probe reads them off the first picture.
+        seed: of the poses that the first search begins from.
+    """
+
+    def __init__(self, robot: str, own: NDArray[np.int64], places: Floats, seed: int = 0) -> None:
+        self._forward, self._own = truth.own_places(robot), own
+        self._body = Body.of(robot) if FAMILY.fullmatch(robot) else None
+        low, high = np.array([[-np.pi, -np.pi], [np.pi, np.pi]]) if self._body is None else self._body.limits
+        self._width = high - low
+        starts = np.random.default_rng(seed).uniform(low, high, (STARTS, len(low)))
+        found = [self._search(start, places) for start in starts]
+        self.pose = min(found, key=lambda pose: self._far(pose, places))
+        self._blocks = places[len(self._forward(self.pose)) :]
+
+    @property
+    def state(self) -> State:
+        """Return the state as it is now."""
+        holding = False
+        if self._body is not None and self._body.grip and self._body.holds(self.pose):
+            tip, _ = self._body.mechanism.tip(self.pose)
+            holding = bool((np.linalg.norm(self._blocks - tip, axis=1) < REACH).any())
+        return State(self.pose, self._blocks, holding)
+
+    def move(self, command: NDArray[np.float32]) -> None:
+        """Take a command (A,) that was given, until the next picture."""
+        if self._body is None:
+            self.pose = self.pose + command / planar_arm.HZ
+        else:
+            self.pose = self._body.moved(self.pose, command.astype(np.float64))
+
+    def see(self, places: Floats) -> None:
+        """Take the places (P + B, 2) of a new picture."""
+        self.pose = self._search(self.pose, places)
+        self._blocks = places[len(places) - len(self._blocks) :]
+
+    def _far(self, pose: Floats, places: Floats) -> float:
+        return float(np.square(self._forward(pose)[self._own] - places[self._own]).sum())
+
+    def _search(self, pose: Floats, places: Floats) -> Floats:
+        """Return the pose near another whose parts lie at places: damped least squares."""
+        damping = DAMPING
+        for _ in range(ROUNDS):
+            here = self._forward(pose)[self._own]
+            miss = (places[self._own] - here).ravel()
+            nudges = np.diag(self._width * NUDGE)
+            slope = [((self._forward(pose + n)[self._own] - here) / NUDGE).ravel() for n in nudges]
+            jacobian = np.stack(slope, axis=1)
+            square = jacobian.T @ jacobian + damping * np.eye(len(pose))
+            step = np.linalg.solve(square, jacobian.T @ miss)
+            other = pose + step * self._width
+            if self._far(other, places) < self._far(pose, places):
+                pose, damping = other, damping / 10
+            else:
+                damping *= 10
+            if np.abs(step).max() < CLOSE:
+                break
+        if self._body is None:
+            return (pose + np.pi) % (2 * np.pi) - np.pi
+        turning = np.array([axis.turns for axis in self._body.axes])
+        return np.where(turning, (pose + np.pi) % (2 * np.pi) - np.pi, np.clip(pose, *self._body.limits))

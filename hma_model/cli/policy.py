@@ -1,0 +1,103 @@
+"""Define the verbs `hma policy-eval` and `hma augment`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hma_data.console import human_count, interruptible, print_json, progress
+from hma_model.cli.hub import Json
+
+
+def policy_eval(
+    embodiment: Annotated[str, typer.Argument(help="A robot of the laboratory that the checkpoint has.")],
+    policies: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="POLICY…",
+            help="scripted, scripted:noise=SHARE, random, still, MODULE:NAME of a Python function or class "
+            "from a picture to a command, or lerobot:FOLDER_OR_REPO.",
+        ),
+    ],
+    checkpoint: Annotated[
+        str, typer.Option("--checkpoint", help="A checkpoint, a run's folder, or a hub repo.")
+    ] = "embedded",
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes of each policy.")] = 32,
+    frames: Annotated[int, typer.Option("--frames", min=4, help="Frames of an episode.")] = 40,
+    judge: Annotated[
+        str, typer.Option("--judge", help="What success is: moved, reached, or with px: moved=8.")
+    ] = "moved",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for the page and the figures.")] = None,
+    json: Json = False,
+) -> None:
+    """Score policies in a robot's simulator and inside the world model, and compare the two.
+
+    Example: hma policy-eval rails_03 scripted scripted:noise=0.5 random still --out policies
+    """
+    from hma_model.simulate.policy_eval import evaluate_policies
+    from hma_model.simulate.policy_page import show, write_report
+
+    with progress("policies", len(policies) * episodes * frames) as update:
+        found = evaluate_policies(
+            embodiment, policies, checkpoint=checkpoint, episodes=episodes, frames=frames, judge=judge,
+            seed=seed, on_progress=update,
+        )  # fmt: skip
+    page = write_report(found, out) if out else None
+    if json:
+        print_json(found.to_json())
+        return
+    show(found)
+    if page:
+        print(f"open {page}")
+
+
+def augment(
+    embodiment: Annotated[str, typer.Argument(help="A robot that the checkpoint has.")],
+    out: Annotated[Path, typer.Argument(help="Folder for the shard set.")],
+    checkpoint: Annotated[
+        str, typer.Option("--checkpoint", help="A checkpoint, a run's folder, or a hub repo.")
+    ] = "embedded",
+    source: Annotated[
+        Path | None,
+        typer.Option("--from", help="Shard set of first frames and commands; else the simulator's."),
+    ] = None,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes to make.")] = 64,
+    frames: Annotated[int, typer.Option("--frames", min=4, help="Frames to generate of each.")] = 40,
+    commands: Annotated[
+        str,
+        typer.Option(
+            "--commands", help="replay, perturb=SHARE of their spread, or a policy as of hma policy-eval."
+        ),
+    ] = "replay",
+    keep: Annotated[
+        float, typer.Option("--keep", help="Share to keep: the episodes of which the model is surest.")
+    ] = 0.5,
+    judge: Annotated[
+        str, typer.Option("--judge", help="Keep only successes at this: moved, reached, moved=PX.")
+    ] = "",
+    lerobot: Annotated[
+        Path | None, typer.Option("--lerobot", help="Folder for them as a LeRobotDataset v3.0 as well.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
+    json: Json = False,
+) -> None:
+    """Make synthetic episodes with the world model, as shards and as a LeRobotDataset.
+
+    Example: hma augment rails_03 synthetic/rails_03 --episodes 64 --commands perturb=0.3
+    """
+    from hma_model.simulate.augment import Augmentation
+    from hma_model.simulate.augment import augment as run
+
+    name = source.resolve().name if source else ""
+    settings = Augmentation(embodiment, name, episodes, frames, commands, keep, judge, seed)
+    words = f"finished batches are kept in {out}; run the same command again to continue"
+    with interruptible(lambda: words), progress("episodes", episodes * frames) as update:
+        made = run(out, settings, checkpoint=checkpoint, shards=source, lerobot=lerobot, on_progress=update)
+    kept = sum(split["episodes"] for split in made.splits.values())
+    if json:
+        print_json({"out": str(out), "made": episodes, "kept": kept, "plan": made.plan})
+        return
+    print(f"kept {human_count(kept, 'episode')} of {episodes} in {out}; synthetic: true in every file")
+    if lerobot:
+        print(f"the same as a LeRobotDataset: {lerobot}")

@@ -1,0 +1,224 @@
+"""Judge from pictures alone whether an episode of a laboratory robot is a success.
+
+A task is a score of the places of the parts over an episode, and the least score of a success. The simulator
+knows the places; a judge reads them off pictures with a probe. A probe finds a place even for what is gone,
+so a loose part of which less than half the pixels are left counts as where it was last seen. Reading blurs
+the score, so the judge's own limit is set on recorded episodes whose outcome is known. Its accuracy is that
+on others.
+
+N episodes, T frames, S pixels a side, P parts. Places are px of a picture of 128 by 128.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import HMAError, UsageError
+from hma_data.lab import truth
+from hma_model.evaluation.agreement import Accuracy, Bools, accuracy
+from hma_model.evaluation.probe import EPISODES, FIRST, Probe, as_seen, as_shown, train_probe
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+
+Floats = NDArray[np.float64]
+Images = NDArray[np.uint8]
+Score = Callable[[Floats, int], Floats]
+
+SPAN = 3  # last frames over which a place is the median
+EXAMPLES = 96  # recorded episodes, of which half set the judge's limit and half test it
+MOVED = {"pusht_fast": 10.0, "pusht_slow": 10.0}  # px; the T wanders further than a small block
+BLOCK_MOVED, NEAR = 5.0, 12.0  # px
+SEEN = 0.5  # share of a loose part's first pixels up to which it is there
+
+
+def moved(parts: Floats, driven: int) -> Floats:
+    """Return how far the loose part that moved furthest ends from its first place.
+
+    Args:
+        parts: (N, T, P, 2).
+        driven: how many of the parts, the first ones, are the robot's own.
+
+    Returns:
+        (N,) px.
+    """
+    ends = np.median(parts[:, -SPAN:, driven:], axis=1)
+    far: Floats = np.linalg.norm(ends - parts[:, 0, driven:], axis=-1).max(axis=-1)
+    return far
+
+
+def reached(parts: Floats, driven: int) -> Floats:
+    """Return how near an own part comes to the first place of a loose part, negative; (N,) px."""
+    gap = parts[:, 1:, :driven, None] - parts[:, :1, None, driven:]
+    near: Floats = np.linalg.norm(gap, axis=-1).min(axis=(1, 2, 3))
+    return -near
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a robot is to do.
+
+    Attributes:
+        name: a key of TASKS.
+        limit: the least score of a success; of `reached` negative.
+    """
+
+    name: str
+    limit: float
+
+    @property
+    def text(self) -> str:
+        """Return the task in words."""
+        return TASKS[self.name][1].format(abs(self.limit))
+
+    def score(self, parts: Floats, driven: int) -> Floats:
+        """Return the scores (N,) of the places (N, T, P, 2) of an episode's parts."""
+        return TASKS[self.name][0](parts, driven)
+
+
+TASKS: dict[str, tuple[Score, str]] = {
+    "moved": (moved, "some loose part ends {:g} px or more from where it lay"),
+    "reached": (reached, "a moving part of the robot comes within {:g} px of where a loose part lay"),
+}
+
+
+def task_of(robot: str, words: str = "moved") -> Task:
+    """Return the task of a robot from words: `moved`, `moved=8`, `reached` or `reached=15`.
+
+    Raises:
+        UsageError: the words name no task.
+    """
+    name, given, number = words.partition("=")
+    try:
+        if name not in TASKS:
+            raise ValueError
+        limit = float(number) if given else {"moved": MOVED.get(robot, BLOCK_MOVED), "reached": NEAR}[name]
+        if not 0 < limit < truth.SIZE:
+            raise ValueError
+    except ValueError:
+        remedy = f"give {' or '.join(TASKS)}, if wanted with px: moved={BLOCK_MOVED:g}"
+        raise UsageError("judge", f"{words!r} is no task", remedy) from None
+    return Task(name, -limit if name == "reached" else limit)
+
+
+@dataclass(frozen=True)
+class StateJudge:
+    """A judge of one robot and one task, for pictures as its tokenizer shows them.
+
+    It is also a `Judge` of `WorldModelEnv`: the reward is the score so far, and it never ends an episode.
+
+    Attributes:
+        probe: reads the places.
+        limit: the least score, as read, of a success.
+        held_out: its accuracy on true episodes that neither the probe nor the limit has seen.
+    """
+
+    robot: str
+    task: Task
+    probe: Probe
+    limit: float
+    held_out: Accuracy
+
+    def score(self, pictures: Images) -> Floats:
+        """Return the scores (N,) of episodes (N, T, S, S, 3)."""
+        return _read_score(self.task, self.probe, pictures)
+
+    def true_score(self, parts: Floats) -> Floats:
+        """Return the scores (N,) of true places (N, T, P, 2)."""
+        return _true_score(self.task, self.probe, parts)
+
+    def success(self, scores: Floats) -> Bools:
+        """Return which scores are judged a success."""
+        judged: Bools = scores >= self.limit
+        return judged
+
+    def __call__(self, pictures: Images, commands: Any) -> tuple[float, bool]:
+        return float(self.score(pictures[None])[0]), False
+
+
+def train_judge(
+    robot: str,
+    tokenizer: "Tokenizer",
+    stride: int,
+    frames: int,
+    task: Task | None = None,
+    *,
+    seed: int = 0,
+    examples: int = EXAMPLES,
+    probe: Probe | None = None,
+) -> StateJudge:
+    """Train a judge on recorded episodes of a laboratory robot.
+
+    Args:
+        robot: a laboratory robot.
+        tokenizer: whose pictures it is to judge.
+        stride: control steps a frame.
+        frames: T of the episodes to judge.
+        task: by default `moved`.
+        seed: of the probe, the episodes and the intervals.
+        examples: recorded episodes for the limit and its test.
+        probe: one that is trained already.
+
+    Raises:
+        HMAError: the robot has no loose parts that can be read, or the judge is no better than chance.
+    """
+    task = task or task_of(robot)
+    probe = probe or train_probe(robot, tokenizer, stride, seed)
+    if not len(probe.loose) or (task.name == "reached" and not len(probe.own)):
+        fault = f"cannot tell whether {task.text}: the probe does not read these parts"
+        raise HMAError(f"judge of {robot}", fault, "judge another task or robot")
+    looked = {0, *range(max(frames - SPAN, 1), frames)} if task.name == "moved" else set(range(frames))
+    numbers = range(FIRST + EPISODES, FIRST + EPISODES + examples)
+    true, read = np.empty(examples), np.empty(examples)
+    for row, number in enumerate(numbers):
+        made = truth.episode(robot, frames, stride, seed, number, looked)
+        shown = as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures))
+        true[row] = _true_score(task, probe, made.parts[None])[0]
+        read[row] = _read_score(task, probe, shown[None])[0]
+    half, success = examples // 2, true >= task.limit
+    limit = best_limit(read[:half], success[:half], task.limit)
+    found = accuracy(success[half:], read[half:] >= limit, seed)
+    if not found.better_than_chance:
+        remedy = f"try another task or limit, such as --judge {task.name}={2 * abs(task.limit):g}"
+        raise HMAError(f"judge of {robot}", f"is no better than chance: {found}", remedy)
+    return StateJudge(robot, task, probe, limit, found)
+
+
+def best_limit(read: Floats, success: Bools, limit: float) -> float:
+    """Return the limit of scores (N,) that best tells successes; of several, the one nearest to the true one.
+
+    Best has the highest balanced accuracy. If all episodes end alike, the true limit stays.
+    """
+    if success.all() or not success.any():
+        return limit
+    ordered = np.unique(read)
+    tried = np.concatenate([[limit], (ordered[1:] + ordered[:-1]) / 2])
+    said = read >= tried[:, None]
+    balanced = (said[:, success].mean(axis=1) + (~said[:, ~success]).mean(axis=1)) / 2
+    best = tried[balanced >= balanced.max() - 1e-12]
+    return float(best[np.abs(best - limit).argmin()])
+
+
+def _read_score(task: Task, probe: Probe, pictures: Images) -> Floats:
+    """Return the scores (N,) of episodes (N, T, S, S, 3), by the parts that a probe can read."""
+    places = probe.read(pictures)
+    loose = last_seen(places[..., probe.loose, :], probe.areas(pictures)[..., probe.loose])
+    own = places[..., probe.own, :]
+    return task.score(np.concatenate([own, loose], axis=-2), len(probe.own))
+
+
+def _true_score(task: Task, probe: Probe, parts: Floats) -> Floats:
+    """Return the scores (N,) of true places, by the own parts that can be read and all loose ones."""
+    kept = np.concatenate([probe.own, np.arange(probe.driven, parts.shape[-2])])
+    return task.score(parts[..., kept, :], len(probe.own))
+
+
+def last_seen(places: Floats, areas: Floats) -> Floats:
+    """Return places (N, T, P, 2), where a part stays as long as its area (N, T, P) is small."""
+    seen = areas >= SEEN * areas[:, :1]
+    seen[:, 0] = True
+    times = np.where(seen, np.arange(seen.shape[1])[:, None], 0)
+    return np.take_along_axis(places, np.maximum.accumulate(times, axis=1)[..., None], axis=1)

@@ -1,0 +1,356 @@
+"""Make synthetic episodes: the world model continues real frames under replayed, perturbed or other commands.
+
+Of the episodes made, the share is kept of which the model was least unsure, and of these, if a judge is
+given, the successes. `synthetic` writes them as a shard set of the model's own tokens.
+
+Finished batches lie in a folder of the output until the shards are written, so the same call continues.
+
+N episodes, P frames of a prompt, T generated frames, A action dims, K = stride · A.
+"""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.conversion.output import locked
+from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.lab.simulator import simulated
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.manifest import MANIFEST, Manifest
+from hma_data.shards.reader import ShardSet
+from hma_data.storage.files import atomic_path, file_sha256
+from hma_data.storage.paths import StrPath, as_path
+from hma_model.checkpoint.folder import STEM, Checkpoint
+from hma_model.evaluation.judge import StateJudge, task_of, train_judge
+from hma_model.evaluation.probe import Probe, train_probe
+from hma_model.simulate.arenas import Arena, Floats, ModelArena, Scenes, TrueArena
+from hma_model.simulate.policies import Policy, read_policy
+from hma_model.simulate.policy_eval import run
+from hma_model.simulate.prompts import default_frames, read_prompt
+from hma_model.simulate.scenes import Prompt
+from hma_model.simulate.synthetic import Synthetic, write_as_lerobot, write_shards
+from hma_model.simulate.world import World, load_world
+
+WORK, SETTINGS = ".augment", "settings.json"
+BATCH = 16  # episodes that step in one pass
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What synthetic episodes are made of; all of it is in the plan of the shards.
+
+    Attributes:
+        embodiment: its id.
+        source: name of the shard set of the first frames; empty for the laboratory's simulator.
+        episodes: N that are made.
+        frames: T.
+        commands: `replay`, `perturb=SHARE`, or a policy as `read_policy` takes it.
+        keep: share of the episodes that is kept.
+        judge: the task whose successes are kept, as `task_of` takes it; empty for none.
+        seed: of everything.
+    """
+
+    embodiment: str
+    source: str = ""
+    episodes: int = 64
+    frames: int = 40
+    commands: str = "replay"
+    keep: float = 0.5
+    judge: str = ""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.keep <= 1:
+            raise UsageError("--keep", f"is {self.keep:g}", "give a share above 0, at most 1")
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Episodes of one pass: stored frames (n, P + T, …), chunks (n, P + T - 1, K), and what to choose by.
+
+    Attributes:
+        nats: (n,) mean entropy of the generated tokens' predictions, in nats a token.
+        success: (n,) as judged; all True without a judge.
+        groups: (n,) ids of the real episodes that they begin with.
+    """
+
+    stored: NDArray[Any]
+    chunks: Floats
+    nats: NDArray[np.float64]
+    success: NDArray[np.bool_]
+    groups: NDArray[np.str_]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Real beginnings from shards; a `Beginning`."""
+
+    scenes: Scenes
+    prompts: Sequence[Prompt]
+    held: Floats
+    told: Sequence[Floats]
+    groups: Sequence[str]
+
+
+class Replay:
+    """The recorded commands, to which noise is added.
+
+    Args:
+        share: of the commands' standard deviation; the noise is held for a chunk.
+    """
+
+    def __init__(self, share: float, std: Sequence[float]) -> None:
+        self._std = share * np.asarray(std)
+
+    def begin(self, arena: Arena) -> None:
+        self._rng = arena.scenes.rng(4)
+        dims = arena.scenes.dimensions
+        self._low, self._high = np.array([dim.low for dim in dims]), np.array([dim.high for dim in dims])
+
+    def act(self, arena: Arena) -> Floats:
+        if arena.fresh:
+            self._noise = np.stack([rng.normal(0, self._std) for rng in self._rng])
+        commands = arena.recorded()
+        if not self._std.any():
+            return commands
+        return np.clip(commands + self._noise, self._low, self._high).astype(np.float32)
+
+
+def augment(
+    out: StrPath,
+    settings: Augmentation,
+    *,
+    checkpoint: StrPath = "embedded",
+    shards: StrPath | None = None,
+    lerobot: StrPath | None = None,
+    world: World | None = None,
+    on_progress: Callable[[float, str], None] = lambda done, words: None,
+) -> Manifest:
+    """Make synthetic episodes, and write those that are kept as a shard set.
+
+    Args:
+        out: its folder.
+        settings: what to make.
+        checkpoint: as `load_world` takes it.
+        shards: shard set whose episodes give first frames and commands; by default the simulator does.
+        lerobot: folder for the same episodes as a LeRobotDataset v3.0.
+        world: a world instead of a checkpoint.
+        on_progress: called with the frames done, and what is done.
+
+    Raises:
+        HMAError: the robot, the shards or the policy do not fit, the folder holds something else, the judge
+            is no better than chance, or no episode is left.
+    """
+    folder = as_path(out)
+    if lerobot is not None and as_path(lerobot).exists():
+        raise OutputError(lerobot, "exists already", "remove it or choose another folder")
+    world = world or load_world(checkpoint)
+    if world.model.config.kind != "discrete" or world.model.config.views > 1:
+        raise HMAError("augment", "takes models of discrete tokens and one view", "choose another checkpoint")
+    made_by = (
+        {"by": "hma augment", "synthetic": True} | asdict(settings) | _digests(world, settings.embodiment)
+    )
+    with locked(folder):
+        if (folder / MANIFEST).is_file():
+            found = Manifest.load(folder)
+            if found.plan.get("made_by") != json.loads(json.dumps(made_by)):
+                raise OutputError(folder, "holds another shard set", "choose another folder")
+        else:
+            maker = _Maker(world, settings, None if shards is None else ShardSet(shards))
+            batches = maker.run(_work(folder, made_by), on_progress)
+            found = write_shards(
+                folder, _chosen(batches, settings), world.tokenizer.spec, maker.robot, made_by
+            )
+            shutil.rmtree(folder / WORK)
+    if lerobot is not None:
+        write_as_lerobot(as_path(lerobot), folder, world.tokenizer)
+    return found
+
+
+def _digests(world: World, embodiment: str) -> dict[str, str]:
+    """Return what tells the checkpoint from others."""
+    if "origin" not in vars(world.model):
+        return {"checkpoint": "in memory"}
+    kept = Checkpoint.open(vars(world.model)["origin"])
+    return {"checkpoint_sha256": kept.trunk_sha256, "stem_sha256": file_sha256(kept.path(embodiment, STEM))}
+
+
+def _work(folder: Path, made_by: dict[str, Any]) -> Path:
+    """Return the folder of finished batches; refuse those of other settings."""
+    work, text = folder / WORK, json.dumps(made_by, indent=1)
+    work.mkdir(exist_ok=True)
+    path = work / SETTINGS
+    if path.exists() and path.read_text(encoding="utf-8") != text:
+        raise OutputError(folder, "was begun with other settings", "give the same ones, or another folder")
+    with atomic_path(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return work
+
+
+class _Maker:
+    """What makes batches of synthetic episodes."""
+
+    def __init__(self, world: World, settings: Augmentation, shards: ShardSet | None) -> None:
+        self.world, self.settings, self.shards = world, settings, shards
+        name = settings.embodiment
+        self.prompt_frames = default_frames(world.model)
+        self.scenes = Scenes.of(world, name, settings.episodes, settings.seed, simulator=shards is None)
+        self.robot: Embodiment = self.scenes.robot.embodiment
+        self.policy = self._policy(settings.commands)
+        self.judge: StateJudge | None = None
+        self.probe: Probe | None = None
+        self._long = [] if shards is None else self._long_enough(shards)
+
+    def _policy(self, commands: str) -> Policy:
+        kind, given, number = commands.partition("=")
+        std = self.world.model.embodiments[self.robot.id].std
+        if kind not in ("replay", "perturb"):
+            return read_policy(commands, self.scenes)
+        try:
+            return Replay(float(number) if given else 0.0, std)
+        except ValueError:
+            raise UsageError("--commands", f"{commands!r} is unknown", "give perturb=SHARE") from None
+
+    def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:
+        """Return the rows of episodes that are long enough, with the first frames that leave room."""
+        span = (self.prompt_frames + self.settings.frames - 1) * shards.embodiment.stride
+        rows = [
+            row | {"room": row["length"] * shards.manifest.frame_stride - span}
+            for row in shards.episodes.to_pylist()
+        ]
+        found = [row for row in rows if row["room"] > 0]
+        if not found:
+            fault = f"has no episode of {self.prompt_frames} + {self.settings.frames} frames"
+            raise UsageError(shards.folder, fault, "give fewer --frames")
+        return found
+
+    def run(self, work: Path, on_progress: Callable[[float, str], None]) -> list[Batch]:
+        """Return all batches; those in the folder are not made again."""
+        count, frames = self.settings.episodes, self.settings.frames
+        batches = []
+        for begin in range(0, count, BATCH):
+            path = work / f"batch-{begin:06d}.npz"
+            if not path.exists():
+                self._train(on_progress)
+                numbers = range(begin, min(begin + BATCH, count))
+                batch = self._make(numbers, lambda at, b=begin: on_progress(b * frames + at, "episodes"))  # type: ignore[misc]
+                with atomic_path(path) as part, part.open("wb") as file:
+                    np.savez(file, **vars(batch))
+            with np.load(path) as arrays:
+                batches.append(Batch(**arrays))
+            on_progress(min(begin + BATCH, count) * frames, "episodes")
+        return batches
+
+    def _train(self, on_progress: Callable[[float, str], None]) -> None:
+        """Train the judge, or the probe alone, if they are asked for."""
+        settings = self.settings
+        stateful = settings.commands.startswith(("scripted", "lerobot:")) and simulated(settings.embodiment)
+        needed = bool(settings.judge) or stateful
+        if self.probe is not None or not needed:
+            return
+        on_progress(0, "training the judge")
+        name, stride = settings.embodiment, self.scenes.stride
+        self.probe = train_probe(name, self.world.tokenizer, stride, settings.seed)
+        if settings.judge:
+            task, frames = task_of(name, settings.judge), settings.frames + 1
+            self.judge = train_judge(
+                name, self.world.tokenizer, stride, frames, task, seed=settings.seed, probe=self.probe
+            )
+
+    def _make(self, numbers: range, tell: Callable[[float], None]) -> Batch:
+        begun = self._simulated(numbers) if self.shards is None else self._recorded(self.shards, numbers)
+        arena = ModelArena(self.world, begun, self.probe)
+        kept, nats = [], []
+
+        def look(done: float) -> None:
+            kept.append(arena.stored())
+            nats.append(arena.entropies())
+            tell(done)
+
+        self.world.measure = True
+        try:
+            pictures, commands = run(self.settings.commands, self.policy, arena, self.settings.frames, look)
+        finally:
+            self.world.measure = False
+            arena.close()
+        count, width = len(numbers), self.robot.chunk_dim
+        own = np.stack(commands, axis=1).reshape(count, -1, width)
+        success: NDArray[np.bool_] = np.ones(count, np.bool_)
+        if self.judge is not None:
+            success = self.judge.success(self.judge.score(np.stack(pictures, axis=1)))
+        return Batch(
+            np.concatenate([_prompt_tokens(self.world, begun.prompts), np.stack(kept, axis=1)], axis=1),
+            np.concatenate([np.stack([prompt.chunks for prompt in begun.prompts]), own], axis=1),
+            np.stack(nats).mean(axis=0),
+            success,
+            np.array(begun.groups),
+        )
+
+    def _simulated(self, numbers: range) -> Recorded:
+        """Return beginnings from the simulator, with the commands of its driver."""
+        scenes = self.scenes.take(numbers)
+        true = TrueArena(scenes, self.world.picture_shape[0], drawn=False)
+        for _ in range(self.settings.frames * scenes.stride):
+            true.step(true.recorded())
+        groups = [f"{scenes.name}/{number}" for number in scenes.numbers]
+        return Recorded(scenes, true.prompts, true.held, true.told, groups)
+
+    def _recorded(self, shards: ShardSet, numbers: range) -> Recorded:
+        """Return beginnings from episodes of shards, with their commands."""
+        scenes, known = self.scenes.take(numbers), self.prompt_frames
+        prompts, told, groups = [], [], []
+        for number in numbers:
+            row = self._long[number % len(self._long)]
+            rng = np.random.default_rng((self.settings.seed, 5, number))
+            start = (
+                int(rng.integers(row["room"])) // shards.manifest.frame_stride * shards.manifest.frame_stride
+            )
+            given = {"shards": shards.folder, "episode": row["episode_index"], "start": start}
+            frames, chunks = read_prompt(
+                self.world.model, scenes.name, given | {"frames": known + self.settings.frames}
+            )
+            assert chunks is not None
+            prompts.append(Prompt(frames[:known], chunks[: known - 1]))
+            told.append(np.nan_to_num(chunks[known - 1 :]).reshape(-1, len(scenes.dimensions)))
+            groups.append(str(row["group"] or row["id"]))
+        steps = list(np.stack(told, axis=1).astype(np.float32))
+        held = np.where([dim.kind == "rate" for dim in scenes.dimensions], 0, steps[0]).astype(np.float32)
+        return Recorded(scenes, prompts, held, steps, groups)
+
+
+def _prompt_tokens(world: World, prompts: Sequence[Prompt]) -> NDArray[Any]:
+    """Return the frames of prompts as shards store them (N, P, h, w)."""
+    frames = [prompt.frames for prompt in prompts]
+    if frames[0].ndim == 4:
+        frames = [world.tokenizer.encode(pictures) for pictures in frames]
+    return np.stack(frames).astype(world.tokenizer.spec.dtype)
+
+
+# -- what is kept
+
+
+def _chosen(batches: Sequence[Batch], settings: Augmentation) -> list[Synthetic]:
+    """Return the episodes of which the model was least unsure, without those that are judged failures."""
+    nats = np.concatenate([batch.nats for batch in batches])
+    success = np.concatenate([batch.success for batch in batches])
+    kept = np.zeros(len(nats), np.bool_)
+    kept[np.argsort(nats, kind="stable")[: max(1, round(settings.keep * len(nats)))]] = True
+    if not (kept & success).any():
+        fault = f"none of the {kept.sum()} surest of {len(nats)} episodes is judged a success"
+        raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")
+    return [one for one in _each(batches, nats) if (kept & success)[one.number]]
+
+
+def _each(batches: Sequence[Batch], nats: NDArray[np.float64]) -> Iterator[Synthetic]:
+    """Yield all episodes, numbered through."""
+    number = 0
+    for batch in batches:
+        for stored, chunks, group in zip(batch.stored, batch.chunks, batch.groups, strict=True):
+            yield Synthetic(number, stored, chunks, float(nats[number]), str(group))
+            number += 1

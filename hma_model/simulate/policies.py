@@ -1,0 +1,211 @@
+"""Make policies from the words of a command: scripted, random, still, a Python function, or one of lerobot.
+
+A policy acts in N scenes at once. `Arena` gives it the newest pictures, and to those that ask for it a state.
+
+N scenes, S pixels a side, A action dims, S' values of a state.
+"""
+
+import copy
+import importlib
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from hma_data.errors import HMAError, UsageError
+from hma_data.lab.scripted import driver, steerable
+from hma_model.simulate.arenas import Arena, Floats, Scenes
+
+WAYS = (
+    "give scripted, scripted:noise=0.5, random, still, MODULE:NAME of a Python function or class, or "
+    "lerobot:FOLDER_OR_REPO"
+)
+
+
+class Policy(Protocol):
+    """A policy in N scenes."""
+
+    def begin(self, arena: Arena) -> None:
+        """Begin episodes in all scenes."""
+
+    def act(self, arena: Arena) -> Floats:
+        """Return the next commands (N, A)."""
+
+
+def read_policy(words: str, scenes: Scenes) -> Policy:
+    """Return the policy of words such as `scripted:noise=0.5`, for the robot of scenes.
+
+    Raises:
+        HMAError: there is no such policy, or it does not fit the robot.
+    """
+    kind, _, rest = words.partition(":")
+    if kind == "lerobot" and rest:
+        from hma_model.simulate.lerobot_policy import LeRobotPolicy
+
+        return LeRobotPolicy(rest, scenes)
+    if words in ("random", "still"):
+        return Random() if words == "random" else Still()
+    if kind == "scripted":
+        return Scripted(_noise(words, rest))
+    if rest:
+        return Called(_named(words))
+    raise UsageError("policy", f"{words!r} is unknown", WAYS)
+
+
+def _noise(words: str, rest: str) -> float:
+    name, _, value = rest.partition("=")
+    try:
+        share = float(value) if rest else 0.0
+    except ValueError:
+        share = np.nan
+    if (rest and name != "noise") or not 0 <= share <= 1:
+        raise UsageError("policy", f"{words!r} is unknown", "give scripted:noise=SHARE, from 0 to 1")
+    return share
+
+
+def _named(words: str) -> Any:
+    """Return the object that MODULE:NAME names; modules of the working folder are found."""
+    module, _, name = words.partition(":")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        found: Any = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+    except Exception as fault:
+        raise HMAError(
+            f"policy {words}", f"cannot be imported: {type(fault).__name__}: {fault}", WAYS
+        ) from fault
+    finally:
+        sys.path.pop(0)
+    return found
+
+
+class Still:
+    """The commands that leave the robot as it is: no velocity, or the last target."""
+
+    def begin(self, arena: Arena) -> None:
+        pass
+
+    def act(self, arena: Arena) -> Floats:
+        return arena.held
+
+
+class Random:
+    """A uniform command in the range of training, another one for each chunk."""
+
+    def begin(self, arena: Arena) -> None:
+        self._rng = arena.scenes.rng(1)
+        self._low, self._high = (
+            np.array([getattr(dim, end) for dim in arena.scenes.dimensions]) for end in ("low", "high")
+        )
+
+    def act(self, arena: Arena) -> Floats:
+        if arena.fresh:
+            drawn = [rng.uniform(self._low, self._high) for rng in self._rng]
+            self._command = np.stack(drawn).astype(np.float32)
+        return self._command
+
+
+class Scripted:
+    """The manoeuvres of the recorder, of which a share of the chunks is random.
+
+    They go by the robot's state: in the simulator by the true one, in the model by what a probe reads off its
+    pictures. Robots of which no state can be read so are driven by the simulator's own driver, and in the
+    model its commands are replayed.
+
+    Args:
+        noise: the share of chunks with random commands.
+    """
+
+    def __init__(self, noise: float = 0.0) -> None:
+        self.noise, self._random = noise, Random()
+
+    def begin(self, arena: Arena) -> None:
+        self._random.begin(arena)
+        self._coins = arena.scenes.rng(2)
+        self._drivers: list[Callable[..., Floats]] = []
+        if steerable(arena.scenes.name):
+            begun = zip(arena.states(), arena.scenes.rng(3), strict=True)
+            self._drivers = [driver(arena.scenes.name, state.pose, rng) for state, rng in begun]
+
+    def act(self, arena: Arena) -> Floats:
+        noisy = self._random.act(arena)
+        if arena.fresh:
+            self._thrown = np.array([coin.random() < self.noise for coin in self._coins])[:, None]
+        if self._drivers:
+            pairs = zip(self._drivers, arena.states(), strict=True)
+            commands = np.stack([drive(state) for drive, state in pairs])
+        else:
+            commands = arena.recorded()
+        return np.where(self._thrown, noisy, commands).astype(np.float32)
+
+
+class Called:
+    """A Python function from a picture (S, S, 3) to a command (A,), or a class or object of such.
+
+    Each scene has its own: an instance of a class, or a copy of an object, so that what it remembers belongs
+    to one episode. Its `reset()`, if there is one, is called when an episode begins.
+    """
+
+    def __init__(self, given: Any) -> None:
+        if not callable(given):
+            raise UsageError("policy", f"{given!r} cannot be called", WAYS)
+        self._given = given
+
+    def begin(self, arena: Arena) -> None:
+        made = (
+            self._given() if isinstance(self._given, type) else copy.deepcopy(self._given)
+            for _ in arena.pictures
+        )
+        self._functions = list(made)
+        for function in self._functions:
+            if hasattr(function, "reset"):
+                function.reset()
+
+    def act(self, arena: Arena) -> Floats:
+        pairs = zip(self._functions, arena.pictures, strict=True)
+        commands = [np.asarray(function(picture.copy())) for function, picture in pairs]
+        shapes = {command.shape for command in commands}
+        if len(shapes) > 1:
+            raise ValueError(f"it returned commands of the shapes {shapes}")
+        return np.stack(commands)
+
+
+def begin(name: str, policy: Policy, arena: Arena) -> None:
+    """Begin a policy's episodes; an HMAError names the policy if it raises."""
+    with _named_errors(name):
+        policy.begin(arena)
+
+
+def checked(name: str, policy: Policy, arena: Arena) -> Floats:
+    """Return the next commands (N, A) of a policy.
+
+    Raises:
+        HMAError: it raises, or returns another shape or values that are not finite.
+    """
+    where, width = f"policy {name}", len(arena.scenes.dimensions)
+    with _named_errors(name):
+        commands = np.asarray(policy.act(arena), np.float32)
+    if commands.shape != (len(arena.pictures), width):
+        names = ", ".join(dim.name for dim in arena.scenes.dimensions)
+        fault = f"returns commands of the shape {commands.shape[1:]}"
+        raise HMAError(where, fault, f"{arena.scenes.name} takes ({width},): {names}")
+    if not np.isfinite(commands).all():
+        raise HMAError(
+            where, "returns NaN or infinite values", "return a number for each value of the command"
+        )
+    return commands
+
+
+@contextmanager
+def _named_errors(name: str) -> Iterator[None]:
+    try:
+        yield
+    except HMAError:
+        raise
+    except Exception as fault:
+        remedy = "mend it; --debug shows where it happened"
+        raise HMAError(f"policy {name}", f"raised {type(fault).__name__}: {fault}", remedy) from fault

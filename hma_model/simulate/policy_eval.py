@@ -1,0 +1,286 @@
+"""Score policies in the true simulator and inside the world model, and compare the two.
+
+    found = evaluate_policies("rails_03", ["scripted", "scripted:noise=0.5", "random", "still"])
+    found.success.spearman            # of the policies' success rates
+
+Every policy acts in the same scenes of a laboratory robot: once in its simulator, which knows the outcome,
+and once in the world model from the same frames, where a judge reads the outcome off the pictures. The
+commands that it gave in the model are also played to the simulator. So the judge's word on generated frames
+is compared with what truly comes of the same commands.
+
+M policies, N episodes, T frames after the prompt, S pixels a side.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import UsageError
+from hma_data.storage.paths import StrPath
+from hma_model.evaluation.agreement import (
+    Accuracy,
+    Bools,
+    Estimate,
+    accuracy,
+    correlations,
+    mean_interval,
+    pearson,
+)
+from hma_model.evaluation.judge import StateJudge, task_of, train_judge
+from hma_model.simulate.arenas import Arena, Floats, ModelArena, Picture, Scenes, TrueArena
+from hma_model.simulate.policies import Policy, begin, checked, read_policy
+from hma_model.simulate.world import World, load_world
+
+Scores = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+EPISODES, FRAMES = 32, 40
+SHOWN = 8  # pictures that are kept of an episode
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """Scores (N,) of a policy's episodes, and which are a success (N,)."""
+
+    scores: Scores
+    success: Bools
+
+
+@dataclass(frozen=True)
+class Scored:
+    """What came of one policy.
+
+    Attributes:
+        true: in the simulator.
+        model: in the world model, as judged.
+        replayed: in the simulator, under the commands that the policy gave in the model.
+        shown: frames of which pictures are kept.
+        true_pictures, model_pictures: (N, len(shown), S, S, 3).
+    """
+
+    policy: str
+    true: Outcomes
+    model: Outcomes
+    replayed: Outcomes
+    shown: tuple[int, ...]
+    true_pictures: Picture
+    model_pictures: Picture
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """How a figure of the policies in the model follows that in the simulator."""
+
+    pearson: Estimate
+    spearman: Estimate
+
+
+@dataclass(frozen=True)
+class PolicyEvaluation:
+    """Policies scored twice.
+
+    Attributes:
+        success, score: correlation over policies of the success rates, and of the mean scores.
+        generated: accuracy of the judge on generated frames, against the simulator under the same commands.
+        followed: how the scores of single episodes, as judged on generated frames, correlate with the true
+            ones under the same commands; None if they do not vary.
+    """
+
+    embodiment: str
+    checkpoint: str
+    seed: int
+    frames: int
+    judge: StateJudge
+    policies: tuple[Scored, ...]
+    success: Correlation
+    score: Correlation
+    generated: Accuracy
+    followed: float | None
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the figures of each policy."""
+        rows = []
+        for one in self.policies:
+            row: dict[str, Any] = {"policy": one.policy}
+            for name in ("true", "model", "replayed"):
+                outcomes: Outcomes = getattr(one, name)
+                rate = outcomes.success.astype(np.float64)
+                row |= {
+                    f"{name}_success": float(rate.mean()),
+                    f"{name}_success_interval": mean_interval(rate, self.seed),
+                    f"{name}_score": float(outcomes.scores.mean()),
+                }
+            agree = (one.true.success == one.model.success).mean()
+            rows.append(row | {"episodes_alike": float(agree)})
+        return rows
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures, and the outcome of each episode, as plain values."""
+        judge = {
+            "task": self.judge.task.name,
+            "success": self.judge.task.text,
+            "limit": self.judge.limit,
+            "held_out": asdict(self.judge.held_out),
+            "generated": asdict(self.generated) | {"score_correlation": self.followed},
+            "generated_better_than_chance": self.generated.better_than_chance,
+        }
+        episodes = {
+            one.policy: {
+                name: {"scores": value.scores.round(3).tolist(), "success": value.success.tolist()}
+                for name, value in (("true", one.true), ("model", one.model), ("replayed", one.replayed))
+            }
+            for one in self.policies
+        }
+        return {
+            "embodiment": self.embodiment,
+            "checkpoint": self.checkpoint,
+            "seed": self.seed,
+            "frames": self.frames,
+            "episodes": len(self.policies[0].true.scores),
+            "judge": judge,
+            "policies": self.rows(),
+            "correlation": {"success": asdict(self.success), "score": asdict(self.score)},
+            "outcomes": episodes,
+        }
+
+
+def evaluate_policies(
+    embodiment: str,
+    policies: Sequence[str | tuple[str, Policy]],
+    *,
+    checkpoint: StrPath = "embedded",
+    episodes: int = EPISODES,
+    frames: int = FRAMES,
+    judge: str | StateJudge = "moved",
+    seed: int = 0,
+    world: World | None = None,
+    on_progress: Progress | None = None,
+) -> PolicyEvaluation:
+    """Score policies in the simulator of a laboratory robot and inside a world model.
+
+    Args:
+        embodiment: a robot of the laboratory that the checkpoint has.
+        policies: words as `read_policy` takes them, or a name and a policy.
+        checkpoint: as `load_world` takes it.
+        episodes: N.
+        frames: T.
+        judge: words as `task_of` takes them, or a trained judge.
+        seed: of scenes, policies, judge and intervals; the same seed gives the same figures.
+        world: a world instead of a checkpoint.
+        on_progress: called with the frames done, and what is done.
+
+    Raises:
+        HMAError: a policy fails, the robot has no simulator, or the judge is no better than chance.
+    """
+    if not policies:
+        raise UsageError("policies", "none is given", "give at least one; a correlation takes three")
+    tell = on_progress or (lambda done, words: None)
+    world = world or load_world(checkpoint)
+    scenes = Scenes.of(world, embodiment, episodes, seed)
+    made = [(one, read_policy(one, scenes)) if isinstance(one, str) else one for one in policies]
+    for name, policy in made:  # what it returns is refused before minutes of work
+        _try(name, policy, TrueArena(replace(scenes, numbers=scenes.numbers[:1]), world.picture_shape[0]))
+    if not isinstance(judge, StateJudge):
+        task = task_of(embodiment, judge)
+        tell(0, "training the judge")
+        judge = train_judge(embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed)
+    scored: list[Scored] = []
+    for name, policy in made:
+        begun = len(scored) * frames * episodes
+        told = partial(_tell, tell, begun, name)
+        scored.append(score_policy(name, policy, world, scenes, judge, frames, told))
+    success, scores = _matrices(scored, "success"), _matrices(scored, "scores")
+    return PolicyEvaluation(
+        embodiment,
+        str(checkpoint),
+        seed,
+        frames,
+        judge,
+        tuple(scored),
+        Correlation(**correlations(success[0], success[1], seed)),
+        Correlation(**correlations(scores[0], scores[1], seed)),
+        accuracy(success[2].ravel() > 0, success[1].ravel() > 0, seed),
+        _correlation(scores[1].ravel(), scores[2].ravel()),
+    )
+
+
+def _try(name: str, policy: Policy, arena: Arena) -> None:
+    begin(name, policy, arena)
+    checked(name, policy, arena)
+
+
+def _tell(tell: Progress, begun: float, name: str, done: float) -> None:
+    tell(begun + done, name)
+
+
+def _correlation(one: Scores, other: Scores) -> float | None:
+    found = float(pearson(one, other))
+    return None if np.isnan(found) else found
+
+
+def score_policy(
+    name: str,
+    policy: Policy,
+    world: World,
+    scenes: Scenes,
+    judge: StateJudge,
+    frames: int,
+    tell: Callable[[float], None] = lambda done: None,
+) -> Scored:
+    """Return what comes of one policy in the simulator and in the model."""
+    size, limit = world.picture_shape[0], judge.task.limit
+    shown = tuple(sorted({round(frame) for frame in np.linspace(0, frames, SHOWN)}))
+    true = TrueArena(scenes, size)
+    true_pictures, _ = run(name, policy, true, frames)
+    model = ModelArena(world, true, judge.probe)
+    try:
+        model_pictures, commands = run(name, policy, model, frames, tell)
+    finally:
+        model.close()
+    again = TrueArena(scenes, size, drawn=False)
+    for command in commands:
+        again.step(command)
+    scores = [judge.true_score(np.stack(arena.parts, axis=1)) for arena in (true, again)]
+    read = judge.score(np.stack(model_pictures, axis=1))
+    return Scored(
+        name,
+        Outcomes(scores[0], scores[0] >= limit),
+        Outcomes(read, judge.success(read)),
+        Outcomes(scores[1], scores[1] >= limit),
+        shown,
+        np.stack([true_pictures[frame] for frame in shown], axis=1),
+        np.stack([model_pictures[frame] for frame in shown], axis=1),
+    )
+
+
+def run(
+    name: str, policy: Policy, arena: Arena, frames: int, tell: Callable[[float], None] = lambda done: None
+) -> tuple[list[Picture], list[Floats]]:
+    """Let a policy act for so many frames.
+
+    Returns:
+        The T + 1 pictures (N, S, S, 3), the last one of the prompt first; and all commands (N, A).
+
+    Raises:
+        HMAError: the policy fails.
+    """
+    pictures, commands = [arena.pictures], []
+    begin(name, policy, arena)
+    for _ in range(frames * arena.scenes.stride):
+        commands.append(checked(name, policy, arena))
+        arena.step(commands[-1])
+        if arena.fresh:
+            pictures.append(arena.pictures)
+            tell((len(pictures) - 1) * len(arena.pictures))
+    return pictures, commands
+
+
+def _matrices(scored: Sequence[Scored], key: str) -> list[Scores]:
+    """Return "success" or "scores" in the simulator, in the model, and as replayed; (M, N) each."""
+    return [
+        np.stack([getattr(getattr(one, where), key) for one in scored]).astype(np.float64)
+        for where in ("true", "model", "replayed")
+    ]

@@ -1,0 +1,157 @@
+"""Show an evaluation of policies: as a table on a terminal, and as a page with pictures of episodes."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hma_data.console import print_table
+from hma_data.episodes.sheets import grid, png_bytes
+from hma_data.storage.files import atomic_path
+from hma_model.evaluation.pages import COLOURS, MARKERS, Page, label_axes, svg_bytes
+from hma_model.simulate.policy_eval import PolicyEvaluation, Scored
+
+COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same commands, sim.")
+CHOSEN = 2  # episodes of each kind on the page
+KINDS = {  # (success in the simulator, in the model) -> title
+    (True, True): "Both say success",
+    (False, False): "Both say failure",
+    (True, False): "Success in the simulator only",
+    (False, True): "Success in the model only",
+}
+
+
+def table(found: PolicyEvaluation) -> list[list[Any]]:
+    """Return a row of COLUMNS for each policy."""
+    return [
+        [
+            row["policy"],
+            _rate(row, "true"),
+            _rate(row, "model"),
+            round(row["true_score"], 1),
+            round(row["model_score"], 1),
+            f"{row['episodes_alike']:.0%}",
+            _rate(row, "replayed"),
+        ]
+        for row in found.rows()
+    ]
+
+
+def _rate(row: dict[str, Any], name: str) -> str:
+    low, high = row[f"{name}_success_interval"]
+    return f"{row[f'{name}_success']:.0%} ({low:.0%}–{high:.0%})"
+
+
+def sentences(found: PolicyEvaluation) -> list[str]:
+    """Return in words what the table means: the task, the judge, the correlations."""
+    share = "not known" if found.followed is None else f"{found.followed:.2f}"
+    said = [
+        f"success: {found.judge.task.text}; shares with 95 % intervals over episodes, scores in px",
+        f"judge on held-out true episodes: {found.judge.held_out}",
+        f"judge on generated frames, against the simulator under the same commands: {found.generated}; "
+        f"correlation of the scores {share}",
+        f"success rates over policies: Pearson {found.success.pearson}, ranks {found.success.spearman}",
+        f"mean scores over policies: Pearson {found.score.pearson}, ranks {found.score.spearman}",
+    ]
+    if not found.generated.better_than_chance:
+        said.append(
+            "on generated frames the judge is no better than chance: the model's success rates mean nothing"
+        )
+    return said
+
+
+def show(found: PolicyEvaluation) -> None:
+    """Print the table and what it means."""
+    print_table(list(COLUMNS), table(found))
+    for sentence in sentences(found):
+        print(sentence)
+
+
+def write_report(found: PolicyEvaluation, folder: Path) -> Path:
+    """Write results.json and report.html; return the path of the page."""
+    folder.mkdir(parents=True, exist_ok=True)
+    page = folder / "report.html"
+    for path, text in ((folder / "results.json", json.dumps(found.to_json(), indent=1)), (page, html(found))):
+        with atomic_path(path) as part:
+            part.write_text(text, encoding="utf-8")
+    return page
+
+
+def html(found: PolicyEvaluation) -> str:
+    """Return the page."""
+    count = len(found.policies[0].true.scores)
+    lead = (
+        f"{found.embodiment} in {found.checkpoint}: {count} episodes of {found.frames} frames a policy, from "
+        "the same frames in the simulator and in the world model"
+    )
+    page = Page("Policies inside the world model", lead)
+    page.figures(
+        [
+            (_value(found.success.pearson.value), "correlation of success rates over policies"),
+            (_value(found.success.spearman.value), "correlation of their ranks"),
+            (_value(found.judge.held_out.balanced), "judge's balanced accuracy on true episodes"),
+            (_value(found.generated.balanced), "and on generated ones; 0.5 is chance"),
+        ]
+    )
+    page.table(COLUMNS, table(found))
+    for sentence in sentences(found):
+        page.text(sentence[:1].upper() + sentence[1:] + ".")
+    page.section("Success rates", "A policy is a point; bars are 95 % intervals over episodes.")
+    page.picture(_plot(found), "svg+xml", "Success in the simulator and in the model")
+    for kind, title in KINDS.items():
+        chosen = list(_chosen(found, kind))[:CHOSEN]
+        if chosen:
+            page.section(title)
+        for one, number in chosen:
+            page.picture(_strip(one, number), "png", _caption(one, number))
+    return page.html()
+
+
+def _value(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def _chosen(found: PolicyEvaluation, kind: tuple[bool, bool]) -> Iterator[tuple[Scored, int]]:
+    """Yield episodes of a kind, of each policy one before any second one."""
+    there = [
+        np.flatnonzero((one.true.success == kind[0]) & (one.model.success == kind[1]))
+        for one in found.policies
+    ]
+    for turn in range(CHOSEN):
+        for one, numbers in zip(found.policies, there, strict=True):
+            if turn < len(numbers):
+                yield one, int(numbers[turn])
+
+
+def _caption(one: Scored, number: int) -> str:
+    return (
+        f"{one.policy}, episode {number}, frames {', '.join(map(str, one.shown))}: simulator above, scored "
+        f"{one.true.scores[number]:.1f} px, model below, judged {one.model.scores[number]:.1f} px"
+    )
+
+
+def _strip(one: Scored, number: int) -> bytes:
+    return png_bytes(grid([list(one.true_pictures[number]), list(one.model_pictures[number])]))
+
+
+def _plot(found: PolicyEvaluation) -> bytes:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.6, 4.4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="#999999", ls=":", lw=1)
+    for i, row in enumerate(found.rows()):
+        x, y = row["true_success"], row["model_success"]
+        ends = ((x, row["true_success_interval"]), (y, row["model_success_interval"]))
+        bars = [[[max(at - low, 0)], [max(high - at, 0)]] for at, (low, high) in ends]
+        look: dict[str, Any] = {
+            "color": COLOURS[i % len(COLOURS)],
+            "fmt": MARKERS[i // len(COLOURS) % len(MARKERS)],
+        }
+        axes.errorbar([x], [y], xerr=bars[0], yerr=bars[1], label=row["policy"], ms=7, lw=1, **look)
+    axes.set(xlim=(-0.05, 1.05), ylim=(-0.05, 1.05))
+    axes.legend(frameon=False, fontsize=9)
+    label_axes(axes, "success in the simulator", "success in the model")
+    return svg_bytes(figure)

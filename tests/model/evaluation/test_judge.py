@@ -1,0 +1,102 @@
+"""Judges of episodes: scores of places, the limit, and the refusal of a judge that knows nothing."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hma_data.errors import HMAError, UsageError
+from hma_data.lab import truth
+from hma_model.evaluation import judge
+from hma_model.evaluation.judge import best_limit, last_seen, moved, reached, task_of, train_judge
+
+SIDE = 8
+
+
+class WrittenPlaces:
+    """A probe of pictures that hold the places of the parts in their first pixels."""
+
+    driven, own, loose = 1, np.array([0]), np.array([1, 2])
+
+    def __init__(self, blind: bool = False) -> None:
+        self.rng = np.random.default_rng(0) if blind else None
+
+    def read(self, pictures: np.ndarray) -> np.ndarray:
+        places = pictures[..., :3, 0, :2].astype(float)
+        return places if self.rng is None else self.rng.normal(64, 5, places.shape)
+
+    def areas(self, pictures: np.ndarray) -> np.ndarray:
+        return np.ones((*pictures.shape[:-3], 3))
+
+
+def written(parts: np.ndarray) -> np.ndarray:
+    pictures = np.zeros((len(parts), SIDE, SIDE, 3), np.uint8)
+    pictures[:, :3, 0, :2] = parts.round()
+    return pictures
+
+
+@pytest.fixture
+def episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Episodes of three parts, in half of which a loose one moves."""
+
+    def episode(robot: str, frames: int, stride: int, seed: int, number: int, drawn: Any) -> truth.Episode:
+        rng = np.random.default_rng(number)
+        parts = np.repeat(rng.uniform(30, 90, (1, 3, 2)), frames, axis=0)
+        parts[-4:, 1] += (8 * (number % 2), 0)
+        return truth.Episode(written(parts)[sorted(drawn)], np.zeros((frames, 1), np.float32), parts, 1)
+
+    monkeypatch.setattr(truth, "episode", episode)
+    for name in ("as_seen", "as_shown"):
+        monkeypatch.setattr(judge, name, lambda *given: given[-1])
+
+
+def test_scores_are_of_the_loose_part_that_moves_most_and_of_the_nearest_approach() -> None:
+    parts = np.tile([[10.0, 10], [50, 50], [90, 20]], (1, 6, 1, 1))
+    parts[0, 3:, 2] += (3, 4)
+    parts[0, 2, 0] = (50, 44)
+    assert moved(parts, 1) == pytest.approx([5]) and reached(parts, 1) == pytest.approx([-6])
+
+
+def test_a_part_that_is_gone_stays_where_it_was_last_seen() -> None:
+    places = np.arange(10.0).reshape(1, 5, 1, 2)
+    areas = np.array([[[20.0], [18], [3], [12], [0]]])
+    assert last_seen(places, areas)[0, :, 0, 0].tolist() == [0, 2, 2, 6, 6]
+
+
+def test_the_limit_is_the_best_of_all() -> None:
+    rng = np.random.default_rng(1)
+    success = rng.random(40) < 0.4
+    read = rng.normal(5, 2, 40) + 3 * success
+
+    def balanced(limit: float) -> float:
+        said = read >= limit
+        return float(said[success].mean() + (~said[~success]).mean()) / 2
+
+    assert balanced(best_limit(read, success, 5.0)) == max(map(balanced, np.linspace(0, 15, 3001)))
+    assert best_limit(read, np.ones(40, bool), 5.0) == 5.0
+
+
+def test_a_judge_tells_its_accuracy_on_episodes_that_it_was_not_fitted_to(episodes: None) -> None:
+    made = train_judge("rails_03", None, 2, 12, probe=WrittenPlaces(), examples=40)  # type: ignore[arg-type]
+    assert made.held_out.balanced == 1 and made.held_out.count == 20
+    parts = np.full((12, 3, 2), 40.0)
+    reward, ended = made(written(parts), None)
+    assert reward == 0 and not ended
+    parts[5:, 2] += 9
+    assert made.success(made.score(written(parts)[None])).tolist() == [True]
+
+
+def test_a_judge_that_is_no_better_than_chance_is_refused(episodes: None) -> None:
+    with pytest.raises(HMAError, match="judge of rails_03: is no better than chance: balanced"):
+        train_judge("rails_03", None, 2, 12, probe=WrittenPlaces(True), examples=40)  # type: ignore[arg-type]
+    with pytest.raises(HMAError, match="no better than chance: .*all episodes end alike"):
+        train_judge(
+            "rails_03", None, 2, 12, task_of("rails_03", "moved=60"), probe=WrittenPlaces(), examples=40
+        )  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("words", ["fly", "moved=far", "moved=0", "reached=999"])
+def test_words_that_are_no_task_are_refused(words: str) -> None:
+    with pytest.raises(UsageError, match="is no task"):
+        task_of("rails_03", words)
+    assert task_of("pusht_fast").limit == 10 and task_of("arm1_02", "reached=9").limit == -9

@@ -1,0 +1,162 @@
+"""Synthetic episodes: shards that verify and say what they are, replays, resumption, LeRobotDatasets."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hma_data.conversion.job import convert
+from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.lab import family, record
+from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.schema import flag_counts, read_footer
+from hma_data.shards.verify import verify
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.network.model import HMA
+from hma_model.simulate import World
+from hma_model.simulate import augment as augment_module
+from hma_model.simulate.arenas import Scenes, TrueArena
+from hma_model.simulate.augment import Augmentation, augment
+from tests.model.simulate.worlds import tiny_model
+
+ROBOT, FRAMES, KNOWN = "rails_03", 4, 2
+
+
+@pytest.fixture(scope="module")
+def model() -> HMA:
+    return tiny_model(ROBOT)
+
+
+@pytest.fixture
+def world(model: HMA) -> World:
+    return World(model, get_tokenizer("fsq-8"))
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(augment_module, "BATCH", 2)
+
+
+def asked(**given: Any) -> Augmentation:
+    return Augmentation(ROBOT, **{"episodes": 4, "frames": FRAMES, "keep": 1.0} | given)
+
+
+def episodes(folder: Path) -> list[dict[str, Any]]:
+    shards = ShardSet(folder)
+    reader = EpisodeReader(shards, shards.columns())
+    return [reader.episode(row, shards.manifest.cameras[0]) for row in shards.episodes.to_pylist()]
+
+
+def test_replayed_episodes_hold_the_recorders_commands_and_say_that_they_are_synthetic(
+    world: World, tmp_path: Path
+) -> None:
+    manifest = augment(tmp_path / "out", asked(), world=world)
+    assert verify(tmp_path / "out") == []
+    made_by = manifest.plan["made_by"]
+    assert made_by["synthetic"] is True and made_by["seed"] == 0 and made_by["checkpoint"] == "in memory"
+    for shard in manifest.shards:
+        assert read_footer(tmp_path / "out" / shard.path)[0].plan["made_by"] == made_by
+    true = TrueArena(Scenes.of(world, ROBOT, 4, 0), 128)
+    wanted = [true.recorded()]
+    for _ in range(FRAMES * true.scenes.stride - 1):
+        true.step(wanted[-1])
+        wanted.append(true.recorded())
+    commands = np.stack(wanted, axis=1).reshape(4, FRAMES, -1)
+    found = episodes(tmp_path / "out")
+    assert len(found) == 4
+    for number, columns in enumerate(found):
+        prompt = true.prompts[number]
+        known = len(prompt.frames)
+        np.testing.assert_array_equal(columns["action"][known - 1 :], commands[number])
+        np.testing.assert_array_equal(columns["action"][: known - 1], prompt.chunks)
+        stored = world.tokenizer.encode(prompt.frames)
+        np.testing.assert_array_equal(columns["tokens"][:known].reshape(stored.shape), stored)
+
+
+def test_perturbed_commands_lie_around_the_recorded_ones(world: World, tmp_path: Path) -> None:
+    augment(tmp_path / "one", asked(), world=world)
+    augment(tmp_path / "other", asked(commands="perturb=0.2"), world=world)
+    pairs = zip(episodes(tmp_path / "one"), episodes(tmp_path / "other"), strict=True)
+    gaps = np.concatenate([(one["action"] - other["action"])[3:] for one, other in pairs])
+    assert 0 < np.abs(gaps).mean() < 0.5 * 30
+    augment(tmp_path / "still", asked(commands="still"), world=world)
+    assert not any(one["action"][3:].any() for one in episodes(tmp_path / "still"))  # velocities
+
+
+def test_a_stopped_run_continues_and_gives_the_same_bytes(world: World, tmp_path: Path) -> None:
+    whole = augment(tmp_path / "whole", asked(), world=world)
+
+    def stop(done: float, words: str) -> None:
+        if done > 2 * FRAMES:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        augment(tmp_path / "cut", asked(), world=world, on_progress=stop)
+    assert [path.name for path in sorted((tmp_path / "cut/.augment").glob("*.npz"))] == ["batch-000000.npz"]
+    with pytest.raises(OutputError, match="was begun with other settings"):
+        augment(tmp_path / "cut", asked(seed=1), world=world)
+    told: list[float] = []
+    cut = augment(tmp_path / "cut", asked(), world=world, on_progress=lambda done, words: told.append(done))
+    assert told[0] == 2 * FRAMES  # the first batch was not made again
+    assert [shard.sha256 for shard in cut.shards] == [shard.sha256 for shard in whole.shards]
+    assert not (tmp_path / "cut/.augment").exists()
+    assert augment(tmp_path / "cut", asked(), world=world) == cut
+    with pytest.raises(OutputError, match="holds another shard set"):
+        augment(tmp_path / "cut", asked(seed=1), world=world)
+
+
+def test_the_surest_episodes_are_kept(world: World, tmp_path: Path) -> None:
+    augment(tmp_path / "all", asked(), world=world)
+    augment(tmp_path / "half", asked(keep=0.5), world=world)
+    unsure = {}
+    for name in ("all", "half"):
+        rows = ShardSet(tmp_path / name).episodes.to_pylist()
+        unsure[name] = sorted(flag_counts(row["flags"])["millinats"] for row in rows)
+    assert unsure["half"] == unsure["all"][:2] and unsure["all"][0] < unsure["all"][-1]
+    with pytest.raises(UsageError, match="--keep: is 0"):
+        asked(keep=0.0)
+
+
+def test_first_frames_and_commands_come_from_shards(world: World, tmp_path: Path) -> None:
+    recording = record(ROBOT, tmp_path, 1)
+    convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "real")
+    augment(tmp_path / "out", asked(source="real", episodes=2), world=world, shards=tmp_path / "real")
+    assert verify(tmp_path / "out") == []
+    real, made = episodes(tmp_path / "real"), ShardSet(tmp_path / "out").episodes.to_pylist()
+    assert {row["group"] for row in made} == {"demo_0"}
+    stride = world.model.embodiments[ROBOT].stride
+    for columns in episodes(tmp_path / "out"):
+        tokens, length = real[0]["tokens"], len(columns["action"])
+        starts = [at for at, frame in enumerate(tokens) if np.array_equal(frame, columns["tokens"][0])]
+        rows = [real[0]["action"][at : at + length * stride].ravel() for at in starts]
+        assert any(np.array_equal(one, columns["action"].ravel()) for one in rows)
+    with pytest.raises(UsageError, match="has no episode of 2 \\+ 900 frames"):
+        augment(tmp_path / "no", asked(frames=900), world=world, shards=tmp_path / "real")
+
+
+@pytest.mark.slow
+def test_lerobot_loads_the_dataset(world: World, tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    augment(tmp_path / "out", asked(episodes=2), world=world, lerobot=tmp_path / "rails")
+    loaded = LeRobotDataset("lab/rails", root=tmp_path / "rails")
+    stride = world.model.embodiments[ROBOT].stride
+    columns = episodes(tmp_path / "out")
+    assert loaded.num_episodes == 2 and len(loaded) == sum(len(one["action"]) for one in columns) * stride
+    row = loaded[stride]
+    np.testing.assert_allclose(row["action"], columns[0]["action"][1][: len(row["action"])])
+    assert "synthetic" in row["task"]
+    assert json.loads((tmp_path / "rails/synthetic.json").read_text())["synthetic"] is True
+    with pytest.raises(OutputError, match="exists already"):
+        augment(tmp_path / "more", asked(), world=world, lerobot=tmp_path / "rails")
+
+
+def test_a_robot_without_simulator_needs_shards(tmp_path: Path) -> None:
+    from tests.model.robots import make_model
+
+    world = object.__new__(World)
+    world.model, world._commands = make_model({"arm": 2}), {}
+    with pytest.raises(HMAError, match="arm: has no true simulator"):
+        augment(tmp_path / "out", Augmentation("arm"), world=world)

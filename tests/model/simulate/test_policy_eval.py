@@ -1,0 +1,203 @@
+"""Policies scored twice: in a world without error both agree; faults of policies are one clear line."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hma_data.errors import HMAError, UsageError
+from hma_data.lab import truth
+from hma_data.lab.simulator import LabSimulator
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.evaluation.agreement import Accuracy
+from hma_model.evaluation.judge import StateJudge, task_of
+from hma_model.network.model import HMA
+from hma_model.simulate import World
+from hma_model.simulate.arenas import Scenes, TrueArena
+from hma_model.simulate.policies import begin, checked, read_policy
+from hma_model.simulate.policy_eval import evaluate_policies
+from hma_model.simulate.policy_page import html, sentences, write_report
+from tests.model.simulate.worlds import TrueWorld, tiny_model
+
+ROBOT = "rails_03"
+POLICIES = ["scripted", "scripted:noise=0.5", "random", "still"]
+
+
+@pytest.fixture(scope="module")
+def model() -> HMA:
+    return tiny_model(ROBOT)
+
+
+@pytest.fixture
+def world(model: HMA) -> World:
+    return World(model, get_tokenizer("fsq-8"))
+
+
+class KnownPlaces:
+    """A probe that knows the places in every picture that a simulator drew."""
+
+    own, loose, driven = np.array([0, 1]), np.array([2, 3]), 2
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.known: dict[bytes, np.ndarray] = {}
+        draw = LabSimulator.picture
+
+        def picture(simulator: LabSimulator) -> np.ndarray:
+            drawn = draw(simulator)
+            self.known[drawn.tobytes()] = truth.parts_of(simulator.simulation)[1]
+            return drawn
+
+        monkeypatch.setattr(LabSimulator, "picture", picture)
+
+    def read(self, pictures: np.ndarray) -> np.ndarray:
+        flat = pictures.reshape(-1, *pictures.shape[-3:])
+        blank = np.full((4, 2), 64.0)
+        found = np.stack([self.known.get(one.tobytes(), blank) for one in flat])
+        return found.reshape(*pictures.shape[:-3], *found.shape[1:])
+
+    def areas(self, pictures: np.ndarray) -> np.ndarray:
+        return np.ones((*pictures.shape[:-3], 4))
+
+
+@pytest.fixture
+def judge(monkeypatch: pytest.MonkeyPatch) -> StateJudge:
+    sure = Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24)
+    return StateJudge(ROBOT, task_of(ROBOT, "moved=2"), KnownPlaces(monkeypatch), 2.0, sure)  # type: ignore[arg-type]
+
+
+class FlawlessWorld(TrueWorld):
+    """Simulators in place of a model: its sessions do what truly happens."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__()
+        self.model, self.tokenizer, self.picture_shape = world.model, world.tokenizer, world.picture_shape
+        self.commands = world.commands
+
+
+def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJudge) -> None:
+    flawless: Any = FlawlessWorld(world)
+    found = evaluate_policies(ROBOT, POLICIES, world=flawless, judge=judge, episodes=4, frames=10)
+    for one in found.policies:
+        np.testing.assert_allclose(one.model.scores, one.replayed.scores, atol=1e-6)
+        if one.policy != "scripted":  # it steers by places, whose pose is found to a few digits
+            np.testing.assert_allclose(one.model.scores, one.true.scores, atol=1.0)
+    assert (found.policies[2].model.scores == found.policies[2].true.scores).all()
+    assert np.array_equal(found.policies[2].true_pictures, found.policies[2].model_pictures)
+    assert found.policies[3].true.scores.max() == 0 and found.policies[0].true.scores.max() > 2
+    assert found.generated.balanced == 1 and found.followed == pytest.approx(1)
+    assert found.success.pearson.value is None and "4 of the 8 episodes" in sentences(found)[3]
+
+
+def test_a_model_is_scored_and_the_report_written(world: World, judge: StateJudge, tmp_path: Path) -> None:
+    again, found = (
+        evaluate_policies(ROBOT, ["random", "still"], world=world, judge=judge, episodes=4, frames=4, seed=3)
+        for _ in range(2)
+    )
+    assert json.dumps(found.to_json()) == json.dumps(again.to_json())
+    assert len(found.to_json()["outcomes"]["random"]["model"]["scores"]) == 4
+    page = write_report(found, tmp_path / "out").read_text()
+    assert page == html(found) and page.count("<img") >= 2
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["policies"][0]["policy"] == "random"
+
+
+def test_both_arenas_begin_with_the_same_frames_and_numbers_follow_the_seed(world: World) -> None:
+    scenes = Scenes.of(world, ROBOT, 2, 1)
+    one, other = (TrueArena(scenes, 128) for _ in range(2))
+    assert np.array_equal(one.pictures, other.pictures)
+    assert not np.array_equal(one.pictures[0], one.pictures[1])
+    assert not np.array_equal(one.pictures, TrueArena(Scenes.of(world, ROBOT, 2, 2), 128).pictures)
+
+
+def test_a_random_command_is_held_for_a_chunk_and_stays_in_range(world: World) -> None:
+    arena = TrueArena(Scenes.of(world, ROBOT, 3, 0), 128)
+    policy = read_policy("random", arena.scenes)
+    begin("random", policy, arena)
+    commands = []
+    for _ in range(2 * arena.scenes.stride):
+        commands.append(checked("random", policy, arena))
+        arena.step(commands[-1])
+    chunks = np.array(commands).reshape(2, arena.scenes.stride, 3, -1)
+    assert (chunks == chunks[:, :1]).all() and (chunks[0] != chunks[1]).all()
+    high = np.array([dim.high for dim in arena.scenes.dimensions])
+    assert (np.abs(chunks) <= high).all()
+
+
+class Counter:
+    """A policy with a memory: its command is the number of its calls in this episode."""
+
+    def __init__(self) -> None:
+        self.calls = -99
+
+    def reset(self) -> None:
+        self.calls = 0
+
+    def __call__(self, picture: np.ndarray) -> list[float]:
+        assert picture.shape == (128, 128, 3) and picture.dtype == np.uint8
+        self.calls += 1
+        return [self.calls, 0]
+
+
+SHARED = Counter()
+
+
+def short(picture: np.ndarray) -> np.ndarray:
+    return np.zeros(3)
+
+
+def nan(picture: np.ndarray) -> np.ndarray:
+    return np.array([0, np.nan])
+
+
+def broken(picture: np.ndarray) -> np.ndarray:
+    raise KeyError("left")
+
+
+@pytest.mark.parametrize("name", ["Counter", "SHARED"])
+def test_what_a_policy_remembers_belongs_to_one_episode(world: World, name: str) -> None:
+    arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
+    policy = read_policy(f"{__name__}:{name}", arena.scenes)
+    for _ in range(2):
+        begin(name, policy, arena)
+        for calls in (1, 2):
+            assert checked(name, policy, arena).tolist() == [[calls, 0]] * 2
+    assert SHARED.calls == -99
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("short", "returns commands of the shape (3,) — rails_03 takes (2,): "),
+        ("nan", "returns NaN or infinite values"),
+        ("broken", "raised KeyError: 'left'"),
+        ("missing", "cannot be imported: AttributeError"),
+    ],
+)
+def test_a_policy_that_fails_is_named_before_the_judge_is_trained(world: World, name: str, said: str) -> None:
+    with pytest.raises(HMAError, match=re.escape(said)) as fault:
+        evaluate_policies(ROBOT, [f"{__name__}:{name}"], world=world, episodes=2, frames=4)
+    assert name in str(fault.value) and "\n" not in str(fault.value)
+
+
+@pytest.mark.parametrize("words", ["fly", "scripted:noise=2", "scripted:speed=1"])
+def test_words_that_are_no_policy_are_refused(world: World, words: str) -> None:
+    with pytest.raises(UsageError, match="is unknown"):
+        read_policy(words, Scenes.of(world, ROBOT, 1, 0))
+
+
+def test_a_robot_without_a_simulator_is_refused() -> None:
+    from hma_model.cli import app
+    from tests.model.robots import make_model
+
+    with pytest.raises(HMAError, match="arm: has no true simulator"):
+        Scenes.of(_world_of(make_model({"arm": 2})), "arm", 1, 0)
+    assert "POLICY" in CliRunner().invoke(app, ["policy-eval", "--help"]).output
+
+
+def _world_of(model: HMA) -> World:
+    made = object.__new__(World)
+    made.model, made._commands = model, {}
+    return made
