@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from hma_data.conversion.plan import Plan, ShardUnit
     from hma_data.registry.embodiment import Embodiment
     from hma_data.shards.stats import Stats
+    from hma_data.sources.base import EpisodeRef
+    from hma_data.storage.records import Records
     from hma_data.tokenizers.base import TokenizerSpec
 
 MEDIAN, SIGMA, LONGEST = 250, 1.55, 20_000  # frames of an episode: log-normal, 830 on average
@@ -60,16 +62,26 @@ def _robots(settings: dict[str, Any]) -> Iterator[tuple[int, int, "Embodiment", 
 def _planned(settings: dict[str, Any]) -> Iterator[tuple["Embodiment", "TokenizerSpec", "Plan"]]:
     """Yield each embodiment with the plan of its made-up recording."""
     from hma_data.conversion.plan import Settings, make_plan
-    from hma_data.sources.base import EpisodeRef
 
     for number, count, robot, spec in _robots(settings):
-        drawn = MEDIAN * np.exp(SIGMA * np.random.default_rng(number).standard_normal(count))
-        frames = np.clip(drawn, 10, LONGEST).astype(int).tolist()
-        refs = [
-            EpisodeRef(f"episode_{i:07d}", length, None, f"{i:08x}{length:08x}")
-            for i, length in enumerate(frames)
-        ]
-        yield robot, spec, make_plan(refs, robot, spec, Settings(), SOURCE)
+        yield robot, spec, make_plan(_recording(number, count), robot, spec, Settings(), SOURCE)
+
+
+def _recording(number: int, count: int) -> "Records[EpisodeRef]":
+    """Return the episodes of a recording, as the index of a source does."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    from hma_data.sources.base import EpisodeRef
+    from hma_data.storage.records import Records
+
+    drawn = MEDIAN * np.exp(SIGMA * np.random.default_rng(number).standard_normal(count))
+    frames = pa.array(np.clip(drawn, 10, LONGEST).astype(np.int64))
+    digits = pc.utf8_lpad(pa.array(np.arange(count)).cast(pa.string()), 7, "0")
+    ids = pc.binary_join_element_wise("episode", digits, "_")
+    marks = pc.binary_join_element_wise(digits, pc.utf8_lpad(frames.cast(pa.string()), 9, "0"), "")
+    table = pa.table({"id": ids, "frames": frames, "fingerprint": marks})
+    return Records.of_table(EpisodeRef, table)
 
 
 def _make(folder: str, settings: dict[str, Any]) -> None:

@@ -32,7 +32,7 @@ from hma_data.shards.manifest import SPLITS, digest_of_texts, json_list, plan_ha
 from hma_data.shards.schema import RowLayout, to_numpy
 from hma_data.sources.base import EpisodeRef, Source, open_source
 from hma_data.storage.paths import StrPath, as_text
-from hma_data.storage.records import Records, schema_of, values_of
+from hma_data.storage.records import BATCH, Records, schema_of, values_of
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 
 FRAMES, TRIED = 64, 5  # of an estimate: pictures tokenized, episodes tried
@@ -204,12 +204,13 @@ def repeated(ids: pa.ChunkedArray) -> str | None:
 
 def recording_json(table: pa.Table) -> Iterator[str]:
     """Yield the JSON of [[id, fingerprint], …] in pieces."""
-    return json_list(zip(values_of(table["id"]), values_of(table["fingerprint"])))
+    batches = table.select(["id", "fingerprint"]).to_batches(max_chunksize=BATCH)
+    return json_list(list(zip(*(column.to_pylist() for column in batch.columns))) for batch in batches)
 
 
 def cut_json(units: Sequence[ShardUnit]) -> Iterator[str]:
     """Yield the JSON of [[shard name, [number, …]], …] in pieces."""
-    return json_list((unit.name, unit.numbers.to_pylist()) for unit in units)
+    return json_list([(unit.name, unit.numbers.to_pylist())] for unit in units)
 
 
 def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) -> list[str]:
@@ -223,7 +224,7 @@ def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) ->
     if any(own.unique().to_pylist()):
         return [split or "train" for split in values_of(own)]
     groups = pc.if_else(pc.equal(group, ""), known.column("id"), group).combine_chunks().dictionary_encode()
-    draws = np.array([_unit_interval(f"{seed}/{name}") for name in values_of(groups.dictionary)])
+    draws = _unit_intervals(pc.binary_join_element_wise(str(seed), groups.dictionary, "/"))
     held = draws < val_fraction
     if len(draws) >= 2 and val_fraction > 0:
         held[draws.argmin()] = True
@@ -251,8 +252,10 @@ def pack(
     return units
 
 
-def _unit_interval(text: str) -> float:
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") / 2**64
+def _unit_intervals(texts: pa.Array) -> NDArray[np.float64]:
+    """Return a number in 0..1 for each text: the first eight bytes of its sha256, big-endian, over 2⁶⁴."""
+    hashed = b"".join(hashlib.sha256(text).digest() for text in values_of(texts.cast(pa.binary())))
+    return np.frombuffer(hashed, ">u8").reshape(-1, 4)[:, 0] / 2.0**64
 
 
 def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from itertools import batched
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from hma_data.shards.schema import (
     Refused,
     RowLayout,
     check_version,
-    read_footer,
+    read_metadata,
     to_numpy,
 )
 from hma_data.shards.stats import Stats
@@ -262,11 +261,11 @@ def digest_of_texts(texts: Iterable[str]) -> str:
     return hashed.hexdigest()[:16]
 
 
-def json_list(items: Iterable[Any]) -> Iterator[str]:
-    """Yield the JSON of a long list in pieces."""
+def json_list(parts: Iterable[Sequence[Any]]) -> Iterator[str]:
+    """Yield the JSON of a long list in pieces; `parts` are lists that follow one another in it."""
     yield "["
-    for number, some in enumerate(batched(items, 1024)):
-        yield ", " * (number > 0) + json.dumps(some)[1:-1]
+    for number, part in enumerate(parts):
+        yield ", " * (number > 0) + json.dumps(part)[1:-1]
     yield "]"
 
 
@@ -296,10 +295,13 @@ class Gathered:
     def episodes(self) -> pa.Table:
         """Return the table of episodes.parquet, in order of episode_index."""
         table = pa.concat_tables([schema_of(EpisodeRow).empty_table(), *self._tables])
-        table = table.take(pa.array(np.argsort(to_numpy(table["episode_index"]), kind="stable")))
         source = pc.if_else(pc.equal(table["source"], ""), self.source, table["source"])
         table = table.set_column(table.column_names.index("source"), "source", source)
-        table = table.select(_EPISODE_SCHEMA.names).cast(_EPISODE_SCHEMA).combine_chunks()
+        order = pa.array(np.argsort(to_numpy(table["episode_index"]), kind="stable"))
+        columns = [  # one after the other: taking from many chunks is slow
+            table[column.name].combine_chunks().take(order).cast(column.type) for column in _EPISODE_SCHEMA
+        ]
+        table = pa.table(columns, schema=_EPISODE_SCHEMA)
         known = pc.any(pc.not_equal(table["content"], "")).as_py()
         return table if known else table.drop_columns("content")  # sets of older releases lack this column
 
@@ -404,23 +406,18 @@ def _described(
 ) -> Iterator[tuple[ShardFile, Footer]]:
     """Yield each shard as the manifest lists it, with its footer; hash a few shards at a time."""
 
-    def describe(name: str) -> tuple[ShardFile, Footer]:
+    def look(name: str) -> tuple[str, pq.FileMetaData, int, str]:
         path = folder / name
-        footer, row_groups = read_footer(path)
-        file = ShardFile(
-            path=name,
-            split=footer.split,
-            rows=sum(row_groups),
-            episodes=len(footer.episodes),
-            bytes=path.stat().st_size,
-            sha256=hashes.get(name) or file_sha256(path),
-            row_groups=tuple(row_groups),
-        )
-        return file, footer
+        return name, read_metadata(path), path.stat().st_size, hashes.get(name) or file_sha256(path)
 
     with ThreadPoolExecutor(HASHERS) as pool:
         for start in range(0, len(names), 4 * HASHERS):  # few footers are in memory at a time
-            yield from pool.map(describe, names[start : start + 4 * HASHERS])
+            for name, metadata, size, sha256 in pool.map(look, names[start : start + 4 * HASHERS]):
+                footer, rows = Footer.of_file(metadata, folder / name)
+                file = ShardFile(
+                    name, footer.split, sum(rows), len(footer.episodes), size, sha256, tuple(rows)
+                )
+                yield file, footer
 
 
 def split_totals(episodes: pa.Table, files: Sequence[ShardFile], split: str) -> dict[str, int]:

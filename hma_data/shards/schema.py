@@ -104,6 +104,12 @@ class Footer:
     quarantine: tuple[Refused, ...]
     stats: dict[str, Stats]
 
+    @classmethod
+    def of_file(cls, metadata: pq.FileMetaData, path: Path) -> tuple["Footer", list[int]]:
+        """Return the footer and the number of rows of each row group; see `read_footer`."""
+        footer = cls.from_metadata(metadata.metadata, str(path))
+        return footer, [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+
     @property
     def table(self) -> pa.Table:
         """Return its episodes as a table, a column for each field of `EpisodeRow`."""
@@ -393,6 +399,4 @@ def read_footer(path: Path) -> tuple[Footer, list[int]]:
     Raises:
         ShardError: it is not a whole parquet file, or not a shard.
     """
-    metadata = read_metadata(path)
-    footer = Footer.from_metadata(metadata.metadata, str(path))
-    return footer, [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+    return Footer.of_file(read_metadata(path), path)

@@ -53,7 +53,10 @@ class Records[T](Sequence[T]):
         columns = {}
         for field in fields(kind):  # type: ignore[arg-type]
             name, default = field.name, field.default
-            columns[name] = [item[name] if default is MISSING else item.get(name, default) for item in items]
+            if default is MISSING:
+                columns[name] = [item[name] for item in items]
+            else:
+                columns[name] = [item.get(name, default) for item in items]
         return cls(kind, pa.table(columns, schema=schema_of(kind)))
 
     @classmethod
