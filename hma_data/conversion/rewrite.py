@@ -7,7 +7,7 @@ T frames of an episode, A values of an action.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -205,29 +205,43 @@ def merge(
     first = sets[0]
     for other in sets[1:]:
         _check_alike(first, other)
-    tables, refused = [_rows(shards) for shards in sets], [_refused(shards) for shards in sets]
-    ids = [pa.array([item.id for item in some], pa.string()) for some in refused]
-    counts = pa.chunked_array(chain(ids, *(table["id"].chunks for table in tables))).value_counts()
-    twice = counts.field("values").filter(pc.greater(counts.field("counts"), pa.scalar(1, pa.int64())))
-    many = pa.scalar(len(sets) > 1)
-    for number, table in enumerate(tables):
-        names, groups = table["id"], table["group"]
-        names = pc.if_else(pc.is_in(names, twice), _numbered(number, names), names)
-        groups = pc.if_else(pc.and_(many, pc.not_equal(groups, "")), _numbered(number, groups), groups)
-        tables[number] = _with_columns(table, id=names, group=groups, set=pa.repeat(number, len(table)))
-    again = set(twice.to_pylist())
-    listed = [
-        replace(item, id=f"{number + 1}/{item.id}") if item.id in again else item
-        for number, some in enumerate(refused)
-        for item in some
-    ]
-    episodes = pa.concat_tables(tables)
+    episodes, refused = _joined([_rows(shards) for shards in sets], [_refused(shards) for shards in sets])
     made_by = {"merge": [shards.manifest.plan["hash"] for shards in sets]}
     sources = list(dict.fromkeys(shards.manifest.source for shards in sets))
     source = sources[0] if len(sources) == 1 else f"merged of {len(sources)} recordings, first {sources[0]}"
     settings = replace(_settings(first), limit=None, only=(), exclude=())
-    job = _Job(sets, settings, episodes, pa.repeat("", len(episodes)), source, listed, made_by)
+    job = _Job(sets, settings, episodes, pa.repeat("", len(episodes)), source, refused, made_by)
     return job.run(out, workers, on_progress)
+
+
+def _joined(
+    tables: Sequence[pa.Table], refused: Sequence[Sequence[Refused]]
+) -> tuple[pa.Table, list[Refused]]:
+    """Return the episodes and the refused of several sets, with ids that are unique; see `merge`."""
+    several = chain((_texts(item.id for item in some) for some in refused), *(t["id"].chunks for t in tables))
+    counts = pa.chunked_array(several, pa.string()).value_counts()
+    again = counts.field("values").filter(pc.greater(counts.field("counts"), pa.scalar(1, pa.int64())))
+    found = []
+    for number, table in enumerate(tables):
+        ids, groups = table["id"], table["group"]
+        named = pc.and_(pa.scalar(len(tables) > 1), pc.not_equal(groups, ""))
+        own = {
+            "id": pc.if_else(pc.is_in(ids, again), _numbered(number, ids), ids),
+            "group": pc.if_else(named, _numbered(number, groups), groups),
+            "set": pa.repeat(number, len(table)),
+        }
+        found.append(_with_columns(table, **own))
+    twice = set(again.to_pylist())
+    listed = [
+        replace(item, id=f"{number + 1}/{item.id}") if item.id in twice else item
+        for number, some in enumerate(refused)
+        for item in some
+    ]
+    return pa.concat_tables(found), listed
+
+
+def _texts(values: Iterable[str]) -> pa.Array:
+    return pa.array(list(values), pa.string())
 
 
 def split(
