@@ -183,9 +183,9 @@ def _refuse_claimed(out: RemotePath, plan: Plan) -> None:
         other = theirs["hash"] != plan.facts["hash"]
     except FileNotFoundError:
         return
-    except (ValueError, KeyError, TypeError) as fault:
+    except (ValueError, KeyError, TypeError) as damage:
         remedy = "delete it and run the same command again"
-        raise OutputError(out / PLAN, "is damaged: it states no plan", remedy) from fault
+        raise OutputError(out / PLAN, "is damaged: it states no plan", remedy) from damage
     if other:
         fault = f"another conversion is being written there; different: {differences(plan.facts, theirs)}"
         remedy = f"wait for it, or choose another --out; if no such job runs any more, delete {out / PLAN}"

@@ -4,9 +4,10 @@ A record is a frozen dataclass of texts, numbers and truth values. Millions of t
 of as many objects, and columns are compared, chosen and summed without a loop.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import MISSING, fields
 from functools import cache
+from operator import itemgetter
 from typing import Any, overload
 
 import numpy as np
@@ -17,9 +18,9 @@ _TYPES = {"str": pa.string(), "int": pa.int64(), "float": pa.float64(), "bool": 
 
 
 @cache
-def schema_of(kind: type[Any]) -> pa.Schema:
+def schema_of(kind: Callable[..., Any]) -> pa.Schema:
     """Return the columns of a dataclass whose fields are str, int, float or bool, or one of them or None."""
-    names = {field.name: getattr(field.type, "__name__", str(field.type)) for field in fields(kind)}
+    names = {f.name: getattr(f.type, "__name__", str(f.type)) for f in fields(kind)}  # type: ignore[arg-type]
     return pa.schema([(name, _TYPES[text.partition(" | ")[0]]) for name, text in names.items()])
 
 
@@ -43,21 +44,19 @@ class Records[T](Sequence[T]):
         return cls(kind, pa.table(columns, schema=schema_of(kind)))
 
     @classmethod
-    def of_json(cls, kind: type[T], items: Sequence[Mapping[str, Any]]) -> "Records[T]":
+    def of_json(cls, kind: type[T], items: Sequence[dict[str, Any]]) -> "Records[T]":
         """Return mappings as records; fields that a mapping lacks have their default.
 
         Raises:
             KeyError: a field without a default is missing.
             TypeError, ValueError: a value is not of its field's type.
         """
-        columns = {}
-        for field in fields(kind):  # type: ignore[arg-type]
-            name, default = field.name, field.default
-            if default is MISSING:
-                columns[name] = [item[name] for item in items]
-            else:
-                columns[name] = [item.get(name, default) for item in items]
-        return cls(kind, pa.table(columns, schema=schema_of(kind)))
+        schema = schema_of(kind)
+        defaults = {f.name: f.default for f in fields(kind) if f.default is not MISSING}  # type: ignore[arg-type]
+        whole = (item if len(item) == len(schema) else defaults | item for item in items)
+        columns = list(zip(*map(itemgetter(*schema.names), whole))) or [()] * len(schema)
+        arrays = [pa.array(values, column.type) for values, column in zip(columns, schema)]
+        return cls(kind, pa.Table.from_arrays(arrays, schema=schema))
 
     @classmethod
     def of_table(cls, kind: type[T], table: pa.Table) -> "Records[T]":
