@@ -4,9 +4,8 @@ A record is a frozen dataclass of texts, numbers and truth values. Millions of t
 of as many objects, and columns are compared, chosen and summed without a loop.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import MISSING, fields
-from functools import cache
 from operator import itemgetter
 from typing import Any, overload
 
@@ -15,13 +14,16 @@ import pyarrow as pa
 
 BATCH = 4096  # records made into objects together
 _TYPES = {"str": pa.string(), "int": pa.int64(), "float": pa.float64(), "bool": pa.bool_()}
+_SCHEMAS: dict[type[Any], pa.Schema] = {}
 
 
-@cache
-def schema_of(kind: Callable[..., Any]) -> pa.Schema:
+def schema_of(kind: type[Any]) -> pa.Schema:
     """Return the columns of a dataclass whose fields are str, int, float or bool, or one of them or None."""
-    names = {f.name: getattr(f.type, "__name__", str(f.type)) for f in fields(kind)}  # type: ignore[arg-type]
-    return pa.schema([(name, _TYPES[text.partition(" | ")[0]]) for name, text in names.items()])
+    if kind not in _SCHEMAS:
+        names = {f.name: getattr(f.type, "__name__", str(f.type)) for f in fields(kind)}
+        columns = [(name, _TYPES[text.partition(" | ")[0]]) for name, text in names.items()]
+        _SCHEMAS[kind] = pa.schema(columns)
+    return _SCHEMAS[kind]
 
 
 class Records[T](Sequence[T]):
