@@ -19,6 +19,7 @@ BENCHES: dict[str, str] = {  # name -> module:object; hma_model adds its own
     "convert": "hma_data.bench.convert:BENCH",
     "lerobot": "hma_data.bench.sources:LEROBOT",
     "loader": "hma_data.bench.loader:BENCH",
+    "scale": "hma_data.bench.scale:BENCH",
     "sources": "hma_data.bench.sources:BENCH",
 }
 

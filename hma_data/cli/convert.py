@@ -239,9 +239,7 @@ def _plan(job: _Job, json: bool) -> bool:
     opened = get_tokenizer(job.tokenizer, weights=job.weights, device=job.device)
     plan, uri = plan_conversion(robot, job.source, opened, job.settings)
     cost = estimate(plan, uri, robot, opened, job.workers)
-    units = [
-        {"shard": unit.name, "episodes": len(unit.episodes), "frames": unit.frames} for unit in plan.units
-    ]
+    units = [{"shard": unit.name, "episodes": len(unit), "frames": unit.frames} for unit in plan.units]
     if json:
         print_json(
             {

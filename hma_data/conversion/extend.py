@@ -11,14 +11,26 @@ all numbers, times and texts, and three pictures a camera.
 import hashlib
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from hma_data.conversion.plan import Plan, ShardUnit, differences, pack, read_clip, shard_size
+from hma_data.conversion.plan import (
+    Plan,
+    ShardUnit,
+    cut_json,
+    differences,
+    pack,
+    read_clip,
+    recording_json,
+    shard_size,
+)
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepared
 from hma_data.errors import EpisodeError, OutputError
@@ -29,11 +41,12 @@ from hma_data.shards.manifest import (
     SPLITS,
     Manifest,
     damaged_files,
-    digest,
+    digest_of_texts,
     shard_sizes,
 )
-from hma_data.shards.schema import RowLayout
+from hma_data.shards.schema import RowLayout, to_numpy
 from hma_data.sources.base import EpisodeRef, Source
+from hma_data.storage.records import Records
 from hma_data.storage.remote import parquet_file
 
 log = logging.getLogger(__name__)
@@ -76,18 +89,25 @@ def extended(
     if ways(plan.facts) != ways(base.plan):
         fault = f"cannot be extended; different: {differences(plan.facts, base.plan)}"
         raise OutputError(out, fault, "convert with the same settings, or choose another --out")
-    known = parquet_file(out / EPISODES).read(columns=["id", "fingerprint", "content"]).to_pydict()
-    fingerprints = dict(zip(known["id"], known["fingerprint"]))
-    contents = dict(zip(known["id"], known.get("content", ())))  # sets of older releases have none
-    refused = {json.loads(line)["id"] for line in (out / QUARANTINE).read_text("utf-8").splitlines()}
-    placed = ((index, ref, unit.split) for unit in plan.units for index, ref in unit.episodes)
-    now = [(ref, split) for _, ref, split in sorted(placed, key=lambda item: item[0])]
-    other = [ref for ref, _ in now if fingerprints.get(ref.id, ref.fingerprint) != ref.fingerprint]
-    _refuse_changed(out, other, contents, content)
-    new = [(ref, split) for ref, split in now if ref.id not in fingerprints and ref.id not in refused]
-    if not new:
+    known = parquet_file(out / EPISODES).read(columns=["id", "fingerprint", "content"])
+    lines = (out / QUARANTINE).read_text("utf-8").splitlines()
+    refused = pa.array([json.loads(line)["id"] for line in lines], pa.string())
+    now = plan.table()
+    place = pc.index_in(now["id"], known["id"])  # null for episodes that the set does not have
+    other = now.filter(pc.not_equal(now["fingerprint"], known["fingerprint"].take(place)))
+    _refuse_changed(out, Records(EpisodeRef, other), _contents(known, other["id"]), content)
+    new = now.filter(pc.and_not(pc.is_null(place), pc.is_in(now["id"], refused)))
+    if not len(new):
         return Plan((), base.plan)
-    return _with(base, new, len(fingerprints) + len(refused), shard_frames)
+    return _with(base, Records(EpisodeRef, new), len(known) + len(refused), shard_frames)
+
+
+def _contents(known: pa.Table, ids: pa.ChunkedArray) -> dict[str, str]:
+    """Return id -> hash of the content, of these ids; sets of older releases have none."""
+    if not len(ids) or "content" not in known.column_names:
+        return {}
+    some = known.filter(pc.is_in(known["id"], ids.combine_chunks()))
+    return dict(zip(some["id"].to_pylist(), some["content"].to_pylist()))
 
 
 def _refuse_damaged(out: Path, base: Manifest) -> None:
@@ -103,7 +123,7 @@ def _refuse_damaged(out: Path, base: Manifest) -> None:
 
 
 def _refuse_changed(
-    out: Path, refs: list[EpisodeRef], contents: dict[str, str], content: Callable[[EpisodeRef], str]
+    out: Path, refs: Sequence[EpisodeRef], contents: dict[str, str], content: Callable[[EpisodeRef], str]
 ) -> None:
     """Raise OutputError unless all episodes whose files have changed still have the same content."""
 
@@ -122,21 +142,25 @@ def _refuse_changed(
         raise OutputError(out, fault, "--overwrite to start anew, or give the new episodes other names")
 
 
-def _with(base: Manifest, new: list[tuple[EpisodeRef, str]], first: int, shard_frames: int | None) -> Plan:
-    target = shard_frames or shard_size(sum(ref.frames for ref, _ in new))
-    numbered = [(first + i, ref, split) for i, (ref, split) in enumerate(new)]
+def _with(base: Manifest, new: Records[EpisodeRef], first: int, shard_frames: int | None) -> Plan:
+    target = shard_frames or shard_size(int(to_numpy(new.column("frames")).sum()))
     units: list[ShardUnit] = []
     for split in SPLITS:
         begun = sum(shard.split == split for shard in base.shards)
-        mine = [(i, ref) for i, ref, its in numbered if its == split]
-        units += pack(split, mine, target, begun)
+        mine = np.flatnonzero(to_numpy(pc.equal(new.column("split"), split)))
+        units += pack(split, first + mine, new.take(mine), target, begun)
     facts = {key: value for key, value in base.plan.items() if key not in ("hash", "extends")}
     facts |= {
         "extends": [*base.plan.get("extends", ()), base.plan["hash"]],
-        "recording": digest([base.plan["recording"], [(ref.id, ref.fingerprint) for ref, _ in new]]),
-        "shards": digest([base.plan["shards"], [(u.name, [i for i, _ in u.episodes]) for u in units]]),
+        "recording": _digest_after(base.plan["recording"], recording_json(new.table)),
+        "shards": _digest_after(base.plan["shards"], cut_json(units)),
     }
     return Plan.of(units, facts)
+
+
+def _digest_after(earlier: str, pieces: Iterator[str]) -> str:
+    """Return the digest of [earlier, list], of the pieces of the list's JSON."""
+    return digest_of_texts(chain([f"[{json.dumps(earlier)}, "], pieces, ["]"]))
 
 
 # -- the hash of an episode

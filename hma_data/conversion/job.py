@@ -14,6 +14,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+import pyarrow as pa
+import pyarrow.compute as pc
+
 from hma_data.conversion.engines import LIMITS, Limits, Retry
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.extend import content_of, extended
@@ -36,11 +39,12 @@ from hma_data.errors import OutputError, RegistryError, SourceError, StorageAway
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, finish, shard_sizes
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.schema import RowLayout, flag_totals
+from hma_data.shards.schema import RowLayout, flag_totals, to_numpy
 from hma_data.sources.base import EpisodeRef, of_another_format, open_source
 from hma_data.sources.common.choice import chosen_ids, ids_for_robot
 from hma_data.storage.files import remove_parts
 from hma_data.storage.paths import StrPath, as_text
+from hma_data.storage.records import Records
 from hma_data.storage.remote import parquet_file, place
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
@@ -119,10 +123,12 @@ def plan_conversion(
         raise
     except SourceError as fault:
         raise of_another_format(uri, form, fault) from fault
-    kept = set(
-        chosen_ids(ids_for_robot([ref.id for ref in refs], embodiment), settings.only, settings.exclude)
-    )
-    chosen = [ref for ref in refs if ref.id in kept]
+    refs = Records.of(EpisodeRef, refs)
+    chosen, robot = refs, embodiment.source
+    if robot.only or robot.exclude or settings.only or settings.exclude:
+        ids = ids_for_robot(refs.column("id").to_pylist(), embodiment)
+        kept = pa.array(chosen_ids(ids, settings.only, settings.exclude), pa.string())
+        chosen = refs.take(to_numpy(pc.is_in(refs.column("id"), kept)))
     plan = make_plan(chosen, embodiment, tokenizer.spec, settings, uri)
     return replace(plan, left_out=len(refs) - len(chosen)), uri
 
@@ -298,10 +304,10 @@ class _Conversion:
         kept = [unit for unit in mine if unit.name in there]
         layout = RowLayout.of_plan(plan.facts, self.embodiment)
         progress = Progress(
-            episodes=sum(len(unit.episodes) for unit in kept),
+            episodes=sum(len(unit) for unit in kept),
             frames=_encoded(kept, layout),
             kept_shards=len(kept) + (len(base.shards) if base else 0),
-            total_episodes=sum(len(unit.episodes) for unit in mine),
+            total_episodes=sum(len(unit) for unit in mine),
             total_frames=_encoded(mine, layout),
             pictures=self.pictures,
         )
@@ -357,7 +363,7 @@ class _Conversion:
 
 def _encoded(units: Sequence[ShardUnit], layout: RowLayout) -> int:
     """Return the number of frames to encode: of every camera, and with --frames strided only the grid's."""
-    rows = sum(ref.frames // layout.frame_stride for unit in units for _, ref in unit.episodes)
+    rows = sum(int((to_numpy(unit.refs.column("frames")) // layout.frame_stride).sum()) for unit in units)
     return rows * len(layout.cameras)
 
 

@@ -27,7 +27,7 @@ from hma_data.shards.manifest import (
     Manifest,
     shard_sizes,
 )
-from hma_data.shards.schema import Footer, read_footer
+from hma_data.shards.schema import PLAN_HASH, Footer, read_metadata
 from hma_data.storage.files import PART, remove_parts
 from hma_data.storage.remote import RemotePath, create_bytes, is_remote, put_bytes
 
@@ -152,10 +152,12 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
     kept = {shard.path for shard in base.shards} if base else set()
     planned = {unit.name for unit in plan.units}
     done: set[str] = set()
-    for name, footer in _footers(out, sorted(shard_sizes(out).keys() - kept)):
-        if footer.plan["hash"] == plan.facts["hash"] and name in planned:
+    for name, metadata in _metadata(out, sorted(shard_sizes(out).keys() - kept)):
+        if name in planned and metadata.get(PLAN_HASH) == plan.facts["hash"].encode():
             done.add(name)
-        elif base and footer.plan.get("extends") and hashes(base.plan) & hashes(footer.plan):
+            continue
+        footer = Footer.from_metadata(metadata, str(out / name))
+        if base and footer.plan.get("extends") and hashes(base.plan) & hashes(footer.plan):
             (out / name).unlink()  # of an unfinished extension that differs from this one
         else:
             raise other_plan(out, plan.facts, footer.plan)
@@ -178,21 +180,25 @@ def _refuse_claimed(out: RemotePath, plan: Plan) -> None:
     """Raise OutputError where another plan is being written into this folder of a store."""
     try:
         theirs = json.loads((out / PLAN).read_bytes())
+        other = theirs["hash"] != plan.facts["hash"]
     except FileNotFoundError:
         return
-    if theirs["hash"] != plan.facts["hash"]:
+    except (ValueError, KeyError, TypeError) as damage:
+        remedy = "delete it and run the same command again"
+        raise OutputError(out / PLAN, "is damaged: it states no plan", remedy) from damage
+    if other:
         fault = f"another conversion is being written there; different: {differences(plan.facts, theirs)}"
         remedy = f"wait for it, or choose another --out; if no such job runs any more, delete {out / PLAN}"
         raise OutputError(out, fault, remedy)
 
 
-def _footers(out: Path, names: list[str]) -> Iterator[tuple[str, Footer]]:
-    """Yield (name, footer) of each shard; in a store, read many at a time because each is slow."""
+def _metadata(out: Path, names: list[str]) -> Iterator[tuple[str, dict[bytes, bytes]]]:
+    """Yield the key-value metadata of each shard; in a store, read many at a time because each is slow."""
     readers = READERS if is_remote(out) else 1
     with ThreadPoolExecutor(readers) as pool:
         for start in range(0, len(names), 4 * readers):
             some = names[start : start + 4 * readers]
-            yield from zip(some, pool.map(lambda name: read_footer(out / name)[0], some))
+            yield from zip(some, pool.map(lambda name: read_metadata(out / name).metadata or {}, some))
 
 
 def other_plan(out: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> OutputError:

@@ -12,23 +12,27 @@ import hashlib
 import json
 import math
 import time
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import islice
 from pathlib import PurePath
 from typing import Any, Literal
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepare
 from hma_data.errors import EpisodeError, HMAError, SourceError, StorageAwayError, UsageError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import digest, plan_hash
-from hma_data.shards.schema import RowLayout
+from hma_data.shards.manifest import SPLITS, digest_of_texts, json_list, plan_hash
+from hma_data.shards.schema import RowLayout, to_numpy
 from hma_data.sources.base import EpisodeRef, Source, open_source
 from hma_data.storage.paths import StrPath, as_text
+from hma_data.storage.records import BATCH, Records, schema_of, values_of
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 
 FRAMES, TRIED = 64, 5  # of an estimate: pictures tokenized, episodes tried
@@ -82,16 +86,30 @@ class Settings:
 
 @dataclass(frozen=True)
 class ShardUnit:
-    """A shard to make: the unit of work and of commit."""
+    """A shard to make: the unit of work and of commit.
+
+    Attributes:
+        numbers: of its episodes, in the plan.
+        refs: its episodes.
+    """
 
     name: str
     split: str
-    episodes: tuple[tuple[int, EpisodeRef], ...]
+    numbers: pa.Int64Array
+    refs: Records[EpisodeRef]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @property
+    def episodes(self) -> list[tuple[int, EpisodeRef]]:
+        """Return its episodes, each with its number; they are made anew on every call."""
+        return list(zip(self.numbers.to_pylist(), self.refs))
 
     @property
     def frames(self) -> int:
         """Return the number of frames, as the source estimates it."""
-        return sum(ref.frames for _, ref in self.episodes)
+        return int(to_numpy(self.refs.column("frames")).sum())
 
 
 @dataclass(frozen=True)
@@ -115,12 +133,20 @@ class Plan:
     @property
     def episodes(self) -> int:
         """Return the number of episodes in all shards."""
-        return sum(len(unit.episodes) for unit in self.units)
+        return sum(len(unit) for unit in self.units)
 
     @property
     def frames(self) -> int:
         """Return the number of frames in all shards, as the source estimates it."""
         return sum(unit.frames for unit in self.units)
+
+    def table(self) -> pa.Table:
+        """Return all episodes in the order of their numbers: the fields of EpisodeRef, `split` as planned."""
+        if not self.units:
+            return schema_of(EpisodeRef).empty_table()
+        tables = [unit.refs.with_columns(split=pa.repeat(unit.split, len(unit))).table for unit in self.units]
+        numbers = np.concatenate([to_numpy(unit.numbers) for unit in self.units])
+        return pa.concat_tables(tables).take(pa.array(np.argsort(numbers)))
 
 
 def make_plan(
@@ -142,17 +168,17 @@ def make_plan(
     """
     if not refs:
         raise SourceError(source, "has no episodes")
-    refs = list(refs)[: settings.limit]
-    ((name, count),) = Counter(ref.id for ref in refs).most_common(1)
-    if count > 1:
+    known = Records.of(EpisodeRef, refs)[: settings.limit]
+    if (name := repeated(known.column("id"))) is not None:
         raise SourceError(source, f"has two episodes with id {name!r}")
     cameras = chosen_cameras(embodiment, settings.cameras)
-    splits = choose_splits(refs, settings.val_fraction, settings.seed)
-    target = settings.shard_frames or shard_size(sum(ref.frames for ref in refs))
+    splits = np.array(choose_splits(known, settings.val_fraction, settings.seed))
+    target = settings.shard_frames or shard_size(int(to_numpy(known.column("frames")).sum()))
     units = [
         unit
-        for split in ("train", "val")
-        for unit in pack(split, [(i, ref) for i, ref in enumerate(refs) if splits[i] == split], target)
+        for split in SPLITS
+        for mine in [np.flatnonzero(splits == split)]
+        for unit in pack(split, mine, known.take(mine), target)
     ]
     facts: dict[str, Any] = {
         "embodiment": embodiment.id,
@@ -163,10 +189,28 @@ def make_plan(
         "frames": settings.frames,
         "frame_stride": settings.frame_stride(embodiment),
         "settings": settings.facts(cameras),
-        "recording": digest([(ref.id, ref.fingerprint) for ref in refs]),
-        "shards": digest([(unit.name, [i for i, _ in unit.episodes]) for unit in units]),
+        "recording": digest_of_texts(recording_json(known.table)),
+        "shards": digest_of_texts(cut_json(units)),
     }
     return Plan.of(units, facts)
+
+
+def repeated(ids: pa.ChunkedArray) -> str | None:
+    """Return the id that occurs most often if it occurs twice; None if every id is alone."""
+    counts = ids.value_counts()
+    most = int(np.argmax(to_numpy(counts.field("counts"))))
+    return str(counts.field("values")[most]) if len(counts) < len(ids) else None
+
+
+def recording_json(table: pa.Table) -> Iterator[str]:
+    """Yield the JSON of [[id, fingerprint], …] in pieces."""
+    batches = table.select(["id", "fingerprint"]).to_batches(max_chunksize=BATCH)
+    return json_list(list(zip(*(column.to_pylist() for column in batch.columns))) for batch in batches)
+
+
+def cut_json(units: Sequence[ShardUnit]) -> Iterator[str]:
+    """Yield the JSON of [[shard name, [number, …]], …] in pieces."""
+    return json_list([(unit.name, unit.numbers.to_pylist())] for unit in units)
 
 
 def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) -> list[str]:
@@ -175,15 +219,17 @@ def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) ->
     An episode without a group is a group of its own. With two or more groups and a fraction above zero, at
     least one group is val and at least one is train.
     """
-    if any(ref.split for ref in refs):
-        return [ref.split or "train" for ref in refs]
-    draws = {ref.group or ref.id: _unit_interval(f"{seed}/{ref.group or ref.id}") for ref in refs}
-    held = {group for group, draw in draws.items() if draw < val_fraction}
+    known = Records.of(EpisodeRef, refs)
+    own, group = known.column("split"), known.column("group")
+    if any(own.unique().to_pylist()):
+        return [split or "train" for split in values_of(own)]
+    groups = pc.if_else(pc.equal(group, ""), known.column("id"), group).combine_chunks().dictionary_encode()
+    draws = _unit_intervals(pc.binary_join_element_wise(str(seed), groups.dictionary, "/"))
+    held = draws < val_fraction
     if len(draws) >= 2 and val_fraction > 0:
-        held = held or {min(draws, key=lambda group: draws[group])}
-        if len(held) == len(draws):
-            held.remove(max(draws, key=lambda group: draws[group]))
-    return ["val" if (ref.group or ref.id) in held else "train" for ref in refs]
+        held[draws.argmin()] = True
+        held[draws.argmax()] = False
+    return ["val" if is_held else "train" for is_held in held[to_numpy(groups.indices)]]
 
 
 def shard_size(frames: int) -> int:
@@ -191,24 +237,25 @@ def shard_size(frames: int) -> int:
     return min(LARGEST_SHARD, max(SMALLEST_SHARD, frames // SHARDS_WANTED))
 
 
-def pack(split: str, episodes: list[tuple[int, EpisodeRef]], target: int, begun: int = 0) -> list[ShardUnit]:
-    """Pack episodes into shards of about `target` frames; `begun` shards of the split exist already."""
-    groups: list[list[tuple[int, EpisodeRef]]] = []
-    filled = target
-    for item in episodes:
-        if filled >= target:
-            groups.append([])
-            filled = 0
-        groups[-1].append(item)
-        filled += max(item[1].frames, 1)
-    return [
-        ShardUnit(f"{split}/shard-{i:05d}.parquet", split, tuple(group))
-        for i, group in enumerate(groups, start=begun)
-    ]
+def pack(
+    split: str, numbers: NDArray[np.int64], refs: Records[EpisodeRef], target: int, begun: int = 0
+) -> list[ShardUnit]:
+    """Pack episodes (N,) into shards of about `target` frames; `begun` shards of the split exist already."""
+    ends = np.cumsum(np.maximum(to_numpy(refs.column("frames")), 1))
+    units: list[ShardUnit] = []
+    start = filled = 0
+    while start < len(ends):
+        stop = min(int(np.searchsorted(ends, filled + target)) + 1, len(ends))
+        name = f"{split}/shard-{begun + len(units):05d}.parquet"
+        units.append(ShardUnit(name, split, pa.array(numbers[start:stop], pa.int64()), refs[start:stop]))
+        start, filled = stop, int(ends[stop - 1])
+    return units
 
 
-def _unit_interval(text: str) -> float:
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") / 2**64
+def _unit_intervals(texts: pa.Array) -> NDArray[np.float64]:
+    """Return a number in 0..1 for each text: the first eight bytes of its sha256, big-endian, over 2⁶⁴."""
+    hashed = b"".join(hashlib.sha256(text).digest() for text in values_of(texts.cast(pa.binary())))
+    return np.frombuffer(hashed, ">u8").reshape(-1, 4)[:, 0] / 2.0**64
 
 
 def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:
@@ -337,7 +384,7 @@ def estimate(
     size = int(rows * bytes_a_row(layout))
     source = open_source(embodiment.source.format)
     fault = ""
-    for _, ref in [item for unit in plan.units for item in unit.episodes][:TRIED]:
+    for _, ref in islice((item for unit in plan.units for item in unit.episodes), TRIED):
         try:
             begun = time.monotonic()
             clip = read_clip(source, as_text(uri), ref.id, embodiment, layout.cameras)

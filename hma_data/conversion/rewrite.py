@@ -7,14 +7,17 @@ T frames of an episode, A values of an action.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -38,11 +41,20 @@ from hma_data.shards.manifest import (
     stored_embodiment,
 )
 from hma_data.shards.reader import EpisodeReader, ShardSet
-from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, read_footer, token_column
+from hma_data.shards.schema import (
+    EpisodeRow,
+    Footer,
+    Refused,
+    RowLayout,
+    read_footer,
+    to_numpy,
+    token_column,
+)
 from hma_data.shards.verify import REMAKE, check_rows
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.storage.paths import StrPath
+from hma_data.storage.records import Records
 from hma_data.storage.remote import parquet_input, place
 from hma_data.tokenizers.base import TokenizerSpec
 
@@ -51,28 +63,13 @@ AGAIN = "run the same hma convert again"
 
 
 @dataclass(frozen=True)
-class _Episode:
-    """An episode of the new set.
-
-    Attributes:
-        row: its row of episodes.parquet. A split in it is kept; its shard and its place there are set anew.
-        number: which of the sets holds it.
-        old: its row there.
-        together: episodes that share this text go into one split; empty means the episode's own id.
-    """
-
-    row: EpisodeRow
-    number: int
-    old: EpisodeRow
-    together: str = ""
-
-
-@dataclass(frozen=True)
 class _Job:
     """The description of a shard set to make of others, which share embodiment, tokenizer and row layout.
 
     Attributes:
-        episodes: in the order of their new numbers.
+        episodes: in the order of their new numbers: the fields of `EpisodeRow`, with the place in the old
+            set, and `set`, which of the sets. A split is kept; an empty one is chosen anew.
+        together: episodes that share this text go into one split; empty means the episode's own id.
         refused: the episodes that its quarantine lists.
         made_by: the operation that made the set, recorded in the plan; empty if a conversion could have
             made the same set.
@@ -80,7 +77,8 @@ class _Job:
 
     sets: Sequence[ShardSet]
     settings: Settings
-    episodes: Sequence[_Episode]
+    episodes: pa.Table
+    together: pa.Array
     source: str
     refused: Sequence[Refused]
     made_by: Mapping[str, Any]
@@ -88,17 +86,19 @@ class _Job:
     def plan(self) -> Plan:
         first = self.sets[0]
         stride = first.manifest.frame_stride
-        refs = [
-            EpisodeRef(
-                item.row.id,
-                item.row.length * stride,
-                item.row.split or None,
-                item.row.fingerprint,
-                item.together,
-            )
-            for item in self.episodes
-        ]
-        plan = make_plan(refs, first.embodiment, first.spec, self.settings, self.source)
+        own = self.episodes
+        refs = pa.table(
+            {
+                "id": own["id"],
+                "frames": pc.multiply(own["length"], pa.scalar(stride, pa.int64())),
+                "split": own["split"],
+                "fingerprint": own["fingerprint"],
+                "group": self.together,
+            }
+        )
+        plan = make_plan(
+            Records.of_table(EpisodeRef, refs), first.embodiment, first.spec, self.settings, self.source
+        )
         if not self.made_by:
             return plan
         facts = {key: value for key, value in plan.facts.items() if key != "hash"}
@@ -136,27 +136,26 @@ def _make_shard(job: _Job, plan: Plan, out: Path, unit: ShardUnit, refused: Sequ
     stats = layout.empty_stats()
     rows: list[EpisodeRow] = []
     with ShardWriter(out / unit.name, layout.schema, layout.tokenizer) as writer:
-        for index, _ in unit.episodes:
-            item, start = job.episodes[index], writer.rows
-            row, old = item.row, item.old
-            place = {"shard": old.shard, "row_start": old.row_start, "length": old.length}
-            views = {camera: readers[item.number].episode(place, camera) for camera in layout.cameras}
+        for index, item in zip(unit.numbers.to_pylist(), job.episodes.take(unit.numbers).to_pylist()):
+            number, start = item.pop("set"), writer.rows
+            old = EpisodeRow(**item)
+            views = {camera: readers[number].episode(item, camera) for camera in layout.cameras}
             if any((view["episode_index"] != old.episode_index).any() for view in views.values()):
                 fault = f"its rows from {old.row_start} on are not episode {old.episode_index}"
                 remedy = "hma shards verify tells what is damaged"
-                raise ShardError(job.sets[item.number].folder / old.shard, fault, remedy)
+                raise ShardError(job.sets[number].folder / old.shard, fault, remedy)
             writer.add(_rows_of(index, views, layout))
             for name, own in layout.stats(views[layout.cameras[0]], slice(old.length)).items():
                 stats[name].merge(own)
-            source = "" if row.source == job.source else row.source
+            source = "" if old.source == job.source else old.source
             rows.append(
                 replace(
-                    row,
+                    old,
                     episode_index=index,
                     split=unit.split,
                     shard=unit.name,
                     row_start=start,
-                    rows=row.length,
+                    rows=old.length,
                     source=source,
                 )
             )
@@ -206,27 +205,43 @@ def merge(
     first = sets[0]
     for other in sets[1:]:
         _check_alike(first, other)
-    counts: Counter[str] = Counter()
-    for shards in sets:
-        counts.update(shards.episodes["id"].to_pylist())
-        counts.update(item["id"] for item in shards.refused())
-
-    def unique(number: int, name: str) -> str:
-        return f"{number + 1}/{name}" if counts[name] > 1 else name
-
-    episodes, refused = [], []
-    for number, shards in enumerate(sets):
-        for row in _rows(shards):
-            group = f"{number + 1}/{row.group}" if row.group and len(sets) > 1 else row.group
-            changed = replace(row, id=unique(number, row.id), group=group)
-            episodes.append(_Episode(changed, number, row))
-        refused += [replace(item, id=unique(number, item.id)) for item in _refused(shards)]
+    episodes, refused = _joined([_rows(shards) for shards in sets], [_refused(shards) for shards in sets])
     made_by = {"merge": [shards.manifest.plan["hash"] for shards in sets]}
     sources = list(dict.fromkeys(shards.manifest.source for shards in sets))
     source = sources[0] if len(sources) == 1 else f"merged of {len(sources)} recordings, first {sources[0]}"
     settings = replace(_settings(first), limit=None, only=(), exclude=())
-    job = _Job(sets, settings, episodes, source, refused, made_by)
+    job = _Job(sets, settings, episodes, pa.repeat("", len(episodes)), source, refused, made_by)
     return job.run(out, workers, on_progress)
+
+
+def _joined(
+    tables: Sequence[pa.Table], refused: Sequence[Sequence[Refused]]
+) -> tuple[pa.Table, list[Refused]]:
+    """Return the episodes and the refused of several sets, with ids that are unique; see `merge`."""
+    several = chain((_texts(item.id for item in some) for some in refused), *(t["id"].chunks for t in tables))
+    counts = pa.chunked_array(several, pa.string()).value_counts()
+    again = counts.field("values").filter(pc.greater(counts.field("counts"), pa.scalar(1, pa.int64())))
+    found = []
+    for number, table in enumerate(tables):
+        ids, groups = table["id"], table["group"]
+        named = pc.and_(pa.scalar(len(tables) > 1), pc.not_equal(groups, ""))
+        own = {
+            "id": pc.if_else(pc.is_in(ids, again), _numbered(number, ids), ids),
+            "group": pc.if_else(named, _numbered(number, groups), groups),
+            "set": pa.repeat(number, len(table)),
+        }
+        found.append(_with_columns(table, **own))
+    twice = set(again.to_pylist())
+    listed = [
+        replace(item, id=f"{number + 1}/{item.id}") if item.id in twice else item
+        for number, some in enumerate(refused)
+        for item in some
+    ]
+    return pa.concat_tables(found), listed
+
+
+def _texts(values: Iterable[str]) -> pa.Array:
+    return pa.array(list(values), pa.string())
 
 
 def split(
@@ -252,20 +267,20 @@ def split(
     """
     shards = ShardSet(folder)
     _check_out(out, [folder])
-    rows = [replace(row, split="") for row in _rows(shards)]
+    rows = _rows(shards)
     if by not in ("episode", "instruction", "source"):
         raise UsageError("--by", f"{by!r} is not known", "allowed: episode, instruction, source")
     settings = replace(_settings(shards), val_fraction=val_fraction, seed=seed)
     if settings.limit is not None and settings.limit < len(rows):
         settings = replace(settings, limit=None)  # the set was extended beyond its limit
-    together = [row.group for row in rows] if by == "episode" else _together(rows, by)
-    episodes = [_Episode(row, 0, old, key) for row, old, key in zip(rows, _rows(shards), together)]
+    together = rows["group"] if by == "episode" else _together(rows, by)
+    episodes = _with_columns(rows, split=pa.repeat("", len(rows)), set=pa.repeat(0, len(rows)))
     made_by = {} if by == "episode" else {"split_by": by}
-    job = _Job([shards], settings, episodes, shards.manifest.source, list(_refused(shards)), made_by)
+    job = _Job([shards], settings, episodes, together, shards.manifest.source, _refused(shards), made_by)
     return job.run(out, workers, on_progress)
 
 
-def _together(rows: Sequence[EpisodeRow], by: str) -> list[str]:
+def _together(rows: pa.Table, by: str) -> pa.Array:
     """Return a name for each episode; episodes linked through `by` or through their recording share it."""
     leader: dict[tuple[str, str], tuple[str, str]] = {}
 
@@ -275,11 +290,19 @@ def _together(rows: Sequence[EpisodeRow], by: str) -> list[str]:
             key = leader[key]
         return key
 
-    for row in rows:
-        for kind, value in ((by, getattr(row, by)), ("group", row.group)):
-            if value:
-                leader[find(("id", row.id))] = find((kind, value))
-    return ["/".join(find(("id", row.id))) for row in rows]
+    values, groups = (rows[name].combine_chunks().dictionary_encode() for name in (by, "group"))
+    kinds, recordings = values.dictionary.to_pylist(), groups.dictionary.to_pylist()
+    pairs = to_numpy(values.indices) * np.int64(len(recordings)) + to_numpy(groups.indices)
+    distinct, first, codes = np.unique(pairs, return_index=True, return_inverse=True)
+    keys: dict[int, tuple[str, str] | None] = {}
+    for pair in distinct[np.argsort(first)].tolist():
+        value, group = kinds[pair // len(recordings)], recordings[pair % len(recordings)]
+        if value and group:
+            leader[find((by, value))] = find(("group", group))
+        keys[pair] = (by, value) if value else ("group", group) if group else None
+    shared = ["/".join(find(key)) if key else None for key in map(keys.__getitem__, distinct.tolist())]
+    alone = pc.binary_join_element_wise("id", rows["id"].combine_chunks(), "/")
+    return pc.coalesce(pa.array(shared, pa.string()).take(pa.array(codes)), alone)
 
 
 def _check_out(out: StrPath, folders: Sequence[StrPath]) -> None:
@@ -312,14 +335,25 @@ def _settings(shards: ShardSet) -> Settings:
     return Settings(**{**said, **choice, "cameras": tuple(shards.manifest.cameras)})
 
 
-def _rows(shards: ShardSet) -> list[EpisodeRow]:
+def _rows(shards: ShardSet) -> pa.Table:
     """Return the rows of episodes.parquet as they were in the footers, each with its own source."""
-    return [EpisodeRow(**row) for row in shards.episodes.to_pylist()]
+    return Records.of_table(EpisodeRow, shards.episodes).table
 
 
-def _refused(shards: ShardSet) -> Iterator[Refused]:
-    for item in shards.refused():
-        yield Refused(**{key: value for key, value in item.items() if key != "uri"})
+def _numbered(number: int, names: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return the names, each after the number of its set: `2/demo_0`."""
+    return pc.binary_join_element_wise(str(number + 1), names, "/")
+
+
+def _with_columns(table: pa.Table, **columns: Any) -> pa.Table:
+    """Return a table with these columns instead of its own, or after them."""
+    return pa.table({name: table[name] for name in table.column_names} | columns)
+
+
+def _refused(shards: ShardSet) -> list[Refused]:
+    return [
+        Refused(**{key: value for key, value in item.items() if key != "uri"}) for item in shards.refused()
+    ]
 
 
 # -- a manifest anew
@@ -385,7 +419,7 @@ def _as_found(folder: Path) -> tuple[list[str], dict[str, Any], str, Embodiment]
     counts = Counter(footer.split for footer in footers)
     gapless = names == [f"{split}/shard-{i:05d}.parquet" for split in SPLITS for i in range(counts[split])]
     # the plan's digest holds unless an episode is in quarantine
-    cut = [(name, [row.episode_index for row in footer.episodes]) for name, footer in zip(names, footers)]
+    cut = [(name, footer.table["episode_index"].to_pylist()) for name, footer in zip(names, footers)]
     if not gapless or not (plan["shards"] == digest(cut) or _lists(folder, gathered)):
         raise ShardError(folder, "cannot tell from its files whether all its shards are there", AGAIN)
     embodiment = stored_embodiment(folder)

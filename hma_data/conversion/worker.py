@@ -195,15 +195,14 @@ def _decoded(job: Job, unit: ShardUnit, report: Report, attempt: Attempt) -> Ite
     earlier items are then void.
     """
     source = open_source(job.embodiment.source.format)
-    first = unit.episodes[0][1] if unit.episodes else None
-    for index, ref in unit.episodes:
+    for place, (index, ref) in enumerate(unit.episodes):
         if ref.id in attempt.refused:
             yield Refused(ref.id, "Fatal", f"{ref.id}: reading it {attempt.refused[ref.id]}")
             continue
         report(Step(ref.id))
         for wait_s in (*WAITS_S, None):
             try:
-                yield from _episode(job, source, index, ref, report if ref is first else None)
+                yield from _episode(job, source, index, ref, None if place else report)
                 break
             except (*FATAL, MemoryError):
                 raise

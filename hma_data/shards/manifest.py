@@ -6,13 +6,14 @@ They are written last, so a shard set without a manifest is one whose job has no
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -27,12 +28,14 @@ from hma_data.shards.schema import (
     Refused,
     RowLayout,
     check_version,
-    read_footer,
+    read_metadata,
+    to_numpy,
 )
 from hma_data.shards.stats import Stats
 from hma_data.storage.files import atomic_path, file_sha256, parse_json, write_atomic
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath
+from hma_data.storage.records import schema_of
 from hma_data.storage.remote import RemotePath, place
 from hma_data.tokenizers.base import TokenizerSpec
 
@@ -45,18 +48,17 @@ SHARD_NAME = re.compile(r"(train|val)/shard-([0-9]{5,9})\.parquet")
 _SEAL = re.compile(rb'"manifest_sha256": "([0-9a-f]{64})"')
 _UNSEALED = "0" * 64
 
-_NUMBERS = {
-    "episode_index": pa.int32(),
-    **dict.fromkeys(("row_start", "rows", "length", "trimmed"), pa.int64()),
-    **dict.fromkeys(("skew_p50_ms", "skew_p95_ms", "skew_max_ms"), pa.float64()),
-    "success": pa.bool_(),
-}
 _EPISODE_COLUMNS = (
     "episode_index", "id", "split", "shard", "row_start", "rows", "length", "instruction", "success",
     "source", "fingerprint", "skew_p50_ms", "skew_p95_ms", "skew_max_ms", "skew", "trimmed", "flags",
     "group", "content",
 )  # fmt: skip
-_EPISODE_SCHEMA = pa.schema([(name, _NUMBERS.get(name, pa.string())) for name in _EPISODE_COLUMNS])
+_EPISODE_SCHEMA = pa.schema(
+    [
+        (name, pa.int32() if name == "episode_index" else schema_of(EpisodeRow).field(name).type)
+        for name in _EPISODE_COLUMNS
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -248,7 +250,23 @@ def seal_problem(text: bytes) -> str:
 
 def digest(value: Any) -> str:
     """Return sixteen hex digits of the SHA-256 of plain values."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
+    return digest_of_texts([json.dumps(value, sort_keys=True)])
+
+
+def digest_of_texts(texts: Iterable[str]) -> str:
+    """Return the digest of plain values whose JSON is given in pieces."""
+    hashed = hashlib.sha256()
+    for text in texts:
+        hashed.update(text.encode())
+    return hashed.hexdigest()[:16]
+
+
+def json_list(parts: Iterable[Sequence[Any]]) -> Iterator[str]:
+    """Yield the JSON of a long list in pieces; `parts` are lists that follow one another in it."""
+    yield "["
+    for number, part in enumerate(parts):
+        yield ", " * (number > 0) + json.dumps(part)[1:-1]
+    yield "]"
 
 
 def plan_hash(plan: dict[str, Any]) -> str:
@@ -267,7 +285,7 @@ class Gathered:
 
     def add(self, footer: Footer) -> None:
         """Add the next shard's footer."""
-        self._tables.append(_episode_table(footer.episodes, self.source))
+        self._tables.append(footer.table)
         self.refused += footer.quarantine
         for name, stats in footer.stats.items():
             merged = self.stats.setdefault(name, Stats.empty(len(stats.mean)))
@@ -276,8 +294,14 @@ class Gathered:
 
     def episodes(self) -> pa.Table:
         """Return the table of episodes.parquet, in order of episode_index."""
-        tables = self._tables or [_episode_table((), self.source)]
-        table = pa.concat_tables(tables).combine_chunks().sort_by("episode_index")
+        table = pa.concat_tables([schema_of(EpisodeRow).empty_table(), *self._tables])
+        source = pc.if_else(pc.equal(table["source"], ""), self.source, table["source"])
+        table = table.set_column(table.column_names.index("source"), "source", source)
+        order = pa.array(np.argsort(to_numpy(table["episode_index"]), kind="stable"))
+        columns = [  # one after the other: taking from many chunks is slow
+            table[column.name].combine_chunks().take(order).cast(column.type) for column in _EPISODE_SCHEMA
+        ]
+        table = pa.table(columns, schema=_EPISODE_SCHEMA)
         known = pc.any(pc.not_equal(table["content"], "")).as_py()
         return table if known else table.drop_columns("content")  # sets of older releases lack this column
 
@@ -382,23 +406,18 @@ def _described(
 ) -> Iterator[tuple[ShardFile, Footer]]:
     """Yield each shard as the manifest lists it, with its footer; hash a few shards at a time."""
 
-    def describe(name: str) -> tuple[ShardFile, Footer]:
+    def look(name: str) -> tuple[str, pq.FileMetaData, int, str]:
         path = folder / name
-        footer, row_groups = read_footer(path)
-        file = ShardFile(
-            path=name,
-            split=footer.split,
-            rows=sum(row_groups),
-            episodes=len(footer.episodes),
-            bytes=path.stat().st_size,
-            sha256=hashes.get(name) or file_sha256(path),
-            row_groups=tuple(row_groups),
-        )
-        return file, footer
+        return name, read_metadata(path), path.stat().st_size, hashes.get(name) or file_sha256(path)
 
     with ThreadPoolExecutor(HASHERS) as pool:
         for start in range(0, len(names), 4 * HASHERS):  # few footers are in memory at a time
-            yield from pool.map(describe, names[start : start + 4 * HASHERS])
+            for name, metadata, size, sha256 in pool.map(look, names[start : start + 4 * HASHERS]):
+                footer, rows = Footer.of_file(metadata, folder / name)
+                file = ShardFile(
+                    name, footer.split, sum(rows), len(footer.episodes), size, sha256, tuple(rows)
+                )
+                yield file, footer
 
 
 def split_totals(episodes: pa.Table, files: Sequence[ShardFile], split: str) -> dict[str, int]:
@@ -410,9 +429,3 @@ def split_totals(episodes: pa.Table, files: Sequence[ShardFile], split: str) -> 
         "rows": pc.sum(rows["rows"]).as_py() or 0,
         "shards": sum(file.split == split for file in files),
     }
-
-
-def _episode_table(rows: Sequence[EpisodeRow], source: str) -> pa.Table:
-    columns = {name: [getattr(row, name) for row in rows] for name in _EPISODE_COLUMNS}
-    columns["source"] = [row.source or source for row in rows]
-    return pa.table(columns, schema=_EPISODE_SCHEMA)

@@ -186,15 +186,16 @@ class ShardSet:
         path = self.folder / shard
         if not isinstance(path, RemotePath):
             return pq.ParquetFile(path, pre_buffer=False)
-        listed = self._listed[shard]
-        whole = sum(item.bytes for item in self._listed.values())
+        listed = self.listed[shard]
+        whole = sum(item.bytes for item in self.listed.values())
         if self._cache and whole <= limit_bytes() and (kept := kept_shard(path, listed.sha256, listed.bytes)):
             return pq.ParquetFile(kept, pre_buffer=False)
         metadata = _footer(path, listed.bytes, listed.sha256)
         return pq.ParquetFile(RangeFile(path, listed.bytes), pre_buffer=True, metadata=metadata)
 
     @cached_property
-    def _listed(self) -> dict[str, ShardFile]:
+    def listed(self) -> dict[str, ShardFile]:
+        """Return name -> what the manifest says of that shard."""
         return {shard.path: shard for shard in self.manifest.shards}
 
     def episode_rows(
@@ -236,9 +237,8 @@ class EpisodeReader:
     def __init__(self, shards: ShardSet, columns: Sequence[str]) -> None:
         self._set, self._columns = shards, list(columns)
         self._group = lru_cache(2)(lambda shard, group: shards.read(shard, [group], self._columns))
-        self._edges = {
-            shard.path: np.cumsum([0, *shard.row_groups], dtype=np.int64) for shard in shards.manifest.shards
-        }
+        listed = shards.listed
+        self._edges = lru_cache(64)(lambda shard: np.cumsum([0, *listed[shard].row_groups], dtype=np.int64))
 
     def episode(self, row: Mapping[str, Any], camera: str) -> dict[str, NDArray[Any]]:
         """Read the columns of an episode, (T,) or (T, width) each, as one camera recorded it.
@@ -263,7 +263,7 @@ class EpisodeReader:
         Raises:
             ShardError: the shard is missing or damaged.
         """
-        edges = self._edges[shard]
+        edges = self._edges(shard)
         first = int(np.searchsorted(edges, row_start, side="right")) - 1
         last = int(np.searchsorted(edges, row_start + rows, side="left"))
         parts = []

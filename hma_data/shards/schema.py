@@ -6,7 +6,7 @@ S = h·w tokens a frame, c channels, A values of an action. docs/format.md speci
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from hma_data.errors import ShardError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.stats import Stats
 from hma_data.storage.files import parse_json
+from hma_data.storage.records import Records
 from hma_data.storage.remote import parquet_input
 from hma_data.tokenizers.base import TokenizerSpec
 
@@ -27,6 +28,7 @@ ROW_GROUP = 2048
 GROUP_VALUES = 1 << 24  # tokens of a row group; Parquet's writer holds small integers in four bytes each
 MALFORMED = (KeyError, TypeError, ValueError, AttributeError, RecursionError)  # what wrong JSON raises
 _FOOTER = b"hma"
+PLAN_HASH = b"hma.plan_hash"  # states the plan beside the footer's JSON, for those who need no more
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class Footer:
         plan: what the shard was made from, see `hma_data.conversion.plan.Plan.facts`.
         name: its path below the shard set.
         split: train or val.
-        episodes: its episodes, in row order.
+        episodes: its episodes, in row order; `Records` where the footer was read.
         quarantine: episodes planned for it that were refused.
         stats: "action" and, if recorded, "state" -> Stats, per raw dim.
     """
@@ -98,9 +100,20 @@ class Footer:
     plan: dict[str, Any]
     name: str
     split: str
-    episodes: tuple[EpisodeRow, ...]
+    episodes: Sequence[EpisodeRow]
     quarantine: tuple[Refused, ...]
     stats: dict[str, Stats]
+
+    @classmethod
+    def of_file(cls, metadata: pq.FileMetaData, path: Path) -> tuple["Footer", list[int]]:
+        """Return the footer and the number of rows of each row group; see `read_footer`."""
+        footer = cls.from_metadata(metadata.metadata, str(path))
+        return footer, [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+
+    @property
+    def table(self) -> pa.Table:
+        """Return its episodes as a table, a column for each field of `EpisodeRow`."""
+        return Records.of(EpisodeRow, self.episodes).table
 
     def to_metadata(self) -> dict[bytes, bytes]:
         """Return the key-value metadata of the parquet footer."""
@@ -109,8 +122,8 @@ class Footer:
             "plan": self.plan,
             "name": self.name,
             "split": self.split,
-            "episodes": [asdict(row) for row in self.episodes],
-            "quarantine": [asdict(item) for item in self.quarantine],
+            "episodes": [vars(row) for row in self.episodes],
+            "quarantine": [vars(item) for item in self.quarantine],
             "stats": {name: stats.to_json() for name, stats in self.stats.items()},
         }
         facts = {
@@ -118,9 +131,12 @@ class Footer:
             "hma.embodiment_hash": self.plan["embodiment_hash"],
             "hma.tokenizer": self.plan["tokenizer"]["name"],
             "hma.tokenizer_sha256": self.plan["tokenizer"]["weights_sha256"],
-            "hma.plan_hash": self.plan["hash"],
         }
-        return {_FOOTER: json.dumps(values).encode(), **{k.encode(): v.encode() for k, v in facts.items()}}
+        return {
+            _FOOTER: json.dumps(values).encode(),
+            **{k.encode(): v.encode() for k, v in facts.items()},
+            PLAN_HASH: self.plan["hash"].encode(),
+        }
 
     @classmethod
     def from_metadata(cls, metadata: dict[bytes, bytes] | None, where: str) -> "Footer":
@@ -138,7 +154,7 @@ class Footer:
                 plan=values["plan"],
                 name=values["name"],
                 split=values["split"],
-                episodes=tuple(EpisodeRow(**row) for row in values["episodes"]),
+                episodes=Records.of_json(EpisodeRow, values["episodes"]),
                 quarantine=tuple(Refused(**item) for item in values["quarantine"]),
                 stats={name: Stats.from_json(stats) for name, stats in values["stats"].items()},
             )
@@ -364,16 +380,23 @@ def _flat(array: pa.Array) -> NDArray[Any]:
     return bits[array.offset : array.offset + len(array)].astype(np.bool_)
 
 
+def read_metadata(path: Path) -> pq.FileMetaData:
+    """Return the metadata of a shard's file.
+
+    Raises:
+        ShardError: it is not a whole parquet file.
+    """
+    try:
+        return pq.read_metadata(parquet_input(path))
+    except (pa.ArrowInvalid, OSError) as fault:
+        remedy = "delete it and convert again"
+        raise ShardError(path, f"is not a whole parquet file: {fault}", remedy) from fault
+
+
 def read_footer(path: Path) -> tuple[Footer, list[int]]:
     """Return the footer and the number of rows of each row group of a shard.
 
     Raises:
         ShardError: it is not a whole parquet file, or not a shard.
     """
-    try:
-        metadata = pq.read_metadata(parquet_input(path))
-    except (pa.ArrowInvalid, OSError) as fault:
-        remedy = "delete it and convert again"
-        raise ShardError(path, f"is not a whole parquet file: {fault}", remedy) from fault
-    footer = Footer.from_metadata(metadata.metadata, str(path))
-    return footer, [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+    return Footer.of_file(read_metadata(path), path)

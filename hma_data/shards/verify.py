@@ -172,13 +172,15 @@ def _footer_problems(
         found.append(f"its row groups of {row_groups} rows are not those of the manifest")
     if len(footer.episodes) != shard.episodes:
         found.append(f"holds {len(footer.episodes)} episodes, the manifest says {shard.episodes}")
-    if any((row.shard, row.split) != (footer.name, footer.split) for row in footer.episodes):
+    named = {(row.shard, row.split) for row in footer.episodes}
+    if named - {(footer.name, footer.split)}:
         found.append("its episodes name another shard or split")
-    starts = np.cumsum([0, *(row.rows for row in footer.episodes)])
-    if any(row.row_start != start for row, start in zip(footer.episodes, starts)) or starts[-1] != shard.rows:
+    begun, rows, length = (to_numpy(footer.table[name]) for name in ("row_start", "rows", "length"))
+    starts = np.cumsum([0, *rows])
+    if (begun != starts[:-1]).any() or starts[-1] != shard.rows:
         found.append("its episodes do not follow one another row by row")
     each = manifest.layout.rows_a_frame
-    if any(row.rows != row.length * each or row.length < 1 for row in footer.episodes):
+    if ((rows != length * each) | (length < 1)).any():
         found.append(f"an episode does not have {each} rows for each frame")
     expected, actual = manifest.layout.schema, pq.read_schema(parquet_input(path))
     if not actual.equals(expected, check_metadata=False):
@@ -221,8 +223,8 @@ def _row_problems(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Ma
     """Check rows against the footer: whole episodes, frames that count up, zeros where nothing is known."""
     found: list[str] = []
     each = manifest.layout.rows_a_frame
-    length = np.array([row.length for row in footer.episodes], np.int64)
-    episodes = np.repeat([row.episode_index for row in footer.episodes], length * each)
+    length = to_numpy(footer.table["length"])
+    episodes = np.repeat(to_numpy(footer.table["episode_index"]), length * each)
     counting = [np.tile(np.arange(n), each) for n in length] or [np.zeros(0)]
     if not np.array_equal(columns["episode_index"], episodes):
         found.append("column episode_index is not what its footer says")

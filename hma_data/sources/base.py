@@ -39,7 +39,7 @@ PACKED = {  # the command that unpacks a file, by the end of its name
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class EpisodeRef:
     """An episode that has not been read yet.
 
@@ -172,8 +172,8 @@ class Source(Protocol):
         """Return what the recording holds; sample the values and pictures of `episodes` episodes."""
         ...
 
-    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
-        """Return the episodes in a stable order, without decoding any."""
+    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> Sequence[EpisodeRef]:
+        """Return the episodes in a stable order, without decoding any; millions of them as `Records`."""
         ...
 
     def episode_ids(self, uri: StrPath) -> list[str]:

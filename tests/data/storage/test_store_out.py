@@ -249,6 +249,12 @@ def test_another_plan_is_refused_while_a_job_runs(toy_arm, toy_recording, out, w
     assert remote(out) == whole
 
 
+def test_a_damaged_claim_is_one_error(toy_arm, toy_recording, out) -> None:
+    put_bytes(b'{"hash": ', out / PLAN)
+    with pytest.raises(OutputError, match=rf"{out}/\.plan: is damaged: it states no plan — delete it"):
+        run(toy_arm, toy_recording, out)
+
+
 def test_an_equal_job_at_the_same_time_only_wastes_work(toy_arm, toy_recording, out, whole) -> None:
     run(toy_arm, toy_recording, out, on_progress=once(lambda: run(toy_arm, toy_recording, out)))
     assert remote(out) == whole
