@@ -65,12 +65,17 @@ class Part:
 
     def rows(self, model: "HMA", length: int, stride: int, start: int) -> NDArray[np.int64]:
         """Return the rows (P,) of the frames in an episode of that length, from row `start` on."""
-        count = max(1, model.config.frames // 2) if self.frames is None else self.frames
+        count = default_frames(model) if self.frames is None else self.frames
         last = start + (count - 1) * stride
         if count < 1 or start < 0 or last >= length:
             fault = f"{count} frames, {stride} steps apart, from {start} on do not fit an episode of {length}"
             raise UsageError("prompt", fault, "choose another start or fewer frames")
         return np.arange(start, last + 1, stride)
+
+
+def default_frames(model: "HMA") -> int:
+    """Return P of a prompt from a recording: half the model's window, at least one."""
+    return max(1, model.config.frames // 2)
 
 
 def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int = 0) -> Prompt:

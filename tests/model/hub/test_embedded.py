@@ -58,7 +58,7 @@ def test_the_embedded_trunk_is_the_one_of_the_recipe() -> None:
     # `hma train world`, carried over to the present fsq-lab, then `hma train world_on` twice: docs/results.md
     own = folder.Checkpoint.open("embedded")
     own.trunk()
-    assert own.trunk_sha256 == "aa0e402af5c6bea881a2a6025b668ee7684366775d26660c45f13d846c1f958f"
+    assert own.trunk_sha256 == "f8c9fb2c8cf0f25b5aec666dafb18ffba8dd8bc8664e3017ab461ba17992a675"
     assert set(own.embodiments) == ROBOTS
     assert not set(own.embodiments) & set(HELD_OUT)
     for embodiment in own.embodiments:
