@@ -411,8 +411,10 @@ def _described(
         return name, read_metadata(path), path.stat().st_size, hashes.get(name) or file_sha256(path)
 
     with ThreadPoolExecutor(HASHERS) as pool:
-        for start in range(0, len(names), 4 * HASHERS):  # few footers are in memory at a time
-            for name, metadata, size, sha256 in pool.map(look, names[start : start + 4 * HASHERS]):
+        ahead = pool.map(look, names[: 4 * HASHERS])
+        for start in range(4 * HASHERS, len(names) + 4 * HASHERS, 4 * HASHERS):  # few are in memory at a time
+            looked, ahead = ahead, pool.map(look, names[start : start + 4 * HASHERS])
+            for name, metadata, size, sha256 in looked:
                 footer, rows = Footer.of_file(metadata, folder / name)
                 file = ShardFile(
                     name, footer.split, sum(rows), len(footer.episodes), size, sha256, tuple(rows)

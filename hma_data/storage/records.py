@@ -4,7 +4,7 @@ A record is a frozen dataclass of texts, numbers and truth values. Millions of t
 of as many objects, and columns are compared, chosen and summed without a loop.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, fields
 from operator import itemgetter
 from typing import Any, overload
@@ -121,9 +121,3 @@ def values_of(column: pa.ChunkedArray | pa.Array) -> Iterator[Any]:
     for chunk in column.chunks if isinstance(column, pa.ChunkedArray) else [column]:
         for start in range(0, len(chunk), BATCH):
             yield from chunk.slice(start, BATCH).to_pylist()
-
-
-def concat[T](several: Iterable[Records[T]], kind: type[T]) -> Records[T]:
-    """Return the records of several sequences, one after the other."""
-    tables = [records.table for records in several] or [schema_of(kind).empty_table()]
-    return Records(kind, pa.concat_tables(tables))
