@@ -35,7 +35,7 @@ source: {format: rosbag}
     [
         ("bridge_data_v2", "rlds/bridge_dataset", 3),
         ("robosuite_lift", "hdf5/lift_rendered.hdf5", 2),
-        ("g1_inspire", "lerobot/g1_v21", 3),
+        pytest.param("g1_inspire", "lerobot/g1_v21", 3, marks=pytest.mark.slow),
     ],
 )
 def test_inspect_and_convert(real_data: Path, tmp_path: Path, robot: str, recording: str, limit: int) -> None:

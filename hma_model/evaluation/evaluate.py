@@ -26,6 +26,7 @@ from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.folder import require_tokenizer
+from hma_model.config import OBJECTIVES
 from hma_model.evaluation.commands import gaussian, shuffled, shuffled_actions, without_commands
 from hma_model.evaluation.intervals import interval, rounded, summary
 from hma_model.evaluation.losses import (
@@ -330,7 +331,8 @@ def _notes(
             f"the true pictures of {still} of {count} windows never change: a copy of the prompt is perfect "
             "there, and the figures say nothing about the actions"
         )
-    if not config.drop_commands and "passive" not in config.objectives:
+    blind = any(not OBJECTIVES[name].sees_actions for name, often in config.objectives.items() if often)
+    if not config.drop_commands and not blind:
         notes.append("the model was not trained without commands, so its rollouts with none may be poor")
     return notes
 

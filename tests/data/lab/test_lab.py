@@ -258,7 +258,10 @@ def test_progress_counts_episodes(tmp_path: Path) -> None:
     assert seen == [(1, 2), (2, 2)]
 
 
-@pytest.mark.parametrize("robot", RECORDERS)
+@pytest.mark.parametrize(
+    "robot",
+    [pytest.param(robot, marks=pytest.mark.slow if "lerobot" in robot else ()) for robot in RECORDERS],
+)
 def test_failing_midway_leaves_nothing(tmp_path: Path, robot: str) -> None:
     def stop(done: int, total: int) -> None:
         raise KeyboardInterrupt

@@ -182,6 +182,7 @@ def test_pictures_that_were_not_drawn_are_named_with_what_draws_them(tmp_path):
         load_pools([DrawnSource(kind="drawn", pictures=4)], tmp_path)
 
 
+@pytest.mark.slow
 def test_the_script_draws_what_the_recipe_lists(tmp_path):
     script = Path(__file__).parents[3] / "recipes/tokenizer/draw.py"
     command = [sys.executable, str(script), str(tmp_path), "--pusht", "2", "--drawn", "3"]

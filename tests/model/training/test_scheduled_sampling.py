@@ -195,7 +195,7 @@ def test_a_past_of_its_own_is_what_generation_makes_of_the_same_prompt_and_actio
         made, other = (
             model.generate(
                 stored[i : i + 1, :at], actions[i : i + 1], true.embodiment[i], depth,
-                unmask_steps=1, sample_steps=SAMPLE_STEPS if continuous else None,
+                unmask_steps=1, temperature=0, sample_steps=SAMPLE_STEPS if continuous else None,
             )[0]
             for actions in (true.actions, -true.actions)
         )  # fmt: skip
