@@ -271,6 +271,7 @@ def test_a_missing_camera_topic_names_the_bags_own(bags: Path, tmp_path: Path) -
     assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.slow
 def test_a_folder_of_another_embodiment_is_left_alone(arm: Path, tmp_path: Path) -> None:
     arguments = ["--source", str(tmp_path / "toy.hdf5"), "--tokenizer", "fsq-8", "--out", str(tmp_path / "o")]
     assert hma("convert", "-e", str(arm), *arguments).returncode == 0

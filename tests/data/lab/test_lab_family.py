@@ -125,6 +125,7 @@ def test_blocks_stay_inside_and_out_of_the_parts_that_push(robot: str) -> None:
                     assert np.linalg.norm(line - place, axis=1).min() > part.radius + radii[number] - 0.5
 
 
+@pytest.mark.slow
 def test_most_robots_push_a_block_in_some_of_their_episodes() -> None:
     pushed = [any(episode(Body.of(robot), SEED, number).success for number in range(3)) for robot in TRUNK]
     assert sum(pushed) >= 20

@@ -40,6 +40,7 @@ def episodes_of(robot: str, recording: Path) -> list[Episode]:
     return [source.read(str(recording), name, embodiment) for name in source.episode_ids(str(recording))]
 
 
+@pytest.mark.slow
 def test_lerobot_reads_the_rows_and_pictures_that_we_read(recorded: Path, theirs: Any) -> None:
     ours = episodes_of("planar_arm_lerobot", recorded)
     assert len(theirs) == EPISODES * STEPS and len(ours) == EPISODES

@@ -356,6 +356,7 @@ def test_tokens_of_another_kind_are_refused(tiny, bad):
 # -- in shards
 
 
+@pytest.mark.slow
 def test_it_makes_shards_that_verify_and_decode(toy_arm: Embodiment, tmp_path, weights, tiny):
     write_toy(tmp_path / "toy.hdf5", [5, 4])
     out = tmp_path / "out"

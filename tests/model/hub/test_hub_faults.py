@@ -167,6 +167,7 @@ def test_a_push_cut_at_any_request_is_ended_by_the_same_command(server, source, 
 # -- downloads
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", EVERY)
 def test_a_pull_cut_at_any_request_is_ended_by_the_same_command(
     published, source, tmp_path, monkeypatch, step

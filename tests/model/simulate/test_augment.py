@@ -75,6 +75,7 @@ def test_replayed_episodes_hold_the_recorders_commands_and_say_that_they_are_syn
         np.testing.assert_array_equal(columns["tokens"][:known].reshape(stored.shape), stored)
 
 
+@pytest.mark.slow
 def test_perturbed_commands_lie_around_the_recorded_ones(world: World, tmp_path: Path) -> None:
     augment(tmp_path / "one", asked(), world=world)
     augment(tmp_path / "other", asked(commands="perturb=0.2"), world=world)
@@ -107,6 +108,7 @@ def test_a_stopped_run_continues_and_gives_the_same_bytes(world: World, tmp_path
         augment(tmp_path / "cut", asked(seed=1), world=world)
 
 
+@pytest.mark.slow
 def test_the_surest_episodes_are_kept(world: World, tmp_path: Path) -> None:
     augment(tmp_path / "all", asked(), world=world)
     augment(tmp_path / "half", asked(keep=0.5), world=world)
@@ -119,6 +121,7 @@ def test_the_surest_episodes_are_kept(world: World, tmp_path: Path) -> None:
         asked(keep=0.0)
 
 
+@pytest.mark.slow
 def test_first_frames_and_commands_come_from_shards(world: World, tmp_path: Path) -> None:
     recording = record(ROBOT, tmp_path, 1)
     convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "real")
