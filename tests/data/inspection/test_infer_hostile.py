@@ -49,7 +49,6 @@ FACTS = ["dataset", "simulator", "controller", "layout", "instruction", "timesta
         facts=st.dictionaries(st.sampled_from([*FACTS, "episode keys"]), NASTY, max_size=4),
     )
 )
-@pytest.mark.slow
 def test_whatever_is_inspected_gives_a_yaml_with_questions_alone_or_one_line(found: Inspection) -> None:
     try:
         text = from_inspection(found, "mine")
