@@ -90,7 +90,7 @@ class Hub(ThreadingHTTPServer):
         return totals
 
     def count(self, request: str) -> int:
-        """How many requests matched."""
+        """Return how many requests matched."""
         return sum(re.search(request, f"{asked.method} {asked.path}") is not None for asked in self.log)
 
     def await_count(self, request: str, times: int) -> None:

@@ -17,7 +17,7 @@ LFS_KINDS = (".safetensors", ".png", ".parquet", ".bin")
 
 @dataclass
 class Habits:
-    """What hubs do differently.
+    """The ways in which hubs differ.
 
     Attributes:
         page: entries of a listing's page.
@@ -48,7 +48,7 @@ class Habits:
     empty: bool = True
 
     def by_lfs(self, path: str, size: int) -> bool:
-        """Whether a file goes by LFS."""
+        """Check whether a file goes by LFS."""
         if self.lfs != "kinds":
             return self.lfs == "all"
         return size > LFS_BYTES or path.endswith(LFS_KINDS)
@@ -117,13 +117,13 @@ class Repository:
 
     @property
     def files(self) -> dict[str, bytes]:
-        """What is there now."""
+        """Return what is there now."""
         return self.commits[-1].files
 
 
 @dataclass
 class Fault:
-    """What goes wrong: an answer, or a connection cut after some bytes.
+    """A fault: an answer, or a connection cut after some bytes.
 
     Attributes:
         request: regular expression over "METHOD path".

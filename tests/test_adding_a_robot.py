@@ -75,7 +75,7 @@ def test_a_robot_goes_from_a_recording_to_the_hub_by_its_yaml_alone(
 
 
 def answer(path: Path) -> None:
-    """What the person knows about the robot, in place of every question."""
+    """Write what the person knows about the robot in place of every question."""
     known = {"kind": "simulation", "robot": "test arm", "frequency_hz": 10, "target_hz": 2}
     values = yaml.safe_load(path.read_text())
     for key, value in known.items():

@@ -33,7 +33,7 @@ PAUSE = 1.5  # a longer interval, in median intervals, is a pause of the camera
 
 @dataclass(frozen=True)
 class Offset:
-    """How the commands of a topic lie between the pictures of a camera.
+    """The place of the commands of a topic between the pictures of a camera.
 
     A spread is half the distance from the 5th to the 95th percentile.
 

@@ -28,7 +28,7 @@ CLOSE = 1e-4  # step in that scale at which a search ends
 
 @dataclass(frozen=True)
 class State:
-    """What a driver needs: a pose (Q,), blocks (B, 2), and whether one of them is carried."""
+    """The scene as a driver sees it: a pose (Q,), blocks (B, 2), and whether one of them is carried."""
 
     pose: Floats
     blocks: Floats

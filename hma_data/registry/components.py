@@ -263,7 +263,7 @@ class SourceLayout(BaseModel):
 
 
 class Hdf5Layout(SourceLayout):
-    """Where an HDF5 file has its episodes, and what the numbers of its pictures mean."""
+    """The place of an HDF5 file's episodes, and what the numbers of its pictures mean."""
 
     episodes: str | None = Field(
         None, description="pattern of the groups that are episodes; / for one file an episode"
@@ -281,7 +281,7 @@ class Hdf5Layout(SourceLayout):
 
 
 class LeRobotLayout(SourceLayout):
-    """How the rows of a LeRobotDataset find their pictures."""
+    """The way in which the rows of a LeRobotDataset find their pictures."""
 
     pairing: Literal["time", "index"] = Field(
         "time", description="time: by the stamps; index: row i has picture i, whatever the film's stamps say"
@@ -304,7 +304,7 @@ Size = Annotated[
 
 
 class HandsLayout(SourceLayout):
-    """Where the labels of hand videos are, and what a frame without a hand does.
+    """The place of the labels of hand videos, and what a frame without a hand does.
 
     `missing: split` ends the run. `hold` keeps the hand's last position for at most `max_hold` frames, and
     then ends the run. `mask` continues the run: the values that need the hand are unknown; with `max_hold`

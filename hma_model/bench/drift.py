@@ -64,7 +64,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Found:
-    """What was measured on a robot.
+    """The measurements on a robot.
 
     Attributes:
         frames: the W numbers of the predicted frames that were looked at, from 1.
@@ -218,9 +218,9 @@ def rows(found: Found, seed: int) -> list[dict[str, Any]]:
 
 
 def _row(found: Found, case: Case, mark: int, seed: int) -> dict[str, Any]:
-    from hma_model.evaluation.evaluate import PSNR_LIMIT
     from hma_model.evaluation.intervals import interval
     from hma_model.evaluation.metrics import psnr
+    from hma_model.evaluation.scores import PSNR_LIMIT
 
     window = [found.frames.index(frame) for frame in range(mark - SPAN + 1, mark + 1)]
     made, true, parts = case.pictures[:, window], found.truth[:, window], found.parts[:, window]

@@ -38,7 +38,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How often yes-or-no judgements were right.
+    """The shares of yes-or-no judgements that were right.
 
     Attributes:
         balanced: the mean of the shares of right ones among the true successes and among the failures.

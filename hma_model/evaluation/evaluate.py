@@ -12,7 +12,7 @@ B batch, T frames, P predicted frames, N windows.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -27,7 +27,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import OBJECTIVES
-from hma_model.evaluation.commands import gaussian, shuffled, shuffled_actions, without_commands
+from hma_model.evaluation.commands import gaussian, shuffled, shuffled_actions
 from hma_model.evaluation.intervals import interval, rounded, summary
 from hma_model.evaluation.losses import (
     Means,
@@ -38,26 +38,64 @@ from hma_model.evaluation.losses import (
     validation_losses,
     windows,
 )
-from hma_model.evaluation.metrics import masked_scores, perplexity, psnr, ssim, teacher_forced
+from hma_model.evaluation.metrics import masked_scores, perplexity, teacher_forced
 from hma_model.evaluation.perceptual import Judge, Networks
 from hma_model.evaluation.rollouts import Pictures, Sampling, cameras_for, decode, default_prompt, rollout
+from hma_model.evaluation.scores import ROLLOUTS, Rolled, Scores, counted
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
 __all__ = [
-    "Means", "Pictures", "Sampling", "cameras_for", "decode", "default_prompt", "digit_frequencies",
-    "evaluate", "masked_val_loss", "measure", "rollout", "shuffled", "shuffled_actions",
-    "unconditional_baseline", "validation_losses", "verdict", "windows",
+    "Means",
+    "Pictures",
+    "Sampling",
+    "Settings",
+    "cameras_for",
+    "decode",
+    "default_prompt",
+    "digit_frequencies",
+    "evaluate",
+    "masked_val_loss",
+    "measure",
+    "rollout",
+    "shuffled",
+    "shuffled_actions",
+    "unconditional_baseline",
+    "validation_losses",
+    "verdict",
+    "windows",
 ]  # fmt: skip
 
 DRAWS = 5  # of other windows' actions, and of Gaussian ones
 FOLLOWS_DB = 0.5  # gain of the last frame's PSNR from which a model is said to follow its actions
-PSNR_LIMIT = 60.0  # dB; the PSNR of equal pictures, and with it a mean over frames, would be infinite
 PAPER_BATCH = 4  # the paper's perplexity is a mean over batches of so many windows
-ROLLOUTS = ("true", "shuffled", "none", "copy")
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The choices that decide the figures, beside the checkpoint and the shard set.
+
+    Attributes:
+        windows: their number; the other attributes up to `cameras` are as of `evaluate`.
+        paper: also follow the paper's protocol.
+        state: simulated episodes of a laboratory robot; 0 measures no state.
+        sampling: options of `HMA.generate`.
+    """
+
+    split: str = "val"
+    windows: int = 64
+    frames: int | None = None
+    prompt: int | None = None
+    batch_size: int = 16
+    draws: int = DRAWS
+    seed: int = 0
+    cameras: Cameras | None = None
+    paper: bool = False
+    state: int = 0
+    sampling: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -118,90 +156,58 @@ def evaluate(
         CheckpointError: the model was trained on another tokenizer.
         UsageError: the split has no window.
     """
-    return measure(
-        model, tokenizer, data, split=split, count=count, frames=frames, prompt=prompt, batch_size=batch_size,
-        draws=draws, seed=seed, cameras=cameras, **sampling,
-    ).found  # fmt: skip
+    settings = Settings(
+        split=split, windows=count, frames=frames, prompt=prompt, batch_size=batch_size, draws=draws,
+        seed=seed, cameras=cameras, sampling=sampling,
+    )  # fmt: skip
+    return measure(model, tokenizer, data, settings).found
 
 
 def measure(
     model: "HMA",
     tokenizer: "Tokenizer",
     data: StrPath | ShardSet,
-    *,
-    split: str = "val",
-    count: int = 32,
-    frames: int | None = None,
-    prompt: int | None = None,
-    batch_size: int = 16,
-    draws: int = DRAWS,
-    seed: int = 0,
-    cameras: Cameras | None = None,
-    paper: bool = False,
+    settings: Settings = Settings(),
     networks: Networks | None = None,
     on_frames: Callable[[int], None] = lambda frames: None,
-    **sampling: Unpack[Sampling],
 ) -> Measured:
     """Compute the figures of `evaluate`, and keep what pictures are drawn from.
 
     Args:
-        paper: also follow the paper's protocol.
-        networks: what measures LPIPS, FID and FVD.
+        model, tokenizer, data: as of `evaluate`.
+        settings: the options; `state` is not measured here.
+        networks: the networks of LPIPS, FID and FVD.
         on_frames: is told after each batch of rollouts how many frames it predicted.
 
-    The other arguments and the errors are those of `evaluate`.
+    Raises:
+        CheckpointError, UsageError: as of `evaluate`.
     """
     shards = opened(data)
     require_tokenizer(model.config, shards.spec, shards.folder)
-    length = frames or model.config.frames
-    first = default_prompt(length) if prompt is None else prompt
-    cameras = cameras_for(model, shards, cameras)
+    length = settings.frames or model.config.frames
+    first = default_prompt(length) if settings.prompt is None else settings.prompt
+    split, seed, draws = settings.split, settings.seed, settings.draws
+    cameras = cameras_for(model, shards, settings.cameras)
     if not len(WindowDataset(shards, split, length, cameras=cameras)):
         fault = f"has no window of {length} frames in {split}"
         raise UsageError(shards.folder, fault, "give another --split or fewer --frames")
-    batches = list(windows(shards, split, length, count, batch_size, cameras))
+    batches = list(windows(shards, split, length, settings.windows, settings.batch_size, cameras))
     table, by_window = _losses(model, shards, batches, cameras, draws, seed)
-    roll = partial(rollout, model, tokenizer, **sampling)
-    scores: dict[str, list[_Scores]] = {name: [] for name in ROLLOUTS}
-    predicted: dict[str, list[torch.Tensor]] = {"true": [], "shuffled": [], "none": []}
-    judge, still = Judge(networks or Networks()), 0
+    roll = partial(rollout, model, tokenizer, **settings.sampling)
+    rolled = Rolled(first, Judge(networks or Networks()))
     for number, batch in enumerate(batches):
-        own = _counted(partial(roll, prompt=first, seed=seed + number), on_frames)
-        true = own(batch)
-        judge.add("truth", true.truth[:, first:])
-        still += int((true.truth[:, first:] == true.truth[:, first - 1 : first]).all(axis=(1, 2, 3, 4)).sum())
-
-        def keep(name: str, pictures: Pictures, judge: Judge = judge) -> "_Scores":
-            judge.add(name, pictures.predicted[:, first:])
-            return _Scores.of(pictures, judge)
-
-        scores["true"].append(keep("true", true))
-        copied = true.predicted.copy()
-        copied[:, first:] = copied[:, first - 1 : first]
-        everywhere = np.ones_like(true.finite)
-        scores["copy"].append(keep("copy", replace(true, predicted=copied, finite=everywhere)))
-        others = [own(shuffled(batch, first - 1, seed, draw), truth=true.truth) for draw in range(draws)]
-        pairs = [keep("shuffled", others[0]), *(_Scores.of(other, judge) for other in others[1:])]
-        scores["shuffled"].append(_Scores.mean(pairs))
-        none = own(without_commands(batch), truth=true.truth)
-        scores["none"].append(keep("none", none))
-        for name, made in (("true", true), ("shuffled", others[0]), ("none", none)):
-            predicted[name].append(made.stored)
-    joined = {name: _Scores.join(parts) for name, parts in scores.items()}
-    figures = {name: joined[name].figures(seed) for name in ROLLOUTS}
-    for name, part in joined.items():
-        by_window |= {f"{name}.psnr": part.psnr.mean(axis=1), f"{name}.psnr_last": part.psnr[:, -1]}
-        by_window |= {f"{name}.ssim": part.ssim.mean(axis=1)}
-        if part.lpips is not None:
-            by_window[f"{name}.lpips"] = part.lpips.mean(axis=1)
+        rolled.add(batch, counted(partial(roll, prompt=first, seed=seed + number), on_frames), draws, seed)
+    joined = {name: Scores.join(parts) for name, parts in rolled.scores.items()}
+    by_window |= {key: value for name, part in joined.items() for key, value in part.by_window(name).items()}
     gain = by_window["true.psnr_last"] - by_window["shuffled.psnr_last"]
     by_window["psnr_action_gain_last"] = gain
-    frechet, missing = judge.figures(length - first)
-    for name in ROLLOUTS:
-        figures[name] |= frechet.get(name, {})
+    frechet, missing = rolled.judge.figures(length - first)
+    figures = {name: joined[name].figures(seed) | frechet.get(name, {}) for name in ROLLOUTS}
     extra: dict[str, Any] = {}
-    if paper:
+    if settings.paper:
         extra["paper"] = _paper(roll, batches, shards, by_window, draws, seed, on_frames)
+    else:
+        missing = {**missing, "paper": "not measured: --paper follows the paper's protocol"}
     found = {
         "embodiment": shards.embodiment.id,
         "split": split,
@@ -215,23 +221,11 @@ def measure(
         **figures,
         **summary("psnr_action_gain_last", gain, seed, digits=6),
         **extra,
-        "missing": missing
-        | ({} if paper else {"paper": "not measured: --paper follows the paper's protocol"}),
-        "notes": _notes(model, joined, table, still, len(gain)),
+        "missing": missing,
+        "notes": _notes(model, joined, table, rolled.still, len(gain)),
         "seconds_a_frame": round(1 / shards.embodiment.effective_hz, 6),
     }
-    return Measured(found, by_window, batches, predicted)
-
-
-def _counted(roll: Callable[..., Pictures], on_frames: Callable[[int], None]) -> Callable[..., Pictures]:
-    """Return a function that rolls out, and then tells how many frames it predicted."""
-
-    def counting(batch: Batch, **options: Any) -> Pictures:
-        made = roll(batch, **options)
-        on_frames(made.finite.size)
-        return made
-
-    return counting
+    return Measured(found, by_window, batches, rolled.predicted)
 
 
 def verdict(found: Mapping[str, Any]) -> str:
@@ -293,19 +287,17 @@ def _paper(
     on_frames: Callable[[int], None],
 ) -> dict[str, Any]:
     """Follow the paper's protocol: its perplexity, and ΔPSNR of a last frame under Gaussian actions."""
-    scores: dict[str, list[_Scores]] = {"true": [], "gaussian": []}
+    scores: dict[str, list[Scores]] = {"true": [], "gaussian": []}
     for number, batch in enumerate(batches):
-        last = _counted(partial(roll, prompt=batch.actions.shape[1] - 1, seed=seed + number), on_frames)
+        last = counted(partial(roll, prompt=batch.actions.shape[1] - 1, seed=seed + number), on_frames)
         true = last(batch)
-        scores["true"].append(_Scores.of(true))
+        scores["true"].append(Scores.of(true))
         drawn = (
             gaussian(batch, shards.manifest.stats["action"], (seed * 1_009 + number) * 101 + draw)
             for draw in range(draws)
         )
-        scores["gaussian"].append(
-            _Scores.mean([_Scores.of(last(other, truth=true.truth)) for other in drawn])
-        )
-    true_db, gaussian_db = (_Scores.join(scores[name]).psnr[:, 0] for name in ("true", "gaussian"))
+        scores["gaussian"].append(Scores.mean([Scores.of(last(other, truth=true.truth)) for other in drawn]))
+    true_db, gaussian_db = (Scores.join(scores[name]).psnr[:, 0] for name in ("true", "gaussian"))
     by_window["paper.delta_psnr"] = true_db - gaussian_db
     found = summary("psnr_last", true_db, seed) | summary("gaussian_psnr_last", gaussian_db, seed)
     found |= summary("delta_psnr", true_db - gaussian_db, seed) | {"draws": draws}
@@ -317,7 +309,7 @@ def _paper(
 
 
 def _notes(
-    model: "HMA", joined: "Mapping[str, _Scores]", table: Mapping[str, Any], still: int, count: int
+    model: "HMA", joined: "Mapping[str, Scores]", table: Mapping[str, Any], still: int, count: int
 ) -> list[str]:
     """Return what must be known to read the figures."""
     notes, config = [], model.config
@@ -335,60 +327,3 @@ def _notes(
     if not config.drop_commands and not blind:
         notes.append("the model was not trained without commands, so its rollouts with none may be poor")
     return notes
-
-
-@dataclass(frozen=True)
-class _Scores:
-    """PSNR (B, P) in dB, SSIM (B, P) and LPIPS (B, P) of predicted frames; NaN where one is not finite."""
-
-    psnr: Floats
-    ssim: Floats
-    lpips: Floats | None
-    finite: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, pictures: Pictures, judge: Judge | None = None) -> "_Scores":
-        truth, predicted = (part[:, pictures.prompt :] for part in (pictures.truth, pictures.predicted))
-        size, shape = truth.shape[:2], (-1, *truth.shape[2:])
-        truth, predicted = truth.reshape(shape), predicted.reshape(shape)
-        signal = np.minimum(psnr(truth, predicted), PSNR_LIMIT)
-        parts = [signal, ssim(truth, predicted)]
-        if judge and judge.networks.lpips:
-            parts.append(judge.networks.lpips(truth, predicted))
-        parts = [np.where(pictures.finite, part.reshape(size), np.nan) for part in parts]
-        return cls(parts[0], parts[1], parts[2] if len(parts) > 2 else None, pictures.finite)
-
-    @classmethod
-    def mean(cls, draws: "list[_Scores]") -> "_Scores":
-        """Return the means over draws."""
-        return cls._combined(draws, partial(np.mean, axis=0), partial(np.all, axis=0))
-
-    @classmethod
-    def join(cls, batches: "list[_Scores]") -> "_Scores":
-        return cls._combined(batches, np.concatenate, np.concatenate)
-
-    @classmethod
-    def _combined(
-        cls, parts: "list[_Scores]", rule: Callable[..., Any], of_finite: Callable[..., Any]
-    ) -> "_Scores":
-        far = None if parts[0].lpips is None else rule([part.lpips for part in parts])
-        psnrs, ssims = rule([part.psnr for part in parts]), rule([part.ssim for part in parts])
-        return cls(psnrs, ssims, far, of_finite([part.finite for part in parts]))
-
-    def figures(self, seed: int) -> dict[str, Any]:
-        """Return the means over windows, with their intervals."""
-        found = summary("psnr", self.psnr.mean(axis=1), seed, digits=6)
-        found |= summary("psnr_last", self.psnr[:, -1], seed, digits=6)
-        found |= _by_frame("psnr", self.psnr, seed) | summary("ssim", self.ssim.mean(axis=1), seed, digits=6)
-        found |= _by_frame("ssim", self.ssim, seed)
-        if self.lpips is not None:
-            found |= summary("lpips", self.lpips.mean(axis=1), seed) | _by_frame("lpips", self.lpips, seed)
-        return found
-
-
-def _by_frame(name: str, values: Floats, seed: int) -> dict[str, Any]:
-    """Return the means of values (N, P) over windows and their intervals: P pairs."""
-    return {
-        f"{name}_by_frame": rounded(values.mean(axis=0), 3 if name == "psnr" else 4),
-        f"{name}_by_frame_95": rounded(interval(values, seed).T),
-    }

@@ -59,7 +59,7 @@ def reached(parts: Floats, driven: int) -> Floats:
 
 @dataclass(frozen=True)
 class Task:
-    """What a robot is to do.
+    """A task of a robot.
 
     Attributes:
         name: a key of TASKS.

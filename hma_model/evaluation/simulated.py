@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from hma_data.lab import truth
 from hma_data.loading.dataset import Batch
 from hma_model.evaluation.commands import shuffled, without_commands
-from hma_model.evaluation.evaluate import PSNR_LIMIT
 from hma_model.evaluation.intervals import interval, rounded, summary
 from hma_model.evaluation.metrics import perplexity, psnr, teacher_forced
 from hma_model.evaluation.probe import Probe, as_seen, state_errors, train_probe
 from hma_model.evaluation.rollouts import Pictures, Sampling, rollout
+from hma_model.evaluation.scores import PSNR_LIMIT
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer

@@ -13,8 +13,8 @@ bytes of results.json.
 import hashlib
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,14 +27,13 @@ from hma_data.console import Update, progress
 from hma_data.errors import OutputError, UsageError
 from hma_data.lab.simulator import simulated
 from hma_data.loading.dataset import WindowDataset
-from hma_data.loading.views import Cameras
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import finite, read_json, to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
-from hma_model.evaluation.evaluate import DRAWS, measure
+from hma_model.evaluation.evaluate import Settings, measure
 from hma_model.evaluation.perceptual import Networks
 from hma_model.evaluation.rollouts import cameras_for, default_prompt
 from hma_model.evaluation.simulated import measure_state
@@ -45,22 +44,6 @@ if TYPE_CHECKING:
 
 VERSION = 1  # raise it when the same part gives other figures
 PARTS, RESULTS = "parts", "results.json"
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What decides the figures, beside the checkpoint and the shard set; `measure` explains the options."""
-
-    split: str = "val"
-    windows: int = 64
-    frames: int | None = None
-    prompt: int | None = None
-    draws: int = DRAWS
-    seed: int = 0
-    cameras: Cameras | None = None
-    paper: bool = False
-    state: int = 0  # simulated episodes of a laboratory robot; 0 measures no state
-    sampling: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -83,7 +66,7 @@ class Part:
 def evaluate_all(
     checkpoints: Sequence[StrPath],
     data: Sequence[StrPath],
-    settings: Settings = Settings(),
+    settings: Settings | None = None,
     networks: Networks | None = None,
     out: StrPath | None = None,
 ) -> list[Part]:
@@ -101,7 +84,8 @@ def evaluate_all(
         UsageError: a split has no window, cameras do not fit, or a set of a checkpoint comes twice.
         OutputError: the folder holds something else.
     """
-    networks, folder = networks or Networks(), None if out is None else _folder(as_path(out))
+    settings, networks = settings or Settings(), networks or Networks()
+    folder = None if out is None else _folder(as_path(out))
     sets = [ShardSet(item) for item in data]
     _once([as_text(item) for item in checkpoints], "checkpoint")
     _once([shards.embodiment.id for shards in sets], "embodiment")
@@ -211,11 +195,7 @@ def _measured(
 ) -> Part:
     tokenizer = _tokenizer(str(shards.folder))
     sampling: Any = dict(settings.sampling)
-    measured = measure(
-        model, tokenizer, shards, split=settings.split, count=settings.windows, frames=settings.frames,
-        prompt=settings.prompt, draws=settings.draws, seed=settings.seed, cameras=settings.cameras,
-        paper=settings.paper, networks=networks, on_frames=on_frames, **sampling,
-    )  # fmt: skip
+    measured = measure(model, tokenizer, shards, settings, networks, on_frames)
     found, robot = measured.found, shards.embodiment.id
     if settings.state:
         found["state"] = measure_state(

@@ -70,7 +70,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Pass:
-    """What the passes over one frame share.
+    """The inputs that the passes over one frame share.
 
     Attributes:
         past: (rows, T - 1, S) the frames before the new one that the first pass computes.

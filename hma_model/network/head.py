@@ -54,7 +54,7 @@ type Choose = Callable[[Tensor, int], Tensor]
 
 
 class DigitChain(nn.Module):
-    """What a digit's scores gain from the digits before it: an MLP of the features and of their embeddings.
+    """The gain of a digit's scores from the digits before it: an MLP of features and embedded digits.
 
     The output begins at zero, so it can be added to a trained readout.
     """

@@ -101,7 +101,7 @@ class Scenes:
 
 
 class Arena(Protocol):
-    """Where a policy acts."""
+    """A place where a policy acts."""
 
     scenes: Scenes
     pictures: Picture  # (N, S, S, 3), the newest ones
@@ -178,7 +178,7 @@ class TrueArena:
 
 
 class Beginning(Protocol):
-    """What episodes in the model begin with, and what was commanded in the true ones."""
+    """The first frames of episodes in the model, and the commands of the true ones."""
 
     @property
     def scenes(self) -> Scenes:

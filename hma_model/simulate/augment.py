@@ -43,7 +43,7 @@ BATCH = 16  # episodes that step in one pass
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What synthetic episodes are made of; all of it is in the plan of the shards.
+    """The settings of synthetic episodes; all of them are in the plan of the shards.
 
     Attributes:
         embodiment: its id.
@@ -194,7 +194,7 @@ def _work(folder: Path, made_by: dict[str, Any]) -> Path:
 
 
 class _Maker:
-    """What makes batches of synthetic episodes."""
+    """A maker of batches of synthetic episodes."""
 
     def __init__(self, world: World, settings: Augmentation, shards: ShardSet | None) -> None:
         self.world, self.settings, self.shards = world, settings, shards

@@ -46,7 +46,7 @@ class Judge(Protocol):
 
 @dataclass
 class Episodes:
-    """What the environments of one world have in common.
+    """The common part of the environments of one world.
 
     Attributes:
         world: of the sessions.
@@ -184,7 +184,7 @@ class Drive:
 
 
 class _Environment:
-    """What `WorldModelEnv` and `WorldModelVectorEnv` have in common; its arguments are described there."""
+    """The common base of `WorldModelEnv` and `WorldModelVectorEnv`; its arguments are described there."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 

@@ -51,7 +51,7 @@ class Outcomes:
 
 @dataclass(frozen=True)
 class Scored:
-    """What came of one policy.
+    """The results of one policy.
 
     Attributes:
         true: in the simulator.
@@ -72,7 +72,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class Correlation:
-    """How a figure of the policies in the model follows that in the simulator."""
+    """The correlations over policies of a figure in the model with that in the simulator."""
 
     pearson: Estimate
     spearman: Estimate

@@ -65,7 +65,7 @@ class Prompt:
 
 
 class Scene(Protocol):
-    """What a robot is in, and what truly happens there."""
+    """The scene of a robot, and what truly happens there."""
 
     @property
     def prompt(self) -> Prompt:

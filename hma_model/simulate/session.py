@@ -25,7 +25,7 @@ QUALITY = 92  # of JPEG
 
 
 class World(Protocol):
-    """What the engine needs of `hma_model.simulate.world.World`; the sampling is set before each step."""
+    """The part of a world that the engine needs; the sampling is set before each step."""
 
     unmask_steps: int
     temperature: float
@@ -44,7 +44,7 @@ class World(Protocol):
 
 @dataclass(frozen=True)
 class Sampling:
-    """How a frame is decoded: passes, temperature, and the order random or confidence."""
+    """The way in which a frame is decoded: passes, temperature, and the order random or confidence."""
 
     passes: int
     temperature: float
@@ -70,7 +70,7 @@ class Frame:
 
 
 class Viewer(Protocol):
-    """Where a session's pictures go; its methods are called in the engine's thread and return at once."""
+    """The receiver of a session's pictures; the engine's thread calls its methods, which return at once."""
 
     @property
     def stalled(self) -> bool:

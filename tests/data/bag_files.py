@@ -32,7 +32,7 @@ CAMERA, STATE, COMMAND = "/cam/image.raw", "/joint_states", "/command"
 
 @dataclass(frozen=True)
 class Recording:
-    """What the bags hold: times in ns, (T, H, W, 3) pictures, (S, 3) joints, (C, 2) commands."""
+    """The content of the bags: times in ns, (T, H, W, 3) pictures, (S, 3) joints, (C, 2) commands."""
 
     picture_ns: np.ndarray
     pictures: np.ndarray
@@ -142,7 +142,7 @@ def write_ros2(
 
 
 class Encoded(NamedTuple):
-    """How a topic's messages go into an MCAP file: `encode` makes an item's bytes."""
+    """The way of a topic's messages into an MCAP file: `encode` makes an item's bytes."""
 
     type: str
     schema_encoding: str

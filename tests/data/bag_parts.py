@@ -40,7 +40,7 @@ class Said(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """What a bag holds.
+    """The content of a bag.
 
     Attributes:
         times: (T,) of the pictures, seconds after the start; their stamps too.

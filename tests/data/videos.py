@@ -65,7 +65,7 @@ def actions_of(episode: int, length: int) -> np.ndarray:
 
 
 def _info(version: str, fps: int, lengths: Sequence[int], codec: str) -> dict[str, Any]:
-    """What meta/info.json says."""
+    """Return what meta/info.json says."""
     chunk = "chunk-{episode_chunk:03d}"
     paths = {
         "data_path": f"data/{chunk}/episode_{{episode_index:06d}}.parquet",

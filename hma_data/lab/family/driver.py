@@ -18,7 +18,7 @@ Manoeuvre = Callable[[Floats], Floats]  # pose (Q,) -> velocities (A,)
 
 
 class Driver:
-    """What commands a body in one episode."""
+    """The commander of a body in one episode."""
 
     def __init__(self, body: Body, pose: Floats, rng: np.random.Generator) -> None:
         self._body, self._rng = body, rng

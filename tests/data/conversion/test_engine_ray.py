@@ -134,7 +134,7 @@ def test_a_node_that_is_lost_takes_no_unit_along(cluster, tmp_path: Path) -> Non
 
 @pytest.fixture
 def whole(toy_arm, toy_recording, tmp_path: Path) -> dict[str, bytes]:
-    """What the local engine makes."""
+    """Return what the local engine makes."""
     convert(toy_arm, str(toy_recording), "raw", tmp_path / "whole", settings=SETTINGS)
     return contents(tmp_path / "whole")
 

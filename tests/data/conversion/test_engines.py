@@ -51,7 +51,7 @@ class Telling:
 
 @contextmanager
 def quiet() -> Iterator[list[str]]:
-    """What processes started within write to stderr, at the end."""
+    """Return what processes started within write to stderr, at the end."""
     said: list[str] = []
     kept = os.dup(2)
     with tempfile.TemporaryFile() as file:

@@ -43,7 +43,7 @@ def run(arm: Embodiment, recording: Path, out: Path, settings: Settings = SMALL,
 
 @pytest.fixture
 def whole(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
-    """What an undisturbed run makes."""
+    """Return what an undisturbed run makes."""
     run(toy_arm, toy_recording, tmp_path / "whole")
     return contents(tmp_path / "whole")
 

@@ -38,7 +38,7 @@ def dataset(sets: Sequence[str | Path], **others: Any) -> MixtureDataset:
 
 
 def seen(batches: Iterator[Batch], count: int) -> list[list[tuple[str, int, int]]]:
-    """Which windows each batch holds."""
+    """Return which windows each batch holds."""
     return [windows_of(batch) for batch in islice(batches, count)]
 
 

@@ -37,7 +37,7 @@ def merged(rows: np.ndarray, size: int) -> Stats:
 
 
 def rank_error(rows: np.ndarray, stats: Stats) -> float:
-    """How far, as a share of the rows, each stated quantile's ranks are from q; ties span ranks."""
+    """Return how far, as a share of the rows, each stated quantile's ranks are from q; ties span ranks."""
     worst = 0.0
     for q in QUANTILES:
         value = stats.quantile(q)[0]

@@ -59,7 +59,7 @@ def run(arm: Embodiment, recording: Path, out: Path, settings: Settings = SMALL,
 
 @pytest.fixture
 def whole(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
-    """What a folder of this machine holds."""
+    """Return what a folder of this machine holds."""
     run(toy_arm, toy_recording, tmp_path / "whole")
     return local(tmp_path / "whole")
 
@@ -220,7 +220,7 @@ def test_a_driver_that_is_not_installed_is_named(toy_arm, toy_recording, monkeyp
 
 @pytest.fixture
 def other(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
-    """What a job of another plan writes."""
+    """Return what a job of another plan writes."""
     run(toy_arm, toy_recording, tmp_path / "other", settings=replace(SMALL, seed=3))
     return local(tmp_path / "other")
 

@@ -16,6 +16,7 @@ from hma_data.shards.reader import ShardSet
 from hma_model.evaluation import commands
 from hma_model.evaluation.commands import gaussian, without_commands
 from hma_model.evaluation.evaluate import (
+    Settings,
     digit_frequencies,
     evaluate,
     masked_val_loss,
@@ -383,7 +384,9 @@ def test_the_papers_protocol_predicts_the_last_frame_from_the_true_past(data):
     oracle = Oracle(CONFIG)
     oracle.add_embodiment(make_model({"arm": 2}).embodiments["arm"])
     oracle.truth = list(windows(data, "val", 4, 6, batch_size=3))
-    found = measure(oracle.eval(), Blocks(), data, count=6, batch_size=3, prompt=1, paper=True).found
+    found = measure(
+        oracle.eval(), Blocks(), data, Settings(windows=6, batch_size=3, prompt=1, paper=True)
+    ).found
     paper = found["paper"]
     assert paper["psnr_last"] == 60.0 and paper["gaussian_psnr_last"] < 30
     assert paper["delta_psnr"] == pytest.approx(60 - paper["gaussian_psnr_last"])
@@ -391,7 +394,7 @@ def test_the_papers_protocol_predicts_the_last_frame_from_the_true_past(data):
 
 
 def test_the_papers_perplexity_is_a_mean_over_batches_of_four(data, model):
-    measured = measure(model, Blocks(), data, count=6, paper=True, draws=1)
+    measured = measure(model, Blocks(), data, Settings(windows=6, paper=True, draws=1))
     nats = measured.by_window["loss"]
     expected = np.mean([np.exp(nats[:4].mean()), np.exp(nats[4:].mean())])
     assert measured.found["paper"]["perplexity"] == pytest.approx(expected, abs=1e-3)

@@ -79,9 +79,9 @@ def test_parts_that_are_done_are_not_computed_again(
     calls: list[str] = []
     real = suite.measure
 
-    def counted(model: Any, tokenizer: Any, shards: Any, **given: Any) -> Any:
+    def counted(model: Any, tokenizer: Any, shards: Any, *given: Any) -> Any:
         calls.append(shards.embodiment.id)
-        return real(model, tokenizer, shards, **given)
+        return real(model, tokenizer, shards, *given)
 
     monkeypatch.setattr(suite, "measure", counted)
     whole = results(run(made, tmp_path))

@@ -16,7 +16,7 @@ WIDTHS = (64, 128, 256)
 
 
 def _activations(model: HMA) -> dict[str, Tensor]:
-    """What flows at the places where widths might tell."""
+    """Return what flows at the places where widths might tell."""
     seen: dict[str, Tensor] = {}
     block = model.trunk.blocks[-1]
     places = {

@@ -13,25 +13,12 @@ from hma_data.lab import family, record
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
-from hma_data.tokenizers.base import get_tokenizer
-from hma_model.network.model import HMA
 from hma_model.simulate import World
 from hma_model.simulate import augment as augment_module
 from hma_model.simulate.arenas import Scenes, TrueArena
 from hma_model.simulate.augment import Augmentation, augment
-from tests.model.simulate.worlds import tiny_model
 
 ROBOT, FRAMES, KNOWN = "rails_03", 4, 2
-
-
-@pytest.fixture(scope="module")
-def model() -> HMA:
-    return tiny_model(ROBOT)
-
-
-@pytest.fixture
-def world(model: HMA) -> World:
-    return World(model, get_tokenizer("fsq-8"))
 
 
 @pytest.fixture(autouse=True)

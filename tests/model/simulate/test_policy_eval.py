@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import truth
 from hma_data.lab.simulator import LabSimulator
-from hma_data.tokenizers.base import get_tokenizer
 from hma_model.evaluation.agreement import Accuracy
 from hma_model.evaluation.judge import StateJudge, task_of
 from hma_model.network.model import HMA
@@ -21,20 +20,10 @@ from hma_model.simulate.arenas import Scenes, TrueArena
 from hma_model.simulate.policies import begin, checked, read_policy
 from hma_model.simulate.policy_eval import evaluate_policies
 from hma_model.simulate.policy_page import html, sentences, write_report
-from tests.model.simulate.worlds import TrueWorld, tiny_model
+from tests.model.simulate.worlds import TrueWorld
 
 ROBOT = "rails_03"
 POLICIES = ["scripted", "scripted:noise=0.5", "random", "still"]
-
-
-@pytest.fixture(scope="module")
-def model() -> HMA:
-    return tiny_model(ROBOT)
-
-
-@pytest.fixture
-def world(model: HMA) -> World:
-    return World(model, get_tokenizer("fsq-8"))
 
 
 class KnownPlaces:

@@ -36,7 +36,7 @@ def client(engine: Engine) -> Iterator[TestClient]:
 
 
 class Page:
-    """What a page does with its websocket."""
+    """A page, as far as its websocket goes."""
 
     def __init__(self, socket: WebSocketTestSession) -> None:
         self.socket = socket

@@ -71,7 +71,7 @@ def run(seen, painter, tmp_path) -> Path:
 
 
 def events(path: Path) -> list[Event]:
-    """What TensorBoard's own reader finds in an event file, checksums compared."""
+    """Return what TensorBoard's own reader finds in an event file, checksums compared."""
     reader, found = PyRecordReader_New(str(path)), []
     while True:
         try:

@@ -169,7 +169,7 @@ def test_each_episode_has_the_instruction_said_nearest_to_its_beginning(tmp_path
 
 
 def read_bytes() -> int:
-    """What this process has read from files so far."""
+    """Return what this process has read from files so far."""
     for line in Path("/proc/self/io").read_text().splitlines():
         if line.startswith("rchar"):
             return int(line.split()[1])

@@ -50,7 +50,7 @@ def test_a_wrong_layout_says_where_and_what_is_allowed(layout: dict[str, str], f
 
 
 class Touch:
-    """What unpickling it would run."""
+    """An object whose unpickling would run something."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

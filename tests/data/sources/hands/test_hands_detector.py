@@ -73,7 +73,7 @@ def short(real_data: Path, models: Path, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.fixture(autouse=True)
 def apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is found is cached in the test's own folder."""
+    """Cache what is found in the test's own folder."""
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("HMA_HAND_MODELS", raising=False)
 

@@ -1,0 +1,147 @@
+"""Score rollouts of windows beside baselines: PSNR, SSIM and LPIPS of each predicted frame.
+
+B batch, P predicted frames, N windows.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hma_data.loading.dataset import Batch
+from hma_model.evaluation.commands import shuffled, without_commands
+from hma_model.evaluation.intervals import interval, rounded, summary
+from hma_model.evaluation.metrics import psnr, ssim
+from hma_model.evaluation.perceptual import Judge
+from hma_model.evaluation.rollouts import Pictures
+
+PSNR_LIMIT = 60.0  # dB; the PSNR of equal pictures, and with it a mean over frames, would be infinite
+ROLLOUTS = ("true", "shuffled", "none", "copy")
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scores:
+    """PSNR (B, P) in dB, SSIM (B, P) and LPIPS (B, P) of predicted frames; NaN where one is not finite."""
+
+    psnr: Floats
+    ssim: Floats
+    lpips: Floats | None
+    finite: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, pictures: Pictures, judge: Judge | None = None) -> "Scores":
+        truth, predicted = (part[:, pictures.prompt :] for part in (pictures.truth, pictures.predicted))
+        size, shape = truth.shape[:2], (-1, *truth.shape[2:])
+        truth, predicted = truth.reshape(shape), predicted.reshape(shape)
+        signal = np.minimum(psnr(truth, predicted), PSNR_LIMIT)
+        parts = [signal, ssim(truth, predicted)]
+        if judge and judge.networks.lpips:
+            parts.append(judge.networks.lpips(truth, predicted))
+        parts = [np.where(pictures.finite, part.reshape(size), np.nan) for part in parts]
+        return cls(parts[0], parts[1], parts[2] if len(parts) > 2 else None, pictures.finite)
+
+    @classmethod
+    def mean(cls, draws: "list[Scores]") -> "Scores":
+        """Return the means over draws."""
+        return cls._combined(draws, partial(np.mean, axis=0), partial(np.all, axis=0))
+
+    @classmethod
+    def join(cls, batches: "list[Scores]") -> "Scores":
+        return cls._combined(batches, np.concatenate, np.concatenate)
+
+    @classmethod
+    def _combined(
+        cls, parts: "list[Scores]", rule: Callable[..., Any], of_finite: Callable[..., Any]
+    ) -> "Scores":
+        far = None if parts[0].lpips is None else rule([part.lpips for part in parts])
+        psnrs, ssims = rule([part.psnr for part in parts]), rule([part.ssim for part in parts])
+        return cls(psnrs, ssims, far, of_finite([part.finite for part in parts]))
+
+    def figures(self, seed: int) -> dict[str, Any]:
+        """Return the means over windows, with their intervals."""
+        found = summary("psnr", self.psnr.mean(axis=1), seed, digits=6)
+        found |= summary("psnr_last", self.psnr[:, -1], seed, digits=6)
+        found |= _by_frame("psnr", self.psnr, seed) | summary("ssim", self.ssim.mean(axis=1), seed, digits=6)
+        found |= _by_frame("ssim", self.ssim, seed)
+        if self.lpips is not None:
+            found |= summary("lpips", self.lpips.mean(axis=1), seed) | _by_frame("lpips", self.lpips, seed)
+        return found
+
+    def by_window(self, rollout: str) -> dict[str, Floats]:
+        """Return values (N,) of the windows, by the rollout's and the figure's name."""
+        found = {
+            "psnr": self.psnr.mean(axis=1),
+            "psnr_last": self.psnr[:, -1],
+            "ssim": self.ssim.mean(axis=1),
+        }
+        if self.lpips is not None:
+            found["lpips"] = self.lpips.mean(axis=1)
+        return {f"{rollout}.{name}": values for name, values in found.items()}
+
+
+def _by_frame(name: str, values: Floats, seed: int) -> dict[str, Any]:
+    """Return the means of values (N, P) over windows and their intervals: P pairs."""
+    return {
+        f"{name}_by_frame": rounded(values.mean(axis=0), 3 if name == "psnr" else 4),
+        f"{name}_by_frame_95": rounded(interval(values, seed).T),
+    }
+
+
+@dataclass
+class Rolled:
+    """The rollouts of batches of windows, scored.
+
+    Attributes:
+        first: the number of true frames that a rollout starts from.
+        judge: is shown all pictures.
+        scores: of each batch, by the kind of rollout.
+        predicted: the predicted tokens or latents of each batch, by the kind of rollout; of `shuffled` the
+            first draw's.
+        still: windows whose true pictures never change after the prompt.
+    """
+
+    first: int
+    judge: Judge
+    scores: dict[str, list[Scores]] = field(default_factory=lambda: {name: [] for name in ROLLOUTS})
+    predicted: dict[str, list[torch.Tensor]] = field(
+        default_factory=lambda: {name: [] for name in ROLLOUTS if name != "copy"}
+    )
+    still: int = 0
+
+    def add(self, batch: Batch, roll: Callable[..., Pictures], draws: int, seed: int) -> None:
+        """Roll a batch out with the true actions, in several draws with shuffled ones, and with none."""
+        first = self.first
+        true = roll(batch)
+        self.judge.add("truth", true.truth[:, first:])
+        unchanged = true.truth[:, first:] == true.truth[:, first - 1 : first]
+        self.still += int(unchanged.all(axis=(1, 2, 3, 4)).sum())
+        copied = true.predicted.copy()
+        copied[:, first:] = copied[:, first - 1 : first]
+        others = [roll(shuffled(batch, first - 1, seed, draw), truth=true.truth) for draw in range(draws)]
+        none = roll(without_commands(batch), truth=true.truth)
+        self._keep("true", [true])
+        self._keep("copy", [replace(true, predicted=copied, finite=np.ones_like(true.finite))])
+        self._keep("shuffled", others)
+        self._keep("none", [none])
+
+    def _keep(self, kind: str, draws: list[Pictures]) -> None:
+        self.judge.add(kind, draws[0].predicted[:, self.first :])
+        self.scores[kind].append(Scores.mean([Scores.of(pictures, self.judge) for pictures in draws]))
+        if kind in self.predicted:
+            self.predicted[kind].append(draws[0].stored)
+
+
+def counted(roll: Callable[..., Pictures], on_frames: Callable[[int], None]) -> Callable[..., Pictures]:
+    """Return a function that rolls out, and then tells how many frames it predicted."""
+
+    def counting(batch: Batch, **options: Any) -> Pictures:
+        made = roll(batch, **options)
+        on_frames(made.finite.size)
+        return made
+
+    return counting
