@@ -171,7 +171,7 @@ class RunLog:
         evaluations = (line for line in reversed(kept) if line["kind"] == "eval")
         self._evaluation: dict[str, Any] = next(evaluations, {})
         self._paces: deque[float] = deque(maxlen=PACING)  # seconds of steps of this session
-        self._spent, self._shown, self._said = 0.0, 0.0, ""
+        self._spent, self._shown, self._said = 0.0, 0.0, (-1, -1)
         self._opened = time.monotonic()
         self._live: Live | None = None
 
@@ -257,10 +257,11 @@ class RunLog:
         if self._live:
             self._live.update(self._table())
         elif force or time.monotonic() - self._shown >= PLAIN_SECONDS:
-            text, self._shown = self._text(), time.monotonic()
-            if text != self._said:
-                print(text, file=sys.stderr, flush=True)
-            self._said = text
+            self._shown = time.monotonic()
+            news = self._last["step"], self._evaluation.get("step", -1)
+            if news != self._said:  # the same step again differs in its times alone
+                print(self._text(), file=sys.stderr, flush=True)
+            self._said = news
 
     def _pace(self) -> tuple[float, str]:
         """Return windows a second of the last steps, and the session's time so far and still needed."""
