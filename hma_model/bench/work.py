@@ -27,6 +27,7 @@ def products_of(start: Callable[[], Callable[[], None]]) -> Counter[Shape]:
 
     found: Counter[Shape] = Counter()
     inputs = {torch.ops.aten.mm: 0, torch.ops.aten.addmm: 1, torch.ops.mkldnn._linear_pointwise: 0}
+    inputs[torch.ops.quantized.linear_dynamic] = 0
 
     class Watch(TorchDispatchMode):
         def __torch_dispatch__(self, call: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -60,7 +61,7 @@ def _seconds(m: int, k: int, n: int, device: "torch.device", precision: str) -> 
     """Return the seconds of one product."""
     import torch
 
-    from hma_model.generation.packed import PackedLinear, packs
+    from hma_model.generation.packed import PackedLinear, QuantizedLinear, packs
 
     dtype = torch.bfloat16 if precision == "bf16" else torch.float32
     linear = torch.nn.Linear(k, n, device=device, dtype=dtype)
@@ -68,7 +69,7 @@ def _seconds(m: int, k: int, n: int, device: "torch.device", precision: str) -> 
     with torch.inference_mode():
         kinds: list[Callable[[torch.Tensor], torch.Tensor]] = [linear]
         if packs(device, dtype):
-            kinds.append(PackedLinear(linear, dtype))
+            kinds.append(QuantizedLinear(linear) if precision == "int8" else PackedLinear(linear, dtype))
         return min(_best(kind, x) for kind in kinds)
 
 

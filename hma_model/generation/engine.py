@@ -9,13 +9,13 @@ from torch import Tensor, nn
 
 from hma_data.errors import HMAError
 from hma_data.tokenizers.network import one_thread
-from hma_model.generation.packed import has_bfloat16, packed, packs
+from hma_model.generation.packed import has_bfloat16, has_int8, packed, packs
 from hma_model.generation.unmask import TokenFrame
 from hma_model.network.head import TokenReadout
 from hma_model.network.model import HMA
 from hma_model.network.trunk import Trunk
 
-PRECISIONS = {"float32": torch.float32, "bf16": torch.bfloat16}
+PRECISIONS = {"float32": torch.float32, "bf16": torch.bfloat16, "int8": torch.qint8}
 ONE_THREAD = (
     30e6  # operations of a pass's largest product, below which a second thread brings next to nothing
 )
@@ -37,11 +37,7 @@ class Engine:
 
     def __init__(self, model: HMA, precision: str, compile: bool) -> None:
         self.config, self.device, self.precision = model.config, model.device, precision
-        if precision not in PRECISIONS:
-            raise HMAError("precision", f"{precision!r} is unknown", f"give {' or '.join(PRECISIONS)}")
-        dtype, device = PRECISIONS[precision], model.device
-        if dtype == torch.bfloat16 and device.type == "cpu" and not has_bfloat16():
-            raise HMAError("precision", "this processor has no products of bfloat16", "use float32")
+        dtype, device = products_in(precision, model.device, compile), model.device
         whole = model.trunk.position.dtype == torch.float32 and not torch.is_autocast_enabled(device.type)
         pack = whole and not compile and packs(device)
         self.trunk: Trunk = packed(model.trunk, dtype) if pack else model.trunk
@@ -69,6 +65,18 @@ class Engine:
             if self.compiled is None:
                 stack.enter_context(torch.inference_mode())
             yield
+
+
+def products_in(precision: str, device: torch.device, compile: bool) -> torch.dtype:
+    """Return the type of a precision; raise HMAError if it is unknown, or the device has no such products."""
+    if precision not in PRECISIONS:
+        raise HMAError("precision", f"{precision!r} is unknown", f"give {' or '.join(PRECISIONS)}")
+    if precision == "bf16" and device.type == "cpu" and not has_bfloat16():
+        raise HMAError("precision", "this processor has no products of bfloat16", "use float32")
+    if precision == "int8" and (compile or not packs(device) or not has_int8()):
+        fault = "int8 is for processors with AVX-512 VNNI, without compile"
+        raise HMAError("precision", fault, "use float32 or bf16")
+    return PRECISIONS[precision]
 
 
 def _compiled(function: Callable[..., Tensor], device: torch.device) -> Callable[..., Tensor]:

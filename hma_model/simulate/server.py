@@ -364,6 +364,8 @@ async def serve(
     host: str,
     token: str | None,
     ready: Callable[[], None],
+    device: str = "cpu",
+    **settings: Any,
 ) -> None:
     """Serve a checkpoint until the process is interrupted.
 
@@ -373,6 +375,8 @@ async def serve(
         tokenizer: the checkpoint's.
         listener: a socket that listens.
         ready: called when the page can be opened.
+        device: of the network.
+        settings: of `World`.
 
     Raises:
         CheckpointError: the checkpoint is damaged.
@@ -380,10 +384,10 @@ async def serve(
     from hma_model.checkpoint.io import load
     from hma_model.simulate.world import World
 
-    model = load(checkpoint.folder, sorted({robot.embodiment.id for robot in robots.values()}))
-
+    names = sorted({robot.embodiment.id for robot in robots.values()})
+    model = load(checkpoint.folder, names, device)
     confidence = ("confidence",) if checkpoint.config.kind == "discrete" else ()
-    engine = Engine(World(model, tokenizer), robots, orders=("random", *confidence))
+    engine = Engine(World(model, tokenizer, **settings), robots, orders=("random", *confidence))
     engine.start()
     try:
         await run(Server(engine, name, host, token).app, listener, lambda server: ready())

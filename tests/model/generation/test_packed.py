@@ -6,13 +6,17 @@ from torch import nn
 
 from hma_data.errors import HMAError
 from hma_model.generation import engine
-from hma_model.generation.packed import PackedLinear, has_bfloat16, packed, packs
+from hma_model.generation.packed import PackedLinear, QuantizedLinear, has_bfloat16, has_int8, packed, packs
 from hma_model.generation.rollout import Rollout
 from hma_model.network.model import HMA
 from tests.model.network_parts import small_batch, small_model
 
 needs_packing = pytest.mark.skipif(not packs(torch.device("cpu")), reason="this platform has no AVX-512")
 needs_bfloat16 = pytest.mark.skipif(not has_bfloat16(), reason="this platform has no products of bfloat16")
+
+needs_int8 = pytest.mark.skipif(
+    not (packs(torch.device("cpu")) and has_int8()), reason="this platform has no products of int8"
+)
 
 
 def _frames(model: HMA, **how: object) -> torch.Tensor:
@@ -76,7 +80,10 @@ def test_bfloat16_products_keep_the_features_near() -> None:
 
 @pytest.mark.parametrize(
     ("precision", "message"),
-    [("fp8", "'fp8' is unknown — give float32 or bf16"), ("bf16", "no products of bfloat16 — use float32")],
+    [
+        ("fp8", "'fp8' is unknown — give float32 or bf16 or int8"),
+        ("bf16", "no products of bfloat16 — use float32"),
+    ],
 )
 def test_a_precision_that_is_not_there_is_refused(
     precision: str, message: str, monkeypatch: pytest.MonkeyPatch
@@ -84,6 +91,27 @@ def test_a_precision_that_is_not_there_is_refused(
     monkeypatch.setattr(engine, "has_bfloat16", lambda: False)
     with pytest.raises(HMAError, match=message):
         Rollout(small_model(), "arm", precision=precision)
+
+
+@needs_int8
+def test_products_in_int8_keep_the_features_near_and_plain_maps_stay_near_too() -> None:
+    model, seen = small_model(), []
+    batch = small_batch(model.config, ["arm", "hand.v1"], frames=4)
+    for precision in ("float32", "int8"):
+        rollout = Rollout(model, batch.embodiment, 2, precision=precision)
+        rollout.prompt(batch.tokens[:, :3], batch.actions, seeds=[1, 2])
+        rollout.step(batch.actions[:, 2])
+        seen.append(rollout.state.layers[-1].time.flatten())
+    assert torch.nn.functional.cosine_similarity(*seen, dim=0) > 0.995
+    assert not torch.equal(*seen)
+    linear, x = nn.Linear(96, 40), torch.randn(3, 7, 96)
+    expected = nn.functional.gelu(linear(x))
+    assert (QuantizedLinear(linear, "gelu")(x) - expected).abs().max() < 0.02 * expected.abs().max()
+
+
+def test_int8_is_refused_with_a_compiler() -> None:
+    with pytest.raises(HMAError, match="int8 is for processors with AVX-512 VNNI, without compile"):
+        Rollout(small_model(), "arm", precision="int8", compile=True)
 
 
 def test_what_a_rollout_returns_can_be_changed_and_trained_on() -> None:
