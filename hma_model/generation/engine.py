@@ -16,8 +16,9 @@ from hma_model.network.model import HMA
 from hma_model.network.trunk import Trunk
 
 PRECISIONS = {"float32": torch.float32, "bf16": torch.bfloat16, "int8": torch.qint8}
+MOST_GRAPHS = 64  # of a model's passes: each number of rows and of tokens to unmask has one
 ONE_THREAD = (
-    30e6  # operations of a pass's largest product, below which a second thread brings next to nothing
+    150e6  # operations of a pass's largest product, below which a second thread brings next to nothing
 )
 
 
@@ -86,7 +87,8 @@ def _compiled(function: Callable[..., Tensor], device: torch.device) -> Callable
 
     def call(*arguments: object) -> Tensor:
         torch.compiler.cudagraph_mark_step_begin()
-        made: Tensor = compiled(*arguments)
+        with torch._dynamo.config.patch(recompile_limit=MOST_GRAPHS):  # beyond it, code runs uncompiled
+            made: Tensor = compiled(*arguments)
         return made
 
     return call

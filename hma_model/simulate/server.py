@@ -353,6 +353,14 @@ class Connection:
             self.page.tell({"kind": "error", "text": f"command: {fault}"})
             return
         session.held, session.input = np.array(message.command, np.float32), message.input
+        if not session.warned:
+            pairs = zip(session.robot.dimensions, message.command)
+            beyond = [d for d, value in pairs if abs(2 * value - d.low - d.high) > 1.05 * (d.high - d.low)]
+            said = ", ".join(f"{dim.name} {dim.low:g} to {dim.high:g}" for dim in beyond)
+            session.warned = bool(beyond)
+            if beyond:
+                text = f"the model knows only {said}; what it shows beyond is a guess. This is said once"
+                self.page.tell({"kind": "error", "text": f"command: {text}"})
 
 
 async def serve(

@@ -147,3 +147,35 @@ def test_trunk_head_and_unmasking_compile_to_one_graph_of_each_pass(
     made = _frames(model, compile=True, **how)
     assert torch.equal(made, _frames(model, **how))
     assert len(graphs) == 2  # over two frames, and over one
+
+
+@pytest.mark.slow
+def test_new_prompts_and_rows_that_begin_anew_compile_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, compile, graphs = small_model(), torch.compile, []
+
+    def backend(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> torch.fx.GraphModule:
+        graphs.append(graph)
+        return graph
+
+    def traced(function: object, **how: object) -> object:
+        return compile(function, backend=backend, fullgraph=True, dynamic=False)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(torch, "compile", traced)
+    torch._dynamo.reset()
+    batch = small_batch(model.config, ["arm", "hand.v1"], frames=8)
+    rollout = Rollout(model, batch.embodiment, 2, compile=True, unmask_steps=12)
+
+    def play(prompt: int) -> None:
+        rollout.prompt(batch.tokens[:, :prompt], batch.actions, seeds=[prompt, 2])
+        for i in range(prompt - 1, 7):
+            rollout.step(batch.actions[:, i])
+
+    play(3)
+    kinds = len(graphs)  # of passes
+    play(4)
+    rollout.reset([1], batch.tokens[1:, :2], batch.actions[1:], seeds=[5])
+    rollout.step(batch.actions[:, 1])
+    rollout.step(batch.actions[:1, 2], rows=[0])
+    rollout.prompt(batch.tokens[:, :3], batch.actions, torch.rand(2, 8) < 0.5)
+    rollout.step(batch.actions[:, 2], known=torch.tensor([True, False]))
+    assert len(graphs) == kinds > 2
