@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from hma_model.generation.rollout import Rollout
     from hma_model.network.model import HMA
 
-WARMUP = 2  # generated frames before the measured ones
+WARMUP = 1  # generated frames before the measured ones
 CHOSEN = ("kind", "batch", "decode", "cache", "ddim_steps")
 PAPER_STEPS = 100  # of the diffusion head
 TABLE = {
@@ -145,26 +145,26 @@ class Frames:
 
     def seconds(self) -> list[float]:
         """Return the seconds of each measured step; slow ones are fewer, but at least one."""
-        cache, seconds = self.settings["cache"], list[float]()
-        rollout = self._rollout(self.settings["compile"])
-        warmup = WARMUP if cache else 1
-        for index in range(warmup + self.settings["frames"]):
-            if not cache and index:
-                rollout = self._rollout(self.settings["compile"])
+        seconds = list[float]()
+        for index in range(WARMUP + self.settings["frames"]):
+            if not self.settings["cache"] or not index:
+                self.rollout = self._rollout(self.settings["compile"])
             began = time.perf_counter()
-            self._show(rollout.step(self.actions[:, -1]))
+            self._show(self.rollout.step(self.actions[:, -1]))
             finish(self.model.device)
-            if index >= warmup:
+            if index >= WARMUP:
                 seconds.append(time.perf_counter() - began)
             if sum(seconds) > self.settings["seconds"]:
                 break
         return seconds
 
     def step(self) -> Callable[[], None]:
-        """Return a call that makes one more frame, without a compiler."""
-        rollout = self._rollout(False)
-        if self.settings["cache"]:
-            rollout.step(self.actions[:, -1])
+        """Return a call that makes one more frame after `seconds`, without a compiler."""
+        rollout = self.rollout
+        if not self.settings["cache"] or self.settings["compile"]:
+            rollout = self._rollout(False)
+            if self.settings["cache"]:
+                rollout.step(self.actions[:, -1])
 
         def step() -> None:
             frames = rollout.step(self.actions[:, -1])

@@ -93,6 +93,18 @@ def test_a_precision_that_is_not_there_is_refused(
         Rollout(small_model(), "arm", precision=precision)
 
 
+@needs_bfloat16
+def test_latents_drawn_by_bfloat16_products_are_near_those_of_float32() -> None:
+    model, seen = small_model(kind="continuous"), []
+    batch = small_batch(model.config, ["arm", "hand.v1"], frames=4)
+    for precision in ("float32", "bf16"):
+        rollout = Rollout(model, batch.embodiment, 2, precision=precision, sample_steps=8)
+        rollout.prompt(batch.latents[:, :3], batch.actions, seeds=[1, 2])
+        seen.append(rollout.step(batch.actions[:, 2]))
+    error = (seen[0] - seen[1]).square().mean() / seen[0].square().mean()
+    assert 0 < error < 0.01
+
+
 @needs_int8
 def test_products_in_int8_keep_the_features_near_and_plain_maps_stay_near_too() -> None:
     model, seen = small_model(), []
