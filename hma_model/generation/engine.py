@@ -17,9 +17,9 @@ from hma_model.network.trunk import Trunk
 
 PRECISIONS = {"float32": torch.float32, "bf16": torch.bfloat16, "int8": torch.qint8}
 MOST_GRAPHS = 64  # of a model's passes: each number of rows and of tokens to unmask has one
-ONE_THREAD = (
-    150e6  # operations of a pass's largest product, below which a second thread brings next to nothing
-)
+# Operations of a pass's largest product, below which one thread computes: a second one brings little, and
+# beside other work the two wait for each other (docs/results.md, Waiting threads).
+ONE_THREAD = 150e6
 
 
 class Engine:

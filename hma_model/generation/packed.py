@@ -5,9 +5,8 @@ the speed or less. oneDNN uses it. With packed weights a row's result also does 
 rows beside it, so a sample of a batch gets the bits that it gets alone.
 
 Products in bfloat16 are about twice as fast again where the processor has AVX512-BF16 or AMX, and those in
-int8 three times where it has VNNI. The sums stay exact enough (float32, int32), and all values between the
-products are float32. In int8, the inputs of a product share one scale, so the rows of a batch are no longer
-independent of each other.
+int8 three times where it has VNNI. The sums are float32 or int32, and all values between the products are
+float32. In int8, the inputs of a product share one scale, so a row depends on the rows beside it.
 """
 
 import copy

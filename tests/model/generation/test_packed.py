@@ -1,5 +1,7 @@
 """Packed modules: what they compute, and that a row does not depend on the rows beside it."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import nn
@@ -191,3 +193,7 @@ def test_new_prompts_and_rows_that_begin_anew_compile_nothing_more(monkeypatch: 
     rollout.prompt(batch.tokens[:, :3], batch.actions, torch.rand(2, 8) < 0.5)
     rollout.step(batch.actions[:, 2], known=torch.tensor([True, False]))
     assert len(graphs) == kinds > 2
+    for steps in (1, 3, 4, 5, 6, 7):  # each takes other numbers of tokens, more than torch compiles by itself
+        rollout.decoding = replace(rollout.decoding, steps=steps)
+        rollout.step(batch.actions[:, 3])
+    assert len(graphs) > torch._dynamo.config.recompile_limit
