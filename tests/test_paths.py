@@ -253,7 +253,10 @@ def recorded(made: Made, given: Given, out: Path) -> Any:
 
 
 def drawn(made: Made, given: Given, out: Path) -> Any:
-    write_video(given(out / "film.webp"), RolloutVideo(np.zeros((2, 16, 16, 3), np.uint8), 5.0, 1))
+    write_video(
+        given(out / "film.webp"),
+        RolloutVideo(np.zeros((2, 16, 16, 3), np.uint8), 5.0, 1, np.zeros((1, 2, 3), np.float32)),
+    )
     return content(out)
 
 

@@ -2,9 +2,9 @@
 
 A kernel may sum in another order when the batch has another size or more threads share the work. Then
 the last bits of a latent change, and these can change its sign or its rounding. For that reason all
-batches have one size, the last one padded. On a CPU, one thread encodes each frame, and several frames
-are encoded at a time. The same frame then gives the same tokens whatever the batch, the worker or the
-number of cores. Networks run in float32 on a CPU, and in bfloat16 and channels-last on CUDA, except a
+batches are encoded at one size, the last one padded. On a CPU, one thread encodes each frame, and several
+frames are encoded at a time. The same frame then gives the same tokens whatever the batch, the worker or
+the number of cores. Networks run in float32 on a CPU, and in bfloat16 and channels-last on CUDA, except a
 network that asks for float32.
 
 B pictures of a batch, S side, c channels, h·w grid. Pixels inside are (B, 3, S, S) in [-1, 1].
@@ -122,16 +122,19 @@ class NetworkTokenizer:
     def _decode_batch(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
         """Decode at most one batch of ids or latents."""
         discrete = self.spec.kind == "discrete"
-        values = self._padded(tokens.astype(np.int64 if discrete else np.float32))
+        values = self._moved(tokens.astype(np.int64 if discrete else np.float32))  # pixels may differ by 1
         pixels = self._decode(values if discrete else values.to(self.dtype)).float()
         whole = pixels.add(1).mul_(127.5).round_().clamp_(0, 255).to(torch.uint8)
         made: NDArray[np.uint8] = whole.permute(0, 2, 3, 1).cpu().numpy()
-        return made[: len(tokens)]
+        return made
 
     def _padded(self, part: NDArray[Any]) -> Tensor:
         """Return the part on the device, repeated up to a whole batch."""
         if len(part) < self.batch:
             part = np.resize(part, (self.batch, *part.shape[1:]))
+        return self._moved(part)
+
+    def _moved(self, part: NDArray[Any]) -> Tensor:
         return torch.from_numpy(part.copy()).to(self.device)  # torch takes no negative strides
 
 

@@ -1,8 +1,9 @@
 """Measure generated frames, of models with random weights and of the embedded one (`hma bench generate`).
 
-Without `kind`, the results are a table: the discrete model of 32 layers with one and with 16 rollouts, with
-decoding to pixels and without, the continuous one, and the embedded model with decoding: what a person at
-`hma play` gets. With `kind`, the other settings choose the case.
+Without `kind`, the results are a table, of which `rows` chooses some: the discrete model of 32 layers with
+one and with 16 rollouts, with decoding to pixels and without; the continuous one with 4 sampling steps and
+with the paper's 100; and the embedded model with decoding. `hma bench play` measures what a person at
+`hma play` gets of it. With `kind`, the other settings choose the case.
 
 The prompt leaves room for one more frame in the window, so each measured frame is the last of `window`. With
 the cache, each frame follows the one before it. Without the cache, each frame is computed from the prompt
@@ -39,26 +40,30 @@ if TYPE_CHECKING:
     from hma_model.generation.rollout import Rollout
     from hma_model.network.model import HMA
 
-WARMUP = 2  # generated frames before the measured ones
-CHOSEN = ("kind", "batch", "decode", "cache")
-TABLE = [
-    dict(zip(CHOSEN, row))
-    for row in (
-        ("discrete", 1, False, True),
-        ("discrete", 1, True, True),
-        ("discrete", 1, False, False),
-        ("discrete", 16, False, True),
-        ("discrete", 16, True, True),
-        ("continuous", 1, False, True),
-        ("embedded", 1, True, True),
-    )
-]
+WARMUP = 1  # generated frames before the measured ones
+CHOSEN = ("kind", "batch", "decode", "cache", "ddim_steps")
+PAPER_STEPS = 100  # of the diffusion head
+TABLE = {
+    name: {key: value for key, value in zip(CHOSEN, case) if value is not None}
+    for name, case in {
+        "embedded": ("embedded", 1, True, True, None),
+        "discrete": ("discrete", 1, False, True, None),
+        "discrete-pictures": ("discrete", 1, True, True, None),
+        "discrete-uncached": ("discrete", 1, False, False, None),
+        "discrete-16": ("discrete", 16, False, True, None),
+        "discrete-16-pictures": ("discrete", 16, True, True, None),
+        "continuous-4": ("continuous", 1, False, True, 4),
+        "continuous-100": ("continuous", 1, False, True, PAPER_STEPS),
+    }.items()
+}
 
 
 def generate(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Return one result for each case; raise UsageError for a wrong setting."""
     flags = (None, True, False)
-    check_settings("generate", settings, kind=("all", "embedded", *KINDS), cache=flags, decode=flags)
+    precisions = ("fp32", "bf16", "int8")
+    kinds = ("all", "embedded", *KINDS)
+    check_settings("generate", settings, kind=kinds, cache=flags, decode=flags, precision=precisions)
     if settings["window"] < 2:
         raise UsageError("bench generate", "a window of 1 has no prompt", "give window=2 or more")
     if not isinstance(settings["batch"], int | None):
@@ -67,10 +72,19 @@ def generate(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def cases(settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the kind, batch size, decoding and use of the cache of each case."""
+    """Return the kind, batch size, decoding and so on of each case; of a row of the table, also its name.
+
+    Raises:
+        UsageError: the table has no such row.
+    """
     given = {key: settings[key] for key in CHOSEN if settings[key] not in (None, "all")}
     if settings["kind"] == "all":
-        return [row for row in TABLE if given.items() <= row.items()]
+        names = TABLE if settings["rows"] == "all" else [name.strip() for name in settings["rows"].split(",")]
+        for name in names:
+            if name not in TABLE:
+                known = ", ".join(TABLE)
+                raise UsageError("bench generate", f"the table has no row {name!r}", f"rows: {known}")
+        return [{"row": name, **TABLE[name]} for name in names if given.items() <= TABLE[name].items()]
     caches = [True, False] if settings["cache"] is None else [settings["cache"]]
     kinds = KINDS.get(settings["kind"], [settings["kind"]])
     usual = {"batch": 1, "decode": settings["kind"] == "embedded"}
@@ -80,6 +94,7 @@ def cases(settings: dict[str, Any]) -> list[dict[str, Any]]:
 def measure_frames(settings: dict[str, Any]) -> dict[str, Any]:
     """Return the figures of one case."""
     kind = settings["kind"]
+    settings = settings | {"ddim_steps": settings["ddim_steps"] or PAPER_STEPS}
     model = (embedded(settings) if kind == "embedded" else make_model(settings, kind)).eval()
     made = Frames(model, settings)
     seconds = made.seconds()
@@ -89,6 +104,7 @@ def measure_frames(settings: dict[str, Any]) -> dict[str, Any]:
     rate = rate_of(products, model.device, settings["precision"])
     told = ("precision", "batch", "unmask_steps", "decode", "compile")
     return {
+        **({"row": settings["row"]} if "row" in settings else {}),
         "kind": kind,
         "device": device_name(model.device),
         "cache": settings["cache"],
@@ -128,23 +144,27 @@ class Frames:
         self.tokenizer = self._tokenizer() if settings["decode"] else None
 
     def seconds(self) -> list[float]:
-        """Return the seconds of each measured step."""
-        count, cache, seconds = self.settings["frames"], self.settings["cache"], []
-        rollout = self._rollout(self.settings["compile"])
-        for index in range(WARMUP + count if cache else 1 + count):
-            if not cache and index:
-                rollout = self._rollout(self.settings["compile"])
+        """Return the seconds of each measured step; slow ones are fewer, but at least one."""
+        seconds = list[float]()
+        for index in range(WARMUP + self.settings["frames"]):
+            if not self.settings["cache"] or not index:
+                self.rollout = self._rollout(self.settings["compile"])
             began = time.perf_counter()
-            self._show(rollout.step(self.actions[:, -1]))
+            self._show(self.rollout.step(self.actions[:, -1]))
             finish(self.model.device)
-            seconds.append(time.perf_counter() - began)
-        return seconds[-count:]
+            if index >= WARMUP:
+                seconds.append(time.perf_counter() - began)
+            if sum(seconds) > self.settings["seconds"]:
+                break
+        return seconds
 
     def step(self) -> Callable[[], None]:
-        """Return a call that makes one more frame, without a compiler."""
-        rollout = self._rollout(False)
-        if self.settings["cache"]:
-            rollout.step(self.actions[:, -1])
+        """Return a call that makes one more frame after `seconds`, without a compiler."""
+        rollout = self.rollout
+        if not self.settings["cache"] or self.settings["compile"]:
+            rollout = self._rollout(False)
+            if self.settings["cache"]:
+                rollout.step(self.actions[:, -1])
 
         def step() -> None:
             frames = rollout.step(self.actions[:, -1])
@@ -160,7 +180,7 @@ class Frames:
         rollout = Rollout(
             self.model, self.robot, self.batch, unmask_steps=way["unmask_steps"],
             sample_steps=way["ddim_steps"], cache=way["cache"], compile=compile,
-            precision="bf16" if way["precision"] == "bf16" else "float32",
+            precision="float32" if way["precision"] == "fp32" else way["precision"],
         )  # fmt: skip
         rollout.prompt(self.prompt, self.actions)
         return rollout
@@ -182,12 +202,14 @@ GENERATE = Bench(
     "seconds a generated frame, and how near that is to the time of its products alone",
     {
         "kind": "all",  # all (a table) | discrete | continuous | both | embedded
-        **COMMON,
+        "rows": "all",  # of the table, e.g. embedded,discrete-16
+        **COMMON,  # precision may also be int8
         "cache": None,  # true | false; None measures both
-        "frames": 5,  # measured, after a warm-up
+        "frames": 10,  # measured, after a warm-up
+        "seconds": 20.0,  # after which no further frame of a case is measured
         "batch": None,  # None: 1, or those of the table
         "unmask_steps": 2,
-        "ddim_steps": 100,
+        "ddim_steps": None,  # of the diffusion head; None: 100, or those of the table
         "decode": None,  # to pixels; None: false, with kind=embedded true
     },
     generate,

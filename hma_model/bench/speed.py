@@ -54,6 +54,21 @@ def check_settings(bench: str, settings: dict[str, Any], **allowed: tuple[Any, .
             raise UsageError(f"bench {bench}", f"{key}={value} is not allowed", "give at least 1")
 
 
+def numbers_of(bench: str, key: str, settings: dict[str, Any], usual: list[int]) -> list[int]:
+    """Return the numbers of a setting, such as 0,1,2; the usual ones for None.
+
+    Raises:
+        UsageError: they are none.
+    """
+    if settings[key] is None:
+        return usual
+    try:
+        return [int(part) for part in str(settings[key]).split(",")]
+    except ValueError as fault:
+        text = f"{key}={settings[key]} is no list of numbers"
+        raise UsageError(f"bench {bench}", text, "write 0,1,2") from fault
+
+
 def set_threads(settings: dict[str, Any]) -> None:
     """Set the number of torch's threads, if the settings give one."""
     import torch

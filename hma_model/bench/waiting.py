@@ -16,8 +16,7 @@ from statistics import median
 from typing import Any
 
 from hma_data.bench import Bench, in_fresh_process
-from hma_data.errors import UsageError
-from hma_model.bench.speed import check_settings, step_seconds
+from hma_model.bench.speed import check_settings, numbers_of, step_seconds
 
 WAITS: dict[str, dict[str, str]] = {
     "PASSIVE": {"OMP_WAIT_POLICY": "PASSIVE"},
@@ -32,8 +31,8 @@ def waiting(settings: dict[str, Any]) -> list[dict[str, Any]]:
     check_settings("waiting", {**settings, "beside": None})
     cases = [
         (beside, threads, wait)
-        for beside in _numbers("beside", settings, [0, 1, 2])
-        for threads in _numbers("threads", settings, [1, 2])
+        for beside in numbers_of("waiting", "beside", settings, [0, 1, 2])
+        for threads in numbers_of("waiting", "threads", settings, [1, 2])
         for wait in (WAITS if threads > 1 else ["PASSIVE"])  # one thread waits for nobody
     ]
     rounds: dict[tuple[int, int, str], list[dict[str, float]]] = {case: [] for case in cases}
@@ -56,21 +55,12 @@ def waiting(settings: dict[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def _numbers(key: str, settings: dict[str, Any], usual: list[int]) -> list[int]:
-    if settings[key] is None:
-        return usual
-    try:
-        return [int(part) for part in str(settings[key]).split(",")]
-    except ValueError as fault:
-        text = f"{key}={settings[key]} is no list of numbers"
-        raise UsageError("bench waiting", text, "write 0,1,2") from fault
-
-
 def measure_both(settings: dict[str, Any]) -> dict[str, float]:
     """Return the speed of generation and training, and the CPU seconds that each took on all cores."""
     from hma_model.bench.generation import Frames, embedded
 
-    way = {"cache": True, "decode": True, "compile": False, "unmask_steps": 2, "ddim_steps": 100, **settings}
+    way = {"cache": True, "decode": True, "compile": False, "unmask_steps": 2, "ddim_steps": None}
+    way |= {"seconds": float("inf"), **settings}
     model = embedded(way | {"threads": 0})
     begun = time.process_time()
     frame = median(Frames(model.eval(), way | {"batch": 1}).seconds())

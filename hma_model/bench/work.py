@@ -1,7 +1,8 @@
 """Count the floating-point work of a computation, and measure how fast the machine does such work.
 
 The work consists of the matrix products and convolutions. The rate is that of its matrix products alone, one
-shape after the other on warm data, by the faster of torch's kernel and oneDNN's packed one.
+shape after the other on warm data, by the faster of torch's kernel and oneDNN's packed one,
+on one thread or on all.
 
 M rows, K values of a row, N values of a result.
 """
@@ -27,6 +28,7 @@ def products_of(start: Callable[[], Callable[[], None]]) -> Counter[Shape]:
 
     found: Counter[Shape] = Counter()
     inputs = {torch.ops.aten.mm: 0, torch.ops.aten.addmm: 1, torch.ops.mkldnn._linear_pointwise: 0}
+    inputs[torch.ops.quantized.linear_dynamic] = 0
 
     class Watch(TorchDispatchMode):
         def __torch_dispatch__(self, call: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -60,7 +62,8 @@ def _seconds(m: int, k: int, n: int, device: "torch.device", precision: str) -> 
     """Return the seconds of one product."""
     import torch
 
-    from hma_model.generation.packed import PackedLinear, packs
+    from hma_data.tokenizers.network import one_thread
+    from hma_model.generation.packed import PackedLinear, QuantizedLinear, packs
 
     dtype = torch.bfloat16 if precision == "bf16" else torch.float32
     linear = torch.nn.Linear(k, n, device=device, dtype=dtype)
@@ -68,8 +71,12 @@ def _seconds(m: int, k: int, n: int, device: "torch.device", precision: str) -> 
     with torch.inference_mode():
         kinds: list[Callable[[torch.Tensor], torch.Tensor]] = [linear]
         if packs(device, dtype):
-            kinds.append(PackedLinear(linear, dtype))
-        return min(_best(kind, x) for kind in kinds)
+            kinds.append(QuantizedLinear(linear) if precision == "int8" else PackedLinear(linear, dtype))
+        seconds = min(_best(kind, x) for kind in kinds)
+        if device.type == "cpu":
+            with one_thread():
+                seconds = min(seconds, *(_best(kind, x) for kind in kinds))
+        return seconds
 
 
 def _best(product: Callable[["torch.Tensor"], "torch.Tensor"], x: "torch.Tensor") -> float:

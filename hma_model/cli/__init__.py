@@ -197,13 +197,18 @@ def generate(
         raise UsageError("--out", f"{out} is neither .mp4 nor .webp")
     opened = _opened(checkpoint, data)
     from hma_model.evaluation.rollout_video import rollout_video, write_video
+    from hma_model.simulate.commands import Commands
 
+    model, tokenizer, shards = opened
     film = rollout_video(
-        *opened, split=split, window=window, frames=frames, prompt=prompt, seed=seed,
+        model, tokenizer, shards, split=split, window=window, frames=frames, prompt=prompt, seed=seed,
         unmask_steps=unmask_steps, sample_steps=sample_steps, temperature=temperature,
         cameras=camera_names(cameras), precision=precision, compile=compile,
     )  # fmt: skip
     write_video(out, film)
+    commands = Commands.of(model, shards.embodiment.id)
+    if outside := commands.outside(film.actions.reshape(-1, len(commands.names))):
+        print(f"actions are outside the range seen in training ({outside})", file=sys.stderr)
     about = f"{len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
     print(f"wrote {out}: {about}")
 
@@ -227,6 +232,7 @@ BENCHES |= {
     "drift": "hma_model.bench.drift:BENCH",
     "generate": "hma_model.bench.generation:GENERATE",
     "mup": "hma_model.bench.mup:BENCH",
+    "play": "hma_model.bench.play:BENCH",
     "train": "hma_model.bench.speed:TRAIN",
     "waiting": "hma_model.bench.waiting:WAITING",
 }

@@ -18,9 +18,10 @@ SampleSteps = Annotated[
     typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own."),
 ]
 Precision = Annotated[
-    Literal["float32", "bf16"],
+    Literal["float32", "bf16", "int8"],
     typer.Option(
-        "--precision", help="Of the products in rollouts; bf16 wants a processor or GPU that has it."
+        "--precision",
+        help="Of the products in rollouts; bf16 and int8 want a processor that has them, bf16 also a GPU.",
     ),
 ]
 Compile = Annotated[

@@ -13,7 +13,7 @@ from urllib.parse import quote
 import typer
 
 from hma_data.errors import UsageError
-from hma_model.cli.options import require_checkpoint
+from hma_model.cli.options import Compile, Precision, require_checkpoint
 
 
 def play(
@@ -38,6 +38,11 @@ def play(
     token: Annotated[
         str | None, typer.Option("--token", help="What the address must carry; made up with --host.")
     ] = None,
+    device: Annotated[
+        str, typer.Option("--device", help="Of the model and its tokenizer, such as cpu, cuda or mps.")
+    ] = "cpu",
+    precision: Precision = "float32",
+    compile: Compile = False,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
     ] = True,
@@ -63,7 +68,7 @@ def play(
     def tokenizer() -> Any:
         from hma_data.tokenizers.base import get_tokenizer
 
-        return get_tokenizer(opened.config.tokenizer["name"])
+        return get_tokenizer(opened.config.tokenizer["name"], device=device)
 
     robots = drivable(opened, sets or trained_on(opened), tokenizer, pictures)
     from hma_model.simulate.server import LOOPBACK, serve
@@ -81,8 +86,9 @@ def play(
         if browser and _display():
             webbrowser.open(address)
 
+    settings = {"device": device, "precision": precision, "compile": compile}
     try:
-        asyncio.run(serve(opened, name, robots, tokenizer(), listener, host, token, ready))
+        asyncio.run(serve(opened, name, robots, tokenizer(), listener, host, token, ready, **settings))
     except KeyboardInterrupt:
         print("stopped; what was not saved is lost")
 

@@ -36,11 +36,15 @@ COLUMNS = 8  # frames in a row of a sheet
 
 @dataclass(frozen=True)
 class RolloutVideo:
-    """Frames (T, H, W, 3) uint8 at `fps`; the first `prompt` of each window are true, not predictions."""
+    """Frames (T, H, W, 3) uint8 at `fps`; the first `prompt` of each window are true, not predictions.
+
+    `actions` (B, T, K) are the windows' own, raw; NaN where they are unknown.
+    """
 
     frames: NDArray[np.uint8]
     fps: float
     prompt: int
+    actions: NDArray[np.float32]
 
 
 def rollout_video(
@@ -104,7 +108,8 @@ def rollout_video(
         parts.append(_with_time(np.concatenate(columns, axis=2), prompt))
         if len(chosen) > 1:
             parts.append(parts[-1][-1:].repeat(round(HOLD * fps), axis=0))
-    return RolloutVideo(np.concatenate(parts), fps, prompt)
+    actions = batch.actions.masked_fill(~batch.action_mask.unsqueeze(-1), float("nan"))
+    return RolloutVideo(np.concatenate(parts), fps, prompt, actions.numpy())
 
 
 def lively_windows(

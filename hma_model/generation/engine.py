@@ -9,16 +9,17 @@ from torch import Tensor, nn
 
 from hma_data.errors import HMAError
 from hma_data.tokenizers.network import one_thread
-from hma_model.generation.packed import has_bfloat16, packed, packs
+from hma_model.generation.packed import has_bfloat16, has_int8, packed, packs
 from hma_model.generation.unmask import TokenFrame
 from hma_model.network.head import TokenReadout
 from hma_model.network.model import HMA
 from hma_model.network.trunk import Trunk
 
-PRECISIONS = {"float32": torch.float32, "bf16": torch.bfloat16}
-ONE_THREAD = (
-    30e6  # operations of a pass's largest product, below which a second thread brings next to nothing
-)
+PRECISIONS = {"float32": torch.float32, "bf16": torch.bfloat16, "int8": torch.qint8}
+MOST_GRAPHS = 64  # of a model's passes: each number of rows and of tokens to unmask has one
+# Operations of a pass's largest product, below which one thread computes: a second one brings little, and
+# beside other work the two wait for each other (docs/results.md, Waiting threads).
+ONE_THREAD = 150e6
 
 
 class Engine:
@@ -37,15 +38,15 @@ class Engine:
 
     def __init__(self, model: HMA, precision: str, compile: bool) -> None:
         self.config, self.device, self.precision = model.config, model.device, precision
-        if precision not in PRECISIONS:
-            raise HMAError("precision", f"{precision!r} is unknown", f"give {' or '.join(PRECISIONS)}")
-        dtype, device = PRECISIONS[precision], model.device
-        if dtype == torch.bfloat16 and device.type == "cpu" and not has_bfloat16():
-            raise HMAError("precision", "this processor has no products of bfloat16", "use float32")
+        dtype, device = products_in(precision, model.device, compile), model.device
         whole = model.trunk.position.dtype == torch.float32 and not torch.is_autocast_enabled(device.type)
         pack = whole and not compile and packs(device)
         self.trunk: Trunk = packed(model.trunk, dtype) if pack else model.trunk
-        self.readout: nn.Module = packed(model.readout) if pack else model.readout
+        # Scores of tokens stay float32; the diffusion head, most of a frame of latents, may be bfloat16.
+        half = dtype == torch.bfloat16 and model.config.kind == "continuous"
+        self.readout: nn.Module = (
+            packed(model.readout, dtype if half else torch.float32) if pack else model.readout
+        )
         self.compiled = _compiled(model.trunk, device) if compile else None
         self.whole = _compiled(self.unmasked_by, device) if compile else None
         self._casts = dtype == torch.bfloat16 and not pack
@@ -71,6 +72,18 @@ class Engine:
             yield
 
 
+def products_in(precision: str, device: torch.device, compile: bool) -> torch.dtype:
+    """Return the type of a precision; raise HMAError if it is unknown, or the device has no such products."""
+    if precision not in PRECISIONS:
+        raise HMAError("precision", f"{precision!r} is unknown", f"give {' or '.join(PRECISIONS)}")
+    if precision == "bf16" and device.type == "cpu" and not has_bfloat16():
+        raise HMAError("precision", "this processor has no products of bfloat16", "use float32")
+    if precision == "int8" and (compile or not packs(device) or not has_int8()):
+        fault = "int8 is for processors with AVX-512 VNNI, without compile"
+        raise HMAError("precision", fault, "use float32 or bf16")
+    return PRECISIONS[precision]
+
+
 def _compiled(function: Callable[..., Tensor], device: torch.device) -> Callable[..., Tensor]:
     """Return a function compiled for passes of a fixed shape; a result is valid until the next pass."""
     mode = "reduce-overhead" if device.type == "cuda" else "default"
@@ -78,7 +91,8 @@ def _compiled(function: Callable[..., Tensor], device: torch.device) -> Callable
 
     def call(*arguments: object) -> Tensor:
         torch.compiler.cudagraph_mark_step_begin()
-        made: Tensor = compiled(*arguments)
+        with torch._dynamo.config.patch(recompile_limit=MOST_GRAPHS):  # beyond it, code runs uncompiled
+            made: Tensor = compiled(*arguments)
         return made
 
     return call

@@ -58,7 +58,8 @@ class Rollout:
         cache: keep keys and values of past frames.
         compile: compile the passes over one or two frames, on a GPU with CUDA graphs; the first frames then
             take a minute or more. A step of some rows then computes all of them.
-        precision: "float32", or "bf16" for products in bfloat16.
+        precision: "float32"; "bf16" or "int8" for products in these. In int8 a row's frames depend on the
+            rows beside it.
 
     Attributes:
         decoding: the settings of unmasking; they may be replaced between steps.

@@ -238,7 +238,7 @@ class ActionHead(nn.Module):
 
 def cosine_levels(steps: int) -> Tensor:
     """Return (steps,) float64, the signal's share of variance at each noise level (arXiv 2102.09672)."""
-    time = torch.arange(steps + 1, dtype=torch.float64) / steps
+    time = torch.arange(steps + 1, dtype=torch.float64, device="cpu") / steps
     share = ((time + 0.008) / 1.008 * math.pi / 2).cos() ** 2
     noise = (1 - share[1:] / share[:-1]).clamp(max=0.999)
     return (1 - noise).cumprod(0)
@@ -284,7 +284,9 @@ class DiffusionHead(nn.Module):
         self.blocks = nn.ModuleList(_Block(width) for _ in range(config.diffusion_depth))
         self.modulation = Linear(width, 2 * width)
         self.output = Linear(width, values * (2 if config.diffusion_variance else 1))
-        self.register_buffer("levels", cosine_levels(config.diffusion_train_steps).float(), persistent=False)
+        # as a list too, so that sampling does not wait for a GPU
+        self.shares: list[float] = cosine_levels(config.diffusion_train_steps).float().tolist()
+        self.register_buffer("levels", torch.tensor(self.shares), persistent=False)
         for name, module in self.named_modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
@@ -330,16 +332,15 @@ class DiffusionHead(nn.Module):
         Returns:
             (M, C) float32.
         """
-        total = len(self.levels)
+        total = len(self.shares)
         count = min(steps or self.sample_steps, total)
-        levels = torch.linspace(total - 1, 0, count).round().long().tolist() if count > 1 else [total - 1]
-        shares = [*self.levels.double()[levels].tolist(), 1.0]
-        embedded = self.condition(condition)
+        levels = torch.linspace(total - 1, 0, count).round().long()
+        shares = [*(self.shares[level] for level in levels.tolist()), 1.0]
+        embedded, embedded_levels = self.condition(condition), self._level(levels.to(condition.device))
         copies = 1 if guidance is None else 2
         x = randn((len(condition) // copies, self.values), generator, condition.device)
-        for index, level in enumerate(levels):
-            embedded_level = self._level(torch.tensor([level], device=x.device))
-            predicted = self._predict(x.repeat(copies, 1), embedded_level, embedded)
+        for index in range(count):
+            predicted = self._predict(x.repeat(copies, 1), embedded_levels[index], embedded)
             if guidance is not None:
                 commanded, free = predicted.chunk(2)
                 predicted = torch.lerp(free, commanded, guidance)

@@ -349,7 +349,7 @@ class HMA(nn.Module):
                 with commands. Each pass then costs two. For models trained with `drop_commands`.
             noise_level: how corrupted the model is to take its own frames for, 0 to 1. For models trained
                 with `told_noise`.
-            precision: "float32", or "bf16" for products in bfloat16.
+            precision: "float32"; "bf16" or "int8" for products in these.
             compile: compile the trunk; the first frames then take a minute or more.
 
         Returns:

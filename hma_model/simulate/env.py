@@ -241,7 +241,7 @@ class WorldModelEnv(_Environment, gymnasium.Env[Picture, Floats]):
         size: side in pixels of the observations; None for that of the model's pictures.
         world: a world to open the session in, instead of a checkpoint.
         device: of the network.
-        settings: of `World`: unmask_steps, temperature, order, sample_steps, compile.
+        settings: of `World`: unmask_steps, temperature, order, sample_steps, compile, precision.
 
     Raises:
         HMAError: the checkpoint lacks the embodiment, or an argument is wrong.

@@ -353,6 +353,14 @@ class Connection:
             self.page.tell({"kind": "error", "text": f"command: {fault}"})
             return
         session.held, session.input = np.array(message.command, np.float32), message.input
+        if not session.warned:
+            pairs = zip(session.robot.dimensions, message.command)
+            beyond = [d for d, value in pairs if abs(2 * value - d.low - d.high) > 1.05 * (d.high - d.low)]
+            said = ", ".join(f"{dim.name} {dim.low:g} to {dim.high:g}" for dim in beyond)
+            session.warned = bool(beyond)
+            if beyond:
+                text = f"the model knows only {said}; what it shows beyond is a guess. This is said once"
+                self.page.tell({"kind": "error", "text": f"command: {text}"})
 
 
 async def serve(
@@ -364,6 +372,8 @@ async def serve(
     host: str,
     token: str | None,
     ready: Callable[[], None],
+    device: str = "cpu",
+    **settings: Any,
 ) -> None:
     """Serve a checkpoint until the process is interrupted.
 
@@ -373,6 +383,8 @@ async def serve(
         tokenizer: the checkpoint's.
         listener: a socket that listens.
         ready: called when the page can be opened.
+        device: of the network.
+        settings: of `World`.
 
     Raises:
         CheckpointError: the checkpoint is damaged.
@@ -380,10 +392,10 @@ async def serve(
     from hma_model.checkpoint.io import load
     from hma_model.simulate.world import World
 
-    model = load(checkpoint.folder, sorted({robot.embodiment.id for robot in robots.values()}))
-
+    names = sorted({robot.embodiment.id for robot in robots.values()})
+    model = load(checkpoint.folder, names, device)
     confidence = ("confidence",) if checkpoint.config.kind == "discrete" else ()
-    engine = Engine(World(model, tokenizer), robots, orders=("random", *confidence))
+    engine = Engine(World(model, tokenizer, **settings), robots, orders=("random", *confidence))
     engine.start()
     try:
         await run(Server(engine, name, host, token).app, listener, lambda server: ready())

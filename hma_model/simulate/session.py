@@ -104,6 +104,7 @@ class Session:
         self.viewer: Viewer | None = None
         self.due = self.touched = now
         self.paused, self.replays, self.fast = True, False, False
+        self.warned = False  # that commands are outside the range of the page
         self.steps = 0  # single steps asked for
         self.input = 0  # number of the newest input, by which the page measures latency
         self._times: deque[float] = deque(maxlen=40)

@@ -23,6 +23,7 @@ from hma_data.storage.paths import StrPath
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.evaluate import decode
+from hma_model.generation.engine import products_in
 from hma_model.generation.rollout import Rollout
 from hma_model.generation.state import Snapshot as Snapshot
 from hma_model.generation.unmask import Decoding, check, default_temperature
@@ -48,7 +49,7 @@ class World:
         model: in eval mode.
         tokenizer: the tokenizer that the model was trained on.
         unmask_steps, temperature, order, sample_steps: as in `HMA.generate`.
-        compile: as in `Rollout`; for a GPU.
+        compile, precision: as in `Rollout`; compile is for a GPU.
 
     Attributes:
         unmask_steps, temperature, order, sample_steps: may be set between steps; they count for all sessions.
@@ -67,13 +68,15 @@ class World:
         order: str = "random",
         sample_steps: int | None = None,
         compile: bool = False,
+        precision: str = "float32",
     ) -> None:
         require_tokenizer(model.config, tokenizer.spec, "the model")
-        self.model, self.tokenizer, self.compile = model, tokenizer, compile
+        self.model, self.tokenizer, self.compile, self.precision = model, tokenizer, compile, precision
         self.unmask_steps = unmask_steps
         self.temperature = default_temperature(model.config) if temperature is None else temperature
         self.order, self.sample_steps = order, sample_steps
         self.measure, self.entropies = False, dict[int, float]()
+        products_in(precision, model.device, compile)  # checks that the device has them
         self._decoding()
         self.picture_shape = picture_shape(model.config)
         self._rollout: Rollout | None = None
@@ -204,7 +207,7 @@ class World:
         if before is not None and row < before.batch:
             return
         batch = 1 if before is None else 2 * before.batch
-        self._rollout = Rollout(self.model, embodiment, batch, compile=self.compile)
+        self._rollout = Rollout(self.model, embodiment, batch, compile=self.compile, precision=self.precision)
         if before is not None:
             self._rollout.restore(range(before.batch), before.snapshot())
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from hma_data.errors import UsageError
 from hma_data.tokenizers.network import NetworkTokenizer
-from hma_model.bench import generation, speed, waiting, work
+from hma_model.bench import generation, play, speed, waiting, work
 from hma_model.cli import app
 
 SMALL = {
@@ -19,7 +19,7 @@ SMALL = {
 
 
 def _generate(**changes: Any) -> dict[str, Any]:
-    return generation.GENERATE.defaults | SMALL | {"frames": 1, "ddim_steps": 2} | changes
+    return generation.GENERATE.defaults | SMALL | {"frames": 1} | changes
 
 
 @pytest.mark.slow
@@ -47,9 +47,13 @@ def test_without_a_kind_the_rows_of_the_table_are_measured_and_settings_choose_a
     rows = generation.cases(_generate())
     told = [(row["kind"], row["batch"], row["decode"]) for row in rows if row["cache"]]
     pairs = [(batch, decode) for batch in (1, 16) for decode in (False, True)]
-    expected = [("discrete", *pair) for pair in pairs] + [("continuous", 1, False), ("embedded", 1, True)]
-    assert told == expected
-    assert generation.cases(_generate(batch=16, decode=True)) == [generation.TABLE[4]]
+    discrete, latents = [("discrete", *pair) for pair in pairs], [("continuous", 1, False)] * 2
+    assert told == [("embedded", 1, True), *discrete, *latents]
+    assert [row["row"] for row in generation.cases(_generate(batch=16, decode=True))] == [
+        "discrete-16-pictures"
+    ]
+    (chosen,) = generation.cases(_generate(rows="continuous-4"))
+    assert (chosen["row"], chosen["ddim_steps"]) == ("continuous-4", 4)
 
 
 def test_the_embedded_model_is_measured_to_pictures() -> None:
@@ -68,7 +72,7 @@ def test_the_work_of_a_frame_is_that_of_its_products() -> None:
 
 @pytest.mark.parametrize("cache", [True, False])
 def test_latents_are_measured_in_either_precision(cache: bool) -> None:
-    case = {"kind": "continuous", "cache": cache, "batch": 1, "decode": False}
+    case = {"kind": "continuous", "cache": cache, "batch": 1, "decode": False, "ddim_steps": 2}
     result = generation.measure_frames(_generate(precision="bf16") | case)
     assert (result["ddim_steps"], result["precision"], result["cache"]) == (2, "bf16", cache)
 
@@ -88,9 +92,10 @@ def test_frames_are_decoded_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"precision": "fp8"}, "precision=fp8 is not allowed — give one of fp32, bf16"),
+        ({"precision": "fp8"}, "precision=fp8 is not allowed — give one of fp32, bf16, int8"),
         ({"kind": "video"}, "kind=video is not allowed"),
         ({"cache": 3}, "cache=3 is not allowed — give one of True, False"),
+        ({"rows": "base"}, "the table has no row 'base' — rows: embedded, discrete,"),
         ({"batch": "many"}, "batch=many is not allowed — give a number"),
         ({"frames": 0}, "frames=0 is not allowed — give at least 1"),
         ({"window": 1}, "a window of 1 has no prompt"),
@@ -99,6 +104,19 @@ def test_frames_are_decoded_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_wrong_setting_is_named(change: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         generation.generate(_generate(**change))
+
+
+def test_measuring_ends_after_the_seconds_given_with_a_frame_at_least() -> None:
+    case = {"kind": "discrete", "cache": True, "batch": 1, "decode": False}
+    made = generation.Frames(speed.make_model(_generate()).eval(), _generate(frames=9, seconds=0.0) | case)
+    assert len(made.seconds()) == 1
+
+
+@pytest.mark.slow
+def test_viewers_of_the_page_get_frames_under_their_commands() -> None:
+    (result,) = play.play(play.BENCH.defaults | {"viewers": 2, "seconds": 3.0})
+    assert result["viewers"] == 2 and result["frames_per_second"] > 0.5
+    assert 0 < result["latency_p50_ms"] <= result["latency_p95_ms"]
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])

@@ -1,15 +1,19 @@
 """Films of rollouts: which windows they show, and how truth, prompt and prediction differ in them."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.reader import ShardSet
+from hma_model.cli import main
 from hma_model.evaluation import rollout_video as module
 from hma_model.evaluation.rollout_video import lively_windows, rollout_video
+from hma_model.network.model import HMA
 from tests.model.evaluation.test_evaluate import Blocks
-from tests.model.robots import make_model
+from tests.model.robots import make_model, save
 from tests.model.shards import make_shards
 
 LENGTH, PROMPT = 6, 2
@@ -53,3 +57,17 @@ def test_borders_tell_the_prompt_from_predictions_and_the_truth_has_none_of_thos
     panels = np.split(film.frames, 3, axis=2)
     picture = slice(46, 46 + module.SMALLEST)
     assert (panels[0][:PROMPT, picture] == panels[1][:PROMPT, picture]).all()
+
+
+def test_the_verb_tells_of_actions_outside_the_range_seen_in_training(
+    shards: ShardSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(tmp_path / "model", {"arm": 2})
+    model = HMA.from_pretrained(tmp_path / "model").eval()
+    monkeypatch.setattr("hma_model.cli._opened", lambda *names: (model, Blocks(), shards))
+    command = ["generate", "model", "shards", "--out", str(tmp_path / "film.webp")]
+    for low, high, told in ((-1e9, 1e9, False), (5e8, 1e9, True)):
+        ends = np.array([[low] * 2, [high] * 2], np.float32)
+        monkeypatch.setattr("hma_model.simulate.commands._seen", lambda *names, ends=ends: ends)
+        assert main(command) == 0
+        assert ("outside the range seen in training (" in capsys.readouterr().err) == told

@@ -1,18 +1,24 @@
 """Packed modules: what they compute, and that a row does not depend on the rows beside it."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import nn
 
 from hma_data.errors import HMAError
 from hma_model.generation import engine
-from hma_model.generation.packed import PackedLinear, has_bfloat16, packed, packs
+from hma_model.generation.packed import PackedLinear, QuantizedLinear, has_bfloat16, has_int8, packed, packs
 from hma_model.generation.rollout import Rollout
 from hma_model.network.model import HMA
 from tests.model.network_parts import small_batch, small_model
 
 needs_packing = pytest.mark.skipif(not packs(torch.device("cpu")), reason="this platform has no AVX-512")
 needs_bfloat16 = pytest.mark.skipif(not has_bfloat16(), reason="this platform has no products of bfloat16")
+
+needs_int8 = pytest.mark.skipif(
+    not (packs(torch.device("cpu")) and has_int8()), reason="this platform has no products of int8"
+)
 
 
 def _frames(model: HMA, **how: object) -> torch.Tensor:
@@ -76,7 +82,10 @@ def test_bfloat16_products_keep_the_features_near() -> None:
 
 @pytest.mark.parametrize(
     ("precision", "message"),
-    [("fp8", "'fp8' is unknown — give float32 or bf16"), ("bf16", "no products of bfloat16 — use float32")],
+    [
+        ("fp8", "'fp8' is unknown — give float32 or bf16 or int8"),
+        ("bf16", "no products of bfloat16 — use float32"),
+    ],
 )
 def test_a_precision_that_is_not_there_is_refused(
     precision: str, message: str, monkeypatch: pytest.MonkeyPatch
@@ -84,6 +93,39 @@ def test_a_precision_that_is_not_there_is_refused(
     monkeypatch.setattr(engine, "has_bfloat16", lambda: False)
     with pytest.raises(HMAError, match=message):
         Rollout(small_model(), "arm", precision=precision)
+
+
+@needs_bfloat16
+def test_latents_drawn_by_bfloat16_products_are_near_those_of_float32() -> None:
+    model, seen = small_model(kind="continuous"), []
+    batch = small_batch(model.config, ["arm", "hand.v1"], frames=4)
+    for precision in ("float32", "bf16"):
+        rollout = Rollout(model, batch.embodiment, 2, precision=precision, sample_steps=8)
+        rollout.prompt(batch.latents[:, :3], batch.actions, seeds=[1, 2])
+        seen.append(rollout.step(batch.actions[:, 2]))
+    error = (seen[0] - seen[1]).square().mean() / seen[0].square().mean()
+    assert 0 < error < 0.01
+
+
+@needs_int8
+def test_products_in_int8_keep_the_features_near_and_plain_maps_stay_near_too() -> None:
+    model, seen = small_model(), []
+    batch = small_batch(model.config, ["arm", "hand.v1"], frames=4)
+    for precision in ("float32", "int8"):
+        rollout = Rollout(model, batch.embodiment, 2, precision=precision)
+        rollout.prompt(batch.tokens[:, :3], batch.actions, seeds=[1, 2])
+        rollout.step(batch.actions[:, 2])
+        seen.append(rollout.state.layers[-1].time.flatten())
+    assert torch.nn.functional.cosine_similarity(*seen, dim=0) > 0.995
+    assert not torch.equal(*seen)
+    linear, x = nn.Linear(96, 40), torch.randn(3, 7, 96)
+    expected = nn.functional.gelu(linear(x))
+    assert (QuantizedLinear(linear, "gelu")(x) - expected).abs().max() < 0.02 * expected.abs().max()
+
+
+def test_int8_is_refused_with_a_compiler() -> None:
+    with pytest.raises(HMAError, match="int8 is for processors with AVX-512 VNNI, without compile"):
+        Rollout(small_model(), "arm", precision="int8", compile=True)
 
 
 def test_what_a_rollout_returns_can_be_changed_and_trained_on() -> None:
@@ -119,3 +161,39 @@ def test_trunk_head_and_unmasking_compile_to_one_graph_of_each_pass(
     made = _frames(model, compile=True, **how)
     assert torch.equal(made, _frames(model, **how))
     assert len(graphs) == 2  # over two frames, and over one
+
+
+@pytest.mark.slow
+def test_new_prompts_and_rows_that_begin_anew_compile_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, compile, graphs = small_model(), torch.compile, []
+
+    def backend(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> torch.fx.GraphModule:
+        graphs.append(graph)
+        return graph
+
+    def traced(function: object, **how: object) -> object:
+        return compile(function, backend=backend, fullgraph=True, dynamic=False)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(torch, "compile", traced)
+    torch._dynamo.reset()
+    batch = small_batch(model.config, ["arm", "hand.v1"], frames=8)
+    rollout = Rollout(model, batch.embodiment, 2, compile=True, unmask_steps=12)
+
+    def play(prompt: int) -> None:
+        rollout.prompt(batch.tokens[:, :prompt], batch.actions, seeds=[prompt, 2])
+        for i in range(prompt - 1, 7):
+            rollout.step(batch.actions[:, i])
+
+    play(3)
+    kinds = len(graphs)  # of passes
+    play(4)
+    rollout.reset([1], batch.tokens[1:, :2], batch.actions[1:], seeds=[5])
+    rollout.step(batch.actions[:, 1])
+    rollout.step(batch.actions[:1, 2], rows=[0])
+    rollout.prompt(batch.tokens[:, :3], batch.actions, torch.rand(2, 8) < 0.5)
+    rollout.step(batch.actions[:, 2], known=torch.tensor([True, False]))
+    assert len(graphs) == kinds > 2
+    for steps in (1, 3, 4, 5, 6, 7):  # each takes other numbers of tokens, more than torch compiles by itself
+        rollout.decoding = replace(rollout.decoding, steps=steps)
+        rollout.step(batch.actions[:, 3])
+    assert len(graphs) > torch._dynamo.config.recompile_limit

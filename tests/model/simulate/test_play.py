@@ -23,11 +23,11 @@ def served(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     """Keep the arguments of `serve`."""
     kept: list[tuple[Any, ...]] = []
 
-    async def serve(*given: Any) -> None:
-        kept.append(given)
+    async def serve(*given: Any, **settings: Any) -> None:
+        kept.append((*given, settings))
 
     monkeypatch.setattr("hma_model.simulate.server.serve", serve)
-    monkeypatch.setattr("hma_data.tokenizers.base.get_tokenizer", lambda name: name)
+    monkeypatch.setattr("hma_data.tokenizers.base.get_tokenizer", lambda name, device: name)
     return kept
 
 
@@ -71,3 +71,10 @@ def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, served: list[An
     assert json.loads((tmp_path / "run/recipe.json").read_text())["data"] == [data]
     assert main(["play", out, "--no-browser"]) == 0
     assert list(served[0][2]) == ["rover:recordings"]
+
+
+def test_the_device_and_precision_reach_the_world(tmp_path: Path, served: list[Any], picture: str) -> None:
+    save(tmp_path / "model", {"arm": 2})
+    words = ["play", str(tmp_path / "model"), "--prompt", picture, "--no-browser"]
+    assert main([*words, "--precision", "bf16", "--device", "cuda", "--compile"]) == 0
+    assert served[0][-1] == {"device": "cuda", "precision": "bf16", "compile": True}

@@ -105,6 +105,22 @@ def test_a_page_opens_drives_and_sees_both_pictures(client: TestClient) -> None:
         assert page.message("status")["paused"]
 
 
+def test_a_command_far_outside_the_range_seen_in_training_is_told_once(client: TestClient) -> None:
+    with client.websocket_connect(DRIVE) as socket:
+        page = Page(socket)
+        ends = page.open()["robot"]["dimensions"][0]
+        page.send("drive", command=[2 * ends["high"], 0], input=1)
+        assert f"vx {ends['low']:g} to {ends['high']:g}" in page.message("error")["text"]
+        page.send("drive", command=[3 * ends["high"], 0], input=2)
+        page.send("step")
+        received = []
+        while not (data := socket.receive()).get("bytes"):
+            received.append(json.loads(data["text"])["kind"])
+        assert "error" not in received
+        (size,) = struct.unpack(">H", data["bytes"][:2])
+        assert json.loads(data["bytes"][2 : 2 + size])["command"][0] == pytest.approx(3 * ends["high"])
+
+
 def test_a_reload_goes_on_where_it_was(client: TestClient) -> None:
     with client.websocket_connect(DRIVE) as socket:
         page = Page(socket)
