@@ -27,6 +27,8 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import Ints, Short
 from hma_data.storage.paths import StrPath
 
+AHEAD, AHEAD_BYTES = 8, 8 * MIB  # most batches of a lane that are cut together, and their windows
+
 __all__ = ["Batch", "MixtureDataset", "WindowDataset", "as_batch", "open_sets"]
 
 
@@ -138,7 +140,7 @@ class WindowDataset(Dataset[Batch]):
         joined["camera"] = camera[order]
         name = self.shards.embodiment.id
         cut = {name: (order, joined)}
-        return assemble({name: self.shards}, [name] * len(numbers), cut, self._short, self._views)
+        return next(assemble(self.shards.spec, [name] * len(numbers), cut, self._short, self._views))
 
 
 class MixtureDataset(IterableDataset[Batch]):
@@ -163,7 +165,7 @@ class MixtureDataset(IterableDataset[Batch]):
         split: train or val.
         short: "drop" or "pad": what happens to episodes shorter than a window.
         pool: row groups decoded together for an embodiment and lane; None: as `memory_mib` allows, at most 8.
-        lanes: independent streams per rank; at least the number of workers for full speed.
+        lanes: independent streams per rank; a multiple of the number of workers for full speed.
         memory_mib: memory for decoded rows in all lanes together, in MiB, about.
         cameras: `first`, `drawn` (a camera for each window), a name, or the names of several cameras, whose
             views are stacked along the height of the token grid.
@@ -227,6 +229,8 @@ class MixtureDataset(IterableDataset[Batch]):
         self._pools = [pool or pool_size(d, share * 4 / 5 / lanes) for d in self._decoders.values()]
         self._assignments: dict[int, UnitAssignment] = {}
         self._sequences: dict[tuple[int, int], WindowSequence] = {}
+        self._drawn: dict[int, Ints] = {}
+        self._ahead: dict[int, tuple[int, Iterator[Batch]]] = {}  # lane -> its next step, and batches
         self._step = 0
         self._origin: int | None = None  # in a DataLoader worker: the step that worker 0 began with
         self._taken: Ints = np.zeros((lanes, len(counts)), np.int64)
@@ -240,7 +244,7 @@ class MixtureDataset(IterableDataset[Batch]):
         while True:
             lane, draws = self._step % self.lanes, self._draws(self._step)
             mine = (self._step - (self._origin or 0)) % workers == worker
-            batch = self._make(lane, draws, self._taken[lane]) if mine else None
+            batch = self._batch(self._step, self._taken[lane], workers) if mine else None
             self._step, self._taken = self._step + 1, _counted(self._taken, lane, draws)
             if batch is not None:
                 yield batch
@@ -277,22 +281,44 @@ class MixtureDataset(IterableDataset[Batch]):
         return self.mixture.table(self._taken.sum(axis=0))
 
     def _draws(self, step: int) -> Ints:
-        """Return the embodiments (B,) of this rank's batch `step`, as indices."""
+        """Return the embodiments (B,) of this rank's batch `step`, as indices; a few are remembered."""
+        if step not in self._drawn:
+            if len(self._drawn) > 4 * AHEAD * self.lanes:
+                self._drawn.clear()
+            self._drawn[step] = self._drawn_now(step)
+        return self._drawn[step]
+
+    def _drawn_now(self, step: int) -> Ints:
         if self.mixture.draw == "per_batch":
             return self.mixture.batch(step * self.world + self.rank, self.batch_size)
         whole = self.mixture.batch(step, self.batch_size * self.world)
         return whole[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]
 
-    def _make(self, lane: int, draws: Ints, taken: Ints) -> Batch:
+    def _batch(self, step: int, taken: Ints, workers: int) -> Batch:
+        """Return batch `step`; it is cut with the next ones of its lane, which is faster with many sets."""
+        lane = step % self.lanes
+        expected, batches = self._ahead.get(lane, (step, iter(())))
+        batch = next(batches, None) if expected == step else None
+        if batch is None:
+            largest = self.batch_size * max(decoder.window_bytes for decoder in self._decoders.values())
+            some = 1 if self.lanes % workers else int(np.clip(AHEAD_BYTES // largest, 1, AHEAD))
+            draws = [self._draws(step + i * self.lanes) for i in range(some)]
+            batches = self._cut(lane, np.concatenate(draws), taken)
+            batch = next(batches)
+        self._ahead[lane] = step + self.lanes, batches
+        return batch
+
+    def _cut(self, lane: int, draws: Ints, taken: Ints) -> Iterator[Batch]:
         names = self.mixture.names
         windows_of = {}
-        order = np.argsort(draws, kind="stable")
-        for samples in np.split(order, np.flatnonzero(np.diff(draws[order])) + 1):
-            which = int(draws[samples[0]])
-            sequence = self._sequence(lane, which)
-            windows_of[names[which]] = (samples, sequence.take(int(taken[which]), len(samples)))
-        views = view_count(self._cameras)
-        return assemble(self.sets, [names[i] for i in draws], windows_of, self._short, views)
+        order, ends = np.argsort(draws, kind="stable"), np.cumsum(np.bincount(draws)).tolist()
+        for which, (start, end) in enumerate(zip([0, *ends], ends)):
+            if end > start:
+                cut = self._sequence(lane, which).take(int(taken[which]), end - start)
+                windows_of[names[which]] = (order[start:end], cut)
+        spec, views = next(iter(self.sets.values())).spec, view_count(self._cameras)
+        drawn = [names[i] for i in draws]
+        return assemble(spec, drawn, windows_of, self._short, views, self.batch_size)
 
     def _sequence(self, lane: int, which: int) -> WindowSequence:
         if (lane, which) not in self._sequences:
@@ -306,7 +332,12 @@ class MixtureDataset(IterableDataset[Batch]):
         return self._sequences[lane, which]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_sequences": {}, "_assignments": {}}  # a worker makes these anew
+        return {
+            **self.__dict__,
+            "_sequences": {},
+            "_assignments": {},
+            "_ahead": {},
+        }  # a worker makes these anew
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position of the stream after the last batch taken, as plain values of a few kB."""
