@@ -191,8 +191,9 @@ def _ray_processes() -> tuple[list[int], list[int]]:
     for pid in found:  # grows while it is read
         found += children.get(pid, [])
         with suppress(OSError):
-            is_actor = Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::Worker")
-            (actors if is_actor else others).append(pid)
+            name = Path(f"/proc/{pid}/cmdline").read_bytes()  # empty once the process has ended
+            if name:
+                (actors if name.startswith(b"ray::Worker") else others).append(pid)
     return actors, others
 
 

@@ -5,7 +5,7 @@ n windows, B batch, T frames, S values a frame, h·w grid, c·H·W latents, A ac
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -265,6 +265,11 @@ class Batch:
     def pin_memory(self) -> "Batch":
         """Return the same batch in pinned memory; a DataLoader with pin_memory=True calls this."""
         return self._map(Tensor.pin_memory)
+
+    def part(self, start: int, end: int, width: int) -> "Batch":
+        """Return some of the windows, without a copy, with action chunks of `width` values."""
+        part = self._map(lambda value: value[start:end])
+        return replace(part, embodiment=self.embodiment[start:end], actions=part.actions[..., :width])
 
     def _map(self, change: Any) -> "Batch":
         values = {f.name: getattr(self, f.name) for f in fields(self)}
