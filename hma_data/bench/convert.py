@@ -6,7 +6,8 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +18,17 @@ from hma_data.bench import Bench, make_robot, rss_mib
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Time the tokenizer alone on as many frames, then run the conversion and measure its processes."""
-    from hma_data.conversion.engines import Limits
+    from hma_data.conversion.engines import Limits, Resources
     from hma_data.conversion.job import convert
     from hma_data.conversion.plan import Settings
 
     workers = settings["workers"]
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, _cluster(settings["engine"], settings["nodes"]):
         recording = Path(folder) / "recording.hdf5"
         _record(recording, settings)
         rows = settings["episodes"] * settings["frames"]
         alone_cpu = _tokenizer_alone(settings, rows)
-        watch = _Watch(workers)
+        watch = _Watch(workers, settings["engine"])
         summary = convert(
             make_robot("bench_arm", "hdf5", "actions", "obs/image"),
             recording,
@@ -35,6 +36,8 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
             Path(folder) / "out",
             settings=Settings(shard_frames=settings["shard_frames"]),
             workers=workers,
+            engine=settings["engine"],
+            resources=Resources(settings["worker_cpus"]),
             limits=Limits(quiet_s=None),
             on_progress=watch.mark,
         )
@@ -43,6 +46,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     used = watch.cpu_s - watch.start_cpu_s
     return [
         {
+            "engine": settings["engine"],
             "workers": workers,
             "tokenizer": settings["tokenizer"],
             "seconds": round(watch.seconds, 2),
@@ -51,11 +55,32 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
             "tokenizer_cpu_seconds": round(alone_cpu * after, 2),
             "worker_cpu_seconds": round(used, 2),
             "overhead_cpu_share": round(1 - alone_cpu * after / used, 4) if used else None,
+            "ray_cpu_seconds": round(watch.others_cpu_s, 2),
             **watch.memory(),
             "episodes": sum(split["episodes"] for split in summary.manifest.splits.values()),
             "bytes_per_frame": round(summary.manifest.to_json()["totals"]["bytes"] / rows, 1),
         }
     ]
+
+
+@contextmanager
+def _cluster(engine: str, nodes: int) -> Iterator[None]:
+    """Start a Ray cluster of several nodes on this machine, one CPU each, if the engine is Ray."""
+    if engine != "ray":
+        yield
+        return
+    import ray
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    for _ in range(nodes - 1):
+        cluster.add_node(num_cpus=1)
+    ray.init(address=cluster.address, log_to_driver=False, logging_level="error")
+    try:
+        yield
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
 
 
 def _record(path: Path, settings: dict[str, Any]) -> None:
@@ -107,8 +132,9 @@ class _Watch:
     that are done, and MiB of the largest worker and of this process.
     """
 
-    def __init__(self, workers: int) -> None:
-        self.workers = workers
+    def __init__(self, workers: int, engine: str) -> None:
+        self.workers, self._engine = workers, engine
+        self.others_cpu_s = 0.0  # of Ray's own processes
         self.seconds = self.start_seconds = self.cpu_s = self.start_cpu_s = self._share = 0.0
         self.start_frames = 0
         self.samples: list[tuple[float, dict[str, float]]] = []
@@ -140,12 +166,35 @@ class _Watch:
 
     def _look(self) -> None:
         while not self._stop.wait(0.2):
-            children = [child.pid for child in multiprocessing.active_children() if child.pid]
+            if self._engine == "ray":
+                children, others = _ray_processes()
+                self.others_cpu_s = max(self.others_cpu_s, _cpu_s(others))
+            else:
+                children = [child.pid for child in multiprocessing.active_children() if child.pid]
             pids = children if self.workers else [os.getpid()]
             if pids:  # none when the workers have ended, and the manifest is being written
                 self.cpu_s = max(self.cpu_s, _cpu_s(pids))
                 memory = {"worker": max(map(rss_mib, pids)), "parent": rss_mib()}
                 self.samples.append((self._share, memory))
+
+
+def _ray_processes() -> tuple[list[int], list[int]]:
+    """Return the actors of the engine, and the other processes that this one started."""
+    children: dict[int, list[int]] = {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            parent = (entry / "stat").read_text().rpartition(")")[2].split()[1]
+            children.setdefault(int(parent), []).append(int(entry.name))
+    actors: list[int] = []
+    others: list[int] = []
+    found = list(children.get(os.getpid(), []))
+    for pid in found:  # grows while it is read
+        found += children.get(pid, [])
+        with suppress(OSError):
+            name = Path(f"/proc/{pid}/cmdline").read_bytes()  # empty once the process has ended
+            if name:
+                (actors if name.startswith(b"ray::Worker") else others).append(pid)
+    return actors, others
 
 
 def _cpu_s(pids: list[int]) -> float:
@@ -166,6 +215,9 @@ BENCH = Bench(
         "pixels": 128,  # height and width of the recorded pictures, JPEG
         "tokenizer": "fsq-8",
         "workers": 1,
+        "engine": "local",  # or ray, on a cluster of so many nodes of one CPU on this machine
+        "nodes": 1,
+        "worker_cpus": 1.0,  # that an actor of Ray reserves
         "shard_frames": 4_096,
     },
     run,

@@ -16,13 +16,15 @@ from typing import Any
 import numpy as np
 
 from hma_data.bench import Bench, in_fresh_process, make_robot, peak_rss_mib, rss_mib
+from hma_data.bench.peers import run_peer
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """Run the cases: `mixture` streams shuffled batches of all sets; `random` reads one set in any order."""
+    """Run the cases, then the peers: `mixture` streams batches of all sets, `random` reads one set anyhow."""
     with tempfile.TemporaryDirectory() as folder:
         sets = [make_set(Path(folder) / str(i), i, settings) for i in range(settings["embodiments"])]
-        return [in_fresh_process(_load, case, sets, settings) for case in settings["cases"]]
+        results = [in_fresh_process(_load, case, sets, settings) for case in settings["cases"]]
+        return results + [in_fresh_process(run_peer, name, sets[0], settings) for name in settings["peers"]]
 
 
 def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
@@ -150,6 +152,8 @@ BENCH = Bench(
         "batch": 32,
         "draw": "per_sample",
         "cases": ["mixture", "random"],
+        "peers": [],  # datasets, lance, litdata, streaming: random windows of the first set
+        "peer_windows": 4_000,  # measured of each peer
         "workers": 0,
         "runs": 3,
     },

@@ -45,6 +45,8 @@ class _Job:
     device: str
     workers: int
     engine: Literal["local", "ray"]
+    worker_cpus: float
+    worker_gpus: float | None
     frequency_hz: float | None
     max_quarantine: float
     episode_timeout: float
@@ -68,6 +70,13 @@ def convert(
     engine: Annotated[
         Literal["local", "ray"], Option(help="What runs the workers.", rich_help_panel=JOBS)
     ] = "local",
+    worker_cpus: Annotated[
+        float, Option(min=0, help="CPUs that a worker of Ray reserves.", rich_help_panel=JOBS)
+    ] = 1.0,
+    worker_gpus: Annotated[
+        float | None,
+        Option(min=0, help="GPUs of a worker of Ray; default: 1 with --device cuda.", rich_help_panel=JOBS),
+    ] = None,
     limit: Annotated[
         int | None, Option(min=1, help="Convert only so many episodes, from the first on.")
     ] = None,
@@ -168,6 +177,8 @@ def convert(
         device=device,
         workers=workers,
         engine=engine,
+        worker_cpus=worker_cpus,
+        worker_gpus=worker_gpus,
         frequency_hz=frequency_hz,
         max_quarantine=max_quarantine,
         episode_timeout=episode_timeout,
@@ -189,7 +200,7 @@ def convert(
 def _convert(job: _Job, json: bool, extend: bool, overwrite: bool, share: "Share | None") -> bool:
     """Run a conversion, or a share of it; return False if too many episodes are in quarantine."""
     robot = _ready(job)
-    from hma_data.conversion.engines import Limits
+    from hma_data.conversion.engines import Limits, Resources
     from hma_data.conversion.job import convert as run
     from hma_data.conversion.job import convert_share
 
@@ -208,6 +219,7 @@ def _convert(job: _Job, json: bool, extend: bool, overwrite: bool, share: "Share
             done = convert_share(*what, share, **options)
         else:
             options |= {"engine": job.engine, "max_quarantine": job.max_quarantine}
+            options["resources"] = Resources(job.worker_cpus, job.worker_gpus)
             summary = run(*what, overwrite=overwrite, **options)
     if share:
         _report_share(done, share, json)

@@ -17,7 +17,7 @@ from typing import Literal
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hma_data.conversion.engines import LIMITS, Limits, Retry
+from hma_data.conversion.engines import LIMITS, RESOURCES, Limits, Resources, Retry
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.extend import content_of, extended
 from hma_data.conversion.output import (
@@ -148,6 +148,7 @@ def convert(
     max_quarantine: float = 0.01,
     overwrite: bool = False,
     extend: bool = False,
+    resources: Resources = RESOURCES,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> Summary:
     """Convert a recording into the shard set `out`; running it again continues.
@@ -164,6 +165,7 @@ def convert(
         max_quarantine: fraction of episodes that may be refused.
         overwrite: delete what `out` holds, if it is a shard set.
         extend: add the episodes that a finished set in `out` does not have yet.
+        resources: what a worker reserves with engine="ray".
         on_progress: called about once for every batch of frames.
 
     Raises:
@@ -185,6 +187,7 @@ def convert(
         device,
         limits,
         engine,
+        resources,
     )
     with locked(folder):
         if overwrite:
@@ -259,6 +262,7 @@ class _Conversion:
     device: str
     limits: Limits
     engine: str = "local"
+    resources: Resources = RESOURCES
 
     def __post_init__(self) -> None:
         if isinstance(self.tokenizer, str):
@@ -332,8 +336,10 @@ class _Conversion:
         if self.engine == "ray":
             from hma_data.conversion.engines.ray import run as run_ray
 
-            gpus = 1.0 if self.device.startswith("cuda") else 0.0
-            return run_ray(todo, MakeWork(job), self.workers, on_event, self.limits, gpus)
+            cpus, gpus = self.resources.cpus, self.resources.gpus
+            if gpus is None:
+                gpus = 1.0 if self.device.startswith("cuda") else 0.0
+            return run_ray(todo, MakeWork(job), self.workers, on_event, self.limits, cpus, gpus)
         make_work = MakeWork(job, None if self.workers else self._opened)
         return run_local(todo, make_work, self.workers, on_event, self.limits)
 

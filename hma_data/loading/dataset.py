@@ -12,6 +12,7 @@ B batch, T frames, h·w grid, c·H·W latents, A action dims, K = stride·A.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ from hma_data.loading.views import FIRST, Cameras, Views, by_number, view_count
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import Ints, Short
 from hma_data.storage.paths import StrPath
+
+AHEAD, AHEAD_BYTES = 8, 8 * MIB  # most batches of a lane that are cut together, and their windows
 
 __all__ = ["Batch", "MixtureDataset", "WindowDataset", "as_batch", "open_sets"]
 
@@ -138,7 +141,7 @@ class WindowDataset(Dataset[Batch]):
         joined["camera"] = camera[order]
         name = self.shards.embodiment.id
         cut = {name: (order, joined)}
-        return assemble({name: self.shards}, [name] * len(numbers), cut, self._short, self._views)
+        return next(assemble(self.shards.spec, [name] * len(numbers), cut, self._short, self._views))
 
 
 class MixtureDataset(IterableDataset[Batch]):
@@ -163,7 +166,7 @@ class MixtureDataset(IterableDataset[Batch]):
         split: train or val.
         short: "drop" or "pad": what happens to episodes shorter than a window.
         pool: row groups decoded together for an embodiment and lane; None: as `memory_mib` allows, at most 8.
-        lanes: independent streams per rank; at least the number of workers for full speed.
+        lanes: independent streams per rank; a multiple of the number of workers for full speed.
         memory_mib: memory for decoded rows in all lanes together, in MiB, about.
         cameras: `first`, `drawn` (a camera for each window), a name, or the names of several cameras, whose
             views are stacked along the height of the token grid.
@@ -227,6 +230,8 @@ class MixtureDataset(IterableDataset[Batch]):
         self._pools = [pool or pool_size(d, share * 4 / 5 / lanes) for d in self._decoders.values()]
         self._assignments: dict[int, UnitAssignment] = {}
         self._sequences: dict[tuple[int, int], WindowSequence] = {}
+        self._drawn: dict[int, Ints] = {}
+        self._ahead: dict[int, tuple[int, Iterator[Batch]]] = {}  # lane -> its next step, and batches
         self._step = 0
         self._origin: int | None = None  # in a DataLoader worker: the step that worker 0 began with
         self._taken: Ints = np.zeros((lanes, len(counts)), np.int64)
@@ -240,7 +245,7 @@ class MixtureDataset(IterableDataset[Batch]):
         while True:
             lane, draws = self._step % self.lanes, self._draws(self._step)
             mine = (self._step - (self._origin or 0)) % workers == worker
-            batch = self._make(lane, draws, self._taken[lane]) if mine else None
+            batch = self._batch(self._step, self._taken[lane], self.lanes % workers == 0) if mine else None
             self._step, self._taken = self._step + 1, _counted(self._taken, lane, draws)
             if batch is not None:
                 yield batch
@@ -262,37 +267,100 @@ class MixtureDataset(IterableDataset[Batch]):
             batch_size=None,
             num_workers=workers,
             multiprocessing_context=context,
-            prefetch_factor=4,
+            prefetch_factor=2,
             pin_memory=cuda.is_available(),  # so that copies to the GPU need not be waited for
         )
-        for batch in loader:
-            if isinstance(batch, HMAError):
-                raise batch
+        for batch in self._in_order(iter(loader)):
             lane, draws = self._step % self.lanes, self._draws(self._step)
             self._step, self._taken = self._step + 1, _counted(self._taken, lane, draws)
             yield batch
+
+    def blocks(self, worker: int, workers: int) -> Iterator[Batch]:
+        """Yield a worker's share of the batches, as blocks: batches of a lane that are cut together, in one.
+
+        A batch takes a millisecond to another process, and so does a block.
+        """
+        number = 0
+        while True:
+            for i in range(self.lanes):
+                if number % workers == worker:
+                    lane, draws = (self._step + i) % self.lanes, self._drawn_ahead(self._step + i)
+                    yield next(self._cut(lane, draws, self._taken[lane], len(draws)))
+                number += 1
+            for _ in range(self.lanes * self._some):
+                lane, draws = self._step % self.lanes, self._draws(self._step)
+                self._step, self._taken = self._step + 1, _counted(self._taken, lane, draws)
+
+    def _split(self, block: Batch) -> Iterator[Batch]:
+        robots = [self.sets[name].embodiment for name in block.embodiment]
+        widths = [robot.action_dim * robot.stride for robot in robots]
+        for start in range(0, len(widths), self.batch_size):
+            end = start + self.batch_size
+            yield block.part(start, end, max(widths[start:end]))
+
+    def _in_order(self, blocks: Iterator[Batch | HMAError]) -> Iterator[Batch]:
+        """Yield the batches of blocks: the first of each lane, then the second of each lane, and so on."""
+        while True:
+            begun = []
+            for _ in range(self.lanes):
+                block = next(blocks)
+                if isinstance(block, HMAError):
+                    raise block
+                begun.append(self._split(block))
+                yield next(begun[-1])
+            for batches in zip(*begun):
+                yield from batches
 
     def realised(self) -> list[dict[str, float | str | int]]:
         """Return what this rank has drawn of each embodiment beside what was intended: `Mixture.table`."""
         return self.mixture.table(self._taken.sum(axis=0))
 
     def _draws(self, step: int) -> Ints:
-        """Return the embodiments (B,) of this rank's batch `step`, as indices."""
+        """Return the embodiments (B,) of this rank's batch `step`, as indices; a few are remembered."""
+        if step not in self._drawn:
+            if len(self._drawn) > 4 * AHEAD * self.lanes:
+                self._drawn.clear()
+            self._drawn[step] = self._drawn_now(step)
+        return self._drawn[step]
+
+    def _drawn_now(self, step: int) -> Ints:
         if self.mixture.draw == "per_batch":
             return self.mixture.batch(step * self.world + self.rank, self.batch_size)
         whole = self.mixture.batch(step, self.batch_size * self.world)
         return whole[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]
 
-    def _make(self, lane: int, draws: Ints, taken: Ints) -> Batch:
+    @cached_property
+    def _some(self) -> int:
+        """Return the number of batches of a lane that are cut together: with many sets, that is faster."""
+        largest = self.batch_size * max(decoder.window_bytes for decoder in self._decoders.values())
+        return int(np.clip(AHEAD_BYTES // largest, 1, AHEAD))
+
+    def _drawn_ahead(self, step: int) -> Ints:
+        return np.concatenate([self._draws(step + i * self.lanes) for i in range(self._some)])
+
+    def _batch(self, step: int, taken: Ints, ahead: bool) -> Batch:
+        """Return batch `step`; with `ahead`, it is cut with the next ones of its lane."""
+        lane = step % self.lanes
+        expected, batches = self._ahead.get(lane, (step, iter(())))
+        batch = next(batches, None) if expected == step else None
+        if batch is None:
+            draws = self._drawn_ahead(step) if ahead else self._draws(step)
+            batches = self._cut(lane, draws, taken, self.batch_size)
+            batch = next(batches)
+        self._ahead[lane] = step + self.lanes, batches
+        return batch
+
+    def _cut(self, lane: int, draws: Ints, taken: Ints, size: int) -> Iterator[Batch]:
         names = self.mixture.names
         windows_of = {}
-        order = np.argsort(draws, kind="stable")
-        for samples in np.split(order, np.flatnonzero(np.diff(draws[order])) + 1):
-            which = int(draws[samples[0]])
-            sequence = self._sequence(lane, which)
-            windows_of[names[which]] = (samples, sequence.take(int(taken[which]), len(samples)))
-        views = view_count(self._cameras)
-        return assemble(self.sets, [names[i] for i in draws], windows_of, self._short, views)
+        order, ends = np.argsort(draws, kind="stable"), np.cumsum(np.bincount(draws)).tolist()
+        for which, (start, end) in enumerate(zip([0, *ends], ends)):
+            if end > start:
+                cut = self._sequence(lane, which).take(int(taken[which]), end - start)
+                windows_of[names[which]] = (order[start:end], cut)
+        spec, views = next(iter(self.sets.values())).spec, view_count(self._cameras)
+        drawn = [names[i] for i in draws]
+        return assemble(spec, drawn, windows_of, self._short, views, size)
 
     def _sequence(self, lane: int, which: int) -> WindowSequence:
         if (lane, which) not in self._sequences:
@@ -306,7 +374,12 @@ class MixtureDataset(IterableDataset[Batch]):
         return self._sequences[lane, which]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_sequences": {}, "_assignments": {}}  # a worker makes these anew
+        return {
+            **self.__dict__,
+            "_sequences": {},
+            "_assignments": {},
+            "_ahead": {},
+        }  # a worker makes these anew
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position of the stream after the last batch taken, as plain values of a few kB."""
@@ -362,14 +435,16 @@ class MixtureDataset(IterableDataset[Batch]):
 
 
 class _Carrier(IterableDataset[Any]):
-    """A dataset that yields its errors as items, because torch passes on only their text."""
+    """A dataset that yields blocks of batches, and its errors as items: torch passes on only their text."""
 
     def __init__(self, dataset: MixtureDataset) -> None:
         self._dataset = dataset
 
     def __iter__(self) -> Iterator[Batch | HMAError]:
+        info = get_worker_info()
+        assert info is not None
         try:
-            yield from self._dataset
+            yield from self._dataset.blocks(info.id, info.num_workers)
         except HMAError as fault:
             yield fault
 

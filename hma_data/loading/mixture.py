@@ -10,6 +10,7 @@ E embodiments, B samples a batch.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -131,12 +132,18 @@ class Mixture:
             share = _capped(share, limits)
         return cls(tuple(counts), tuple(counts.values()), share, draw, seed)
 
+    @cached_property
+    def _edges(self) -> Floats:
+        edges = np.cumsum(self.p)
+        edges[-1] = 1.0
+        return edges
+
     def batch(self, step: int, size: int) -> NDArray[np.int64]:
         """Return the index (B,) of each sample's embodiment in batch `step`, the same in every process."""
         rng = np.random.Generator(np.random.Philox(key=[self.seed, step]))
-        edges = np.cumsum(self.p)
-        edges[-1] = 1.0
-        draws = np.searchsorted(edges, rng.random(1 if self.draw == "per_batch" else size), side="right")
+        draws = np.searchsorted(
+            self._edges, rng.random(1 if self.draw == "per_batch" else size), side="right"
+        )
         return np.broadcast_to(draws, (size,)).astype(np.int64)
 
     def table(self, drawn: Sequence[int] | NDArray[np.int64]) -> list[dict[str, float | str | int]]:

@@ -117,7 +117,7 @@ class WindowSequence:
         self._units, self._sizes = assignment.of_reader(reader)
         self.length = int(self._sizes.sum())
         self._epoch: tuple[int, Ints, Ints] | None = None
-        self._at: tuple[int, int] | None = None
+        self._begin = self._end = 0  # the part of the sequence that the decoded pool holds
         self._rows: Rows | None = None
         self._view: Ints | None = None
 
@@ -125,17 +125,15 @@ class WindowSequence:
         """Return windows start to start + count of the sequence: those of `Rows.cut`, and camera (n,)."""
         cuts = []
         while count:
-            epoch, offset = divmod(start, self.length)
-            order, ends = self._rounds(epoch)
-            number = int(np.searchsorted(ends, offset, side="right"))
-            rows = self._load(epoch, number, order)
-            inside = offset - (int(ends[number - 1]) if number else 0)
-            some = min(count, int(ends[number]) - offset)
-            chosen = slice(inside, inside + some)
+            rows = self._rows if self._begin <= start < self._end else None
+            rows = rows or self._load(start)
+            some = min(count, self._end - start)
+            chosen = slice(start - self._begin, start - self._begin + some)
             last = None if self._last is None else self._last[chosen]
             view = None if self._view is None else self._view[chosen]
             cut = rows.cut(self._first[chosen], last, self._decoder.index, view)
-            cuts.append(cut | {"camera": self._camera[chosen]})
+            cut["camera"] = self._camera[chosen]
+            cuts.append(cut)
             start, count = start + some, count - some
         if len(cuts) == 1:
             return cuts[0]
@@ -149,9 +147,13 @@ class WindowSequence:
             self._epoch = (epoch, order, np.cumsum(np.add.reduceat(self._sizes[order], firsts)))
         return self._epoch[1:]
 
-    def _load(self, epoch: int, number: int, order: Ints) -> Rows:
-        if self._rows is not None and self._at == (epoch, number):
-            return self._rows
+    def _load(self, start: int) -> Rows:
+        """Decode the pool that holds window `start` of the sequence."""
+        epoch, offset = divmod(start, self.length)
+        order, ends = self._rounds(epoch)
+        number = int(np.searchsorted(ends, offset, side="right"))
+        self._begin = start - offset + (int(ends[number - 1]) if number else 0)
+        self._end = start - offset + int(ends[number])
         self._rows = None  # free the last pool before the next is decoded
         index = self._decoder.index
         units = self._units[order[number * self._pool : (number + 1) * self._pool]]
@@ -174,5 +176,5 @@ class WindowSequence:
         self._last = np.concatenate(lasts)[mixed] if index.padded_episodes else None
         draws = np.random.default_rng([*self._entropy, epoch, number, 1]).integers(0, 2**31, len(first))
         self._camera, self._view = self._decoder.views.taken(draws, np.concatenate(cameras)[mixed])
-        self._at, self._rows = (epoch, number), Rows.join(loaded)
+        self._rows = Rows.join(loaded)
         return self._rows

@@ -4,8 +4,8 @@ n windows, B batch, T frames, S values a frame, h·w grid, c·H·W latents, A ac
 """
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from hma_data.loading.views import FIRST, Cameras, Views, stacked
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns, token_column
 from hma_data.shards.windows import Ints, Short, WindowIndex
+from hma_data.tokenizers.base import TokenizerSpec
 
 MIB = 2**20
 
@@ -31,6 +32,9 @@ class Rows:
     episode: NDArray[np.int32]
     frame: NDArray[np.int32]
     known: NDArray[np.bool_] | None  # True where the row's action is known; None where all are
+
+    def __post_init__(self) -> None:
+        self._of_span: tuple[int, NDArray[np.float32], NDArray[np.bool_] | None] | None = None
 
     @classmethod
     def join(cls, several: "Sequence[Rows]") -> "Rows":
@@ -67,13 +71,19 @@ class Rows:
         found = {"episode": self.episode[first], "frame": self.frame[first]}
         if last is not None:
             return found | self._padded(first, last, index, view)
-        rows = first[:, None] + np.arange(0, index.span, index.row_stride)
-        found["tokens"] = self._frames(rows, view)
-        found["actions"] = _spans(self.actions, index.span)[first].reshape(len(first), index.frames, -1)
-        if self.known is not None:
-            known = _spans(self.known[:, None], index.span)[first]
-            found["known"] = np.all(known.reshape(len(first), index.frames, -1), axis=2)
+        found["tokens"] = self._frames(first[:, None] + index.offsets, view)
+        actions, known = self._spans(index.span)
+        found["actions"] = actions[first].reshape(len(first), index.frames, -1)
+        if known is not None:
+            found["known"] = np.all(known[first].reshape(len(first), index.frames, -1), axis=2)
         return found
+
+    def _spans(self, span: int) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+        """Return the actions and marks of every run of `span` rows, see `_spans`; they are made once."""
+        if self._of_span is None or self._of_span[0] != span:
+            known = None if self.known is None else _spans(self.known[:, None], span)
+            self._of_span = span, _spans(self.actions, span), known
+        return self._of_span[1:]
 
     def _frames(self, rows: Ints, view: Ints | None) -> NDArray[Any]:
         return self.tokens[rows] if view is None else self.tokens[rows, view[:, None]]
@@ -151,6 +161,11 @@ class Decoder:
     def group_bytes(self) -> int:
         """Return the average bytes of a decoded row group."""
         return int(self.index.edges[-1] / max(1, len(self.index.groups)) * self._row_bytes)
+
+    @property
+    def window_bytes(self) -> int:
+        """Return the bytes of a window, about."""
+        return self.index.frames * self._row_bytes
 
     def rows(self, group: int, whole: bool = True) -> Rows:
         """Return all rows that the windows starting in row group `group` need; its own rows come first.
@@ -251,54 +266,61 @@ class Batch:
         """Return the same batch in pinned memory; a DataLoader with pin_memory=True calls this."""
         return self._map(Tensor.pin_memory)
 
+    def part(self, start: int, end: int, width: int) -> "Batch":
+        """Return some of the windows, without a copy, with action chunks of `width` values."""
+        part = self._map(lambda value: value[start:end])
+        return replace(part, embodiment=self.embodiment[start:end], actions=part.actions[..., :width])
+
     def _map(self, change: Any) -> "Batch":
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return Batch(**{k: change(v) if isinstance(v, Tensor) else v for k, v in values.items()})
 
 
 def assemble(
-    sets: Mapping[str, ShardSet],
+    spec: TokenizerSpec,
     names: list[str],
     windows_of: Mapping[str, tuple[Ints, dict[str, NDArray[Any]]]],
     short: Short,
     views: int = 1,
-) -> Batch:
-    """Assemble one batch.
+    size: int | None = None,
+) -> Iterator[Batch]:
+    """Yield the batches that windows make, one after the other.
 
     Args:
-        names: (B,) the embodiment of each sample.
-        windows_of: embodiment -> the indices (n,) of its samples in the batch, and its windows.
+        names: (n,) the embodiment of each sample.
+        windows_of: embodiment -> the indices (m,) of its samples among all, and its windows.
         views: V, the cameras in each frame.
+        size: B, which divides n; None: one batch of all.
     """
-    size = len(names)
-    width = max(windows["actions"].shape[2] for _, windows in windows_of.values())
-    frames = next(iter(windows_of.values()))[1]["actions"].shape[1]
-    spec = next(iter(sets.values())).spec
-    discrete = spec.kind == "discrete"
-    grid = (views * spec.grid[0], spec.grid[1])
-    shape = grid if discrete else (spec.channels or 1, *grid)
-    actions = np.zeros((size, frames, width), np.float32)
-    pictures = np.empty((size, frames, *shape), np.int64 if discrete else np.float32)
-    known, inside = np.ones((size, frames), np.bool_), np.ones((size, frames), np.bool_)
-    where = {key: np.empty(size, np.int64) for key in ("episode", "frame", "camera")}
-    for name, (samples, windows) in windows_of.items():
-        actions[samples, :, : windows["actions"].shape[2]] = windows["actions"]
-        pictures[samples] = stacked(windows["tokens"], sets[name], views)
-        if "known" in windows:
-            known[samples] = windows["known"]
-        if "inside" in windows:
-            inside[samples] = windows["inside"]
-        for key, values in where.items():
-            values[samples] = windows[key]
-    return Batch(
-        embodiment=names,
-        actions=torch.from_numpy(actions),
-        action_mask=torch.from_numpy(known),
-        tokens=torch.from_numpy(pictures) if discrete else None,
-        latents=None if discrete else torch.from_numpy(pictures),
-        **{key: torch.from_numpy(values) for key, values in where.items()},
-        frame_mask=torch.from_numpy(inside) if short == "pad" else None,
-    )
+    count, cuts = len(names), [windows for _, windows in windows_of.values()]
+    order = np.concatenate([samples for samples, _ in windows_of.values()])
+    place = np.empty_like(order)  # of each sample among the cuts
+    place[order] = np.arange(count)
+    ends = np.cumsum([len(samples) for samples, _ in windows_of.values()]).tolist()
+    widths = np.repeat([cut["actions"].shape[2] for cut in cuts], np.diff(ends, prepend=0))
+    frames = cuts[0]["actions"].shape[1]
+    actions = np.zeros((count, frames, widths.max()), np.float32)
+    known, inside = np.ones((count, frames), np.bool_), np.ones((count, frames), np.bool_)
+    for start, end, cut in zip([0, *ends], ends, cuts):
+        actions[start:end, :, : cut["actions"].shape[2]] = cut["actions"]
+        known[start:end] = cut.get("known", True)
+        inside[start:end] = cut.get("inside", True)
+    tokens = np.concatenate([cut["tokens"] for cut in cuts])
+    where = {key: np.concatenate([cut[key] for cut in cuts]) for key in ("episode", "frame", "camera")}
+    discrete, size = spec.kind == "discrete", size or count
+    for start in range(0, count, size):
+        at = place[start : start + size]
+        taken = stacked(tokens[at], spec, views)
+        pictures = torch.from_numpy(np.ascontiguousarray(taken, np.int64 if discrete else np.float32))
+        yield Batch(
+            embodiment=names[start : start + size],
+            actions=torch.from_numpy(actions[at, :, : widths[at].max()]),
+            action_mask=torch.from_numpy(known[at]),
+            tokens=pictures if discrete else None,
+            latents=None if discrete else pictures,
+            **{key: torch.from_numpy(values[at].astype(np.int64)) for key, values in where.items()},
+            frame_mask=torch.from_numpy(inside[at]) if short == "pad" else None,
+        )
 
 
 def as_batch(batch: Batch) -> Batch:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hma_data.errors import ShardError, UsageError
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import Ints
+from hma_data.tokenizers.base import TokenizerSpec
 
 Cameras = str | Sequence[str]
 FIRST, DRAWN = "first", "drawn"
@@ -95,9 +96,8 @@ def by_number(windows: Ints) -> Ints:
     return (mixed >> np.uint64(33)).astype(np.int64)
 
 
-def stacked(tokens: NDArray[Any], shards: ShardSet, views: int) -> NDArray[Any]:
+def stacked(tokens: NDArray[Any], spec: TokenizerSpec, views: int) -> NDArray[Any]:
     """Stack the views of frames (n, T, …) along the height: (n, T, V·h, w) or (n, T, c, V·h, w)."""
-    spec = shards.spec
     (h, w), (samples, frames) = spec.grid, tokens.shape[:2]
     if spec.kind == "discrete":
         return tokens.reshape(samples, frames, views * h, w)

@@ -28,6 +28,7 @@ from hma_data.shards.schema import (
     Refused,
     RowLayout,
     check_version,
+    group_rows,
     read_metadata,
     to_numpy,
 )
@@ -406,19 +407,20 @@ def _described(
 ) -> Iterator[tuple[ShardFile, Footer]]:
     """Yield each shard as the manifest lists it, with its footer; hash a few shards at a time."""
 
-    def look(name: str) -> tuple[str, pq.FileMetaData, int, str]:
+    def look(name: str) -> tuple[pq.FileMetaData, int, str]:
         path = folder / name
-        return name, read_metadata(path), path.stat().st_size, hashes.get(name) or file_sha256(path)
+        return read_metadata(path), path.stat().st_size, hashes.get(name) or file_sha256(path)
 
+    parts = [names[start : start + 4 * HASHERS] for start in range(0, len(names), 4 * HASHERS)]
     with ThreadPoolExecutor(HASHERS) as pool:
-        ahead = pool.map(look, names[: 4 * HASHERS])
-        for start in range(4 * HASHERS, len(names) + 4 * HASHERS, 4 * HASHERS):  # few are in memory at a time
-            looked, ahead = ahead, pool.map(look, names[start : start + 4 * HASHERS])
-            for name, metadata, size, sha256 in looked:
-                footer, rows = Footer.of_file(metadata, folder / name)
-                file = ShardFile(
-                    name, footer.split, sum(rows), len(footer.episodes), size, sha256, tuple(rows)
-                )
+        ahead = pool.map(look, parts[0] if parts else ())
+        for part, after in zip(parts, [*parts[1:], ()]):  # few are in memory at a time
+            looked, ahead = list(ahead), pool.map(look, after)
+            places = [str(folder / name) for name in part]
+            footers = Footer.several([metadata.metadata for metadata, *_ in looked], places)
+            for name, footer, (metadata, size, sha256) in zip(part, footers, looked):
+                rows = tuple(group_rows(metadata))
+                file = ShardFile(name, footer.split, sum(rows), len(footer.episodes), size, sha256, rows)
                 yield file, footer
 
 

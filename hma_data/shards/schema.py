@@ -4,8 +4,10 @@ S = h·w tokens a frame, c channels, A values of an action. docs/format.md speci
 """
 
 import json
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,8 @@ ROW_GROUP = 2048
 GROUP_VALUES = 1 << 24  # tokens of a row group; Parquet's writer holds small integers in four bytes each
 MALFORMED = (KeyError, TypeError, ValueError, AttributeError, RecursionError)  # what wrong JSON raises
 _FOOTER = b"hma"
+# a footer as `to_metadata` writes it; in a text of JSON, quotes have a backslash before them
+_EPISODES_OF_TEXT = re.compile(rb'(.*?), "episodes": (\[.*\])(, "quarantine": .*)')
 PLAN_HASH = b"hma.plan_hash"  # states the plan beside the footer's JSON, for those who need no more
 
 
@@ -104,12 +108,6 @@ class Footer:
     quarantine: tuple[Refused, ...]
     stats: dict[str, Stats]
 
-    @classmethod
-    def of_file(cls, metadata: pq.FileMetaData, path: Path) -> tuple["Footer", list[int]]:
-        """Return the footer and the number of rows of each row group; see `read_footer`."""
-        footer = cls.from_metadata(metadata.metadata, str(path))
-        return footer, [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
-
     @property
     def table(self) -> pa.Table:
         """Return its episodes as a table, a column for each field of `EpisodeRow`."""
@@ -145,22 +143,44 @@ class Footer:
         Raises:
             ShardError: the file is no shard, its version is not read here, or its footer is damaged.
         """
-        if not metadata or _FOOTER not in metadata:
-            raise ShardError(where, "is a parquet file but not a shard: its footer has no 'hma' entry")
+        return cls._of_text(_footer_text(metadata, where), None, where)
+
+    @classmethod
+    def several(cls, metadata: Sequence[dict[bytes, bytes] | None], where: Sequence[str]) -> "list[Footer]":
+        """Read the footers of several shards, several times as fast as one by one; see `from_metadata`."""
+        texts = [_footer_text(values, place) for values, place in zip(metadata, where)]
+        cuts = [_EPISODES_OF_TEXT.fullmatch(text) for text in texts]
+        episodes: list[Any] = [None] * len(texts)
+        if all(cuts):
+            with suppress(ValueError):  # if it is damaged, reading one by one says where
+                episodes = [*Records.of_json_lists(EpisodeRow, [cut[2] for cut in cuts if cut])]
+                texts = [cut[1] + cut[3] for cut in cuts if cut]
+        return [cls._of_text(*args) for args in zip(texts, episodes, where)]
+
+    @classmethod
+    def _of_text(cls, text: bytes, episodes: Sequence[EpisodeRow] | None, where: str) -> "Footer":
         try:
-            values = parse_json(metadata[_FOOTER])
+            values = parse_json(text)
             check_version(values, where)
+            if (episodes is None) != ("episodes" in values):
+                raise KeyError("episodes")
             return cls(
                 plan=values["plan"],
                 name=values["name"],
                 split=values["split"],
-                episodes=Records.of_json(EpisodeRow, values["episodes"]),
+                episodes=Records.of_json(EpisodeRow, values["episodes"]) if episodes is None else episodes,
                 quarantine=tuple(Refused(**item) for item in values["quarantine"]),
                 stats={name: Stats.from_json(stats) for name, stats in values["stats"].items()},
             )
         except MALFORMED as fault:
             text = f"has a damaged footer: {fault!r}"
             raise ShardError(where, text, "delete it and convert again") from fault
+
+
+def _footer_text(metadata: dict[bytes, bytes] | None, where: str) -> bytes:
+    if not metadata or _FOOTER not in metadata:
+        raise ShardError(where, "is a parquet file but not a shard: its footer has no 'hma' entry")
+    return metadata[_FOOTER]
 
 
 def check_version(values: dict[str, Any], where: object) -> None:
@@ -393,10 +413,16 @@ def read_metadata(path: Path) -> pq.FileMetaData:
         raise ShardError(path, f"is not a whole parquet file: {fault}", remedy) from fault
 
 
+def group_rows(metadata: pq.FileMetaData) -> list[int]:
+    """Return the number of rows of each row group of a file."""
+    return [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+
+
 def read_footer(path: Path) -> tuple[Footer, list[int]]:
     """Return the footer and the number of rows of each row group of a shard.
 
     Raises:
         ShardError: it is not a whole parquet file, or not a shard.
     """
-    return Footer.of_file(read_metadata(path), path)
+    metadata = read_metadata(path)
+    return Footer.from_metadata(metadata.metadata, str(path)), group_rows(metadata)

@@ -11,6 +11,7 @@ real frame change no prediction before them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -102,6 +103,11 @@ class WindowIndex:
         )
         object.__setattr__(index, "unit_first", index._windows_before(edges))
         return index
+
+    @cached_property
+    def offsets(self) -> Ints:
+        """Return the rows (T,) of a window's frames after its first row."""
+        return np.arange(0, self.span, self.row_stride)
 
     def _windows_before(self, rows: Ints) -> Ints:
         """Return how many windows start before each row."""

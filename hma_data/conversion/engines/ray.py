@@ -1,32 +1,33 @@
-"""Run work units on a Ray cluster, one actor a worker, with the tokenizer on the actor's GPU if it has one.
+"""Run work units on a Ray cluster: each worker is an actor that holds the tokenizer.
 
-The output folder must be one that every node sees. When a node is lost, its actors are lost too, and their
-units are done again elsewhere. `RAY_ADDRESS` names the cluster; without it, Ray starts on this machine.
+The output folder must be one that every node sees. Ray places the actors and restarts them, elsewhere if a
+node is lost. `RAY_ADDRESS` names the cluster; without it, Ray starts on this machine.
 
-An actor keeps one worker process of the local engine. So the threads and buffers of Ray are in another
-process than the tokenizer, and the exit code of the process is known. The actor collects events, so that the
-driver gets an answer about once a second, not at every step.
+The driver hands an actor one unit at a time, and always has one call waiting that asks for its events. Ray
+does not tell whether a process crashed or was killed. A loss therefore counts as a kill, until as many as
+LOSSES_AT_A_STEP attempts that go step by step have ended at one step; then that step counts as the cause.
 """
 
 import os
-import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
-from types import ModuleType
+from threading import Condition
 from typing import Any
 
-from hma_data.conversion.engines import LIMITS, Attempt, Cause, Ledger, Limits, OnEvent, Work
-from hma_data.conversion.engines.local import Pool, WorkerProcess
+from hma_data.conversion.engines import LIMITS, Attempt, Cause, Ledger, Limits, OnEvent, Step, Work
+from hma_data.cpu import take_ordinary_priority
 from hma_data.errors import HMAError, MissingDependencyError
 
 TICK_S = 0.5
 ANSWER_S = 1.0  # seconds for which an actor collects events before it answers
 ANSWERS_A_S = 100.0  # largest number of answers a second that the driver processes
 NO_ROOM_S = 900.0  # seconds without any actor that could be placed
-LOST_STARTS = 4  # limit of actors in a row, for each worker and one more, that end before they are ready
+LOST_STARTS = 4  # limit of losses in a row, for each worker and one more, before any actor is ready
+LOSSES_AT_A_STEP = 3
 INSTALLED = "install hma-toolkit and what it needs on every node; see Ray's logs"
 
 
@@ -36,12 +37,14 @@ def run(
     workers: int,
     on_event: OnEvent,
     limits: Limits = LIMITS,
+    cpus: float = 1.0,
     gpus: float = 0.0,
 ) -> Iterator[Any]:
     """Run every unit and yield each result when it is ready; see engines.local.run.
 
     Args:
-        workers: number of actors, each with `gpus` GPUs.
+        workers: number of actors.
+        cpus, gpus: of an actor; fractions share a CPU or GPU among actors.
 
     Raises:
         HMAError: a unit failed for a reason that is not its data, its worker was lost too often, or the
@@ -53,7 +56,11 @@ def run(
     if ours:
         _join(ray)
     ledger = Ledger(units, limits, on_event)
-    actors = _Actors(ray, make_work, min(max(workers, 1), max(len(ledger.units), 1)), gpus, ledger, on_event)
+    count = min(max(workers, 1), max(len(ledger.units), 1))
+    # no task events: for its dashboard, Ray keeps a record of each call in three processes
+    options = {"num_cpus": cpus, "num_gpus": gpus, "max_restarts": -1, "enable_task_events": False}
+    actor = ray.remote(concurrency_groups={"look": 1}, **options)(Worker)
+    actors = _Actors(ray, [actor.remote() for _ in range(count)], make_work, ledger, on_event)
     try:
         while ledger.open:
             yield from actors.turn()
@@ -88,85 +95,61 @@ def _join(ray: Any) -> None:
 # -- in an actor
 
 
-# How an actor's task ends: ("ready", None) for its first unit, ("done", result), ("failed", the error that
-# ends the job), or ("lost", (cause, step, how)), see Ledger.lost.
-End = tuple[str, Any]
-Answer = tuple[list[Any], End | None]  # a unit's events since the last answer; and its end, if it is over
+End = tuple[str, Any]  # "done" with a result, "failed" with the error that ends the job, or "short of memory"
 
 
 class Worker:
-    """An actor that keeps a worker process, hands it units and passes on its messages.
+    """An actor that makes units. It collects their events until the driver looks."""
 
-    The driver calls `open` or `do`, then `go_on` until an answer carries an end. To the pool of its one
-    process the actor is what the Ledger is to a local pool.
+    def __init__(self) -> None:
+        self._news = Condition()
+        self._events: list[tuple[int, Any]] = []
+        self._given: list[tuple[int, Any]] = []  # by the last look; the driver has them once it looks again
+        self._urgent = False
 
-    Args:
-        make_work, workers: see `local.serve`.
-        quiet_s: see Limits.
-        answer_s: seconds for which events are collected, unless the unit ends before.
-    """
+    def open(self, make_work: Callable[[int], Work], workers: int) -> End:
+        """Load the tokenizer."""
+        take_ordinary_priority()
+        end, self._work = _outcome(make_work, workers)
+        return ("done", None) if end == "done" else ("failed", self._work or MemoryError("no room to start"))
 
-    def __init__(
-        self, make_work: Callable[[int], Work], workers: int, quiet_s: float | None, answer_s: float
-    ) -> None:
-        self.limits = Limits(quiet_s)
-        start = partial(WorkerProcess, make_work, workers)
-        self.pool = Pool(start, 1, self, lambda _, event: self._events.append(event))
-        self._answer_s = answer_s
-        self._unit: tuple[int, Any, Attempt] | None = None
-        self._opening = False
-        self._events: list[Any] = []
-        self._end: End | None = None
+    def do(self, number: int, unit: Any, attempt: Attempt) -> tuple[End, list[tuple[int, Any]]]:
+        """Make a unit; return how it ended, and its events that no look has returned."""
+        end = _outcome(self._work, unit, partial(self._report, number, attempt), attempt)
+        with self._news:
+            events, self._events = self._events, []
+        return end, events
 
-    def open(self) -> Answer:
-        """Start the process; its last answer ends with "ready"."""
-        self._opening = True
-        return self.go_on()
+    def look(self, wait_s: float) -> list[tuple[int, Any]]:
+        """Wait `wait_s` seconds, or until a step waits; return the events since the last look, with units."""
+        with self._news:
+            self._given = []
+            self._news.notify_all()
+            self._news.wait_for(lambda: self._urgent, wait_s)
+            self._given, self._events, self._urgent = self._events, [], False
+            return self._given
 
-    def do(self, unit: Any, attempt: Attempt) -> Answer:
-        """Start a unit."""
-        self._unit = 0, unit, attempt
-        return self.go_on()
-
-    def go_on(self) -> Answer:
-        """Listen for `answer_s` seconds, or until the end."""
-        until = time.monotonic() + self._answer_s
-        while self._end is None and time.monotonic() < until:
-            with _no_script():
-                self.pool.fill()
-            try:
-                for result in self.pool.turn():
-                    self._end = "done", result
-            except HMAError as fault:
-                self._end = "failed", fault
-            if self._opening and any(process.ready for process in self.pool.processes):
-                self._opening, self._end = False, ("ready", None)
-        answer = self._events, self._end
-        self._events, self._end = [], None
-        return answer
-
-    def take(self) -> tuple[int, Any, Attempt] | None:
-        """Return the unit if it has not been started."""
-        unit, self._unit = self._unit, None
-        return unit
-
-    def finished(self, number: int) -> None:
-        """Do nothing; the pool yields the result."""
-
-    def lost(self, number: int, cause: Cause, step: str, how: str) -> None:
-        """Tell the driver that the unit lost its process."""
-        self._end = "lost", (cause, step, how)
+    def _report(self, number: int, attempt: Attempt, event: Any) -> None:
+        with self._news:
+            self._events.append((number, event))
+            if attempt.number and isinstance(
+                event, Step
+            ):  # it may end this process, and the driver must know
+                self._urgent = True
+                self._news.notify_all()
+                self._news.wait_for(lambda: not self._events and not self._given)
 
 
-@contextmanager
-def _no_script() -> Iterator[None]:
-    """Replace the main module for a moment; a spawned process would run it, and here it is Ray's own."""
-    script = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
+def _outcome(task: Callable[..., Any], *arguments: Any) -> End:
     try:
-        yield
-    finally:
-        sys.modules["__main__"] = script
+        return "done", task(*arguments)
+    except MemoryError:
+        return "short of memory", None
+    except HMAError as fault:
+        return "failed", fault
+    except Exception as fault:
+        text = f"stopped with {type(fault).__name__}: {fault}"
+        return "failed", HMAError("a worker", text, "report this as a bug; --debug --workers 0 shows where")
 
 
 # -- in the driver
@@ -174,90 +157,123 @@ def _no_script() -> Iterator[None]:
 
 @dataclass
 class _Slot:
-    """An actor and the unit it is at; `answer` is a reference to an answer that has not come yet."""
+    """An actor, references to what it is asked, and its unit; while it has a task but no unit, it opens."""
 
     actor: Any
-    answer: Any
-    ready: bool = False
+    task: Any = None
+    look: Any = None
     unit: int | None = None
+    attempt: int = 0
+    step: str = ""
+    hung: bool = False
+    heard: float = field(default_factory=time.monotonic)
 
 
 class _Actors:
     """The actors of one run. Each has at most one unit, so that a slow one delays no other unit."""
 
     def __init__(
-        self, ray: Any, make_work: Callable[[int], Work], count: int, gpus: float,
-        ledger: Ledger, on_event: OnEvent,
-    ) -> None:  # fmt: skip
-        self._ray, self._ledger, self._on_event, self._count = ray, ledger, on_event, count
-        answer_s = max(ANSWER_S, count / ANSWERS_A_S)
-        self._arguments = ray.put(make_work), count, ledger.limits.quiet_s, answer_s
-        # no task events: for its dashboard, Ray keeps a record of each call in three processes
-        self._class = ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, enable_task_events=False)(Worker)
-        self._slots: list[_Slot] = []
+        self, ray: Any, actors: list[Any], make_work: Callable[[int], Work], ledger: Ledger, on_event: OnEvent
+    ) -> None:
+        self._ray, self._ledger, self._on_event = ray, ledger, on_event
+        self._answer_s = max(ANSWER_S, len(actors) / ANSWERS_A_S)
+        self._make_work = ray.put(make_work), len(actors)
+        self._slots = [_Slot(actor) for actor in actors]
+        self._losses: Counter[tuple[int, str]] = Counter()  # of attempts that went step by step
         self._lost_starts = 0
         self._placed = time.monotonic()  # when an actor was last ready
+        for slot in self._slots:
+            self._open(slot)
+
+    def _open(self, slot: _Slot) -> None:
+        slot.unit, slot.look = None, None
+        slot.task = slot.actor.open.remote(*self._make_work)
 
     def turn(self) -> Iterator[Any]:
-        while len(self._slots) < self._count:
-            actor = self._class.remote(*self._arguments)
-            self._slots.append(_Slot(actor, actor.open.remote()))
+        """Hand out units, then handle what has come from the actors; yield results."""
         for slot in self._slots:
-            if slot.ready and slot.unit is None and (taken := self._ledger.take()):
+            if slot.task is None and (taken := self._ledger.take()):
                 slot.unit, unit, attempt = taken
-                slot.answer = slot.actor.do.remote(unit, attempt)
-        waiting = {slot.answer: slot for slot in self._slots if slot.answer is not None}
-        refs = list(waiting)
+                slot.attempt, slot.step, slot.hung, slot.heard = attempt.number, "", False, time.monotonic()
+                slot.task = slot.actor.do.remote(slot.unit, unit, attempt)
+            if slot.unit is not None and slot.look is None:
+                look = slot.actor.look.options(concurrency_group="look")
+                slot.look = look.remote(self._answer_s)
+        refs = [ref for slot in self._slots for ref in (slot.look, slot.task) if ref is not None]
         self._ray.wait(refs, num_returns=1, timeout=TICK_S)
-        heard, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
-        for ref in heard:
-            yield from self._listen(waiting[ref])
-        if any(slot.ready for slot in self._slots):
+        heard = set(self._ray.wait(refs, num_returns=len(refs), timeout=0)[0])
+        for slot in self._slots:
+            if slot.look in heard:
+                self._hear(slot)
+            if slot.task in heard:
+                yield from self._end(slot)
+            quiet_s, waited = self._ledger.limits.quiet_s, time.monotonic() - slot.heard
+            if slot.unit is not None and not slot.hung and quiet_s is not None and waited > quiet_s:
+                slot.hung = True
+                self._ray.kill(slot.actor, no_restart=False)
+        if any(slot.task is None or slot.unit is not None for slot in self._slots):
             self._placed = time.monotonic()
         elif time.monotonic() - self._placed > NO_ROOM_S:
             remedy = "see `ray status`; every worker needs a CPU, and a GPU with --device cuda"
             raise HMAError("the Ray cluster", f"has had no room for a worker for {NO_ROOM_S:g} s", remedy)
 
-    def _listen(self, slot: _Slot) -> Iterator[Any]:
+    def _hear(self, slot: _Slot) -> None:
+        look, slot.look = slot.look, None
+        with suppress(self._ray.exceptions.RayError):  # the actor was lost; so is its task, which comes next
+            self._pass_on(slot, self._ray.get(look))
+
+    def _pass_on(self, slot: _Slot, events: list[tuple[int, Any]]) -> None:
+        for number, event in events:
+            slot.heard = time.monotonic()
+            if isinstance(event, Step):
+                slot.step = event.name
+            else:
+                self._on_event(number, event)
+
+    def _end(self, slot: _Slot) -> Iterator[Any]:
+        number, task, events = slot.unit, slot.task, []
         try:
-            events, end = self._ray.get(slot.answer)
+            end = self._ray.get(task)
         except self._ray.exceptions.RayTaskError as fault:
             raise HMAError("the Ray cluster", f"cannot work: {_first_line(fault)}", INSTALLED) from fault
         except self._ray.exceptions.RayError as fault:
-            self._bury(slot, "was lost: " + _first_line(fault))
+            self._lost(slot, "was lost: " + _first_line(fault))
             return
-        for event in events:
-            assert slot.unit is not None
-            self._on_event(slot.unit, event)
-        if end is None:
-            slot.answer = slot.actor.go_on.remote()
-            return
-        slot.answer, (kind, value) = None, end
+        slot.task, slot.unit = None, None
+        if number is not None:
+            end, events = end
+            self._pass_on(slot, events)
+        kind, value = end
         if kind == "failed":
             raise value
-        if kind == "ready":
-            slot.ready, self._lost_starts = True, 0
-            return
-        number, slot.unit = slot.unit, None
-        assert number is not None
-        if kind == "lost":
-            self._ledger.lost(number, *value)
+        if number is None:
+            self._lost_starts = 0
+        elif kind == "short of memory":
+            self._ledger.lost(number, "killed", slot.step, "ran out of memory")
         else:
             self._ledger.finished(number)
             yield value
 
-    def _bury(self, slot: _Slot, how: str) -> None:
-        self._slots.remove(slot)
-        self._ray.kill(slot.actor)  # an actor that is only out of reach would go on
-        if slot.unit is not None:
-            self._ledger.lost(slot.unit, "killed", "", how)
-        elif not slot.ready:
+    def _lost(self, slot: _Slot, how: str) -> None:
+        """Note that an actor was lost; Ray restarts it."""
+        number, step = slot.unit, slot.step
+        self._open(slot)
+        if number is None:
             self._lost_starts += 1
-            if self._lost_starts >= LOST_STARTS * (self._count + 1):
+            if self._lost_starts >= LOST_STARTS * (len(self._slots) + 1):
                 fault = f"lost {self._lost_starts} workers in a row at their start; the last {how}"
                 raise HMAError("the Ray cluster", fault, INSTALLED)
+            return
+        self._losses[number, step] += bool(slot.attempt)
+        cause: Cause = "killed"
+        if slot.hung:
+            cause, how = "hung", f"made no progress for {self._ledger.limits.quiet_s:g} s"
+        elif step and self._losses[number, step] >= LOSSES_AT_A_STEP:
+            cause, how = "crashed", f"ended the process {LOSSES_AT_A_STEP} times"
+        self._ledger.lost(number, cause, step, how)
 
     def close(self) -> None:
+        """End every actor."""
         for slot in self._slots:
             self._ray.kill(slot.actor)
 

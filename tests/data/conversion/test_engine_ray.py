@@ -58,7 +58,8 @@ def test_every_unit_is_done_once_and_its_events_arrive(cluster, tmp_path: Path) 
 def test_a_process_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None:
     results, events = do([Unit("bad", ("a", "b", "c"), "b", "SIGKILL", times=1), *PLAIN], tmp_path)
     assert results["bad"] == ["a", "b", "c"]
-    assert [event.reason for _, event in events if isinstance(event, Retry)] == ["ended by SIGKILL at b"]
+    (retry,) = [event for _, event in events if isinstance(event, Retry)]
+    assert retry.reason.startswith("was lost: ")
 
 
 @on_a_cluster

@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader
 from hma_data.bench.loader import make_set
 from hma_data.loading.dataset import Batch, MixtureDataset, WindowDataset, as_batch
 from hma_data.shards import writer
+from hma_data.shards.reader import ShardSet
 from tests.data.fresh import run_fresh
 from tests.data.loading.test_pools import SMALL
 
@@ -210,3 +211,14 @@ def test_torchdatas_loader_saves_and_goes_on(sets: list[Path], workers: int, sto
     second = stateful(sets, workers)
     second.load_state_dict(first.state_dict())
     assert begun + seen(iter(second), 16 - stop) == whole
+
+
+def test_sixty_four_ranks_take_every_window_once(sets: list[Path]) -> None:
+    shards = ShardSet(sets[0])
+    taken: list[Any] = []
+    for rank in range(64):
+        data = dataset([shards], rank=rank, world=64, lanes=1, batch_size=1)
+        share = data._sequence(0, 0).length
+        assert 0.8 < share * 64 / data.mixture.counts[0] < 1.2
+        taken += [window for batch in seen(iter(data), share) for window in batch]
+    assert len(taken) == len(set(taken)) == data.mixture.counts[0]

@@ -61,12 +61,10 @@ def test_stacked_latents_keep_their_channels(made: Path) -> None:
     from hma_data.loading.views import stacked
     from hma_data.tokenizers.base import TokenizerSpec
 
-    class Set:
-        spec = TokenizerSpec("l", 1, "continuous", 16, (2, 3), channels=4, dtype="float16")
-
+    spec = TokenizerSpec("l", 1, "continuous", 16, (2, 3), channels=4, dtype="float16")
     one, other = np.random.default_rng(0).normal(size=(2, 5, 6, 4, 2, 3))
     rows = np.stack([one.reshape(5, 6, -1), other.reshape(5, 6, -1)], axis=2)
-    np.testing.assert_array_equal(stacked(rows, Set(), 2), np.concatenate([one, other], axis=3))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(stacked(rows, spec, 2), np.concatenate([one, other], axis=3))
 
 
 def test_drawn_cameras_are_told_and_come_again_after_a_resume(made: Path) -> None:
