@@ -227,6 +227,7 @@ BENCHES |= {
     "drift": "hma_model.bench.drift:BENCH",
     "generate": "hma_model.bench.generation:GENERATE",
     "mup": "hma_model.bench.mup:BENCH",
+    "quality": "hma_model.bench.quality:BENCH",
     "train": "hma_model.bench.speed:TRAIN",
     "waiting": "hma_model.bench.waiting:WAITING",
 }
