@@ -120,29 +120,23 @@ class Shards:
     def __init__(self, out: Path, given: Path | None) -> None:
         self.out, self.given = out, given
 
-    def of(self, robot: str, tokenizer: str, episodes: int) -> Path:
-        """Return the folder of a robot's shards."""
-        folder = self.given and self.given / robot
-        if (
-            folder
-            and episodes == Row.episodes
-            and folder.is_dir()
-            and ShardSet(folder).spec.name == tokenizer
-        ):
-            return folder
+    def of(self, robot: str, tokenizer: str, episodes: int = Row.episodes, own: bool = False) -> Path:
+        """Return the folder of a robot's shards; with `own`, not one of --data."""
+        given = None if own or self.given is None else self.given / robot
+        if given and given.is_dir() and ShardSet(given).spec.name == tokenizer:
+            return given
         return recorded(robot, tokenizer, self.out / "data" / f"{robot}-{tokenizer}-{episodes}", episodes)
 
-    def measured(self, question: str, row: Row) -> Path:
-        """Return the shards whose held-out windows a row is measured on: the largest recording of its robot.
+    def pair(self, question: str, row: Row) -> tuple[Path, Path]:
+        """Return the shards that a row is trained on, and those whose held-out windows it is measured on.
 
-        An episode is held out by the hash of its id, so also in the smaller recordings.
+        Rows that differ in the number of episodes are measured on the largest recording. An episode is held
+        out by the hash of its id, so it is also held out in the smaller recordings of the same settings.
         """
-        same = [
-            other
-            for other in QUESTIONS[question]
-            if (other.robot, other.tokenizer) == (row.robot, row.tokenizer)
-        ]
-        return self.of(row.robot, row.tokenizer, max(other.episodes for other in same))
+        same = (row.robot, row.tokenizer)
+        sizes = {other.episodes for other in QUESTIONS[question] if (other.robot, other.tokenizer) == same}
+        own = len(sizes) > 1
+        return self.of(*same, row.episodes, own), self.of(*same, max(sizes), own)
 
 
 def measure(question: str, row: Row, seed: int, cpu_seconds: float, shards: Shards) -> dict[str, Any]:
@@ -157,7 +151,7 @@ def measure(question: str, row: Row, seed: int, cpu_seconds: float, shards: Shar
         else:
             start: tuple[str, ...] = ()
             if row.before:
-                first = [shards.of(robot, row.tokenizer, Row.episodes) for robot in row.before]
+                first = [shards.of(robot, row.tokenizer) for robot in row.before]
                 checkpoint, _ = _trained(row, first, cpu_seconds, seed, Path(folder) / "before")
                 start = (f"start={checkpoint}",)
             checkpoint, steps = _trained(row, [data], cpu_seconds, seed, Path(folder) / "run", start)
