@@ -33,11 +33,13 @@ class Bench:
         defaults: its settings.
         run: takes the settings; returns one mapping for each case: the values that distinguish the case, and
             the figures, each named with its unit (`frames_per_second`, `peak_rss_mib`).
+        fault: takes these, and returns what is wrong with them, or nothing; with a fault `hma bench` exits 1.
     """
 
     about: str
     defaults: dict[str, Any]
     run: Callable[[dict[str, Any]], list[dict[str, Any]]]
+    fault: Callable[[list[dict[str, Any]]], str] = lambda rows: ""
 
 
 def load(name: str) -> Bench:

@@ -3,10 +3,11 @@
 Only light modules are imported here. Each verb imports what it needs when it runs.
 """
 
+import sys
 from typing import Annotated
 
 import typer
-from typer import Argument, Option
+from typer import Argument, Exit, Option
 
 from hma_data.cli.convert import convert
 from hma_data.cli.inspect import doctor, inspect
@@ -58,8 +59,11 @@ def bench(
     told = report(name, values, results)
     if json:
         print_json(told)
-        return
-    columns = list(dict.fromkeys(key for result in results for key in result))
-    print_table(columns, [[result.get(key) for key in columns] for result in results], title=chosen.about)
-    facts = told["machine"]
-    print(f"{facts['processor']}, {facts['cores']} cores, load {facts['load_average']}, {facts['date']}")
+    else:
+        columns = list(dict.fromkeys(key for result in results for key in result))
+        print_table(columns, [[result.get(key) for key in columns] for result in results], title=chosen.about)
+        facts = told["machine"]
+        print(f"{facts['processor']}, {facts['cores']} cores, load {facts['load_average']}, {facts['date']}")
+    if fault := chosen.fault(results):
+        print(fault, file=sys.stderr)
+        raise Exit(1)

@@ -159,6 +159,8 @@ def record_simulator(
     """
     if episodes < 1:
         raise UsageError("episodes", f"{episodes} asked for", "ask for at least one")
+    if out.is_file():
+        raise OutputError(out, "is a file, not a folder", "name another folder")
     embodiment = find(simulator.robot)
     write, ending = WRITERS[embodiment.source.format]
     finals = [out / f"{embodiment.id}{ending}"]

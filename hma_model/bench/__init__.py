@@ -1,1 +1,1 @@
-"""Benchmark the model: `hma bench generate`, `play`, `train`, `mup`, `waiting`, `drift`."""
+"""Benchmark the model: `hma bench generate`, `play`, `train`, `mup`, `waiting`, `drift`, `quality`."""

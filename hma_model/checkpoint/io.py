@@ -114,7 +114,7 @@ def load(folder: StrPath, embodiments: Iterable[str] | None = None, device: str 
     checkpoint = Checkpoint.open(folder)
     trunk = weights.trunk(checkpoint)
     model = HMA(checkpoint.config)
-    model.load_trunk(trunk)
+    model.load_trunk(trunk, checkpoint.trunk())
     for name in checkpoint.embodiments if embodiments is None else dict.fromkeys(embodiments):
         add_embodiment(model, checkpoint, name)
     vars(model)["origin"] = checkpoint.folder  # where hub.push_model finds YAML and statistics again

@@ -233,6 +233,7 @@ BENCHES |= {
     "generate": "hma_model.bench.generation:GENERATE",
     "mup": "hma_model.bench.mup:BENCH",
     "play": "hma_model.bench.play:BENCH",
+    "quality": "hma_model.bench.quality:BENCH",
     "train": "hma_model.bench.speed:TRAIN",
     "waiting": "hma_model.bench.waiting:WAITING",
 }

@@ -13,6 +13,7 @@ bytes of results.json.
 import hashlib
 import io
 import json
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -30,7 +31,7 @@ from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import finite, read_json, to_json, write_atomic
+from hma_data.storage.files import finite, to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.evaluation.evaluate import Settings, measure
@@ -222,6 +223,9 @@ def _measured(
 
 
 def _folder(out: Path) -> Path:
+    file = next((path for path in (out, *out.parents) if path.is_file()), None)
+    if file:
+        raise OutputError(file, "is a file, not a folder", "name another folder")
     if out.is_dir() and any(out.iterdir()) and not (out / PARTS).is_dir():
         raise OutputError(out, "holds something else than an evaluation", "name a new folder")
     (out / PARTS).mkdir(parents=True, exist_ok=True)
@@ -240,13 +244,14 @@ def _keep(folder: Path, mark: str, part: Part) -> None:
 
 
 def _kept(folder: Path, mark: str, label: str, shards: ShardSet) -> Part | None:
-    """Return a part that is done, under the names of this command; None if it is not done."""
+    """Return a part that is done, under the names of this command; None if it is not done, or damaged."""
     stem = folder / PARTS / f"{shards.embodiment.id}-{mark}"
-    if not stem.with_suffix(".json").is_file():
+    try:
+        content = json.loads(stem.with_suffix(".json").read_bytes())
+        with np.load(stem.with_suffix(".npz")) as arrays:
+            predicted = dict(arrays)
+    except (OSError, ValueError, zipfile.BadZipFile):
         return None
-    content = read_json(stem.with_suffix(".json"), OutputError)
-    with np.load(stem.with_suffix(".npz")) as arrays:
-        predicted = dict(arrays)
     rows = {name: np.array(values, float) for name, values in content["by_window"].items()}
     found = content["found"] | {"checkpoint": label, "data": str(shards.folder)}
     return Part(label, str(shards.folder), found, rows, predicted)

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from hma_data.loading.rows import Batch
     from hma_model.network.objectives import Output
 
+MOST_NAMED = 3  # keys in an error
+
 
 class HMA(nn.Module):
     """Heterogeneous masked autoregression over tokens or latents (paper section 3).
@@ -128,9 +130,9 @@ class HMA(nn.Module):
         """Return the tensors of an embodiment's action head."""
         return self.head(embodiment).state_dict()
 
-    def load_trunk(self, state: Mapping[str, Tensor]) -> None:
-        """Load a result of `trunk_state`; a CheckpointError names the keys that do not fit."""
-        check_fit("trunk", state, self.trunk_state())
+    def load_trunk(self, state: Mapping[str, Tensor], where: object = "trunk") -> None:
+        """Load a result of `trunk_state`; a CheckpointError names `where` and keys that do not fit."""
+        check_fit(where, state, self.trunk_state())
         self._shared().load_state_dict(state)
 
     def load_embodiment(
@@ -432,11 +434,11 @@ def module_key(embodiment: str) -> str:
     return "id_" + embodiment.replace("%", "%25").replace(".", "%2E")
 
 
-def check_fit(where: str, state: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
+def check_fit(where: object, state: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
     """Check that a state has the names and shapes of the one that it replaces.
 
     Raises:
-        CheckpointError: the states differ; it names every key that is missing, unknown or of another shape.
+        CheckpointError: the states differ; it names the first keys that do not fit.
     """
     faults = [f"missing {name}" for name in sorted(own.keys() - state.keys())]
     faults += [f"unknown {name}" for name in sorted(state.keys() - own.keys())]
@@ -446,6 +448,8 @@ def check_fit(where: str, state: Mapping[str, Tensor], own: Mapping[str, Tensor]
         if name in state and state[name].shape != tensor.shape
     ]
     if faults:
+        if len(faults) > MOST_NAMED:
+            faults[MOST_NAMED:] = [f"and {len(faults) - MOST_NAMED} more"]
         raise CheckpointError(where, "; ".join(faults), "load it into the configuration it was saved from")
 
 

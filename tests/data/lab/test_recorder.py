@@ -156,6 +156,8 @@ def test_a_stopped_recording_continues_at_the_next_episode(tmp_path: Path) -> No
     assert [path.name for path in (tmp_path / "parts").iterdir()] == ["fetch.hdf5"]
     with pytest.raises(OutputError, match="exists already"):
         record_simulator(stopped, tmp_path / "parts", EPISODES, SEED)
+    with pytest.raises(OutputError, match="is a file, not a folder"):
+        record_simulator(stopped, tmp_path / "parts" / "fetch.hdf5", EPISODES, SEED)
 
 
 @pytest.mark.parametrize("robot", RECIPES)

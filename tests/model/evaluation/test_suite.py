@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -90,8 +91,11 @@ def test_parts_that_are_done_are_not_computed_again(
     lost = sorted((tmp_path / "parts").glob("hand-*.json"))[0]
     lost.unlink()
     assert results(run(made, tmp_path)) == whole and calls[2:] == ["hand"]
+    damaged = sorted((tmp_path / "parts").glob("arm-*.npz"))[0]
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    assert results(run(made, tmp_path)) == whole and calls[3:] == ["arm"]
     run(made, tmp_path, replace(SETTINGS, seed=1))
-    assert len(calls) == 5
+    assert len(calls) == 6
 
 
 def test_the_same_seed_gives_the_same_bytes(made: Path, tmp_path: Path) -> None:
@@ -135,6 +139,11 @@ def test_the_difference_is_black_where_pictures_are_equal() -> None:
         (["{made}/one", "{made}/arm", "--state"], "arm: is no robot of the laboratory"),
         (["{made}/one", "{made}/arm", "--fid", "nowhere.pt"], "--fid: nowhere.pt: no such file"),
         (["{made}/one", "{made}/arm", "--out", "{made}"], "holds something else than an evaluation"),
+        (
+            ["{made}/one", "{made}/arm", "--out", "{made}/one/config.json/out"],
+            "config.json: is a file, not a folder",
+        ),
+        (["{made}/edited", "{made}/arm"], "edited/trunk.safetensors: missing "),
     ],
 )
 def test_wrong_input_is_one_line(
@@ -143,6 +152,10 @@ def test_wrong_input_is_one_line(
     if not (made / "narrow").exists():
         save(made / "narrow", {"arm": 2})
         other = CONFIG.replace(tokenizer={**SPEC.to_json(), "version": 2})
+        shutil.copytree(made / "one", made / "edited")
+        config = json.loads((made / "edited" / "config.json").read_text())
+        config["model"]["layers"] += 1
+        (made / "edited" / "config.json").write_text(json.dumps(config))
         save(made / "foreign", {"arm": 2}, model=make_model({"arm": 2}, config=other))
     code = main(["evaluate", *(word.format(made=made) for word in words)])
     said = capsys.readouterr()

@@ -1,0 +1,303 @@
+"""Train a small model on laboratory data and compare its quality with recorded bands (`hma bench quality`).
+
+Speed has benchmarks of its own; this one judges a change of the model. Each case trains for a fixed number of
+steps on one thread, so that the same code on the same machine gives the same figures:
+
+    loss        nats a token (continuous: the diffusion loss) on held-out windows
+    psnr_db     of rollouts, mean over the horizon
+    gain_db     PSNR of the last frame, true less shuffled commands: above 0 the model follows
+    error_px    distance of the robot's parts at the last frame from where the simulator has them
+
+The bands (quality.json) are recorded with several seeds by `record=true`. A figure is inside its band if one
+more run of unchanged code would be there in 95 % of cases (Student's t, from the spread over the seeds); with
+`seeds=3` the mean of three runs is compared, and the bands are narrower. The data are recorded into the cache
+with fixed seeds; `data` names a shard set of the same robot and tokenizer instead.
+"""
+
+import hashlib
+import json
+import math
+import statistics
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hma_data import lab
+from hma_data.bench import Bench
+from hma_data.errors import OutputError, UsageError
+from hma_data.lab import family
+from hma_data.shards.manifest import MANIFEST
+from hma_data.shards.reader import ShardSet
+from hma_data.storage.files import cache_folder, read_json, to_json, write_atomic
+
+BANDS = Path(__file__).with_suffix(".json")
+EPISODES, SEED, VAL_FRACTION = 60, 0, 0.1  # of the recording
+FRAMES, PROMPT, WINDOWS, DRAWS = 8, 2, 24, 3  # of the rollouts
+FIGURES = {"loss": -1, "psnr_db": 1, "gain_db": 1, "error_px": -1}  # name -> the sign of what is better
+PLAIN = ["eval_every=0", "checkpoint_every=0", "pictures=0", "report=false", "device=cpu", "frames=8"]
+T95 = (
+    12.71,
+    4.303,
+    3.182,
+    2.776,
+    2.571,
+    2.447,
+    2.365,
+    2.306,
+    2.262,
+)  # Student's t, 1 to 9 degrees of freedom
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is trained.
+
+    Attributes:
+        robot: of the made-up family.
+        steps: of the training.
+        overrides: of the recipe.
+    """
+
+    robot: str
+    tokenizer: str
+    recipe: str
+    steps: int
+    overrides: tuple[str, ...] = ()
+
+
+CASES = {
+    "discrete": Case("rails_03", "fsq-lab", "discrete_tiny", 200, ("model.merge=2",)),
+    "continuous": Case("rails_03", "vae-8", "continuous_tiny", 600, ("model.patch=4",)),
+    "finetuned": Case("arm3_55", "fsq-lab", "demo", 300, ("start=embedded",)),
+}
+
+
+def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return a row for each case and figure; with `record`, write the bands.
+
+    Raises:
+        UsageError: there is no such case, or its bands are missing or of another budget.
+    """
+    names = [name.strip() for name in settings["cases"].split(",")]
+    for name in names:
+        if name not in CASES:
+            raise UsageError("bench quality", f"{name!r} is no case", f"cases: {', '.join(CASES)}")
+    if not 1 <= settings["seeds"] <= len(T95) + 1:
+        raise UsageError("bench quality", f"seeds={settings['seeds']} is not allowed", "give 1 to 10")
+    path = Path(settings["bands"] or BANDS)
+    kept = read_json(path, OutputError) if path.is_file() else {}
+    if settings["record"]:
+        if settings["seeds"] < 2:
+            raise UsageError("bench quality", "bands need the spread over seeds", "add seeds=3")
+    else:
+        for name in names:
+            _check(name, kept, settings, path)
+    rows: list[dict[str, Any]] = []
+    for name in names:
+        budget = _budget(CASES[name], settings)
+        data = Path(settings["data"]) if settings["data"] else _cached(CASES[name])
+        facts = {"budget": budget, "data": digest_of(data), "torch": torch_version()}
+        if settings["record"]:
+            found = _record(name, data, facts, settings["seeds"], kept, path)
+        else:
+            found = [measure(name, data, budget, seed) for seed in range(settings["seeds"])]
+        rows += judged(name, kept[name], found, facts)
+    return rows
+
+
+def fault(rows: Sequence[dict[str, Any]]) -> str:
+    """Return which figures are outside their bands; empty if none is."""
+    outside = [f"{row['case']}: {row['figure']}, {row['verdict']}" for row in rows if not row["inside"]]
+    return f"outside the bands: {'; '.join(outside)}" if outside else ""
+
+
+def _budget(case: Case, settings: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "steps": settings["steps"] or case.steps,
+        "windows": settings["windows"],
+        "episodes": settings["episodes"],
+    }
+
+
+def _check(name: str, kept: dict[str, Any], settings: dict[str, Any], path: Path) -> None:
+    remedy = "record them: record=true seeds=3 bands=FILE"
+    if len(kept.get(name, {}).get("seeds", [])) < 2:
+        raise UsageError(path, f"has no bands of {name!r}", remedy)
+    budget = _budget(CASES[name], settings)
+    other = [
+        f"{key}={kept[name]['budget'][key]}" for key in budget if kept[name]["budget"][key] != budget[key]
+    ]
+    if other:
+        raise UsageError("bench quality", f"the bands of {name!r} are of {', '.join(other)}", remedy)
+
+
+# -- data
+
+
+def recorded(robot: str, tokenizer: str, folder: Path, episodes: int = EPISODES) -> Path:
+    """Return a shard set of a robot of the family; it is recorded and converted where it is not there."""
+    from hma_data.conversion.job import convert
+    from hma_data.conversion.plan import Settings
+
+    if not (folder / MANIFEST).is_file():
+        _tell(f"{robot}: {episodes} episodes are recorded into {folder}")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory() as place:
+            recording = lab.record(robot, place, episodes, SEED)
+            settings = Settings(val_fraction=VAL_FRACTION, frames="strided")
+            convert(family.embodiment(robot), recording, tokenizer, folder, settings=settings)
+    return folder
+
+
+def _cached(case: Case) -> Path:
+    folder = cache_folder() / "bench" / f"{case.robot}-{case.tokenizer}"
+    return recorded(case.robot, case.tokenizer, folder)
+
+
+def digest_of(data: Path) -> str:
+    """Return sixteen hex digits that stand for the shards of a set."""
+    shards = [shard.sha256 for shard in ShardSet(data).manifest.shards]
+    return hashlib.sha256(json.dumps(shards).encode()).hexdigest()[:16]
+
+
+# -- measurement
+
+
+def measure(name: str, data: Path, budget: dict[str, Any], seed: int) -> dict[str, float]:
+    """Train a case and return its figures by name.
+
+    Raises:
+        UsageError: the training was stopped by a signal.
+    """
+    from hma_data.tokenizers.base import get_tokenizer
+    from hma_model.evaluation.evaluate import evaluate
+    from hma_model.evaluation.simulated import measure_state
+    from hma_model.network.model import HMA
+    from hma_model.training.loop import train
+
+    case, shards = CASES[name], ShardSet(data)
+    robot = shards.embodiment.id
+    tokenizer = get_tokenizer(shards.spec.name)
+    with one_thread(), tempfile.TemporaryDirectory() as folder:
+        _tell(f"{name}, seed {seed}: {budget['steps']} steps")
+        result = train(recipe_of(case, data, budget["steps"], seed), out=Path(folder) / "run", show=False)
+        if result.interrupted:
+            raise UsageError("bench quality", "was stopped by a signal", "run it again")
+        model = HMA.from_pretrained(result.checkpoint).eval()
+        found = evaluate(
+            model, tokenizer, shards, count=budget["windows"], frames=FRAMES, prompt=PROMPT, draws=DRAWS
+        )
+        figures = {
+            "loss": found["loss"],
+            "psnr_db": found["true"]["psnr"],
+            "gain_db": found["psnr_action_gain_last"],
+        }
+        if budget["episodes"]:
+            state = measure_state(
+                model, tokenizer, robot, frames=FRAMES, prompt=PROMPT, episodes=budget["episodes"]
+            )
+            figures["error_px"] = state["true"]["error_px_last"]
+    return {key: round(value, 4) for key, value in figures.items()}
+
+
+def recipe_of(case: Case, data: Path, steps: int, seed: int) -> Any:
+    """Return the recipe of a training of a case."""
+    from hma_model.training.recipe import load_recipe
+
+    own = [f"data=[{json.dumps(str(data))}]", f"steps={steps}", f"seed={seed}"]
+    return load_recipe(case.recipe, [*PLAIN, *case.overrides, *own])
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute on one thread: sums in another order would give other figures."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+# -- bands
+
+
+def _record(
+    name: str, data: Path, facts: dict[str, Any], seeds: int, kept: dict[str, Any], path: Path
+) -> list[dict[str, float]]:
+    """Measure the seeds of a case and write its bands; a recording that was stopped continues."""
+    before = kept.get(name, {})
+    if len(before.get("seeds", [])) >= seeds or {key: before.get(key) for key in facts} != facts:
+        before = {**facts, "seeds": []}
+    kept[name] = before
+    for seed in range(len(before["seeds"]), seeds):
+        before["seeds"].append(measure(name, data, facts["budget"], seed))
+        write_atomic(path, to_json(kept))
+    return list(before["seeds"])
+
+
+def torch_version() -> str:
+    """Return the version of torch, whose sums may differ from one version to another."""
+    import torch
+
+    return str(torch.__version__).partition("+")[0]
+
+
+def judged(
+    name: str, kept: dict[str, Any], found: Sequence[dict[str, float]], facts: dict[str, Any]
+) -> list[dict[str, Any]]:
+    """Return the rows of a case: each figure's mean over the seeds, and whether it is inside its band.
+
+    Args:
+        kept: of the bands' file; `seeds` holds the figures of each seed.
+        found: the figures of each seed, now.
+        facts: the data's digest and the version of torch, now.
+    """
+    rows, count = [], len(kept["seeds"])
+    other = [key for key in ("data", "torch") if facts[key] != kept[key]]
+    for figure in kept["seeds"][0]:
+        recorded = [one[figure] for one in kept["seeds"]]
+        mean, middle = statistics.mean(one[figure] for one in found), statistics.mean(recorded)
+        width = T95[count - 2] * statistics.stdev(recorded) * math.sqrt(1 / len(found) + 1 / count)
+        away = mean - middle
+        inside = abs(away) <= width
+        rows.append(
+            {
+                "case": name,
+                "figure": figure,
+                "value": round(mean, 4),
+                "low": round(middle - width, 4),
+                "high": round(middle + width, 4),
+                "inside": inside,
+                "verdict": "inside" if inside else "better" if away * FIGURES[figure] > 0 else "worse",
+                "other than the bands'": ", ".join(other) or None,
+            }
+        )
+    return rows
+
+
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+BENCH = Bench(
+    "what a small model learns in a fixed number of steps, compared with recorded bands",
+    {
+        "cases": "discrete",  # of discrete, continuous, finetuned
+        "steps": 0,  # of the training; 0: the case's own
+        "seeds": 1,
+        "windows": WINDOWS,  # held out, that are rolled out
+        "episodes": 16,  # simulated, for the robot's place; 0: not measured
+        "data": "",  # a shard set
+        "record": False,  # write the bands
+        "bands": "",  # their file; by default the package's
+    },
+    run,
+    fault,
+)
