@@ -46,4 +46,4 @@ __getattr__ = lazy(
         "MixtureDataset": "hma_data.loading.dataset",
     },
 )
-__version__ = "0.1.0"
+__version__ = "0.2.0"
