@@ -1,22 +1,20 @@
 """Show a training run in Rerun: its losses and rates, and a held-out window beside its prediction."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hma_data.errors import HMAError, UsageError
+from hma_data.errors import UsageError
 from hma_data.inspection.view import View
 from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import read_json
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.training.logging import read_metrics
-from hma_model.training.runtime import RECIPE
 
 RATES = ("lr", "grad_norm", "step_seconds", "data_seconds")
 
@@ -35,7 +33,8 @@ def view_run(out: StrPath, window: int = 0, data: Sequence[StrPath] = ()) -> Vie
         UsageError: neither figures nor shards are there, or no such window.
     """
     out, checkpoint = as_path(out), Checkpoint.open(out)
-    shards = next(_sets(out, checkpoint, data), None)
+    sets = [ShardSet(folder) for folder in data] if data else checkpoint.shards()
+    shards = next((one for one in sets if one.embodiment.id in checkpoint.embodiments), None)
     figures = _figures(read_metrics(out))
     if shards is None and not figures:
         raise UsageError(out, "has no metrics.jsonl and none of its shards are here", "name a shard set too")
@@ -59,20 +58,6 @@ def _figures(lines: list[dict[str, Any]]) -> dict[str, list[tuple[int, float]]]:
             if value is not None:
                 found[entity].append((line["step"], value))
     return found
-
-
-def _sets(out: Path, checkpoint: Checkpoint, data: Sequence[StrPath]) -> Iterator[ShardSet]:
-    """Yield the shard sets of the checkpoint's robots: those given, or those of the recipe that are here."""
-    named = list(data) or (read_json(out / RECIPE)["data"] if (out / RECIPE).is_file() else [])
-    for folder in named:
-        try:
-            shards = ShardSet(folder)
-        except HMAError:
-            if data:
-                raise
-            continue  # it was moved or removed
-        if shards.embodiment.id in checkpoint.embodiments:
-            yield shards
 
 
 def _rolled(out: Path, checkpoint: Checkpoint, shards: ShardSet, window: int) -> View:
