@@ -38,7 +38,9 @@ def test_the_hubs_filters_find_a_model_by_its_data_and_its_base(tmp_path: Path) 
     assert {"robotics", "world-model", "embodiment:arm", "embodiment:hand"} <= set(card.tags)
 
 
-@pytest.mark.parametrize(("tokenizer", "views"), [("fsq-lab", 1), ("fsq-lab", 2), ("vae-8", 1)])
+@pytest.mark.parametrize(
+    ("tokenizer", "views"), [("fsq-lab", 1), ("fsq-lab", 2), pytest.param("vae-8", 1, marks=pytest.mark.slow)]
+)
 def test_the_cards_code_runs_as_pasted(tokenizer: str, views: int, tmp_path: Path) -> None:
     spec = get_tokenizer(tokenizer).spec
     numbers = {"factored": spec.factored} if spec.kind == "discrete" else {"channels": spec.channels}

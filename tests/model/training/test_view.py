@@ -9,11 +9,10 @@ import pytest
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.reader import ShardSet
-from hma_model.checkpoint import io as checkpoints
 from hma_model.training import view as module
 from tests.data.inspection.test_view import pictures, read, seconds
 from tests.model.evaluation.test_evaluate import Blocks
-from tests.model.robots import make_model, yaml
+from tests.model.robots import save
 from tests.model.shards import make_shards
 
 
@@ -21,10 +20,8 @@ from tests.model.shards import make_shards
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of a run: a checkpoint, two lines of a log, and a recipe that names its shards."""
     shards = make_shards(tmp_path / "arm", "arm")
-    stats = {"arm": ShardSet(shards).manifest.stats}
-    model, folder = make_model({"arm": 2}), tmp_path / "run"
-    saved = folder / "checkpoints" / "step-00000002"
-    checkpoints.save(model, saved, embodiment_yaml={"arm": yaml("arm", 2)}, stats=stats, cards={})
+    folder = tmp_path / "run"
+    save(folder / "checkpoints" / "step-00000002", {"arm": 2})
     lines = [
         {"kind": "train", "step": 1, "loss_by_embodiment": {"arm": 3.5}, "lr": 0.1, "grad_norm": None},
         {"kind": "eval", "step": 1, "loss_by_embodiment": {"arm": 3.25}},
