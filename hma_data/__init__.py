@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from hma_data.sources.base import open_source as open_source
     from hma_data.tokenizers.base import get_tokenizer as get_tokenizer
 
+__all__ = ["MixtureDataset", "convert", "find", "get_tokenizer", "open_sets", "open_source"]
+
 
 def lazy(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
     """Return the `__getattr__` of a package whose public names are imported on use.
@@ -46,4 +48,4 @@ __getattr__ = lazy(
         "MixtureDataset": "hma_data.loading.dataset",
     },
 )
-__version__ = "0.1.0"
+__version__ = "0.2.0"

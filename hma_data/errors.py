@@ -3,6 +3,10 @@
 The command line prints an error as one line and exits with `exit_code`; programs read the attributes.
 """
 
+from pathlib import Path
+
+_CHECKOUT = Path(__file__).parents[1] / "pyproject.toml"
+
 
 class HMAError(Exception):
     """The base class of all errors here.
@@ -98,3 +102,10 @@ class HubError(HMAError):
 
 class MissingDependencyError(HMAError):
     """An optional package is not installed; the remedy is the command that installs it."""
+
+
+def install_command(extra: str = "") -> str:
+    """Return the command that installs what the toolkit or an extra of it needs: uv in a checkout, or pip."""
+    if _CHECKOUT.is_file():
+        return f"uv sync --extra {extra}" if extra else "uv sync"
+    return f"pip install 'hma-toolkit[{extra}]'" if extra else "pip install hma-toolkit"

@@ -11,4 +11,5 @@ if TYPE_CHECKING:
     from hma_model.config import HMAConfig as HMAConfig
     from hma_model.network.model import HMA as HMA
 
+__all__ = ["HMA", "HMAConfig"]
 __getattr__ = lazy(__name__, {"HMA": "hma_model.network.model", "HMAConfig": "hma_model.config"})

@@ -28,6 +28,7 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
     verbs = [
         "demo",
         "play",
+        "view",
         "registry",
         "inspect",
         "convert",
@@ -44,6 +45,7 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
         assert verb in shown.stdout
     for verb in (
         ["play"],
+        ["view"],
         ["convert"],
         ["inspect"],
         ["train"],

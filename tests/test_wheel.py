@@ -1,12 +1,16 @@
 """What the wheel holds, and that it works away from the checkout."""
 
 import os
+import re
 import subprocess
 import sys
 import zipfile
+from importlib.metadata import PathDistribution
 from pathlib import Path
 
 import pytest
+
+from hma_data import __version__
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -48,8 +52,26 @@ def test_it_holds_registry_recipes_and_weights(installed: Path) -> None:
     assert "hma_data/shipped/registry/lab/pusht_fast.yaml" in files
     assert any(name.startswith("hma_data/shipped/recipes/") and name.endswith(".yaml") for name in files)
     assert any(name.startswith("hma_data/tokenizers/weights/") for name in files)
-    assert "hma_model/simulate/page.html" in files
+    assert {"hma_model/simulate/page.html", "hma_data/py.typed", "hma_model/py.typed"} <= files
+    assert "hma_model/embedded/trunk.safetensors" in files
     assert not any(name.startswith(("tests/", "docs/")) for name in files)
+
+
+def test_its_metadata_ask_for_one_opencv_and_state_the_version(installed: Path) -> None:
+    (folder,) = installed.glob("hma_toolkit-*.dist-info")
+    metadata = PathDistribution(folder).metadata
+    asked = {re.split(r"[^\w-]", line)[0] for line in metadata.get_all("Requires-Dist", [])}
+    assert metadata["Version"] == __version__ and (folder / "licenses" / "LICENSE").is_file()
+    assert {name for name in asked if "opencv" in name} == {"opencv-python-headless"}
+    assert "gym-pusht" not in asked  # it asks for the other build of OpenCV
+
+
+def test_every_extra_that_an_error_names_is_one(installed: Path) -> None:
+    (folder,) = installed.glob("hma_toolkit-*.dist-info")
+    extras = set(PathDistribution(folder).metadata.get_all("Provides-Extra", []))
+    code = "".join(path.read_text() for path in installed.glob("hma_*/**/*.py"))
+    named = set(re.findall(r'install_command\("(\w+)"\)', code))
+    assert named == extras
 
 
 def test_the_registry_answers_from_another_folder(installed: Path, tmp_path: Path) -> None:

@@ -143,6 +143,16 @@ def webp_bytes(frames: Images, fps: float) -> bytes:
     return buffer.getvalue()
 
 
+def gif_bytes(frames: Iterable[Images], fps: float) -> bytes:
+    """Return frames (H, W, 3) as the bytes of a GIF of 128 colours that loops."""
+    from PIL import Image
+
+    first, *rest = (Image.fromarray(frame).quantize(128) for frame in frames)
+    buffer = io.BytesIO()
+    first.save(buffer, "GIF", save_all=True, append_images=rest, duration=round(1000 / fps), loop=0)
+    return buffer.getvalue()
+
+
 def write_png(path: Path, picture: Images) -> None:
     """Write a PNG file, whole or not at all."""
     with atomic_path(path) as part:

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 
-from hma_data.errors import MissingDependencyError, OutputError, UsageError
+from hma_data.errors import MissingDependencyError, OutputError, UsageError, install_command
 from hma_data.storage.paths import StrPath, as_path
 
 Progress = Callable[[int, int], None]
@@ -92,11 +92,11 @@ def _counted(episodes: int, on_progress: Progress | None) -> Iterator[int]:
 
 
 @contextmanager
-def imported(package: str, install: str) -> Iterator[None]:
+def imported(package: str) -> Iterator[None]:
     """Import a third-party package, without pygame's greeting and the warnings that imports make.
 
     Raises:
-        MissingDependencyError: it cannot be imported; `install` is the command for that.
+        MissingDependencyError: it cannot be imported.
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
@@ -104,4 +104,4 @@ def imported(package: str, install: str) -> Iterator[None]:
             warnings.simplefilter("ignore", UserWarning)
             yield
     except ImportError as fault:
-        raise MissingDependencyError(package, f"cannot be imported: {fault}", install) from fault
+        raise MissingDependencyError(package, f"cannot be imported: {fault}", install_command()) from fault

@@ -39,7 +39,7 @@ class Pendulum:
     """
 
     def __init__(self, angle: float, speed: float) -> None:
-        with imported("gymnasium's Pendulum-v1", "uv pip install gymnasium pygame"):
+        with imported("gymnasium's Pendulum-v1"):
             from gymnasium.envs.classic_control.pendulum import PendulumEnv
             from pygame import Surface
             from pygame.time import Clock

@@ -67,7 +67,7 @@ class Arm:
     """
 
     def __init__(self, joints: Floats, blocks: Floats) -> None:
-        with imported("pymunk", "uv pip install pymunk"):
+        with imported("pymunk"):
             import pymunk
         self._munk: Any = pymunk
         self._space = pymunk.Space()

@@ -1,6 +1,6 @@
-"""Record gym-pusht as two robots: one position-controlled to HDF5, one velocity-controlled to MCAP.
+"""Record Push-T as two robots: one position-controlled to HDF5, one velocity-controlled to MCAP.
 
-Both push a T toward its goal pose in the environment's own physics, drawn by its own renderer:
+Both push a T toward its goal pose on the table of gym-pusht (`hma_data.lab.tee_table`):
 
     pusht_fast  10 Hz   action (x, y): target of the pusher in px, the environment's native action
     pusht_slow   5 Hz   action (vx, vy, lift): velocity in px/s; lift 1 raises the pusher over the T,
@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.lab import imported
 from hma_data.lab.pusher import Floats, Planned, Tee, Wandering, rotation
+from hma_data.lab.tee_table import GOAL, TICK_S, TeeTable
 from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mcap
 
-TICK_S = 0.01  # step of the physics
+SUCCESS = 0.95  # share of the goal that the T covers
 LAG_S = 0.2  # delay of the pusher's spring (k_v / k_p of the environment) behind a moving target
 SPEED = 300.0  # px/s of planned motion
 STARTS = ("near", "random", "near", "far", "near")
@@ -59,29 +59,23 @@ def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
 
 
 class Arena:
-    """The environment, with the parts of its state that the robots need; `start` is one of STARTS.
-
-    Raises:
-        MissingDependencyError: gym-pusht is not installed.
-    """
+    """The table, with the parts of its state that the robots need; `start` is one of STARTS."""
 
     def __init__(self, look: Look, start: str, rng: np.random.Generator) -> None:
-        with imported("gym-pusht", "uv sync"):
-            from gym_pusht.envs.pusht import PushTEnv
-            from pygame import Color
-        self._env = PushTEnv(obs_type="state", observation_width=look.size, observation_height=look.size)
-        self._colors = {True: Color(look.raised), False: Color(look.pusher)}
-        self._env.reset(seed=int(rng.integers(2**31)))
-        bars = sorted(sorted(shape.get_vertices()) for shape in self._env.block.shapes)  # a set has no order
+        self._size = look.size
+        dice = np.random.default_rng(int(rng.integers(2**31)))
+        places = [dice.integers(low, high) for low, high in ((50, 450), (50, 450), (100, 400), (100, 400))]
+        self._table = TeeTable(np.array([*places, dice.uniform(-np.pi, np.pi)]))
+        bars = sorted(sorted(bar.get_vertices()) for bar in self._table.bars)
         boxes = [(np.min(corners, axis=0), np.max(corners, axis=0)) for corners in bars]
-        body, (pusher,) = self._env.block, self._env.agent.shapes
+        body, (pusher,) = self._table.block, self._table.agent.shapes
         center = np.array(body.center_of_gravity)
         self.tee = Tee(np.array(boxes), center, body.mass, body.moment, pusher.radius)
-        self.goal: Floats = np.asarray(self._env.goal_pose, dtype=np.float64)
+        self.goal: Floats = np.array(GOAL)
         if start == "near":
-            self._env.reset(options={"reset_to_state": self._near_goal(rng)})
-        for shape in self._env.block.shapes:
-            shape.color = Color(look.block)
+            self._table.reset(self._near_goal(rng))
+        self._table.paint(look.block)
+        self._colors = {True: look.raised, False: look.pusher}
         self.raised = False
         self.lift(False)
         self.ticks, self.reward, self.success = 0, 0.0, False
@@ -99,45 +93,41 @@ class Arena:
     @property
     def pose(self) -> Floats:
         """Return (3,) x, y, angle of the T."""
-        return np.array([*self._env.block.position, self._env.block.angle])
+        return np.array([*self._table.block.position, self._table.block.angle])
 
     @property
     def agent(self) -> Floats:
         """Return the (2,) centre of the pusher."""
-        return np.array(self._env.agent.position)
+        return np.array(self._table.agent.position)
 
     @property
     def velocity(self) -> Floats:
         """Return the (2,) velocity of the pusher in px/s."""
-        return np.array(self._env.agent.velocity)
+        return np.array(self._table.agent.velocity)
 
     @property
     def state(self) -> Floats:
         """Return (5,) pusher x, y, T x, y, angle: the environment's observation."""
-        return np.asarray(self._env.get_obs(), dtype=np.float64)
+        return np.append(np.concatenate([self.agent, self.pose[:2]]), self.pose[2] % (2 * np.pi))
 
     def picture(self) -> NDArray[np.uint8]:
         """Render the arena; (size, size, 3) RGB."""
-        self._env.obs_type = "pixels"
-        pixels: NDArray[np.uint8] = self._env.get_obs()
-        self._env.obs_type = "state"
-        return pixels
+        return self._table.picture(self._size)
 
     def lift(self, up: bool) -> None:
         """Raise or lower the pusher; it cannot be lowered over the T."""
         local = (self.agent - self.pose[:2]) @ rotation(self.pose[2])
         over = float(self.tee.distance(local)) < self.tee.radius
         self.raised = up or (self.raised and over)
-        (shape,) = self._env.agent.shapes
-        shape.sensor, shape.color = self.raised, self._colors[self.raised]
+        self._table.raise_disc(self.raised, self._colors[self.raised])
 
     def advance(self, target: Floats, ticks: int) -> None:
         """Run the physics for `ticks` while a spring pulls the pusher to `target` (2,)."""
-        self._env.control_hz = 1 / (TICK_S * (ticks + 0.5))  # the environment rounds down to ticks
-        _, reward, _, _, info = self._env.step(target)
-        self.reward = round(float(reward), 9)  # the last digits depend on the order of the T's set of bars
+        self._table.advance(target, ticks)
+        coverage = self._table.coverage()
+        self.reward = round(min(coverage / SUCCESS, 1.0), 9)
         self.ticks += ticks
-        self.success = self.success or bool(info["is_success"])
+        self.success = self.success or coverage > SUCCESS
 
 
 def _policy(arena: Arena, rng: np.random.Generator, episode: int, fly: bool) -> Planned | Wandering:

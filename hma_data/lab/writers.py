@@ -229,7 +229,7 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
         MissingDependencyError: lerobot cannot be imported.
     """
     assert embodiment.frequency_hz
-    with imported("lerobot", "uv sync"):
+    with imported("lerobot"):
         from lerobot.configs.video import RGBEncoderConfig
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 

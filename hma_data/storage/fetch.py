@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from hma_data.errors import HMAError, MissingDependencyError, SourceError, StorageAwayError
+from hma_data.errors import HMAError, MissingDependencyError, SourceError, StorageAwayError, install_command
 
 CONNECT_S = 3.0  # seconds to wait for a server to answer
 WAITS_S = (0.2, 0.6, 1.8)  # before the second, third and fourth try
@@ -161,8 +161,8 @@ def file_system(uri: str) -> tuple[Any, str]:
         files, path = fsspec.core.url_to_fs(uri, **options)
     except ImportError as fault:
         package = PACKAGES.get(scheme)
-        remedy = f"uv pip install {package}" if package else said(fault)
-        remedy = "uv sync --extra remote" if package in OF_EXTRA else remedy
+        remedy = f"pip install {package}" if package else said(fault)
+        remedy = install_command("remote") if package in OF_EXTRA else remedy
         raise MissingDependencyError(uri, f"needs the package of {scheme}://", remedy) from fault
     return files, path
 

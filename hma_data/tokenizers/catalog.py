@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
-from hma_data.errors import PluginError, TokenizerError
+from hma_data.errors import PluginError, TokenizerError, install_command
 from hma_data.plugins import TOKENIZER_GROUP, Plugin, installed
 
 EMBEDDED = Path(__file__).parent / "weights"
@@ -131,7 +131,7 @@ _ROWS = (
         "download", "hma_data.tokenizers.latents", licence="Stability AI Community License",
         repo="stabilityai/stable-video-diffusion-img2vid", bytes=391_000_000,
         file="vae/diffusion_pytorch_model.safetensors", revision="9cf024d5bfa8f56622af86c884f26a52f6676f2e",
-        imports=("torch", "diffusers"), extra="uv sync --extra svd",
+        imports=("torch", "diffusers"), extra=install_command("svd"),
     ),
     Entry(
         "taesd", "continuous", 256, (32, 32),

@@ -16,6 +16,7 @@ a step to `STEPS` and a test.
 import hashlib
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.config import HMAConfig
 
 if TYPE_CHECKING:
+    from hma_data.shards.reader import ShardSet
     from hma_data.tokenizers.base import TokenizerSpec
 
 Values = dict[str, Any]
@@ -38,7 +40,8 @@ STEM, HEAD, YAML, STATS, CARD = (
     "stem.safetensors", "head.safetensors", "embodiment.yaml", "stats.json", "card.json",
 )  # fmt: skip
 PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card is last: its presence means that the others are there
-SAMPLE = "sample.png"  # optional, shown in the model card
+SAMPLE, FILM = "sample.png", "sample.gif"  # optional, shown in the model card
+SHOWN = (SAMPLE, FILM)
 EMBEDDED, EMBEDDED_NAME = Path(__file__).parents[1] / "embedded", "embedded"  # comes along with the package
 _APART = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was cut short: do it again"
@@ -138,6 +141,17 @@ class Checkpoint:
         values = read_json(path)
         action_stats(values, path)
         return values
+
+    def shards(self) -> "list[ShardSet]":
+        """Open the shard sets of the run that wrote this checkpoint, as far as they are still here."""
+        from hma_data.shards.reader import ShardSet  # imports pyarrow
+
+        path, sets = self.folder.parent.parent / "recipe.json", []
+        if self.folder.parent.name == "checkpoints" and path.is_file():
+            for folder in read_json(path).get("data", ()):
+                with suppress(HMAError):  # it was moved or removed
+                    sets.append(ShardSet(folder))
+        return [one for one in sets if one.embodiment.id in self.embodiments]
 
     def check(self, embodiment: str) -> None:
         """Raise unless the embodiment's parts belong to this trunk, tokenizer and statistics.

@@ -22,6 +22,7 @@ from hma_model.checkpoint.folder import (
     PARTS,
     README,
     SAMPLE,
+    SHOWN,
     STATS,
     STEM,
     TRAINING,
@@ -156,7 +157,8 @@ def write_readme(folder: StrPath) -> None:
     folder = as_path(folder)
     checkpoint = Checkpoint.open(folder)
     cards = {name: checkpoint.card(name) for name in checkpoint.embodiments}
-    samples = {name for name in cards if (folder / "embodiments" / name / SAMPLE).is_file()}
+    homes = folder / "embodiments"
+    samples = {f"{name}/{part}" for name in cards for part in SHOWN if (homes / name / part).is_file()}
     text = render(config_json(checkpoint.config, checkpoint.trunk_sha256), cards, samples=samples)
     write_atomic(folder / README, text)
 
@@ -189,7 +191,7 @@ def _take_over(base: Checkpoint, new: Path, besides: set[str]) -> str:
     names = [CONFIG, TRUNK]
     for name in kept:
         home = base.folder / "embodiments" / name
-        names += [f"embodiments/{name}/{part}" for part in (*PARTS, SAMPLE) if (home / part).is_file()]
+        names += [f"embodiments/{name}/{part}" for part in (*PARTS, *SHOWN) if (home / part).is_file()]
     for name in names:
         (new / name).parent.mkdir(parents=True, exist_ok=True)
         try:

@@ -8,9 +8,11 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
+from hma_data.storage.paths import REPOSITORY
 from hma_data.storage.yaml_io import write_yaml
 
 _TAGS = ("robotics", "world-model", "video-prediction", "hma")
+_DATASET = re.compile(rf"hf://datasets/({REPOSITORY.pattern})")
 _HEADINGS = ["embodiment", "robot", "action dims", "Hz", "stride", "data", "metrics", "licence"]
 
 # The identifiers that the hub accepts in a card's front matter; it refuses any other.
@@ -38,14 +40,15 @@ def render(
         config: the values of config.json.
         cards: id -> the values of card.json.
         repo: the name of the checkpoint for a reader; None for the reader's own path.
-        samples: ids that have a sample.png.
+        samples: files that are there of `ID/sample.gif` (a film) and `ID/sample.png`; the film is shown.
     """
     pictures = [
-        f"### {name}\n\n![A rollout of {name} beside the truth](embodiments/{name}/sample.png)"
-        for name in sorted(set(cards) & set(samples))
+        f"### {name}\n\n![A rollout of {name} beside the truth](embodiments/{found[0]})"
+        for name in sorted(cards)
+        if (found := [part for part in (f"{name}/sample.gif", f"{name}/sample.png") if part in samples])
     ]
     front: dict[str, Any] = {"library_name": "hma-toolkit", "pipeline_tag": "robotics"}
-    front |= licence(card.get("license") for card in cards.values())
+    front |= licence(card.get("license") for card in cards.values()) | _origins(cards)
     front["tags"] = [*_TAGS, *(f"embodiment:{name}" for name in sorted(cards))]
     parts = [
         f"---\n{write_yaml(front)}---",
@@ -53,7 +56,7 @@ def render(
         _about(config),
         "## Embodiments\n\n" + _table(cards),
         *pictures,
-        "## How to use\n\n" + _usage(repo or "PATH", cards),
+        "## How to use\n\n" + _usage(repo or "PATH", config, cards),
         f"Format version {line(config.get('format_version'))}. Each `card.json` names its trunk by SHA-256: "
         "parts that do not belong together are refused on loading.",
     ]
@@ -95,14 +98,53 @@ def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
-def _usage(name: str, cards: Mapping[str, Any]) -> str:
-    example = min(cards, default="ID")
+def _origins(cards: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the datasets of the hub and the checkpoints there that the embodiments name."""
+    data = [parts.get(key) for parts in _parts(cards, "data") for key in ("source", "shards")]
+    datasets = {found[1] for uri in data if (found := _DATASET.match(str(uri)))}
+    bases = {str(parts.get("from")).split("@")[0] for parts in _parts(cards, "training")}
+    bases = {name for name in bases if REPOSITORY.fullmatch(name)}
+    front: dict[str, Any] = {"datasets": sorted(datasets)} if datasets else {}
+    if bases:
+        front |= {"base_model": sorted(bases), "base_model_relation": "finetune"}
+    return front
+
+
+def _parts(cards: Mapping[str, Mapping[str, Any]], key: str) -> list[Mapping[str, Any]]:
+    return [part for card in cards.values() if isinstance(part := card.get(key), Mapping)]
+
+
+_CODE = """
+import numpy as np
+import torch
+from hma_data import get_tokenizer
+from hma_model import HMA
+
+tokenizer = get_tokenizer("{tokenizer}")
+model = HMA.from_pretrained("{name}", embodiments=["{example}"]).eval()
+
+pictures = np.zeros((2, {side}, {side}, 3), np.uint8)  # two frames of your camera, RGB
+actions = torch.zeros(1, 2 + 6, {chunk})  # the commands from each frame up to the next, {chunk} values
+stored = tokenizer.encode(pictures){views}
+prompt = torch.from_numpy(stored.astype(np.{dtype}))[None]
+frames = model.generate(prompt, actions, "{example}", frames=6)
+film = tokenizer.decode(frames[0]{first}.numpy().astype(stored.dtype))  # (6, {side}, {side}, 3) uint8
+"""
+
+
+def _usage(name: str, config: Mapping[str, Any], cards: Mapping[str, Any]) -> str:
+    example, model, tokenizer = min(cards, default="ID"), config["model"], config["tokenizer"]
+    views, (height, *_) = model.get("views", 1), tokenizer.get("grid", (0, 0))
+    discrete = model.get("kind") == "discrete"
+    code = _CODE.strip().format(
+        name=name, example=example, tokenizer=line(tokenizer.get("name")),
+        side=line(tokenizer.get("image_size")), chunk=line(cards.get(example, {}).get("chunk_dim")) or "K",
+        dtype="int64" if discrete else "float32",
+        views="" if views == 1 else f".repeat({line(views)}, axis=-2)  # one picture a camera, stacked",
+        first="" if views == 1 else f"[..., :{line(height)}, :]",
+    )  # fmt: skip
     return (
-        "```python\n"
-        "from hma_model import HMA\n\n"
-        f'model = HMA.from_pretrained("{name}", embodiments=["{example}"])\n'
-        f'frames = model.generate(prompt, actions, "{example}", frames=8)  # their token ids\n'
-        "```\n\n"
+        f"```python\n{code}\n```\n\n"
         "```sh\n"
         f"hma hub pull {name} --embodiment {example} --out model\n"
         "hma generate model SHARDS --out rollout.mp4\n"

@@ -37,6 +37,7 @@ from hma_model.cli.options import (
 from hma_model.cli.play import play
 from hma_model.cli.policy import augment, policy_eval
 from hma_model.cli.train import MODELS
+from hma_model.cli.view import view
 
 
 class _Verbs(TyperGroup):
@@ -159,6 +160,7 @@ def demo(
 
 
 app.command()(play)
+app.command()(view)
 mount(app)
 cli_train.mount(app)
 

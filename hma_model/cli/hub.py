@@ -1,5 +1,6 @@
 """Define the verbs of `hma hub`: publish and fetch checkpoints and shard sets; convert released ones."""
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,8 +23,12 @@ def push(
     target: Annotated[str, typer.Argument(help="A folder, or org/name on the hub.")],
     embodiment: Embodiments = None,
     sample: Annotated[
-        list[Path] | None, typer.Option("--sample", help="Shard set to roll out for the card's picture.")
+        list[Path] | None,
+        typer.Option("--sample", help="Shard set to roll out for the card's film; default: the run's."),
     ] = None,
+    film: Annotated[
+        bool, typer.Option("--film/--no-film", help="Make a film for the card if the run's shards are here.")
+    ] = True,
     private: Private = False,
 ) -> None:
     """Publish a checkpoint, whole or robot by robot.
@@ -32,11 +37,24 @@ def push(
     """
     from hma_model.hub import publish as hub
 
-    if sample:
-        from hma_model.hub.sample import add_samples
-
-        add_samples(checkpoint, sample)
+    if film or sample:
+        _add_films(checkpoint, sample, embodiment)
     print(f"published to {hub.push(checkpoint, target, embodiment, private)}")
+
+
+def _add_films(checkpoint: Path, sample: list[Path] | None, embodiments: list[str] | None) -> None:
+    """Add films of the given shards; or those that can be made of the run's own shards."""
+    from hma_data.errors import HMAError
+    from hma_model.hub.sample import add_samples, at_hand
+
+    if sample:
+        add_samples(checkpoint, sample)
+        return
+    for folder in at_hand(checkpoint, embodiments):
+        try:
+            add_samples(checkpoint, [folder])
+        except HMAError as fault:  # a film is no condition of publishing
+            print(f"no film: {fault}", file=sys.stderr)
 
 
 @hub_app.command("pull")

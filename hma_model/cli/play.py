@@ -83,7 +83,7 @@ def play(
 
     def ready() -> None:
         print(f"drive at {address} (Ctrl-C ends)", flush=True)
-        if browser and _display():
+        if browser and has_display():
             webbrowser.open(address)
 
     settings = {"device": device, "precision": precision, "compile": compile}
@@ -103,6 +103,6 @@ def _listen(host: str, port: int) -> socket.socket:
         ) from fault
 
 
-def _display() -> bool:
+def has_display() -> bool:
     """Check whether there is a screen to open a browser on."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -26,7 +26,7 @@ from hma_model.checkpoint.folder import (
     EMBEDDED_NAME,
     PARTS,
     README,
-    SAMPLE,
+    SHOWN,
     TRUNK,
     YAML,
     Checkpoint,
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 Content = Path | bytes
 Store = FolderStore | Repository  # a place where a checkpoint or a shard set is published
-SHOWN = 50  # ids that an error lists
+LISTED = 50  # ids that an error lists
 _ADD_ONE = (
     f"Add one: hma finetune --from {EMBEDDED_NAME} --data SHARDS --out RUN, "
     "with shards of hma convert --tokenizer {name}"
@@ -148,7 +148,7 @@ def _pull(
     for name in wanted:
         check_id(name, store.name)
         if name not in there:
-            known = f"it has: {', '.join(there[:SHOWN]) or 'none'}"
+            known = f"it has: {', '.join(there[:LISTED]) or 'none'}"
             away = " in the cache, and is out of reach" if store.from_cache else ""
             if store.name == str(EMBEDDED):
                 raise HubError(
@@ -163,8 +163,8 @@ def _pull(
             raise HubError(store.name, fault, "name the embodiments you want, or have it pushed again")
     if TRUNK not in files and not store.from_cache:
         raise HubError(store.name, f"has no {TRUNK}", "have it pushed again")
-    names = [f"embodiments/{name}/{part}" for name in wanted for part in (SAMPLE, *PARTS)]
-    names = [CONFIG, TRUNK, *(name for name in names if name in files or not name.endswith(SAMPLE))]
+    names = [f"embodiments/{name}/{part}" for name in wanted for part in (*SHOWN, *PARTS)]
+    names = [CONFIG, TRUNK, *(name for name in names if name in files or not name.endswith(SHOWN))]
     place = folder = store.pull(names)
     if isinstance(folder, RemotePath):
         key = f"{store.name} {values.get('trunk_sha256')}".encode()
@@ -282,15 +282,14 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
     if TRUNK not in files:
         present[TRUNK] = inside(source.folder, TRUNK)
     for name in ids:
-        sample = source.folder / "embodiments" / name / SAMPLE
-        parts = (SAMPLE, *PARTS) if sample.is_file() else PARTS
-        present.update({f"embodiments/{name}/{part}": source.path(name, part) for part in parts})
+        home = source.folder / "embodiments" / name
+        shown = (part for part in SHOWN if (home / part).is_file())
+        present.update({f"embodiments/{name}/{part}": source.path(name, part) for part in (*shown, *PARTS)})
     others = [name for name in embodiment_ids(files) if name not in ids]
     store.warm([f"embodiments/{name}/{CARD}" for name in others])
     cards = {name: _readable_card(store, name) for name in others}
     cards.update({name: source.card(name) for name in ids})
-    suffix = f"/{SAMPLE}"
-    samples = {path.split("/")[1] for path in (*files, *present) if path.endswith(suffix)}
+    samples = {path.removeprefix("embodiments/") for path in (*files, *present) if path.endswith(SHOWN)}
     config = checkpoints.config_json(source.config, source.trunk_sha256)
     present[README] = render(config, cards, repo=store.repo, samples=samples)
     return present

@@ -1,4 +1,4 @@
-"""Make the sample picture of a model card: the truth, a short rollout, and one with other actions."""
+"""Make the picture and the film of a model card: the truth, a short rollout, and one with other actions."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -10,13 +10,14 @@ import numpy as np
 from hma_data.errors import CheckpointError, UsageError
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath
+from hma_data.storage.remote import RemotePath
 from hma_model.checkpoint import io as checkpoints
-from hma_model.checkpoint.folder import SAMPLE, Checkpoint, require_tokenizer
+from hma_model.checkpoint.folder import FILM, SAMPLE, Checkpoint, require_tokenizer
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hma_data.loading.dataset import Batch
+    from hma_data.loading.dataset import WindowDataset
     from hma_data.loading.views import Cameras
     from hma_data.shards.reader import ShardSet
 
@@ -24,14 +25,14 @@ COLUMNS, SIDE = 6, 128  # pictures in a row, and pixels of a side
 
 
 def add_samples(checkpoint: StrPath, data: Iterable[StrPath]) -> list[Path]:
-    """Write a sample.png for the embodiment of each shard set, and update the model card.
+    """Write sample.png and sample.gif for the embodiment of each shard set, and update the model card.
 
     Args:
         checkpoint: str or path of its folder, or of the folder of a training run.
         data: str or path of shard sets, one an embodiment.
 
     Returns:
-        The paths of the pictures.
+        The paths of the pictures and films.
 
     Raises:
         CheckpointError: the checkpoint lacks the embodiment, or was trained on another tokenizer.
@@ -46,23 +47,39 @@ def add_samples(checkpoint: StrPath, data: Iterable[StrPath]) -> list[Path]:
         if name not in source.embodiments:
             known = ", ".join(source.embodiments) or "none"
             raise CheckpointError(source.folder, f"has no embodiment {name!r}", f"it has: {known}")
-        path = source.folder / "embodiments" / name / SAMPLE
-        write_atomic(path, _picture(source.folder, shards))
-        made.append(path)
+        home = source.folder / "embodiments" / name
+        for part, content in zip((SAMPLE, FILM), _shown(source.folder, shards)):
+            write_atomic(home / part, content)
+            made.append(home / part)
     checkpoints.write_readme(source.folder)
     return made
 
 
-def _picture(checkpoint: Path, shards: "ShardSet") -> bytes:
-    """Return a PNG of one window: truth, prediction, and prediction with other actions, over time."""
-    from hma_data.episodes.sheets import grid, png_bytes
+def at_hand(checkpoint: StrPath, embodiments: Iterable[str] | None = None) -> list[RemotePath | Path]:
+    """Return the shard sets of a run that are still here, of the robots that have no film yet.
+
+    Args:
+        checkpoint: str or path of its folder, or of the folder of a training run.
+        embodiments: ids; None for all.
+    """
+    source = Checkpoint.open(checkpoint)
+    wanted = set(source.embodiments if embodiments is None else embodiments)
+    lacking = {name for name in wanted if not (source.folder / "embodiments" / name / FILM).is_file()}
+    return [shards.folder for shards in source.shards() if shards.embodiment.id in lacking]
+
+
+def _shown(checkpoint: Path, shards: "ShardSet") -> tuple[bytes, bytes]:
+    """Return a PNG of truth and predictions over a window, and a GIF of both with the commands."""
+    from hma_data.episodes.sheets import gif_bytes, grid, png_bytes
     from hma_data.shards.preview import tokenizer_of
     from hma_model.evaluation.evaluate import cameras_for, rollout
+    from hma_model.evaluation.rollout_video import rollout_video
 
     model = checkpoints.load(checkpoint, [shards.embodiment.id])
     require_tokenizer(model.config, shards.spec, shards.folder)
-    batch = _window(shards, model.config.frames, cameras_for(model, shards))
-    tokenizer = tokenizer_of(shards)
+    split, windows = _windows(shards, model.config.frames, cameras_for(model, shards))
+    middle, tokenizer = len(windows) // 2, tokenizer_of(shards)
+    batch = windows.batch([middle])
     true = rollout(model, tokenizer, batch)
     backwards = replace(batch, actions=batch.actions.flip(1), action_mask=batch.action_mask.flip(1))
     other = rollout(model, tokenizer, backwards, truth=true.truth)
@@ -72,22 +89,23 @@ def _picture(checkpoint: Path, shards: "ShardSet") -> bytes:
         f"predicted from frame {true.prompt} on": true.predicted[0],
         "with the actions in reverse": other.predicted[0],
     }
-    shown = [[_shown(frame) for frame in frames[picks]] for frames in rows.values()]
-    return png_bytes(grid(shown, list(rows)))
+    shown = [[_sized(frame) for frame in frames[picks]] for frames in rows.values()]
+    film = rollout_video(model, tokenizer, shards, split=split, window=middle, prompt=true.prompt)
+    return png_bytes(grid(shown, list(rows))), gif_bytes(film.frames, film.fps)
 
 
-def _window(shards: "ShardSet", frames: int, cameras: "Cameras") -> "Batch":
-    """Return the middle window of the validation split, or of training if that has none."""
+def _windows(shards: "ShardSet", frames: int, cameras: "Cameras") -> "tuple[str, WindowDataset]":
+    """Return the windows of the validation split, or of training if that has none."""
     from hma_data.loading.dataset import WindowDataset
 
     for split in ("val", "train"):
         windows = WindowDataset(shards, split, frames, cameras=cameras)
         if len(windows):
-            return windows.batch([len(windows) // 2])
+            return split, windows
     raise UsageError(shards.folder, f"has no window of {frames} frames", "give shards with longer episodes")
 
 
-def _shown(frame: "NDArray[np.uint8]") -> "NDArray[np.uint8]":
+def _sized(frame: "NDArray[np.uint8]") -> "NDArray[np.uint8]":
     """Return a frame near the size of the card: a small one enlarged, a large one subsampled."""
     side = frame.shape[0]
     if side < SIDE:

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from hma_model.simulate.world import World as World
     from hma_model.simulate.world import load_world as load_world
 
+__all__ = [
+    "ENVIRONMENT", "Judge", "World", "WorldModelEnv", "WorldModelVectorEnv", "load_world", "read_prompt",
+    "starting_window",
+]  # fmt: skip
 __getattr__ = lazy(
     __name__,
     {

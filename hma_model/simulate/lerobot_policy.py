@@ -29,7 +29,7 @@ class LeRobotPolicy:
 
     def __init__(self, source: str, scenes: Scenes) -> None:
         self.name = f"policy lerobot:{source}"
-        with imported("lerobot", "uv sync"):
+        with imported("lerobot"):
             from lerobot.configs.policies import PreTrainedConfig
             from lerobot.policies.factory import get_policy_class, make_pre_post_processors
         try:

@@ -7,7 +7,6 @@ knows it for a robot that begins from pictures.
 P frames of a prompt, H×W pixels, A action dims, K = stride * A values of a chunk.
 """
 
-import contextlib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,13 +16,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import HMAError, UsageError
+from hma_data.errors import UsageError
 from hma_data.lab import FAMILY
 from hma_data.lab.simulator import SIZE, LabSimulator, simulated
 from hma_data.registry.components import Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import read_json
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.simulate.pictures import Picture, fitted, sample_picture
 
@@ -318,15 +316,7 @@ def trained_on(checkpoint: Checkpoint) -> list[ShardSet]:
     Args:
         checkpoint: one of the run's; of any other there are none.
     """
-    path = checkpoint.folder.parent.parent / "recipe.json"
-    if checkpoint.folder.parent.name != "checkpoints" or not path.is_file():
-        return []
-    sets = []
-    for folder in read_json(path).get("data", ()):
-        with contextlib.suppress(HMAError):  # it was moved or removed
-            sets.append(ShardSet(folder))
-    known = [one for one in sets if one.embodiment.id in checkpoint.embodiments]
-    return [one for one in known if not simulated(one.embodiment.id)]
+    return [one for one in checkpoint.shards() if not simulated(one.embodiment.id)]
 
 
 def dimensions(embodiment: Embodiment, stats: Mapping[str, Any]) -> tuple[Dimension, ...]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from hma_data.console import human_times
-from hma_data.errors import MissingDependencyError
+from hma_data.errors import MissingDependencyError, install_command
 from hma_data.storage.files import finite, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.metrics import perplexity
@@ -63,7 +63,7 @@ class Remote:
     """A tracker for trackio or wandb, which have the same functions; the run has the name of its folder."""
 
     def __init__(self, name: str, recipe: Recipe, out: Path) -> None:
-        self._package = _package(name, name, f"uv pip install {name}")
+        self._package = _package(name, name, f"pip install {name}")
         run = out.absolute().name
         given = {"project": recipe.project, "name": run, "config": recipe.values(), "resume": "allow"}
         if name == "wandb":  # wandb resumes a run by its id, trackio by its name
@@ -92,7 +92,7 @@ class EventFile:
     """
 
     def __init__(self, folder: Path, step: int = 0) -> None:
-        install = "uv sync --extra tensorboard"
+        install = install_command("tensorboard")
         self._protos = _package("tensorboard", "tensorboard.compat.proto.event_pb2", install)
         records = _package("tensorboard", "tensorboard.summary.writer.record_writer", install)
         folder.mkdir(exist_ok=True)

@@ -18,6 +18,7 @@ from hma_data.errors import CheckpointError, RecipeError, TrainingError, UsageEr
 from hma_data.loading.dataset import Batch, WindowDataset, open_sets
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import remove_partial, to_json, write_atomic
+from hma_data.storage.paths import addressed, is_repository
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import Checkpoint, action_stats, training_checkpoints
 from hma_model.config import OBJECTIVES, ActionSpace
@@ -362,10 +363,14 @@ class Run:
             data["cameras"] = self.recipe.cameras
         if "://" in shards.manifest.source:  # a path is of no use on another machine
             data["source"] = shards.manifest.source
+        if "://" in str(shards.folder):
+            data["shards"] = str(shards.folder)
         training: dict[str, Any] = {"steps": self.step, "seed": self.recipe.seed}
         if self.start:
             training["from_trunk_sha256"] = self.start.checkpoint.trunk_sha256
             training["trunk"] = "frozen" if self.start.frozen else "tuned"
+            if is_repository(addressed(self.start.source)[0]):
+                training["from"] = self.start.source
         return {"data": data, "metrics": metrics, "training": training}
 
     # -- resuming

@@ -20,7 +20,7 @@ from typing import Any
 
 from hma_data.conversion.engines import LIMITS, Attempt, Cause, Ledger, Limits, OnEvent, Step, Work
 from hma_data.cpu import take_ordinary_priority
-from hma_data.errors import HMAError, MissingDependencyError
+from hma_data.errors import HMAError, MissingDependencyError, install_command
 
 TICK_S = 0.5
 ANSWER_S = 1.0  # seconds for which an actor collects events before it answers
@@ -76,8 +76,9 @@ def _ray() -> Any:
     try:
         import ray
     except ImportError as fault:
-        remedy = "uv sync --extra ray"
-        raise MissingDependencyError("--engine ray", "Ray is not installed", remedy) from fault
+        raise MissingDependencyError(
+            "--engine ray", "Ray is not installed", install_command("ray")
+        ) from fault
     return ray
 
 

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import Images, opencv
-from hma_data.errors import MissingDependencyError, SourceError
+from hma_data.errors import MissingDependencyError, SourceError, install_command
 from hma_data.storage.kinds import LFS, unreadable
 from hma_data.storage.paths import StrPath, as_text
 
@@ -115,8 +115,8 @@ class Network:
         try:
             interpreter = import_module("ai_edge_litert.interpreter").Interpreter
         except ImportError as fault:
-            remedy = "uv sync --extra hands"
-            raise MissingDependencyError("ai-edge-litert", f"is not installed ({fault})", remedy) from fault
+            said = f"is not installed ({fault})"
+            raise MissingDependencyError("ai-edge-litert", said, install_command("hands")) from fault
         try:
             self._interpreter = interpreter(model_content=content, num_threads=1)
             self._interpreter.allocate_tensors()

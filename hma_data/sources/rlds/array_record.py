@@ -10,7 +10,7 @@ from typing import Any
 import google_crc32c
 import numpy as np
 
-from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
+from hma_data.errors import EpisodeError, MissingDependencyError, SourceError, install_command
 from hma_data.sources.rlds.records import EMPTY, Framing, RecordFile
 from hma_data.storage.fetch import is_local
 from hma_data.storage.kinds import unreadable
@@ -56,5 +56,5 @@ class ArrayRecordFile(RecordFile):
             from array_record.python.array_record_module import ArrayRecordReader
         except ImportError as fault:
             said = "ArrayRecord files need the package array-record"
-            raise MissingDependencyError(self._path, said, "uv sync --extra arrayrecord") from fault
+            raise MissingDependencyError(self._path, said, install_command("arrayrecord")) from fault
         return ArrayRecordReader(self._path, RANDOM_ACCESS)

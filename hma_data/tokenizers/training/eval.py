@@ -88,7 +88,7 @@ def open_lpips(*, download: bool, device: str = "cpu") -> Perceptual:
         lpips = import_module("lpips")
     except ImportError as fault:
         raise MissingDependencyError(
-            "LPIPS", "the package lpips is not installed", "uv pip install lpips"
+            "LPIPS", "the package lpips is not installed", "pip install lpips"
         ) from fault
     cached = Path(torch.hub.get_dir()) / "checkpoints" / BACKBONE
     if not download and not cached.is_file():

@@ -20,6 +20,7 @@ from hma_data.errors import MissingDependencyError, OutputError, UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
 from hma_data.lab.pusht import SLOW_LOOK, Arena
+from hma_data.lab.tee_table import TeeTable
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.storage.paths import shipped
@@ -104,6 +105,26 @@ def test_environment_replays_the_recorded_actions(fast: h5py.File, demo: int) ->
         coverage.append(info["coverage"])
     np.testing.assert_allclose(np.stack(replayed[:-1]), states, atol=1e-3)
     assert (max(coverage) > env.success_threshold) == fast[f"data/demo_{demo}"].attrs["success"]
+
+
+def test_the_table_is_that_of_gym_pusht() -> None:
+    from gym_pusht.envs.pusht import PushTEnv
+
+    rng = np.random.default_rng(0)
+    env = PushTEnv(obs_type="pixels", observation_width=96, observation_height=96)
+    for _ in range(4):
+        state = np.array([*rng.uniform(60, 450, 2), *rng.uniform(200, 320, 2), rng.uniform(-np.pi, np.pi)])
+        env.reset(options={"reset_to_state": state})
+        table, touched = TeeTable(state), False
+        for _ in range(12):
+            picture, _, _, _, info = env.step(target := rng.uniform(100, 400, 2))
+            table.advance(target, 10)
+            np.testing.assert_array_equal(table.picture(96), picture)
+            pose = [*table.agent.position, *table.block.position, table.block.angle]
+            np.testing.assert_array_equal(pose, [*info["pos_agent"], *info["block_pose"]])
+            assert table.coverage() == pytest.approx(info["coverage"], abs=1e-9)
+            touched = touched or info["coverage"] > 0
+        assert touched
 
 
 def test_pictures_show_the_state_they_are_recorded_with(fast: h5py.File) -> None:
@@ -293,9 +314,9 @@ def test_no_episodes_is_refused(tmp_path: Path) -> None:
         record("pusht_fast", tmp_path, 0)
 
 
-def test_missing_gym_pusht_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "gym_pusht.envs.pusht", None)
-    with pytest.raises(MissingDependencyError, match="gym-pusht.*uv sync"):
+def test_missing_physics_say_how_to_install_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pymunk", None)
+    with pytest.raises(MissingDependencyError, match="pymunk and pygame.*uv sync"):
         record("pusht_fast", tmp_path, 1)
     assert list(tmp_path.iterdir()) == []
 

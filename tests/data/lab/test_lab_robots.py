@@ -121,7 +121,7 @@ def test_missing_simulator_says_how_to_install_it(
     robot: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(MissingDependencyError, match="pip install"):
+    with pytest.raises(MissingDependencyError, match="uv sync"):
         record(robot, tmp_path, 1)
     assert list(tmp_path.iterdir()) == []
 

@@ -210,7 +210,7 @@ def test_a_store_that_refuses_is_one_error(toy_arm, toy_recording, out, monkeypa
 def test_a_driver_that_is_not_installed_is_named(toy_arm, toy_recording, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "adlfs", None)
     with pytest.raises(
-        MissingDependencyError, match="az://box/set: needs the package of az:// — uv pip install"
+        MissingDependencyError, match="az://box/set: needs the package of az:// — pip install"
     ):
         run(toy_arm, toy_recording, Path("az://box/set"))
 

@@ -1,7 +1,6 @@
 """`hma demo`, small and in this process."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -23,7 +22,6 @@ def test_a_demo_that_was_cut_goes_on_by_the_same_command(
 
     out = tmp_path / "demo"
     embedded(tmp_path / "embedded", monkeypatch)
-    monkeypatch.setitem(sys.modules, "gym_pusht", None)  # the demo does not need it
     monkeypatch.setattr(demos, "usable_cores", lambda: 1)
     monkeypatch.setattr(demos, "WINDOWS", 2)
     monkeypatch.setattr(demos, "LONGEST", 6)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from hma_data.errors import CheckpointError, HubError, UsageError
 from hma_model.checkpoint.io import Checkpoint
-from hma_model.cli import app
+from hma_model.cli import app, main
 from hma_model.hub import publish as hub
 from hma_model.hub.listing import survey
 from hma_model.hub.sample import add_samples
@@ -142,10 +142,13 @@ def test_a_released_repository_is_listed_without_its_weights_being_sent(shelf, t
 
 def test_a_sample_shows_truth_and_predictions_over_time(folder, tmp_path, monkeypatch):
     monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Flat())
-    (path,) = add_samples(folder, [make_shards(tmp_path / "shards", "arm")])
+    path, film = add_samples(folder, [make_shards(tmp_path / "shards", "arm")])
     picture = np.asarray(Image.open(path))
     height, width = picture.shape[:2]
     assert width > height > 3 * 128 and len(np.unique(picture)) > 5
+    with Image.open(film) as opened:  # four frames at 5 Hz: truth, true actions, other actions
+        assert (opened.format, opened.n_frames, opened.info["duration"]) == ("GIF", 4, 200)
+        assert opened.size[0] > 3 * 192
 
 
 def test_the_picture_is_pushed_with_its_embodiment_and_shown_in_the_card(folder, tmp_path, monkeypatch):
@@ -153,8 +156,9 @@ def test_the_picture_is_pushed_with_its_embodiment_and_shown_in_the_card(folder,
     add_samples(folder, [make_shards(tmp_path / "shards", "arm")])
     hub.push(folder, tmp_path / "hub")
     page = (tmp_path / "hub/README.md").read_text()
-    assert "(embodiments/arm/sample.png)" in page and "(embodiments/hand/sample.png)" not in page
-    assert (hub.pull(tmp_path / "hub", ["arm"], tmp_path / "out") / "embodiments/arm/sample.png").is_file()
+    assert "(embodiments/arm/sample.gif)" in page and "(embodiments/hand/sample." not in page
+    home = hub.pull(tmp_path / "hub", ["arm"], tmp_path / "out") / "embodiments/arm"
+    assert (home / "sample.png").is_file() and (home / "sample.gif").is_file()
 
 
 def test_the_command_makes_the_picture_on_pushing(folder, tmp_path, monkeypatch):
@@ -163,6 +167,21 @@ def test_the_command_makes_the_picture_on_pushing(folder, tmp_path, monkeypatch)
     call = ["hub", "push", str(folder), str(tmp_path / "hub"), "--sample", str(shards)]
     assert CliRunner().invoke(app, call).exit_code == 0
     assert (tmp_path / "hub/embodiments/hand/sample.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_runs_own_shards_make_the_film_while_they_are_there(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Flat())
+    run = tmp_path / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    folder.rename(run / "checkpoints" / "step-00000001")
+    short = make_shards(tmp_path / "short", "hand", dims=3, length=3)
+    data = [make_shards(tmp_path / "shards", "arm"), short, tmp_path / "moved"]
+    (run / "recipe.json").write_text(json.dumps({"data": [str(path) for path in data]}))
+    assert main(["hub", "push", str(run), str(tmp_path / "plain"), "--no-film"]) == 0
+    assert not list((tmp_path / "plain").rglob("*.gif"))
+    assert main(["hub", "push", str(run), str(tmp_path / "hub")]) == 0
+    assert [path.parent.name for path in (tmp_path / "hub").rglob("*.gif")] == ["arm"]
+    assert capsys.readouterr().err.count("no film: ") == 1
 
 
 def test_shards_of_another_robot_or_too_short_make_no_picture(folder, tmp_path):

@@ -164,8 +164,8 @@ def test_trackio_and_wandb_get_the_recipe_the_figures_and_the_pictures(package, 
 @pytest.mark.parametrize(
     ("name", "module", "install"),
     [
-        ("trackio", "trackio", "uv pip install trackio"),
-        ("wandb", "wandb", "uv pip install wandb"),
+        ("trackio", "trackio", "pip install trackio"),
+        ("wandb", "wandb", "pip install wandb"),
         ("tensorboard", "tensorboard.compat.proto.event_pb2", "uv sync --extra tensorboard"),
     ],
 )

@@ -238,7 +238,7 @@ def test_a_remote_file_cut_short_is_an_episode_error(memory):
         ("gs", "gcsfs", "uv sync --extra remote"),
         ("s3", "s3fs", "uv sync --extra remote"),
         ("http", "aiohttp", "uv sync --extra remote"),
-        ("abfs", "adlfs", "uv pip install adlfs"),
+        ("abfs", "adlfs", "pip install adlfs"),
     ],
 )
 def test_a_driver_that_is_missing_is_named_with_its_install_line(monkeypatch, protocol, package, install):

@@ -1,0 +1,72 @@
+"""Define the verb `hma view`: an episode, or a run beside its truth, in Rerun."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hma_data.errors import UsageError
+from hma_model.cli.play import has_display
+
+if TYPE_CHECKING:
+    from hma_data.inspection.view import View
+
+
+def view(
+    place: Annotated[str, typer.Argument(help="A recording (with -e), a shard set, or a training run.")],
+    data: Annotated[
+        list[Path] | None, typer.Argument(help="Of a run: shard sets, if those of its recipe were moved.")
+    ] = None,
+    embodiment: Annotated[
+        str | None,
+        typer.Option("--embodiment", "-e", help="Robot of a recording: a registry id, or a YAML file."),
+    ] = None,
+    episode: Annotated[
+        int, typer.Option("--episode", min=0, help="Number of the episode; of a run, of the held-out window.")
+    ] = 0,
+    tokenizer: Annotated[
+        str | None, typer.Option("--tokenizer", help="Of a recording: show its decoded tokens too.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="The .rrd file; by default the viewer opens.")
+    ] = None,
+) -> None:
+    """Show an episode in Rerun: cameras, decoded tokens, actions, states and skew on one clock.
+
+    A run is shown by its losses and rates, and by a held-out window beside its prediction. Without a display,
+    the file is written to the present folder.
+
+    Example: hma view shards/my_arm --out my_arm.rrd
+    """
+    if out is not None and out.suffix != ".rrd":
+        raise UsageError("--out", f"{out} does not end in .rrd")
+    from hma_data.inspection.view import rerun
+
+    rerun()
+    made = _made(place, data or [], embodiment, episode, tokenizer)
+    if out is None and has_display():
+        made.open()
+        return
+    path = out or Path(f"{Path(place).resolve().stem}.rrd")
+    made.save(path)
+    print(f"wrote {path}; rerun {path} opens it")
+
+
+def _made(
+    place: str, data: list[Path], embodiment: str | None, episode: int, tokenizer: str | None
+) -> "View":
+    """Return the view of what lies at a place."""
+    from hma_data.inspection.view import view_recording, view_shards
+    from hma_data.storage.kinds import kind_of
+
+    kind = kind_of(Path(place).expanduser())
+    if embodiment is None and kind == "a checkpoint":
+        from hma_model.training.view import view_run
+
+        return view_run(Path(place).expanduser(), episode, data)
+    if embodiment is None and kind == "a recording":
+        remedy = "add -e ROBOT; hma registry infer writes the YAML of a new one"
+        raise UsageError(place, "is a recording, whose robot is not named", remedy)
+    if embodiment is None:
+        return view_shards(place, episode)
+    return view_recording(place, embodiment, episode, tokenizer)

@@ -1,0 +1,86 @@
+"""Show a training run in Rerun: its losses and rates, and a held-out window beside its prediction."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hma_data.errors import UsageError
+from hma_data.inspection.view import View
+from hma_data.loading.dataset import WindowDataset
+from hma_data.shards.preview import tokenizer_of
+from hma_data.shards.reader import ShardSet
+from hma_data.storage.paths import StrPath, as_path
+from hma_model.checkpoint.folder import Checkpoint
+from hma_model.training.logging import read_metrics
+
+RATES = ("lr", "grad_norm", "step_seconds", "data_seconds")
+
+
+def view_run(out: StrPath, window: int = 0, data: Sequence[StrPath] = ()) -> View:
+    """Show a run's figures on the timeline `step`, and a rollout on `time` and `frame`.
+
+    Args:
+        out: str or path of the run's folder, or of a checkpoint.
+        window: number of the held-out window that is rolled out.
+        data: str or path of shard sets, of which the first with a robot of the checkpoint is shown; none
+            takes those that the run's recipe names, if they are still there.
+
+    Raises:
+        CheckpointError: there is no checkpoint.
+        UsageError: neither figures nor shards are there, or no such window.
+    """
+    out, checkpoint = as_path(out), Checkpoint.open(out)
+    sets = [ShardSet(folder) for folder in data] if data else checkpoint.shards()
+    shards = next((one for one in sets if one.embodiment.id in checkpoint.embodiments), None)
+    figures = _figures(read_metrics(out))
+    if shards is None and not figures:
+        raise UsageError(out, "has no metrics.jsonl and none of its shards are here", "name a shard set too")
+    if shards is None:
+        view = View(out.absolute().name, np.zeros(0))
+    else:
+        view = _rolled(out, checkpoint, shards, window)
+    for entity, points in figures.items():
+        view.steps(entity, [step for step, _ in points], [value for _, value in points])
+    return view
+
+
+def _figures(lines: list[dict[str, Any]]) -> dict[str, list[tuple[int, float]]]:
+    """Return the points (step, value) of each figure by its entity."""
+    found: dict[str, list[tuple[int, float]]] = defaultdict(list)
+    for line in lines:
+        kind = "training" if line["kind"] == "train" else "held_out"
+        values = {f"{kind}/loss/{name}": loss for name, loss in line["loss_by_embodiment"].items()}
+        values |= {f"rates/{name}": line.get(name) for name in RATES}
+        for entity, value in values.items():
+            if value is not None:
+                found[entity].append((line["step"], value))
+    return found
+
+
+def _rolled(out: Path, checkpoint: Checkpoint, shards: ShardSet, window: int) -> View:
+    """Return a view of one window: the truth, the prediction, and that with other actions."""
+    from hma_model.checkpoint.io import load
+    from hma_model.evaluation.evaluate import cameras_for, rollout, shuffled
+
+    robot, frames = shards.embodiment, checkpoint.config.frames
+    model = load(checkpoint.folder, [robot.id]).eval()
+    windows = WindowDataset(shards, "val", frames, cameras=cameras_for(model, shards))
+    if window >= len(windows):
+        fault = f"{shards.folder} has {len(windows)} held-out windows of {frames} frames, the first is 0"
+        raise UsageError("--episode", fault)
+    batch, tokenizer = windows.batch([window]), tokenizer_of(shards)
+    true = rollout(model, tokenizer, batch)
+    other = rollout(model, tokenizer, shuffled(batch, true.prompt - 1), truth=true.truth)
+    view = View(f"{out.absolute().name} {robot.id}", np.arange(frames) / robot.effective_hz)
+    films = {"truth": true.truth, "predicted": true.predicted, "actions_reversed": other.predicted}
+    for name, film in films.items():
+        view.pictures(f"cameras/{name}", [film[0]])
+    view.curves("actions", batch.actions[0, :, : robot.action_dim].numpy(), robot.action.names())
+    view.text(
+        f"{out}: {robot.id}, held-out window {window} of {len(windows)}. The first {true.prompt} of {frames} "
+        "frames are given; `actions_reversed` is predicted with the window's actions in reverse."
+    )
+    return view

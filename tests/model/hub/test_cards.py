@@ -1,0 +1,85 @@
+"""Cards as the Hub reads them: their metadata by its own client, and code that runs as pasted."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from huggingface_hub import DatasetCard, ModelCard
+
+from hma_data.errors import HubError
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.config import HMAConfig
+from hma_model.hub import publish as hub
+from hma_model.hub.datasets import push_data
+from tests.hub_server import Hub
+from tests.hub_state import TOKEN
+from tests.model.robots import edit_card, make_model, save
+from tests.model.shards import make_shards
+
+pytest_plugins = ["tests.hub_fixtures"]
+REPO = "team/model"
+
+
+def test_the_hubs_filters_find_a_model_by_its_data_and_its_base(tmp_path: Path) -> None:
+    save(tmp_path / "model", {"arm": 2, "hand": 3})
+    edit_card(
+        tmp_path / "model", "arm",
+        data={"episodes": 3, "source": "hf://datasets/team/arms/v1", "shards": "hf://datasets/team/shards"},
+        training={"steps": 5, "from": "team/base@main"},
+    )  # fmt: skip
+    edit_card(tmp_path / "model", "hand", data={"source": "s3://a/b"}, training={"from": "a: b\n- c"})
+    hub.push(tmp_path / "model", tmp_path / "hub")
+    card: Any = ModelCard.load(tmp_path / "hub" / "README.md").data
+    assert (card.library_name, card.pipeline_tag, card.license) == ("hma-toolkit", "robotics", "apache-2.0")
+    assert card.datasets == ["team/arms", "team/shards"]
+    assert card.base_model == ["team/base"] and card.to_dict()["base_model_relation"] == "finetune"
+    assert {"robotics", "world-model", "embodiment:arm", "embodiment:hand"} <= set(card.tags)
+
+
+@pytest.mark.parametrize(
+    ("tokenizer", "views"), [("fsq-lab", 1), ("fsq-lab", 2), pytest.param("vae-8", 1, marks=pytest.mark.slow)]
+)
+def test_the_cards_code_runs_as_pasted(tokenizer: str, views: int, tmp_path: Path) -> None:
+    spec = get_tokenizer(tokenizer).spec
+    numbers = {"factored": spec.factored} if spec.kind == "discrete" else {"channels": spec.channels}
+    config = HMAConfig(
+        kind=spec.kind, layers=1, width=16, heads=2, frames=4, grid=spec.grid, views=views,
+        latent_scale=spec.latent_scale, tokenizer=spec.to_json(), **numbers,
+    )  # fmt: skip
+    save(tmp_path / "model", {"arm": 2}, model=make_model({"arm": 2}, config=config))
+    hub.push(tmp_path / "model", tmp_path / "hub")
+    card = ModelCard.load(tmp_path / "hub" / "README.md")
+    found = re.search(r"```python\n(.*?)```", card.text, re.DOTALL)
+    assert found
+    made: dict[str, Any] = {}
+    exec(found[1].replace('"PATH"', repr(str(tmp_path / "hub"))), made)
+    assert made["film"].shape == (6, spec.image_size, spec.image_size, 3) and made["film"].dtype == np.uint8
+
+
+def test_a_shard_sets_card_tells_the_viewer_its_tables(tmp_path: Path) -> None:
+    push_data(make_shards(tmp_path / "shards", "arm"), tmp_path / "hub")
+    data: Any = DatasetCard.load(tmp_path / "hub" / "README.md").data
+    assert [config["config_name"] for config in data.to_dict()["configs"]] == ["frames", "episodes"]
+    for config in data.to_dict()["configs"]:
+        for files in config["data_files"]:
+            assert list((tmp_path / "hub").glob(files["path"]))
+    assert data.license == "apache-2.0" and data.task_categories == ["robotics"]
+
+
+def test_a_token_is_in_no_file_log_or_error(
+    server: Hub, source: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("DEBUG")
+    hub.push(source, REPO)
+    hub.pull(REPO, out=tmp_path / "pulled")
+    for status in (400, 401, 403):
+        server.fail("GET /api/models/.*", status, body=f'{{"error": "no, {TOKEN}"}}'.encode())
+        with pytest.raises(HubError) as found:
+            hub.pull("team/other", out=tmp_path / f"out-{status}")
+        assert TOKEN not in str(found.value)
+    files = [path.read_bytes() for path in (tmp_path / "pulled").rglob("*") if path.is_file()]
+    files += list(server.model(REPO).files.values())
+    assert files and not any(TOKEN.encode() in content for content in files)
+    assert caplog.records and not any(TOKEN in record.getMessage() for record in caplog.records)
