@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hma_data.episodes.images import decode_image
-from hma_data.episodes.sheets import write_mp4, write_text
+from hma_data.episodes.sheets import gif_bytes, write_mp4, write_text
 from hma_data.lab.writers import LeRobotEpisode, write_lerobot
 from hma_data.registry.embodiment import Embodiment
 from hma_model.simulate.scenes import Drivable, Picture
@@ -37,7 +37,7 @@ def film(kind: str, robot: Drivable, frames: Sequence[Frame]) -> bytes:
     if all(frame.true is None for frame in frames[1:]):
         frames = [replace(frames[0], true=None), *frames[1:]]
     if kind == "gif":
-        return _gif(frames[-GIF_FRAMES:], hz)
+        return gif_bytes(panels(frames[-GIF_FRAMES:], GIF_SIDE), hz)
     with TemporaryDirectory(prefix="hma-play-") as folder:
         if kind == "mp4":
             path = Path(folder) / "film.mp4"
@@ -72,15 +72,6 @@ def _panel(title: str, data: bytes, side: int) -> Picture:
     panel[HEAD:] = large
     write_text(panel, title, (4, HEAD - 9), 0.45)
     return panel
-
-
-def _gif(frames: Sequence[Frame], hz: float) -> bytes:
-    from PIL import Image
-
-    first, *rest = (Image.fromarray(picture).quantize(128) for picture in panels(frames, GIF_SIDE))
-    buffer = io.BytesIO()
-    first.save(buffer, "GIF", save_all=True, append_images=rest, duration=round(1000 / hz), loop=0)
-    return buffer.getvalue()
 
 
 # -- LeRobot
