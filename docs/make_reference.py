@@ -188,9 +188,9 @@ def recipe_page() -> str:
     choices = [f"`{path.stem}`" for path in sorted((FOLDER.parents[1] / "recipes/train").glob("*.yaml"))]
     parts = [
         f"{MADE}# Keys of a recipe\n\nA recipe is a YAML file with these keys, for `hma train RECIPE "
-        "[key=value …]` and `hma finetune`. `extends: NAME` begins with another recipe. On the command line a dot goes one "
-        f"level down: `model.layers=4`. These ship with the toolkit: {', '.join(choices)}. "
-        "Unknown keys are errors.",
+        "[key=value …]` and `hma finetune`. `extends: NAME` begins with another recipe. On the "
+        f"command line a dot goes one level down: `model.layers=4`. These ship with the toolkit: "
+        f"{', '.join(choices)}. Unknown keys are errors.",
         "## The run",
         _fields(Recipe),
         "## mixture\n\nHow often each robot is drawn: [the mixture](../mixture.md).",
