@@ -144,10 +144,13 @@ def webp_bytes(frames: Images, fps: float) -> bytes:
 
 
 def gif_bytes(frames: Iterable[Images], fps: float) -> bytes:
-    """Return frames (H, W, 3) as the bytes of a GIF of 128 colours that loops."""
+    """Return frames (H, W, 3) as the bytes of an animated GIF that loops."""
     from PIL import Image
 
-    first, *rest = (Image.fromarray(frame).quantize(128) for frame in frames)
+    pictures = [Image.fromarray(frame) for frame in frames]
+    some = np.concatenate([np.asarray(picture) for picture in pictures[:: max(1, len(pictures) // 8)]])
+    palette = Image.fromarray(some).quantize(256)  # one for all: nothing flickers, and the file is small
+    first, *rest = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
     buffer = io.BytesIO()
     first.save(buffer, "GIF", save_all=True, append_images=rest, duration=round(1000 / fps), loop=0)
     return buffer.getvalue()

@@ -78,17 +78,21 @@ class Component(SpecModel):
     names: tuple[str, ...] | None = Field(
         None, description="one name for each value; messages with names are read by these names"
     )
-    unit: str | None = None
-    normalize: bool = True
-    sign: Number | tuple[Number, ...] = 1.0
-    offset: Number | tuple[Number, ...] = 0.0
-    range: tuple[Number, Number] | None = None
-    representation: Representation | None = None
+    unit: str | None = Field(None, description="of the values, such as m or rad; for plots")
+    normalize: bool = Field(
+        True, description="false leaves the values as they are, as of an open/close gripper"
+    )
+    sign: Number | tuple[Number, ...] = Field(1.0, description="factor of the values, one or one each")
+    offset: Number | tuple[Number, ...] = Field(0.0, description="added after `sign`, one or one each")
+    range: tuple[Number, Number] | None = Field(
+        None, description="[low, high] of the values; changes nothing"
+    )
+    representation: Representation | None = Field(None, description="of an angle or a rotation")
     gripper: Gripper | None = Field(
         None,
         description="how a value opens it; opening_ and closing_is_high are for commands that move it a bit",
     )
-    stamp: Literal["header", "receive"] | None = None
+    stamp: Literal["header", "receive"] | None = Field(None, description="as `sync.stamp`, for this alone")
 
     @field_validator("slice", "names", "sign", "offset")
     @classmethod
@@ -112,7 +116,7 @@ class Component(SpecModel):
 class Vector(SpecModel):
     """The components of an action or state, in the vector's order."""
 
-    components: tuple[Component, ...] = Field(min_length=1)
+    components: tuple[Component, ...] = Field(min_length=1, description="parts, in the vector's order")
 
     @property
     def dims(self) -> int:
@@ -131,19 +135,23 @@ class Vector(SpecModel):
 class Action(Vector):
     """The action vector: the command to the robot at each step."""
 
-    space: Space
+    space: Space = Field(description="what the numbers are")
 
 
 class Camera(SpecModel):
     """A camera stream and how its pictures are brought to a square."""
 
-    name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_.-]+$")
-    key: str = Field(min_length=1)
+    name: str = Field(
+        min_length=1, pattern=r"^[A-Za-z0-9_.-]+$", description="its name in shards and commands"
+    )
+    key: str = Field(min_length=1, description="where the recording has its pictures")
     size: tuple[Positive, Positive] | None = Field(
         None, description="[height, width] of the recorded picture in pixels; changes nothing"
     )
-    color: Literal["rgb", "bgr"] = "rgb"
-    resize: Literal["short_side_crop", "letterbox", "stretch"] = "short_side_crop"
+    color: Literal["rgb", "bgr"] = Field("rgb", description="order of the channels as recorded")
+    resize: Literal["short_side_crop", "letterbox", "stretch"] = Field(
+        "short_side_crop", description="how a picture becomes the tokenizer's square"
+    )
     rotate: Literal[0, 90, 180, 270] = Field(0, description="degrees clockwise")
     flip: Literal["vertical", "horizontal"] | None = Field(
         None, description="applied before rotate; vertical: rows are stored from bottom to top"
@@ -151,7 +159,7 @@ class Camera(SpecModel):
     crop: tuple[Start, Start, Positive, Positive] | None = Field(
         None, description="[x, y, width, height] in source pixels"
     )
-    stamp: Literal["header", "receive"] | None = None
+    stamp: Literal["header", "receive"] | None = Field(None, description="as `sync.stamp`, for this alone")
     levels: tuple[Number, Number] | None = Field(
         None, description="[black, white] of a bag's 16-bit grey pictures: the values that become 0 and 255"
     )
@@ -172,9 +180,9 @@ class Sync(SpecModel):
     rate_hz: Number | None = Field(
         None, gt=0, le=100_000, description="a fixed grid instead of a camera's frames"
     )
-    images: Method = "nearest"
-    actions: Method = "hold"
-    states: Method = "interpolate"
+    images: Method = Field("nearest", description="which picture a time gets")
+    actions: Method = Field("hold", description="which command a time gets")
+    states: Method = Field("interpolate", description="which state a time gets")
     max_skew_ms: Number | None = Field(
         None, gt=0, description="the largest time by which a sample may be moved"
     )
@@ -191,7 +199,7 @@ class Sync(SpecModel):
         le=100,
         description="in steps: the command of frame t is recorded at t + action_shift; not for bags",
     )
-    stamp: Literal["header", "receive"] = "header"
+    stamp: Literal["header", "receive"] = Field("header", description="which of a message's times counts")
 
     @field_validator("beyond")
     @classmethod
@@ -214,7 +222,7 @@ class Marker(SpecModel):
     """
 
     key: str = Field(min_length=1, description="/topic or /topic.field.path")
-    equals: bool | Number | str | None = None
+    equals: bool | Number | str | None = Field(None, description="only when the value becomes this")
 
     @model_validator(mode="after")
     def _field_of_topic(self) -> Self:
@@ -391,8 +399,8 @@ class SourceSpec(SpecModel):
 
     model_config = ConfigDict(json_schema_extra=_by_format)
 
-    format: Format
-    uri: str | None = None
+    format: Format = Field(description="of the recordings; rosbag is ROS 1, ROS 2 and MCAP")
+    uri: str | None = Field(None, description="file, folder or URI of the recordings")
     split: str | None = Field(None, description="the source's own split to read")
     episodes: Count | None = Field(None, ge=1, description="the published number of episodes")
     instruction: str | None = Field(None, description="key of the language instruction")
@@ -431,4 +439,4 @@ class Quality(SpecModel):
     repeated: Verdict = Field(
         "flag", description="more than repeated_share of a camera's pictures repeat the picture before"
     )
-    repeated_share: Number = Field(0.5, ge=0, le=1)
+    repeated_share: Number = Field(0.5, ge=0, le=1, description="the share above which `repeated` counts")

@@ -1,8 +1,8 @@
 """List the tokenizers: what each is, where its weights come from, and what it needs on this machine.
 
-To add a tokenizer, add a row to `CATALOG`, or have an installed package add an `Entry` (CONTRIBUTING.md), and
-a module with `load(name, *, weights, device, **arguments)`. This module imports neither torch nor a built-in
-tokenizer's module.
+To add a tokenizer, add a row to `CATALOG`, or have an installed package add an `Entry`
+(docs/adding-a-source.md), and a module with `load(name, *, weights, device, **arguments)`. This module
+imports neither torch nor a built-in tokenizer's module.
 """
 
 from collections.abc import Mapping

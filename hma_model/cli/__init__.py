@@ -172,7 +172,7 @@ app.command("evaluate", rich_help_panel=MODELS)(evaluate)
 def generate(
     checkpoint: Checkpoint,
     data: Data,
-    out: Annotated[Path, typer.Option("--out", help="The video: .mp4 or .webp.")],
+    out: Annotated[Path, typer.Option("--out", help="The video: .mp4, .webp or .gif.")],
     split: Split = "val",
     window: Annotated[int, typer.Option("--window", min=0, help="Number of the window to start at.")] = 0,
     frames: Annotated[
@@ -195,8 +195,8 @@ def generate(
 
     Example: hma generate runs/first shards/my_arm --out rollout.mp4
     """
-    if out.suffix not in (".mp4", ".webp"):
-        raise UsageError("--out", f"{out} is neither .mp4 nor .webp")
+    if out.suffix not in (".mp4", ".webp", ".gif"):
+        raise UsageError("--out", f"{out} is none of .mp4, .webp and .gif")
     opened = _opened(checkpoint, data)
     from hma_model.evaluation.rollout_video import rollout_video, write_video
     from hma_model.simulate.commands import Commands

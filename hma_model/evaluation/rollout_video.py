@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.sheets import grid, png_bytes, webp_bytes, with_actions, write_mp4, write_text
+from hma_data.episodes.sheets import (
+    gif_bytes,
+    grid,
+    png_bytes,
+    webp_bytes,
+    with_actions,
+    write_mp4,
+    write_text,
+)
 from hma_data.errors import HMAError, UsageError
 from hma_data.loading.dataset import WindowDataset
 from hma_data.loading.views import FIRST, Cameras
@@ -183,7 +191,7 @@ def _with_time(film: NDArray[np.uint8], prompt: int) -> NDArray[np.uint8]:
 
 
 def write_video(path: StrPath, film: RolloutVideo) -> None:
-    """Write an .mp4 or an animated .webp to a str or path, atomically.
+    """Write an .mp4, or an animated .webp or .gif, to a str or path, atomically.
 
     Raises:
         UsageError: the path has another suffix.
@@ -193,8 +201,10 @@ def write_video(path: StrPath, film: RolloutVideo) -> None:
         write_mp4(path, film.frames, film.fps)
     elif path.suffix == ".webp":
         write_atomic(path, webp_bytes(film.frames, film.fps))
+    elif path.suffix == ".gif":
+        write_atomic(path, gif_bytes(film.frames, film.fps))
     else:
-        raise UsageError("--out", f"{path} is neither .mp4 nor .webp")
+        raise UsageError("--out", f"{path} is none of .mp4, .webp and .gif")
 
 
 def write_sheets(

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-FIRST = "rails_03"  # the robot that a page opens with: it follows its commands longest (docs/results.md)
+FIRST = "rails_03"  # the robot that a page opens with: it follows its commands longest (docs/results-log.md)
 MOST_VIEWERS = 32
 RATE, BURST = 200.0, 400.0  # messages of a viewer a second, and at once
 AHEAD = 2  # frames that are sent before a page says that it has shown one

@@ -55,7 +55,8 @@ ROBOTS = {
 
 
 def test_the_embedded_trunk_is_the_one_of_the_recipe() -> None:
-    # `hma train world`, carried over to the present fsq-lab, then `hma train world_on` twice: docs/results.md
+    # `hma train world`, carried over to the present fsq-lab, then `hma train world_on` twice: see
+    # docs/results-log.md
     own = folder.Checkpoint.open("embedded")
     own.trunk()
     assert own.trunk_sha256 == "f8c9fb2c8cf0f25b5aec666dafb18ffba8dd8bc8664e3017ab461ba17992a675"
