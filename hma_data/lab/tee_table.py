@@ -138,7 +138,7 @@ def _clip(polygon: Floats, convex: Floats) -> Floats:
 def _pencil(munk: Any, game: Any, screen: Any) -> Any:
     """Return what draws a space of pymunk on a surface, in flat colours with a dark outline."""
 
-    class Pencil(munk.SpaceDebugDrawOptions):  # type: ignore[misc]
+    class Pencil(munk.SpaceDebugDrawOptions):
         def draw_circle(self, pos: Any, angle: float, radius: float, outline: Any, fill: Any) -> None:
             game.draw.circle(screen, fill.as_int(), _rounded(pos), round(radius))
             game.draw.circle(screen, _light(fill), _rounded(pos), round(radius - 4))
