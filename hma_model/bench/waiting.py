@@ -59,8 +59,8 @@ def measure_both(settings: dict[str, Any]) -> dict[str, float]:
     """Return the speed of generation and training, and the CPU seconds that each took on all cores."""
     from hma_model.bench.generation import Frames, embedded
 
-    way = {"cache": True, "decode": True, "compile": False, "unmask_steps": 2, "ddim_steps": None}
-    way |= {"seconds": float("inf"), **settings}
+    way: dict[str, Any] = {"cache": True, "decode": True, "compile": False, "unmask_steps": 2}
+    way |= {"ddim_steps": None, "seconds": float("inf"), **settings}
     model = embedded(way | {"threads": 0})
     begun = time.process_time()
     frame = median(Frames(model.eval(), way | {"batch": 1}).seconds())

@@ -86,7 +86,7 @@ def play(
         if browser and has_display():
             webbrowser.open(address)
 
-    settings = {"device": device, "precision": precision, "compile": compile}
+    settings: dict[str, Any] = {"device": device, "precision": precision, "compile": compile}
     try:
         asyncio.run(serve(opened, name, robots, tokenizer(), listener, host, token, ready, **settings))
     except KeyboardInterrupt:
