@@ -38,6 +38,7 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
         "generate",
         "policy-eval",
         "augment",
+        "label-actions",
         "hub",
     ]
     for verb in verbs:
@@ -49,6 +50,7 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
         ["train"],
         ["policy-eval"],
         ["augment"],
+        ["label-actions"],
         ["hub", "push"],
         ["shards", "verify"],
         ["registry", "infer"],
