@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from hma_data.console import human_count, interruptible, print_json, progress
+from hma_data.errors import OutputError
 from hma_model.cli.hub import Json
 
 
@@ -38,6 +39,8 @@ def policy_eval(
     from hma_model.simulate.policy_eval import evaluate_policies
     from hma_model.simulate.policy_page import show, write_report
 
+    if out and out.is_file():  # before minutes of work
+        raise OutputError(out, "is a file", "name a folder")
     with progress("policies", len(policies) * episodes * frames) as update:
         found = evaluate_policies(
             embodiment, policies, checkpoint=checkpoint, episodes=episodes, frames=frames, judge=judge,

@@ -6,8 +6,8 @@
 Table 6 of the paper: 10 real episodes with 0, 10, 50 and 90 synthetic ones, beside 100 real ones. A row is a
 policy of ours (objective `policy`), trained from scratch for the same CPU seconds on its episodes. The world
 model that makes the synthetic ones has seen the 10 real episodes of the robot alone: it is fine-tuned on them
-from `--world`, whose trunk must not have seen the robot. By default that is `embedded`, and the robot one that
-it lacks. Every result is a line of OUT/results.csv; those that are there are not computed again.
+from `--world`, whose trunk must not have seen the robot. By default that is `embedded`, and the robot one
+that it lacks. Every result is a line of OUT/results.csv; those that are there are not computed again.
 """
 
 import argparse
@@ -68,9 +68,9 @@ def trained(given: argparse.Namespace, data: Path, row: str, seed: int) -> World
     """Return a world of the policy trained on shards."""
     out = given.out / f"policy-{row.replace(' ', '')}-{seed}"
     words = [
-        "objectives={policy: 1.0}", f"cpu_seconds={given.policy_cpu_seconds}", "steps=1000000", "eval_every=0",
-        "checkpoint_every=0", "report=false", "pictures=0", "model.merge=2", "batch_size=8", f"seed={seed}",
-        f"data=[{data}]", "short=pad",
+        "objectives={policy: 1.0}", f"cpu_seconds={given.policy_cpu_seconds}", "steps=1000000",
+        "eval_every=0", "checkpoint_every=0", "report=false", "pictures=0", "model.merge=2", "batch_size=8",
+        f"seed={seed}", f"data=[{data}]", "short=pad",
     ]  # fmt: skip
     if not (out / "checkpoints").is_dir():
         train(load_recipe("discrete_tiny", [*words, f"out={out}"]))

@@ -89,6 +89,7 @@ def test_the_distance_from_a_goal_is_least_at_the_goal() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["cem", "icem", "mppi"])
 def test_a_solver_of_stable_worldmodel_finds_the_way(kind: str) -> None:
+    pytest.importorskip("stable_worldmodel")
     from gymnasium.spaces import Box
 
     from hma_model.simulate.planning import solver_of
@@ -105,7 +106,8 @@ def test_a_solver_of_stable_worldmodel_finds_the_way(kind: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_plan_beats_what_it_began_with_by_the_judge() -> None:
+def test_a_plan_asks_the_judge_about_each_candidate() -> None:
+    pytest.importorskip("stable_worldmodel")
     world = World(tiny_model(ROBOT), get_tokenizer("fsq-8"))
     arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
     policy = read_policy("plan:cem,horizon=2,samples=8,steps=2,receding=1", arena.scenes, world)
@@ -124,7 +126,9 @@ def test_a_plan_beats_what_it_began_with_by_the_judge() -> None:
     assert asked == [(16, 3, 128, 128, 3)] * 4
 
 
+@pytest.mark.slow  # stable-worldmodel's import takes seconds
 def test_words_that_are_no_plan_are_refused() -> None:
+    pytest.importorskip("stable_worldmodel")
     world = World(tiny_model(ROBOT), get_tokenizer("fsq-8"))
     scenes = Scenes.of(world, ROBOT, 1, 0)
     with pytest.raises(UsageError, match="plan:fly: is no solver — choose from cem, icem, mppi"):
