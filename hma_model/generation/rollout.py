@@ -315,7 +315,7 @@ class Rollout:
                 for row in rows:
                     self.state.pending[row] = 0
             return features
-        times, made = self.state.times, {}
+        times, made = self.state.times, dict[int, Tensor]()
         for age in dict.fromkeys(times[row] for row in rows):
             own = [row for row in rows if times[row] == age]
             places = window_times(self.config, age, self.model.device)
