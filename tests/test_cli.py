@@ -39,6 +39,7 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
         "generate",
         "policy-eval",
         "augment",
+        "label-actions",
         "hub",
     ]
     for verb in verbs:
@@ -51,6 +52,7 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
         ["train"],
         ["policy-eval"],
         ["augment"],
+        ["label-actions"],
         ["hub", "push"],
         ["shards", "verify"],
         ["registry", "infer"],

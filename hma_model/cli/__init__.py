@@ -35,7 +35,7 @@ from hma_model.cli.options import (
     require_checkpoint,
 )
 from hma_model.cli.play import play
-from hma_model.cli.policy import augment, policy_eval
+from hma_model.cli.policy import augment, label_actions, policy_eval
 from hma_model.cli.train import MODELS
 from hma_model.cli.view import view
 
@@ -230,6 +230,7 @@ def _opened(checkpoint: str, data: Path) -> tuple[Any, Any, Any]:
 
 app.command("policy-eval", rich_help_panel=MODELS)(policy_eval)
 app.command(rich_help_panel=MODELS)(augment)
+app.command("label-actions", rich_help_panel=MODELS)(label_actions)
 BENCHES |= {
     "drift": "hma_model.bench.drift:BENCH",
     "generate": "hma_model.bench.generation:GENERATE",

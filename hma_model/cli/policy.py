@@ -1,4 +1,4 @@
-"""Define the verbs `hma policy-eval` and `hma augment`."""
+"""Define the verbs `hma policy-eval`, `hma augment` and `hma label-actions`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from hma_data.console import human_count, interruptible, print_json, progress
+from hma_data.errors import OutputError
 from hma_model.cli.hub import Json
 
 
@@ -15,8 +16,8 @@ def policy_eval(
         list[str],
         typer.Argument(
             metavar="POLICY…",
-            help="scripted, scripted:noise=SHARE, random, still, MODULE:NAME of a Python function or class "
-            "from a picture to a command, or lerobot:FOLDER_OR_REPO.",
+            help="scripted, scripted:noise=SHARE, random, still, hma:CHECKPOINT, plan:cem, "
+            "lerobot:FOLDER_OR_REPO, or MODULE:NAME of a Python function or class: picture to command.",
         ),
     ],
     checkpoint: Annotated[
@@ -38,6 +39,8 @@ def policy_eval(
     from hma_model.simulate.policy_eval import evaluate_policies
     from hma_model.simulate.policy_page import show, write_report
 
+    if out and out.is_file():  # before minutes of work
+        raise OutputError(out, "is a file", "name a folder")
     with progress("policies", len(policies) * episodes * frames) as update:
         found = evaluate_policies(
             embodiment, policies, checkpoint=checkpoint, episodes=episodes, frames=frames, judge=judge,
@@ -101,3 +104,40 @@ def augment(
     print(f"kept {human_count(kept, 'episode')} of {episodes} in {out}; synthetic: true in every file")
     if lerobot:
         print(f"the same as a LeRobotDataset: {lerobot}")
+
+
+def label_actions(
+    film: Annotated[str, typer.Argument(help="A shard set, or a folder of video files.")],
+    checkpoint: Annotated[str, typer.Option("--checkpoint", help="A run with the objective `inverse`.")],
+    embodiment: Annotated[
+        str, typer.Option("-e", "--embodiment", help="The robot of the checkpoint whose commands they are.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the labelled shards.")],
+    check: Annotated[
+        str | None,
+        typer.Option(
+            "--check", help="Labelled shards for the error; else those that the training run held out."
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Infer the commands of film that has none, as shards that say so, with the error on labelled film.
+
+    Example: hma label-actions film --checkpoint runs/inverse -e mover_04 --out labelled/mover_04
+    """
+    from hma_model.simulate.labels import label_actions as run
+
+    words = f"finished episodes are kept in {out}; run the same command again to continue"
+    with interruptible(lambda: words), progress("film", unit="episodes") as update:
+        made = run(film, out, embodiment, checkpoint=checkpoint, check=check, on_progress=update)
+    error, splits = made.error, made.manifest.splits.values()
+    if json:
+        print_json({"out": str(out), "splits": made.manifest.splits, "plan": made.manifest.plan})
+        return
+    print(f"error on {error.commands:,} commands of {error.source} ({error.split}):")
+    for name, rmse, share in zip(error.names, error.rmse, error.explained, strict=True):
+        said = "does not vary there" if share is None else f"{share:.0%} of the variance explained"
+        worse = "; no better than the mean: do not use it" if share is not None and share <= 0 else ""
+        print(f"  {name}: RMSE {rmse:.3g}, {said}{worse}")
+    kept = human_count(sum(split["episodes"] for split in splits), "episode")
+    print(f"{kept} in {out}; inferred_actions: true in every file")

@@ -4,6 +4,8 @@
     rollout.prompt(tokens, actions)
     frames = rollout.step(chunks)            # the frames that the chunks lead to
     rollout.reset([1], tokens, actions)      # row 1 begins anew; row 0 goes on
+    chunks = rollout.act()                   # the chunks that the model itself would command
+    rollout.observe(frames, chunks)          # what came of them, if it is known
 
 All state belongs to a row (`hma_model.generation.state`). Rows begin, end and step independently of each
 other, and a row generates the same frames whatever its neighbours are.
@@ -23,6 +25,7 @@ import torch
 from torch import Tensor
 
 from hma_data.errors import HMAError
+from hma_model.config import POLICY
 from hma_model.generation.chunks import prompt_chunks, step_chunk
 from hma_model.generation.engine import Engine
 from hma_model.generation.state import Pass, RowState, Snapshot
@@ -225,15 +228,8 @@ class Rollout:
         Returns:
             (n, h, w) int64 tokens, or (n, c, H, W) float32 latents as stored.
         """
-        own = self._chosen(rows)
-        for row in own:
-            if not self.state.times[row]:
-                raise HMAError("step", f"row {row} has no prompt", "reset the row first")
-        chosen = [*own, *self._twins(own)]
-        if self.config.time_position == "learned":
-            self.state.slide(chosen)
-        if not self.caching:
-            self.state.grow(chosen)
+        own = self._begun(rows)
+        chosen = self._room(own)
         self._take(own, chunk, following, known)
         if self.twins:
             self.state.put_chunk(self._twins(own), 0, None, None)
@@ -242,6 +238,90 @@ class Rollout:
         self.state.put_frame(chosen, values)
         # A copy, because what is made in inference mode could not be changed in place.
         return self._show(values[: len(own)].clone())
+
+    @torch.no_grad()
+    def observe(
+        self,
+        frames: Tensor,
+        chunk: Tensor | None = None,
+        *,
+        known: Tensor | None = None,
+        rows: Sequence[int] | None = None,
+    ) -> None:
+        """Add the next frame of some rows, which is known and not generated.
+
+        Args:
+            frames: tokens (n, h, w) int64, or latents (n, c, H, W) as stored.
+            chunk, known, rows: as in `step`; the commands that led to the frame.
+        """
+        own = self._begun(rows)
+        values = self.model.frame_values(frames.unsqueeze(1)).to(self.model.device)[:, 0]
+        if len(values) != len(own):
+            raise HMAError("observe", f"gets {len(values)} frames", f"give {len(own)}, one for each row")
+        chosen = self._room(own)
+        if self.caching:
+            with self.engine.computing(len(chosen)):
+                self._catch_up(chosen)
+        self._take(own, chunk, None, known)
+        if self.twins:
+            self.state.put_chunk(self._twins(own), 0, None, None)
+        self.state.put_seen(chosen, values.repeat(1 + self.twins, *[1] * (values.dim() - 1)))
+
+    @torch.no_grad()
+    def act(self, rows: Sequence[int] | None = None) -> Tensor:
+        """Predict the chunk to command from the newest frame of some rows on: `HMA.predict_actions`, cached.
+
+        For models trained with the objective `policy` or `full`. With `step` after it, video and actions are
+        rolled out together; with `observe` after it, the model acts.
+
+        Args:
+            rows: n numbers of rows; by default all.
+
+        Returns:
+            (n, K) float32 raw; those of narrower embodiments are padded with zeros.
+        """
+        own = self._begun(rows)
+        if self.config.action_alignment == "current":
+            self.state.put_chunk(own, 1, None, None)  # it is the one that is asked for
+        with self.engine.computing(len(own)):
+            features = self._newest_features(own)
+        names = [self.state.embodiments[row] for row in own]
+        groups = Groups.of(names, len(own))
+        pooled = groups.sort(self.model.action_features(features.clone()))
+        return self.model.read_chunks(pooled, groups, POLICY, self.state.drawing(own))[:, 0]
+
+    def _begun(self, rows: Sequence[int] | None) -> list[int]:
+        """Return the numbers of rows that have a prompt."""
+        own = self._chosen(rows)
+        for row in own:
+            if not self.state.times[row]:
+                raise HMAError("step", f"row {row} has no prompt", "reset the row first")
+        return own
+
+    def _room(self, own: list[int]) -> list[int]:
+        """Make room for the next frame of rows and of their twins, and return both."""
+        chosen = [*own, *self._twins(own)]
+        if self.config.time_position == "learned":
+            self.state.slide(chosen)
+        if not self.caching:
+            self.state.grow(chosen)
+        return chosen
+
+    def _newest_features(self, rows: list[int]) -> Tensor:
+        """Return the features (n, 1, N, D) of the newest frames."""
+        if self.caching:
+            self._catch_up(rows)
+            features = self._past_features(rows, 1, late=0)[:, -1:]
+            if self.config.action_alignment == "previous":  # else the chunk is still to be put there
+                for row in rows:
+                    self.state.pending[row] = 0
+            return features
+        times, made = self.state.times, dict[int, Tensor]()
+        for age in dict.fromkeys(times[row] for row in rows):
+            own = [row for row in rows if times[row] == age]
+            places = window_times(self.config, age, self.model.device)
+            made |= zip(own, self._known_features(own, places, None)[:, -1:])
+        return torch.stack([made[row] for row in rows])
 
     def _frame(self, rows: list[int]) -> Tensor:
         """Return the next frame (n, S) of rows, unmasked."""
@@ -283,17 +363,27 @@ class Rollout:
 
     def _catch_up(self, rows: list[int]) -> None:
         """Add all pending frames but the newest to the cache."""
-        state = self.state
-        for count in sorted({state.pending[row] - 1 for row in rows} - {0}):
-            late = [row for row in rows if state.pending[row] == count + 1]
-            times = state.cached_times(late, [state.times[row] - count - 1 for row in late], count)
-            past = state.past(late, times.positions)
-            masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
-            conditioning = self._condition(late, times.positions)
-            x = self._tell(self._embed(past, masked), self._levels(late, times.positions))
-            self.engine.trunk(x, conditioning, times, self._cache())
+        pending = self.state.pending
+        for count in sorted({pending[row] - 1 for row in rows if pending[row] > 1}):
+            late = [row for row in rows if pending[row] == count + 1]
+            self._past_features(late, count, late=1)
             for row in late:
-                state.pending[row] = 1
+                pending[row] = 1
+
+    def _past_features(self, rows: list[int], count: int, late: int) -> Tensor:
+        """Add `count` known frames, `late` before the next one, to the cache; return their features."""
+        begin = [self.state.times[row] - count - late for row in rows]
+        return self._known_features(rows, self.state.cached_times(rows, begin, count), self._cache())
+
+    def _known_features(
+        self, rows: list[int], times: TimePositions, cache: list[LayerCache] | None
+    ) -> Tensor:
+        """Return the features (n, T, N, D) of known frames at times that all rows share, or (n, T) ones."""
+        positions = times.positions if times.positions.dim() > 1 else times.positions.unsqueeze(0)
+        past = self.state.past(rows, positions)
+        masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
+        x = self._tell(self._embed(past, masked), self._levels(rows, positions))
+        return self.engine.trunk(x, self._condition(rows, positions), times, cache)
 
     def _newest(self, rows: list[int]) -> Pass:
         """Return the pass over the newest frame and the next one with a cache."""

@@ -189,6 +189,15 @@ class RowState:
         for row in rows:
             self.times[row], self.pending[row] = self.times[row] + 1, 1
 
+    def put_seen(self, rows: Sequence[int], frames: Tensor) -> None:
+        """Add the next frame (n, S) of each row, which no pass has computed; it counts as the prompt's."""
+        pending = [self.pending[row] + 1 for row in rows]
+        for row in rows:
+            self.prompts[row] += self.prompts[row] == self.times[row]
+        self.put_frame(rows, frames)
+        for row, count in zip(rows, pending):
+            self.pending[row] = count
+
     def newest(self, rows: Sequence[int]) -> Tensor:
         """Return the newest frame (n, S) of each row."""
         return self.frames[self.tensor(rows), self._slot(rows, 1)]

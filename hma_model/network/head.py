@@ -228,7 +228,7 @@ class ActionHead(nn.Module):
             return self.diffusion.loss(target, predicted, generator)
         return F.mse_loss(predicted.float(), target.float(), reduction="none").mean(-1)
 
-    def predict(self, features: Tensor, readout: Readout, generator: torch.Generator | None = None) -> Tensor:
+    def predict(self, features: Tensor, readout: Readout, generator: Generators = None) -> Tensor:
         """Predict chunks (M, K) float32 from features (M, D)."""
         predicted = self(features, readout)
         if self.diffusion is not None:

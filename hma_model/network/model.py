@@ -19,7 +19,7 @@ from hma_data.errors import CheckpointError, HMAError
 from hma_data.storage.paths import StrPath
 from hma_model.config import POLICY, READOUTS, ActionSpace, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition, unknown
-from hma_model.network.head import ActionHead, LatentReadout, TokenReadout
+from hma_model.network.head import ActionHead, Generators, LatentReadout, TokenReadout
 from hma_model.network.stem import (
     LatentEmbedding,
     Stem,
@@ -289,8 +289,21 @@ class HMA(nn.Module):
         else:
             x = self.embed_patches(values, torch.zeros_like(values[..., :1], dtype=torch.bool))
         pooled = self.action_features(self.trunk(x, conditioning, times))
-        spans, way = groups.spans(), READOUTS[readout]
-        chunks = [self._predict(pooled[span], name, way, generator) for name, span in spans]
+        return self.read_chunks(pooled, groups, READOUTS[readout], generator)
+
+    def read_chunks(self, pooled: Tensor, groups: Groups, readout: Readout, generator: Generators) -> Tensor:
+        """Read chunks (B, T, K) in the batch's order off action features (B, T, D) sorted by embodiment.
+
+        A list of generators has one for each sample, in the batch's order.
+        """
+        if isinstance(generator, Sequence) and groups.order is not None:
+            generator = [generator[sample] for sample in groups.order]
+        chunks = [
+            self._predict(
+                pooled[span], name, readout, generator[span] if isinstance(generator, Sequence) else generator
+            )
+            for name, span in groups.spans()
+        ]
         widest = max(chunk.shape[-1] for chunk in chunks)
         padded = [torch.nn.functional.pad(chunk, (0, widest - chunk.shape[-1])) for chunk in chunks]
         return groups.unsort(torch.cat(padded))
@@ -302,9 +315,7 @@ class HMA(nn.Module):
         given = None if actions is None else align(self.config, actions, known, frames)
         return condition(self, given, groups, times.positions)
 
-    def _predict(
-        self, pooled: Tensor, embodiment: str, readout: Readout, generator: torch.Generator | None
-    ) -> Tensor:
+    def _predict(self, pooled: Tensor, embodiment: str, readout: Readout, generator: Generators) -> Tensor:
         head = self.head(embodiment)
         chunks = head.predict(pooled.flatten(0, 1), POLICY, generator).unflatten(0, pooled.shape[:2])
         if lag := readout.lag:

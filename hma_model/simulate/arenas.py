@@ -104,6 +104,7 @@ class Arena(Protocol):
     """A place where a policy acts."""
 
     scenes: Scenes
+    prompts: Sequence[Prompt]  # of the scenes, at the rate of the model's frames
     pictures: Picture  # (N, S, S, 3), the newest ones
     held: Floats  # (N, A), the commands that leave the robot as it is after the prompt
 
@@ -141,7 +142,7 @@ class TrueArena:
     def __init__(self, scenes: Scenes, size: int, drawn: bool = True) -> None:
         self.scenes, self._size, self._drawn, self._steps = scenes, size, drawn, 0
         self._begun = scenes.begin()
-        self.prompts: list[Prompt] = [scene.prompt for scene in self._begun]
+        self.prompts: Sequence[Prompt] = [scene.prompt for scene in self._begun]
         self.held = np.stack([scene.command for scene in self._begun])
         self.parts: list[Places] = []
         self.told: list[Floats] = []
@@ -210,6 +211,7 @@ class ModelArena:
         from hma_model.simulate.env import WorldModelVectorEnv
 
         scenes, prompts = true.scenes, true.prompts
+        self.prompts: Sequence[Prompt] = prompts
         self.scenes, self.held, self._told, self._probe, self._steps = scenes, true.held, true.told, probe, 0
         self._env = WorldModelVectorEnv(
             len(prompts), embodiment=scenes.name, world=world, horizon=None, autoreset_mode="Disabled"

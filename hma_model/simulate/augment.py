@@ -8,7 +8,6 @@ Finished batches lie in a folder of the output until the shards are written, so 
 N episodes, P frames of a prompt, T generated frames, A action dims, K = stride · A.
 """
 
-import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -22,11 +21,10 @@ from hma_data.conversion.output import locked
 from hma_data.errors import HMAError, OutputError, UsageError
 from hma_data.lab.simulator import simulated
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import MANIFEST, Manifest
+from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import atomic_path, file_sha256
+from hma_data.storage.files import atomic_path
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.checkpoint.folder import STEM, Checkpoint
 from hma_model.evaluation.judge import StateJudge, task_of, train_judge
 from hma_model.evaluation.probe import Probe, train_probe
 from hma_model.simulate.arenas import Arena, Floats, ModelArena, Scenes, TrueArena
@@ -34,10 +32,17 @@ from hma_model.simulate.policies import Policy, read_policy
 from hma_model.simulate.policy_eval import run
 from hma_model.simulate.prompts import default_frames, read_prompt
 from hma_model.simulate.scenes import Prompt
-from hma_model.simulate.synthetic import Synthetic, write_as_lerobot, write_shards
+from hma_model.simulate.synthetic import (
+    Made,
+    begun,
+    digests,
+    finished,
+    write_as_lerobot,
+    write_shards,
+)
 from hma_model.simulate.world import World, load_world
 
-WORK, SETTINGS = ".augment", "settings.json"
+WORK = ".augment"
 BATCH = 16  # episodes that step in one pass
 
 
@@ -154,16 +159,13 @@ def augment(
     if world.model.config.kind != "discrete" or world.model.config.views > 1:
         raise HMAError("augment", "takes models of discrete tokens and one view", "choose another checkpoint")
     made_by = (
-        {"by": "hma augment", "synthetic": True} | asdict(settings) | _digests(world, settings.embodiment)
+        {"by": "hma augment", "synthetic": True} | asdict(settings) | digests(world, settings.embodiment)
     )
     with locked(folder):
-        if (folder / MANIFEST).is_file():
-            found = Manifest.load(folder)
-            if found.plan.get("made_by") != json.loads(json.dumps(made_by)):
-                raise OutputError(folder, "holds another shard set", "choose another folder")
-        else:
+        found = finished(folder, made_by)
+        if found is None:
             maker = _Maker(world, settings, None if shards is None else ShardSet(shards))
-            batches = maker.run(_work(folder, made_by), on_progress)
+            batches = maker.run(begun(folder, WORK, made_by), on_progress)
             found = write_shards(
                 folder, _chosen(batches, settings), world.tokenizer.spec, maker.robot, made_by
             )
@@ -171,26 +173,6 @@ def augment(
     if lerobot is not None:
         write_as_lerobot(as_path(lerobot), folder, world.tokenizer)
     return found
-
-
-def _digests(world: World, embodiment: str) -> dict[str, str]:
-    """Return what tells the checkpoint from others."""
-    if "origin" not in vars(world.model):
-        return {"checkpoint": "in memory"}
-    kept = Checkpoint.open(vars(world.model)["origin"])
-    return {"checkpoint_sha256": kept.trunk_sha256, "stem_sha256": file_sha256(kept.path(embodiment, STEM))}
-
-
-def _work(folder: Path, made_by: dict[str, Any]) -> Path:
-    """Return the folder of finished batches; refuse those of other settings."""
-    work, text = folder / WORK, json.dumps(made_by, indent=1)
-    work.mkdir(exist_ok=True)
-    path = work / SETTINGS
-    if path.exists() and path.read_text(encoding="utf-8") != text:
-        raise OutputError(folder, "was begun with other settings", "give the same ones, or another folder")
-    with atomic_path(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return work
 
 
 class _Maker:
@@ -335,7 +317,7 @@ def _prompt_tokens(world: World, prompts: Sequence[Prompt]) -> NDArray[Any]:
 # -- what is kept
 
 
-def _chosen(batches: Sequence[Batch], settings: Augmentation) -> list[Synthetic]:
+def _chosen(batches: Sequence[Batch], settings: Augmentation) -> list[Made]:
     """Return the episodes of which the model was least unsure, without those that are judged failures."""
     nats = np.concatenate([batch.nats for batch in batches])
     success = np.concatenate([batch.success for batch in batches])
@@ -344,13 +326,22 @@ def _chosen(batches: Sequence[Batch], settings: Augmentation) -> list[Synthetic]
     if not (kept & success).any():
         fault = f"none of the {kept.sum()} surest of {len(nats)} episodes is judged a success"
         raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")
-    return [one for one in _each(batches, nats) if (kept & success)[one.number]]
+    every = zip(_each(batches, settings), kept & success, strict=True)
+    return [one for one, chosen in every if chosen]
 
 
-def _each(batches: Sequence[Batch], nats: NDArray[np.float64]) -> Iterator[Synthetic]:
+def _each(batches: Sequence[Batch], settings: Augmentation) -> Iterator[Made]:
     """Yield all episodes, numbered through."""
     number = 0
     for batch in batches:
-        for stored, chunks, group in zip(batch.stored, batch.chunks, batch.groups, strict=True):
-            yield Synthetic(number, stored, chunks, float(nats[number]), str(group))
+        for stored, chunks, group, nats in zip(
+            batch.stored, batch.chunks, batch.groups, batch.nats, strict=True
+        ):
+            counts = {
+                "prompt_frames": len(stored) - settings.frames,
+                "generated_frames": settings.frames - 1,  # the last one has no commands after it
+                "millinats": round(1000 * float(nats)),
+            }
+            judged = True if settings.judge else None
+            yield Made(f"synthetic_{number:06d}", stored, chunks, counts, str(group), judged)
             number += 1

@@ -1,4 +1,4 @@
-"""Make policies from the words of a command: scripted, random, still, a Python function, or one of lerobot.
+"""Make policies from the words of a command: scripted, random, still, a function, one of lerobot, a model.
 
 A policy acts in N scenes at once. `Arena` gives it the newest pictures, and to those that ask for it a state.
 
@@ -8,10 +8,10 @@ N scenes, S pixels a side, A action dims, S' values of a state.
 import copy
 import importlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -19,9 +19,13 @@ from hma_data.errors import HMAError, UsageError
 from hma_data.lab.scripted import driver, steerable
 from hma_model.simulate.arenas import Arena, Floats, Scenes
 
+if TYPE_CHECKING:
+    from hma_model.evaluation.judge import StateJudge
+    from hma_model.simulate.world import World
+
 WAYS = (
-    "give scripted, scripted:noise=0.5, random, still, MODULE:NAME of a Python function or class, or "
-    "lerobot:FOLDER_OR_REPO"
+    "give scripted, scripted:noise=0.5, random, still, hma:CHECKPOINT, plan:cem, lerobot:FOLDER_OR_REPO, or "
+    "MODULE:NAME of a Python function or class"
 )
 
 
@@ -35,8 +39,21 @@ class Policy(Protocol):
         """Return the next commands (N, A)."""
 
 
-def read_policy(words: str, scenes: Scenes) -> Policy:
+@runtime_checkable
+class Judged(Protocol):
+    """A policy that needs the judge of its success, and gets it before it begins."""
+
+    def judged(self, judge: "StateJudge") -> None:
+        """Take the judge."""
+
+
+def read_policy(words: str, scenes: Scenes, world: "World | None" = None) -> Policy:
     """Return the policy of words such as `scripted:noise=0.5`, for the robot of scenes.
+
+    Args:
+        words: as `hma policy-eval` takes them.
+        scenes: in which it is to act.
+        world: for policies that plan.
 
     Raises:
         HMAError: there is no such policy, or it does not fit the robot.
@@ -46,6 +63,14 @@ def read_policy(words: str, scenes: Scenes) -> Policy:
         from hma_model.simulate.lerobot_policy import LeRobotPolicy
 
         return LeRobotPolicy(rest, scenes)
+    if kind == "hma" and rest:
+        from hma_model.simulate.acting import read_acting
+
+        return read_acting(rest, scenes)
+    if kind == "plan" and rest:
+        from hma_model.simulate.planning import read_planning
+
+        return read_planning(rest, scenes, world)
     if words in ("random", "still"):
         return Random() if words == "random" else Still()
     if kind == "scripted":
@@ -53,6 +78,30 @@ def read_policy(words: str, scenes: Scenes) -> Policy:
     if rest:
         return Called(_named(words))
     raise UsageError("policy", f"{words!r} is unknown", WAYS)
+
+
+def split_options(kind: str, words: str, known: Mapping[str, type]) -> tuple[str, dict[str, Any]]:
+    """Return what comes before the options in `WHAT,horizon=2,…`, and the options that are given.
+
+    Raises:
+        UsageError: an option is unknown, or its value is not of the type that `known` tells.
+    """
+    what, *parts = words.split(",")
+    while parts and "=" not in parts[0]:
+        what = f"{what},{parts.pop(0)}"  # a comma of a path
+    options = {}
+    for part in parts:
+        name, _, value = part.partition("=")
+        try:
+            options[name] = known[name](value)
+        except (KeyError, ValueError):
+            allowed = ", ".join(
+                f"{key}={'N' if type is int else type.__name__}" for key, type in known.items()
+            )
+            raise UsageError(
+                f"policy {kind}:{words}", f"{part!r} is unknown", f"allowed: {allowed}"
+            ) from None
+    return what, options
 
 
 def _noise(words: str, rest: str) -> float:

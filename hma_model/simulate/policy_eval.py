@@ -12,7 +12,7 @@ M policies, N episodes, T frames after the prompt, S pixels a side.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -32,7 +32,7 @@ from hma_model.evaluation.agreement import (
 )
 from hma_model.evaluation.judge import StateJudge, task_of, train_judge
 from hma_model.simulate.arenas import Arena, Floats, ModelArena, Picture, Scenes, TrueArena
-from hma_model.simulate.policies import Policy, begin, checked, read_policy
+from hma_model.simulate.policies import Judged, Policy, begin, checked, read_policy
 from hma_model.simulate.world import World, load_world
 
 Scores = NDArray[np.float64]
@@ -180,13 +180,17 @@ def evaluate_policies(
     tell = on_progress or (lambda done, words: None)
     world = world or load_world(checkpoint)
     scenes = Scenes.of(world, embodiment, episodes, seed)
-    made = [(one, read_policy(one, scenes)) if isinstance(one, str) else one for one in policies]
+    made = [(one, read_policy(one, scenes, world)) if isinstance(one, str) else one for one in policies]
     for name, policy in made:  # what it returns is refused before minutes of work
-        _try(name, policy, TrueArena(replace(scenes, numbers=scenes.numbers[:1]), world.picture_shape[0]))
+        if not isinstance(policy, Judged):
+            _try(name, policy, TrueArena(scenes.take(range(1)), world.picture_shape[0]))
     if not isinstance(judge, StateJudge):
         task = task_of(embodiment, judge)
         tell(0, "training the judge")
         judge = train_judge(embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed)
+    for _, policy in made:
+        if isinstance(policy, Judged):
+            policy.judged(judge)
     scored: list[Scored] = []
     for name, policy in made:
         begun = len(scored) * frames * episodes

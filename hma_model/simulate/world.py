@@ -3,6 +3,7 @@
     world = load_world("embedded")
     session = world.open("pusht_fast", *starting_window(world.model, "pusht_fast"))
     pictures = world.step({session: commands})   # the picture that the commands lead to
+    commands = world.act([session])              # those of the model itself, if it was trained to act
 
 A session is a row of a rollout. Rows are added as sessions open, and used again as sessions close.
 
@@ -10,7 +11,7 @@ P frames of a prompt, H×W pixels, S pixels a side of the tokenizer's pictures, 
 dims, K = stride · A, n sessions of a step.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from hma_data.errors import HMAError
 from hma_data.storage.paths import StrPath
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint.folder import require_tokenizer
+from hma_model.config import OBJECTIVES, POLICY
 from hma_model.evaluation.evaluate import decode
 from hma_model.generation.engine import products_in
 from hma_model.generation.rollout import Rollout
@@ -32,7 +34,10 @@ from hma_model.simulate.pictures import Picture, fitted, picture_shape
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
+    from hma_model.config import HMAConfig
     from hma_model.network.model import HMA
+
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -146,19 +151,41 @@ class World:
         """
         if not commands:
             return {}
-        order = sorted(commands, key=lambda session: self._at(session).row)
-        read = [self.commands(self._at(one).embodiment).read(commands[one]) for one in order]
-        chunks = np.zeros((len(order), max(len(chunk) for chunk, _ in read)), np.float32)
-        for row, (chunk, _) in zip(chunks, read):
-            row[: len(chunk)] = chunk
+        order, rows = self._ordered(commands)
+        chunks, known = self._chunks(order, commands)
         rollout = self._running()
         rollout.decoding = self._decoding()
-        known = torch.tensor([known for _, known in read])
-        rows = [self._at(session).row for session in order]
-        frames = rollout.step(torch.from_numpy(chunks), known=known, rows=rows)
+        frames = rollout.step(chunks, known=known, rows=rows)
         if self.measure:
             self.entropies |= dict(zip(order, rollout.entropy.tolist()))
         return dict(zip(order, decode(self.tokenizer, frames.unsqueeze(1))[:, 0]))
+
+    def act(self, sessions: Iterable[int]) -> dict[int, Floats]:
+        """Return the commands (stride, A) that the model itself gives after the newest pictures of sessions.
+
+        Raises:
+            HMAError: the model was not trained to act.
+        """
+        require_actor(self.model.config, "the model")
+        order, rows = self._ordered(sessions)
+        made = self._running().act(rows).numpy(force=True)
+        spaces = [self.model.embodiments[self._at(session).embodiment] for session in order]
+        return {
+            session: chunk[: space.chunk_dim].reshape(space.stride, space.action_dim)
+            for session, chunk, space in zip(order, made, spaces)
+        }
+
+    def observe(self, pictures: Mapping[int, Picture], commands: Mapping[int, ArrayLike]) -> None:
+        """Add the pictures that truly came next to sessions, in one pass.
+
+        Args:
+            pictures: session → (H, W, 3) uint8 RGB, all of one size.
+            commands: session → as in `step`, those that led to its picture.
+        """
+        order, rows = self._ordered(pictures)
+        chunks, known = self._chunks(order, commands)
+        stored = self._encoded(self._at(order[0]).embodiment, np.stack([pictures[one] for one in order]))
+        self._running().observe(torch.from_numpy(stored), chunks, known=known, rows=rows)
 
     def picture(self, session: int) -> Picture:
         """Return the newest picture of a session; after `open`, the last of its prompt."""
@@ -173,6 +200,24 @@ class World:
         """Return a copy of a session's state."""
         return self._running().snapshot([self._at(session).row])
 
+    def fork(self, sessions: Sequence[int], n: int) -> "World":
+        """Return a world in which each of some sessions is n times, with the same random numbers.
+
+        Its sessions are numbered from 0, those of one side by side.
+        """
+        rows = [self._at(session).row for session in sessions for _ in range(n)]
+        ones = [replace(self._at(session), row=0) for session in sessions for _ in range(n)]
+        other = World(
+            self.model, self.tokenizer, unmask_steps=self.unmask_steps, temperature=self.temperature,
+            order=self.order, sample_steps=self.sample_steps, compile=self.compile,
+        )  # fmt: skip
+        running = Rollout(self.model, [one.embodiment for one in ones], len(ones), compile=self.compile)
+        kept, place = sorted(set(rows)), {row: i for i, row in enumerate(sorted(set(rows)))}
+        running.restore(range(len(rows)), self._running().snapshot(kept).take([place[row] for row in rows]))
+        other._rollout, other._opened = running, len(ones)
+        other._sessions = {number: replace(one, row=number) for number, one in enumerate(ones)}
+        return other
+
     def restore(self, session: int, snapshot: Snapshot) -> None:
         """Put a session into the state of a snapshot, of itself or of another session of the same model."""
         one = self._at(session)
@@ -186,6 +231,21 @@ class World:
             there = ", ".join(map(str, self._sessions)) or "none"
             raise HMAError(f"session {session}", f"is not open; open are: {there}", "open one first")
         return self._sessions[session]
+
+    def _ordered(self, sessions: Iterable[int]) -> tuple[list[int], list[int]]:
+        """Return sessions in the order of their rows, and these rows."""
+        order = sorted(sessions, key=lambda session: self._at(session).row)
+        return order, [self._at(session).row for session in order]
+
+    def _chunks(
+        self, order: Sequence[int], commands: Mapping[int, ArrayLike]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the commands of sessions as chunks (n, K), and which are known (n,)."""
+        read = [self.commands(self._at(one).embodiment).read(commands[one]) for one in order]
+        chunks = np.zeros((len(order), max(len(chunk) for chunk, _ in read)), np.float32)
+        for row, (chunk, _) in zip(chunks, read):
+            row[: len(chunk)] = chunk
+        return torch.from_numpy(chunks), torch.tensor([known for _, known in read])
 
     def _newest(self, session: int) -> torch.Tensor:
         return self._running().newest([self._at(session).row])
@@ -242,9 +302,22 @@ class World:
         config = self.model.config
         if len(frames) and frames.shape[1:] == config.frame_shape:
             return frames.astype(np.int64 if config.kind == "discrete" else np.float32)
-        frames = fitted(frames, config, described(self.model, embodiment))[-config.frames :]
+        return self._encoded(embodiment, frames[-config.frames :])
+
+    def _encoded(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:
+        """Return pictures (n, H, W, 3) as the model stores them."""
+        config = self.model.config
+        frames = fitted(frames, config, described(self.model, embodiment))
         views = [self.tokenizer.encode(view) for view in np.split(frames, config.views, axis=2)]
         return np.concatenate(views, axis=-2).astype(np.int64 if config.kind == "discrete" else np.float32)
+
+
+def require_actor(config: "HMAConfig", where: str) -> None:
+    """Check that a model was trained to command; an HMAError says how that is done."""
+    trained = [OBJECTIVES[name] for name, weight in config.objectives.items() if weight > 0]
+    if not any(one.readout == POLICY for one in trained):
+        fault = f"was not trained to act, but for {', '.join(one.name for one in trained)}"
+        raise HMAError(where, fault, "train one with objectives={policy: 1.0} or {full: 1.0}")
 
 
 def load_world(checkpoint: StrPath = "embedded", *, device: str = "cpu", **settings: Any) -> World:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hma_data.errors import HMAError, UsageError
+from hma_data.errors import HMAError, OutputError, UsageError
 from hma_data.lab import truth
 from hma_data.lab.simulator import LabSimulator
 from hma_model.evaluation.agreement import Accuracy
@@ -184,6 +184,16 @@ def test_a_robot_without_a_simulator_is_refused() -> None:
     with pytest.raises(HMAError, match="arm: has no true simulator"):
         Scenes.of(_world_of(make_model({"arm": 2})), "arm", 1, 0)
     assert "POLICY" in CliRunner().invoke(app, ["policy-eval", "--help"]).output
+
+
+def test_a_file_in_place_of_the_folder_is_refused_before_the_work(tmp_path: Path) -> None:
+    from hma_model.cli import app
+
+    (tmp_path / "a file").write_text("")
+    ran = CliRunner().invoke(app, ["policy-eval", ROBOT, "still", "--out", str(tmp_path / "a file")])
+    assert isinstance(ran.exception, OutputError) and "a file: is a file — name a folder" in str(
+        ran.exception
+    )
 
 
 def _world_of(model: HMA) -> World:

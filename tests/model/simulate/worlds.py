@@ -87,17 +87,23 @@ class Watcher:
         self.told.append(message)
 
 
-def tiny_model(robot: str) -> HMA:
-    """Return a model of the tokenizer fsq-8 that knows nothing of a robot of the family."""
+def tiny_model(robot: str, *objectives: str) -> HMA:
+    """Return a model of the tokenizer fsq-8 that knows nothing of a robot of the family.
+
+    Its action heads are stirred if it has objectives, so that what they say depends on what they see.
+    """
     torch.manual_seed(0)
     own, tokenizer = family.embodiment(robot), get_tokenizer("fsq-8")
     config = HMAConfig(
         layers=1, width=32, heads=2, frames=4, grid=(8, 8), factored=(8,) * 6, training_pass="pairs",
         tokenizer=tokenizer.spec.to_json(),
+        objectives=dict.fromkeys(objectives or ("forward",), 1.0),
     )  # fmt: skip
     made = HMA(config)
     stats = {"action": {"mean": [0.0] * own.action_dim, "std": [30.0] * own.action_dim}}
     made.add_embodiment(ActionSpace.of(own, action_stats(stats, own.id)))
+    for parameter in made.heads.parameters() if objectives else ():
+        torch.nn.init.normal_(parameter, std=0.3)
     return made.eval()
 
 

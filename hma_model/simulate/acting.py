@@ -1,0 +1,122 @@
+"""Let a trained world model act as a policy: picture history in, commands out.
+
+    policy = Acting(load_world("runs/policy"), scenes, horizon=1)     # hma:runs/policy on the command line
+
+The model gives a chunk of commands from each frame on. With a horizon of several chunks it imagines the frame
+that its chunk leads to, commands again, and so on; then all of them are carried out before it looks again.
+What it imagined is forgotten, and the true pictures take its place.
+
+N scenes, A action dims.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from hma_data.errors import HMAError, UsageError
+from hma_model.config import OBJECTIVES
+from hma_model.simulate.arenas import Arena, Floats, Scenes
+from hma_model.simulate.policies import split_options
+from hma_model.simulate.world import World, load_world, require_actor
+
+OPTIONS: dict[str, type] = {"horizon": int, "temperature": float, "unmask_steps": int}
+
+
+class Follower:
+    """The sessions of a world that follow an arena: they see its pictures and what was commanded between.
+
+    Attributes:
+        world: of the sessions.
+        commands: of the robot.
+        sessions: one a scene.
+
+    Raises:
+        HMAError: the world lacks the robot, or knows it with other commands.
+    """
+
+    def __init__(self, world: World, scenes: Scenes, where: str) -> None:
+        self.world, self.commands, self.sessions = world, world.commands(scenes.name), list[int]()
+        own, robot = self.commands, scenes.robot.embodiment
+        if (own.stride, len(own.names)) != (robot.stride, robot.action_dim):
+            fault = f"takes {own.stride} commands of {len(own.names)} values of {scenes.name} in a chunk"
+            raise HMAError(where, fault, f"the scenes take {robot.stride} of {robot.action_dim}")
+
+    def begin(self, arena: Arena) -> None:
+        """Begin with the arena's prompts."""
+        for session in self.sessions:
+            self.world.close(session)
+        name, seed = arena.scenes.name, arena.scenes.seed
+        self.sessions = [
+            self.world.open(name, prompt.frames, prompt.chunks, seed=seed + row)
+            for row, prompt in enumerate(arena.prompts)
+        ]
+        self._taken: list[Floats] = []  # commands (N, A) since the last picture
+
+    def look(self, arena: Arena) -> None:
+        """See the arena's pictures if they are new."""
+        if arena.fresh and self._taken:
+            chunks = np.stack(self._taken, axis=1)
+            self.world.observe(self.by_session(arena.pictures), self.by_session(chunks))
+            self._taken = []
+
+    def take(self, commands: Floats) -> Floats:
+        """Note commands (N, A) that are given, and return them."""
+        self._taken.append(commands)
+        return commands
+
+    def by_session(self, values: Iterable[Any]) -> dict[int, Any]:
+        """Return values of the scenes by their sessions."""
+        return dict(zip(self.sessions, values, strict=True))
+
+
+class Acting:
+    """A model with the objective `policy` or `full` as a policy.
+
+    Args:
+        world: of the model that acts.
+        scenes: whose robot it has.
+        horizon: chunks between two looks; above 1 for models that also predict video.
+        where: its name, for errors.
+
+    Raises:
+        HMAError: the model was not trained to act, lacks the robot, or knows it with other commands.
+    """
+
+    def __init__(self, world: World, scenes: Scenes, horizon: int = 1, where: str = "the model") -> None:
+        config = world.model.config
+        require_actor(config, where)
+        trained = [OBJECTIVES[name] for name, weight in config.objectives.items() if weight]
+        if horizon > 1 and not any(one.predicts_video for one in trained):
+            raise UsageError(where, "predicts no video to look ahead in", "give horizon=1")
+        self._follower, self._horizon = Follower(world, scenes, where), horizon
+
+    def begin(self, arena: Arena) -> None:
+        self._follower.begin(arena)
+        self._ahead: list[Floats] = []  # commands (N, A) that are still to be given
+
+    def act(self, arena: Arena) -> Floats:
+        self._follower.look(arena)
+        if not self._ahead:
+            self._ahead = self._chosen()
+        return self._follower.take(self._ahead.pop(0))
+
+    def _chosen(self) -> list[Floats]:
+        """Return the commands (N, A) of the chunks up to the horizon."""
+        world, sessions, made = self._follower.world, self._follower.sessions, list[Floats]()
+        kept = {session: world.snapshot(session) for session in sessions if self._horizon > 1}
+        for chunk in range(self._horizon):
+            given = {one: self._follower.commands.clip(said) for one, said in world.act(sessions).items()}
+            made += list(np.stack([given[session] for session in sessions], axis=1))
+            if chunk < self._horizon - 1:
+                world.step(given)
+        for session, snapshot in kept.items():
+            world.restore(session, snapshot)
+        return made
+
+
+def read_acting(words: str, scenes: Scenes) -> Acting:
+    """Return the policy of `CHECKPOINT` or `CHECKPOINT,horizon=2,temperature=0.5,unmask_steps=2`."""
+    checkpoint, options = split_options("hma", words, OPTIONS)
+    horizon = options.pop("horizon", 1)
+    return Acting(load_world(checkpoint, **options), scenes, horizon, f"policy hma:{checkpoint}")

@@ -1,0 +1,152 @@
+"""Film gets commands: shards that verify and say that they are inferred, with their true error."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hma_data.conversion.job import convert
+from hma_data.episodes.sheets import write_mp4
+from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.lab import family, record
+from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.schema import flag_counts, read_footer
+from hma_data.shards.verify import verify
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.simulate import World, labels
+from hma_model.simulate.labels import ShardFilm, VideoFilm, infer, label_actions
+from tests.model.simulate.worlds import tiny_model
+
+ROBOT = "rails_03"
+
+
+@pytest.fixture(autouse=True)
+def yaml(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the model, which is of no checkpoint, have the YAML of its robot."""
+    monkeypatch.setattr(labels, "described", lambda model, name: family.embodiment(name))
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return World(tiny_model(ROBOT, "inverse"), get_tokenizer("fsq-8"))
+
+
+@pytest.fixture(scope="module")
+def real(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("real")
+    convert(family.embodiment(ROBOT), record(ROBOT, folder, 2), world.tokenizer, folder / "shards")
+    return folder / "shards"
+
+
+class Oracle:
+    """An inference that knows the commands of the shards, and errs by a share of their deviation."""
+
+    def __init__(self, film: ShardFilm, share: float) -> None:
+        self.known, self.rng, self.share, self.calls = {}, np.random.default_rng(0), share, 0
+        for number in range(len(film.heads())):
+            stored, actions, _ = film.labelled(number)
+            self.known[stored.tobytes()] = actions[:-1]
+
+    def __call__(self, model: Any, commands: Any, stored: np.ndarray) -> np.ndarray:
+        self.calls += 1
+        true = self.known[stored.tobytes()]
+        return (true + self.share * true.std() * self.rng.normal(size=true.shape)).astype(np.float32)
+
+
+def oracle(world: World, real: Path, share: float) -> Oracle:
+    shards = ShardSet(real)
+    return Oracle(ShardFilm(world, shards, shards.row_stride), share)
+
+
+@pytest.mark.slow
+def test_labelled_shards_verify_and_say_what_they_are(
+    world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    knows = oracle(world, real, 0.5)
+    monkeypatch.setattr(labels, "infer", knows)
+    out = tmp_path / "a folder"
+
+    def stop(done: float, words: str, total: float) -> None:
+        if words == "labelling" and done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        label_actions(real, out, ROBOT, checkpoint="", check=real, world=world, on_progress=stop)
+    knows.rng, knows.calls = np.random.default_rng(0), 0
+    found = label_actions(real, out, ROBOT, checkpoint="", check=real, world=world)
+    splits = [row["split"] for row in ShardSet(real).episodes.to_pylist()]
+    checked_on = splits.count("val") or len(splits)
+    assert knows.calls == checked_on + len(splits) - 1  # the first episode was labelled before
+    assert verify(out) == [] and not (out / ".label").exists()
+    assert found.error.explained == pytest.approx((0.75, 0.75), abs=0.2)
+    made_by = found.manifest.plan["made_by"]
+    assert made_by["inferred_actions"] is True and made_by["error"]["rmse"] == list(found.error.rmse)
+    for shard in found.manifest.shards:
+        assert read_footer(out / shard.path)[0].plan["made_by"] == made_by
+    shards = ShardSet(out)
+    assert "inferred" in shards.embodiment.provenance["recording"] and shards.manifest.frame_stride > 1
+    reader = EpisodeReader(shards, shards.columns())
+    shown = ShardFilm(world, ShardSet(real), ShardSet(real).row_stride)
+    for row in shards.episodes.to_pylist():
+        columns = reader.episode(row, shards.manifest.cameras[0])
+        names = [head[0] for head in shown.heads()]
+        stored, actions, _ = shown.labelled(names.index(row["id"]))
+        np.testing.assert_array_equal(columns["tokens"].reshape(len(stored) - 1, 8, 8), stored[:-1])
+        assert np.abs(columns["action"] - actions[:-1]).max() < 4 * actions.std()
+        assert flag_counts(row["flags"])["inferred_actions"] == len(stored) - 1
+
+
+def test_inference_reads_each_chunk_off_a_window_around_it(world: World) -> None:
+    commands = world.commands(ROBOT)
+    stored = np.random.default_rng(0).integers(0, 8**6, (11, 8, 8))
+    made, width = infer(world.model, commands, stored), world.model.config.frames
+    tokens = torch.from_numpy(stored.astype(np.int64))
+    for number, start in enumerate([0, 0, 0, 2, 2, 4, 4, 6, 7, 7]):
+        window = tokens[None, start : start + width]
+        read = world.model.predict_actions(window, ROBOT, readout="inverse")[0, number - start]
+        np.testing.assert_allclose(
+            made[number], commands.clip(read.numpy().reshape(-1, 2)).ravel(), atol=1e-3
+        )
+    assert len(made) == 10
+
+
+@pytest.mark.slow
+def test_labels_no_better_than_the_mean_are_refused(world: World, real: Path, tmp_path: Path) -> None:
+    with pytest.raises(HMAError, match="are no better than their mean on labelled film"):
+        label_actions(real, tmp_path / "out", ROBOT, checkpoint="run", world=world, check=real)
+    assert not (tmp_path / "out").exists()
+
+
+def film(folder: Path) -> np.ndarray:
+    """Write a video of thirty grey pictures at 30 Hz, and return their levels."""
+    levels = np.linspace(20, 230, 30).astype(np.uint8)
+    write_mp4(folder / "long.mp4", [np.full((96, 128, 3), level, np.uint8) for level in levels], 30)
+    return levels
+
+
+def test_what_cannot_be_labelled_is_refused(world: World, tmp_path: Path) -> None:
+    def run(place: Path = tmp_path, **given: Any) -> None:
+        given = {"checkpoint": "run", "world": world} | given
+        label_actions(place, tmp_path / "out", ROBOT, **given)
+
+    film(tmp_path)
+    with pytest.raises(HMAError, match="run: was not trained to infer commands, but for forward"):
+        run(world=World(tiny_model(ROBOT), get_tokenizer("fsq-8")))
+    with pytest.raises(UsageError, match="no labelled film of it is known — .*--check SHARDS"):
+        run()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UsageError, match="empty: is no shard set and holds no video files"):
+        run(tmp_path / "empty")
+    (tmp_path / "out").write_text("")
+    with pytest.raises(OutputError, match="out: is a file"):
+        run()
+
+
+def test_video_files_are_taken_at_the_rate_of_the_model(world: World, tmp_path: Path) -> None:
+    levels = film(tmp_path)
+    found = labels.film_of(world, tmp_path, ROBOT, 10.0)
+    assert isinstance(found, VideoFilm) and found.heads() == [("long", "", "")]
+    shown = world.tokenizer.decode(found.read(0)).mean(axis=(1, 2, 3))
+    assert len(shown) == 10 and np.abs(shown - levels[::3]).max() < 12
