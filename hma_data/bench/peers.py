@@ -30,7 +30,7 @@ def run_peer(name: str, folder: Path, settings: dict[str, Any]) -> dict[str, Any
 def _measure(name: str, folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
     from hma_data.loading.dataset import WindowDataset
 
-    ours = WindowDataset(folder, "train", settings["window"])
+    ours: Any = WindowDataset(folder, "train", settings["window"])
     rows = _rows_of(ours)
     store, began = folder.with_name(f"{folder.name}-{name}"), time.perf_counter()
     read = PEERS[name](store, rows)

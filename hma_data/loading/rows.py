@@ -68,7 +68,7 @@ class Rows:
             has marks or windows may be padded, also known (n, T) bool. Where windows may be padded, also
             inside (n, T) bool, True for frames of the episode.
         """
-        found = {"episode": self.episode[first], "frame": self.frame[first]}
+        found: dict[str, NDArray[Any]] = {"episode": self.episode[first], "frame": self.frame[first]}
         if last is not None:
             return found | self._padded(first, last, index, view)
         found["tokens"] = self._frames(first[:, None] + index.offsets, view)

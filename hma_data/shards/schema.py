@@ -158,9 +158,9 @@ class Footer:
         return [cls._of_text(*args) for args in zip(texts, episodes, where)]
 
     @classmethod
-    def _of_text(cls, text: bytes, episodes: Sequence[EpisodeRow] | None, where: str) -> "Footer":
+    def _of_text(cls, json_text: bytes, episodes: Sequence[EpisodeRow] | None, where: str) -> "Footer":
         try:
-            values = parse_json(text)
+            values = parse_json(json_text)
             check_version(values, where)
             if (episodes is None) != ("episodes" in values):
                 raise KeyError("episodes")

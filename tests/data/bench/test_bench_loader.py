@@ -1,10 +1,11 @@
 """`hma bench loader` on small sets: what it measures, with units. No figure is asserted."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from hma_data.bench import loader
+from hma_data.bench import loader, peers
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from tests.data.loading.test_pools import SMALL
@@ -42,3 +43,22 @@ def test_a_generated_set_has_as_many_frames_as_asked(tmp_path: Path, frames: int
     splits = ShardSet(loader.make_set(tmp_path / "set", 0, SMALL | {"frames": frames})).manifest.splits
     assert splits["train"]["shards"] == shards
     assert splits["train"]["frames"] >= frames
+
+
+def test_a_peer_must_give_our_windows_and_a_missing_one_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = SMALL | {"frames": 1_500, "peer_windows": 8}
+    folder = loader.make_set(tmp_path / "set", 0, settings)
+
+    def missing(store: Path, rows: Any) -> Any:
+        raise ImportError("no", name="lance")
+
+    (tmp_path / "set-whole").mkdir()
+    right = {"whole": lambda store, rows: lambda numbers: (rows[0][numbers], rows[1][numbers])}
+    wrong = {"shifted": lambda store, rows: lambda numbers: (rows[0][numbers - 1], rows[1][numbers])}
+    monkeypatch.setattr(peers, "PEERS", {**right, **wrong, "lance": missing})
+    assert peers.run_peer("whole", folder, settings)["windows_per_second"] > 0
+    assert peers.run_peer("lance", folder, settings)["left_out"] == "lance is not installed"
+    with pytest.raises(RuntimeError, match="shifted gives other windows"):
+        peers.run_peer("shifted", folder, settings)
