@@ -173,8 +173,8 @@ class Footer:
                 stats={name: Stats.from_json(stats) for name, stats in values["stats"].items()},
             )
         except MALFORMED as fault:
-            text = f"has a damaged footer: {fault!r}"
-            raise ShardError(where, text, "delete it and convert again") from fault
+            said = f"has a damaged footer: {fault!r}"
+            raise ShardError(where, said, "delete it and convert again") from fault
 
 
 def _footer_text(metadata: dict[bytes, bytes] | None, where: str) -> bytes:

@@ -139,7 +139,7 @@ def label_actions(
         raise HMAError(embodiment, "has no YAML that describes its commands", "load a checkpoint")
     shown = film_of(world, film, embodiment, robot.effective_hz)
     error = measure(world, commands, _labelled(model, embodiment, check), on_progress)
-    made_by = {
+    made_by: dict[str, Any] = {
         "by": "hma label-actions",
         "inferred_actions": True,
         "embodiment": embodiment,
