@@ -65,7 +65,7 @@ def script(page: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(580)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_command_of_a_tutorial_runs(page: Path, tmp_path: Path) -> None:
     bin_, work = tmp_path / "bin", tmp_path / "work"
