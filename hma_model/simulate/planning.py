@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import resize
-from hma_data.errors import HMAError, MissingDependencyError, UsageError
+from hma_data.errors import HMAError, MissingDependencyError, UsageError, install_command
 from hma_model.simulate.acting import Follower
 from hma_model.simulate.arenas import Arena, Floats, Picture, Scenes
 from hma_model.simulate.policies import split_options
@@ -218,8 +218,8 @@ def solver_of(kind: str) -> tuple[Any, Any]:
             warnings.simplefilter("ignore")  # of environments that are not installed
             from stable_worldmodel import policy, solver
     except ImportError as fault:
-        remedy = "pip install 'hma-toolkit[planning]'"
-        raise MissingDependencyError("stable-worldmodel", str(fault), remedy) from fault
+        remedy = install_command("planning")
+        raise MissingDependencyError("policy plan", "stable-worldmodel is not installed", remedy) from fault
     return getattr(solver, SOLVERS[kind]), policy.PlanConfig
 
 

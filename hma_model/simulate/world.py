@@ -209,9 +209,10 @@ class World:
         ones = [replace(self._at(session), row=0) for session in sessions for _ in range(n)]
         other = World(
             self.model, self.tokenizer, unmask_steps=self.unmask_steps, temperature=self.temperature,
-            order=self.order, sample_steps=self.sample_steps, compile=self.compile,
+            order=self.order, sample_steps=self.sample_steps, compile=self.compile, precision=self.precision,
         )  # fmt: skip
-        running = Rollout(self.model, [one.embodiment for one in ones], len(ones), compile=self.compile)
+        names = [one.embodiment for one in ones]
+        running = Rollout(self.model, names, len(ones), compile=self.compile, precision=self.precision)
         kept, place = sorted(set(rows)), {row: i for i, row in enumerate(sorted(set(rows)))}
         running.restore(range(len(rows)), self._running().snapshot(kept).take([place[row] for row in rows]))
         other._rollout, other._opened = running, len(ones)

@@ -48,6 +48,7 @@ ROWS: dict[str, list[str]] = {
     "digits of 512 and 64": ["digits=512"],
     "digit after digit": ["model.digit_order=chain"],
     "waves of the commands": ["model.action_waves=5"],
+    "waves of the commands, batch of 2": ["model.action_waves=5", "batch_size=2"],
     "16×16 tokens": ["model.merge=1"],
     "a tenth of the windows without commands": ["model.drop_commands=0.1"],
 }
