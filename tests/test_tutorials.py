@@ -54,7 +54,7 @@ def script(page: str) -> str:
     """Return the page as one script of the shell."""
     parts = ["set -eux"]
     for kind, title, text in BLOCK.findall(page):
-        text = re.sub(r"episodes=\d+", "episodes=6", text).replace("--limit 10", "--limit 2")
+        text = re.sub(r"episodes=\d+", "episodes=3", text).replace("--limit 10", "--limit 2")
         if title:
             parts.append(f"mkdir -p $(dirname {title}); cat > {title} <<'END'\n{text}END")
         elif kind == "python":
