@@ -104,9 +104,14 @@ def commands(page: Path) -> Iterator[list[str]]:
                 yield [word.rstrip(";") for word in words[i + 1 : end[0] + 1 if end else None]]
 
 
+@cache
+def application() -> Any:
+    return typer.main.get_command(app)
+
+
 def check_command(words: list[str]) -> None:
     """Check for verbs and options that the application has."""
-    command = typer.main.get_command(app)
+    command = application()
     while words and hasattr(command, "commands") and not words[0].startswith("-"):
         assert words[0] in command.commands, words
         command, words = command.commands[words[0]], words[1:]

@@ -23,13 +23,13 @@ import re, signal, subprocess, sys
 from urllib.request import urlopen
 
 words = ["cpu" if word == "cuda" else word for word in sys.argv[1:]]
-small = ["steps=2", "warmup=1", "batch_size=2", "workers=0", "precision=fp32", "eval_windows=2"]
+small = ["steps=2", "warmup=1", "batch_size=2", "workers=0", "precision=fp32", "eval_windows=2", "pictures=0"]
 if words[0] == "train":
     words += [*small, "model.layers=1", "model.width=32", "model.heads=2"]
 if words[0] == "finetune":
     words += small
 if words[0] == "evaluate":
-    words += ["--windows", "4"]
+    words += ["--windows", "2"]
 if words[0] == "play":
     words += ["--no-browser"]
 command = [sys.executable, "-m", "hma_model.cli", *words]
@@ -54,7 +54,7 @@ def script(page: str) -> str:
     """Return the page as one script of the shell."""
     parts = ["set -eux"]
     for kind, title, text in BLOCK.findall(page):
-        text = re.sub(r"episodes=\d+", "episodes=6", text).replace("--limit 10", "--limit 2")
+        text = re.sub(r"episodes=\d+", "episodes=3", text).replace("--limit 10", "--limit 2")
         if title:
             parts.append(f"mkdir -p $(dirname {title}); cat > {title} <<'END'\n{text}END")
         elif kind == "python":
