@@ -139,7 +139,6 @@ def label_actions(
         raise HMAError(embodiment, "has no YAML that describes its commands", "load a checkpoint")
     shown = film_of(world, film, embodiment, robot.effective_hz)
     error = measure(world, commands, _labelled(model, embodiment, check), on_progress)
-<<<<<<< HEAD
     made_by: dict[str, Any] = {
         "by": "hma label-actions",
         "inferred_actions": True,
@@ -147,10 +146,6 @@ def label_actions(
         "film": shown.name,
     }
     made_by |= {"error": error.to_json()} | digests(world, embodiment)
-=======
-    made_by: dict[str, Any] = {"by": "hma label-actions", "inferred_actions": True, "film": shown.name}
-    made_by |= {"embodiment": embodiment, "error": error.to_json(), **digests(world, embodiment)}
->>>>>>> act
     with locked(folder):
         manifest = finished(folder, made_by)
         if manifest is None:
