@@ -9,6 +9,7 @@ import math
 import os
 import platform
 import shutil
+import threading
 import uuid
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -69,8 +70,10 @@ def write_atomic(final: Path, content: str | bytes) -> None:
 
 
 def part_of(final: Path) -> Path:
-    """Return the path beside a file where this process writes it until it is complete."""
-    return final.with_name(f".{final.name}.{os.getpid()}{PART}")
+    """Return the path beside a file where this thread of this process writes it until it is complete."""
+    main = threading.current_thread() is threading.main_thread()
+    writer = f"{os.getpid()}" if main else f"{os.getpid()}-{threading.get_ident()}"
+    return final.with_name(f".{final.name}.{writer}{PART}")
 
 
 def upload_folder(folder: RemotePath) -> Path:
@@ -91,7 +94,7 @@ def remove_parts(folder: Path) -> None:
 def remove_dead_parts(folder: Path) -> None:
     """Delete the unfinished files that ended processes of this machine left in a folder."""
     for part in folder.glob(f".*{PART}"):
-        pid = part.name.removesuffix(PART).rpartition(".")[2]
+        pid = part.name.removesuffix(PART).rpartition(".")[2].partition("-")[0]
         if pid.isdecimal() and not _is_running(int(pid)):
             part.unlink(missing_ok=True)
 

@@ -9,6 +9,7 @@ import io
 import os
 import re
 import stat
+import threading
 from collections.abc import Callable, Generator
 from contextlib import suppress
 from fnmatch import fnmatchcase
@@ -316,7 +317,7 @@ def create_bytes(content: bytes, to: RemotePath) -> bool:
 
 def _put(to: RemotePath, upload: Callable[[str], Any]) -> None:
     whole = to.scheme in WHOLE_PUTS
-    beside = to if whole else to.with_name(f".{to.name}.{os.getpid()}.part")
+    beside = to if whole else to.with_name(f".{to.name}.{os.getpid()}-{threading.get_ident()}.part")
     try:
         attempt(to, "written", lambda: upload(beside.key))
         if not whole:
