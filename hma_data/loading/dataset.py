@@ -374,12 +374,8 @@ class MixtureDataset(IterableDataset[Batch]):
         return self._sequences[lane, which]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {
-            **self.__dict__,
-            "_sequences": {},
-            "_assignments": {},
-            "_ahead": {},
-        }  # a worker makes these anew
+        fresh = {"_sequences": {}, "_assignments": {}, "_ahead": {}}  # a worker makes these anew
+        return self.__dict__ | fresh
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position of the stream after the last batch taken, as plain values of a few kB."""
@@ -431,6 +427,7 @@ class MixtureDataset(IterableDataset[Batch]):
             for before in range(step):
                 taken = _counted(taken, before % self.lanes, self._draws(before))
         self._step, self._taken = step, taken
+        self._ahead.clear()  # cut after other windows
         self._origin = state.get("origin") if get_worker_info() else None
 
 

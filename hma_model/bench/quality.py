@@ -20,8 +20,7 @@ import math
 import statistics
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,17 +38,8 @@ EPISODES, SEED, VAL_FRACTION = 60, 0, 0.1  # of the recording
 FRAMES, PROMPT, WINDOWS, DRAWS = 8, 2, 24, 3  # of the rollouts
 FIGURES = {"loss": -1, "psnr_db": 1, "gain_db": 1, "error_px": -1}  # name -> the sign of what is better
 PLAIN = ["eval_every=0", "checkpoint_every=0", "pictures=0", "report=false", "device=cpu", "frames=8"]
-T95 = (
-    12.71,
-    4.303,
-    3.182,
-    2.776,
-    2.571,
-    2.447,
-    2.365,
-    2.306,
-    2.262,
-)  # Student's t, 1 to 9 degrees of freedom
+# Student's t, 1 to 9 degrees of freedom
+T95 = (12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
 @dataclass(frozen=True)
@@ -128,9 +118,8 @@ def _check(name: str, kept: dict[str, Any], settings: dict[str, Any], path: Path
     if len(kept.get(name, {}).get("seeds", [])) < 2:
         raise UsageError(path, f"has no bands of {name!r}", remedy)
     budget = _budget(CASES[name], settings)
-    other = [
-        f"{key}={kept[name]['budget'][key]}" for key in budget if kept[name]["budget"][key] != budget[key]
-    ]
+    theirs = kept[name]["budget"]
+    other = [f"{key}={theirs[key]}" for key in budget if theirs[key] != budget[key]]
     if other:
         raise UsageError("bench quality", f"the bands of {name!r} are of {', '.join(other)}", remedy)
 
@@ -174,6 +163,7 @@ def measure(name: str, data: Path, budget: dict[str, Any], seed: int) -> dict[st
         UsageError: the training was stopped by a signal.
     """
     from hma_data.tokenizers.base import get_tokenizer
+    from hma_data.tokenizers.network import one_thread
     from hma_model.evaluation.evaluate import evaluate
     from hma_model.evaluation.simulated import measure_state
     from hma_model.network.model import HMA
@@ -210,19 +200,6 @@ def recipe_of(case: Case, data: Path, steps: int, seed: int) -> Any:
 
     own = [f"data=[{json.dumps(str(data))}]", f"steps={steps}", f"seed={seed}"]
     return load_recipe(case.recipe, [*PLAIN, *case.overrides, *own])
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch compute on one thread: sums in another order would give other figures."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 # -- bands

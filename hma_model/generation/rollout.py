@@ -231,8 +231,6 @@ class Rollout:
         own = self._begun(rows)
         chosen = self._room(own)
         self._take(own, chunk, following, known)
-        if self.twins:
-            self.state.put_chunk(self._twins(own), 0, None, None)
         with self.engine.computing(len(chosen)):
             values = self._frame(chosen)
         self.state.put_frame(chosen, values)
@@ -263,8 +261,6 @@ class Rollout:
             with self.engine.computing(len(chosen)):
                 self._catch_up(chosen)
         self._take(own, chunk, None, known)
-        if self.twins:
-            self.state.put_chunk(self._twins(own), 0, None, None)
         self.state.put_seen(chosen, values.repeat(1 + self.twins, *[1] * (values.dim() - 1)))
 
     @torch.no_grad()
@@ -482,11 +478,13 @@ class Rollout:
     def _take(
         self, rows: list[int], chunk: Tensor | None, following: Tensor | None, known: Tensor | None
     ) -> None:
-        """Store the chunk at the frame that it conditions."""
+        """Store the chunk at the frame that it conditions; twins get none."""
         if self._clashes(chunk is None):
             raise HMAError("step", "some steps have actions and some have none", "give them always or never")
         if self.passive is None:
             self.passive = chunk is None and not self.told
+        if self.twins:
+            self.state.put_chunk(self._twins(rows), 0, None, None)
         if chunk is None:
             self.state.put_chunk(rows, 0, None, None)
             return
