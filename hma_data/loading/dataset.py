@@ -374,7 +374,11 @@ class MixtureDataset(IterableDataset[Batch]):
         return self._sequences[lane, which]
 
     def __getstate__(self) -> dict[str, Any]:
-        fresh = {"_sequences": {}, "_assignments": {}, "_ahead": {}}  # a worker makes these anew
+        fresh: dict[str, Any] = {
+            "_sequences": {},
+            "_assignments": {},
+            "_ahead": {},
+        }  # a worker makes these anew
         return self.__dict__ | fresh
 
     def state_dict(self) -> dict[str, Any]:

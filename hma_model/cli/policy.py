@@ -125,6 +125,7 @@ def label_actions(
 
     Example: hma label-actions film --checkpoint runs/inverse -e mover_04 --out labelled/mover_04
     """
+    from hma_data.shards.manifest import QUARANTINE
     from hma_model.simulate.labels import label_actions as run
 
     words = f"finished episodes are kept in {out}; run the same command again to continue"
@@ -141,3 +142,5 @@ def label_actions(
         print(f"  {name}: RMSE {rmse:.3g}, {said}{worse}")
     kept = human_count(sum(split["episodes"] for split in splits), "episode")
     print(f"{kept} in {out}; inferred_actions: true in every file")
+    if made.manifest.quarantined:
+        print(f"{made.manifest.quarantined} in quarantine; {out / QUARANTINE} has the reasons")

@@ -4,8 +4,8 @@
     print(found.error.explained)      # on held-out film whose commands are known
 
 Film is a shard set, of any robot or of people, or a folder of video files. Its frames are taken at the rate
-of the robot's model. Labelled episodes lie in a folder of the output until all are written, so the same call
-continues.
+of the robot's model; an episode that cannot be read goes to quarantine. Labelled episodes lie in a folder of
+the output until all are written, so the same call continues.
 
 T frames, A action dims, K = stride · A.
 """
@@ -22,11 +22,12 @@ import torch
 from numpy.typing import NDArray
 
 from hma_data.conversion.output import locked
-from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.errors import EpisodeError, HMAError, OutputError, UsageError
 from hma_data.shards.manifest import MANIFEST, Manifest
 from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.schema import Refused
 from hma_data.sources.common.video_file import VideoFile, frame_table
-from hma_data.storage.files import atomic_path, read_json
+from hma_data.storage.files import atomic_path
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.config import INVERSE, OBJECTIVES
@@ -150,8 +151,9 @@ def label_actions(
         manifest = finished(folder, made_by)
         if manifest is None:
             work = begun(folder, WORK, made_by)
-            episodes = _label(world, commands, shown, work, on_progress)
-            manifest = write_shards(folder, episodes, world.tokenizer.spec, robot, made_by, ORIGIN)
+            episodes, refused = _label(world, commands, shown, work, on_progress)
+            spec = world.tokenizer.spec
+            manifest = write_shards(folder, episodes, spec, robot, made_by, ORIGIN, refused)
             shutil.rmtree(work)
     return Labelled(manifest, error)
 
@@ -220,8 +222,10 @@ def measure(
 
 def _labelled(model: "HMA", embodiment: str, check: StrPath | None) -> ShardSet:
     """Return the labelled shards to check on."""
-    places = [check] if check is not None else _trained_on(model)
-    sets = [ShardSet(place) for place in places if check is not None or (as_path(place) / MANIFEST).is_file()]
+    if check is not None:
+        sets = [ShardSet(check)]
+    else:
+        sets = Checkpoint.open(vars(model)["origin"]).shards() if "origin" in vars(model) else []
     found = [one for one in sets if one.embodiment.id == embodiment]
     if not found:
         fault = (
@@ -232,42 +236,45 @@ def _labelled(model: "HMA", embodiment: str, check: StrPath | None) -> ShardSet:
     return found[0]
 
 
-def _trained_on(model: "HMA") -> list[str]:
-    """Return the shards of the training run that a model is from."""
-    if "origin" not in vars(model):
-        return []
-    run = Checkpoint.open(vars(model)["origin"]).folder.parent.parent
-    return list(read_json(run / "recipe.json").get("data", ())) if (run / "recipe.json").is_file() else []
-
-
 def _label(
     world: World,
     commands: Commands,
     film: Film,
     work: Path,
     on_progress: Callable[[float, str, float], None],
-) -> "_Kept":
+) -> "tuple[_Kept, list[Refused]]":
     """Infer the commands of all episodes that are not in the folder yet."""
-    heads, kept = film.heads(), []
+    heads, kept, refused = film.heads(), [], list[Refused]()
     for number, (name, group, instruction) in enumerate(heads):
         path = work / f"episode-{number:06d}.npz"
         if not path.exists():
             on_progress(number, "labelling", len(heads))
-            stored = film.read(number)
-            chunks = infer(world.model, commands, stored) if len(stored) > 1 else np.empty((0, 0), np.float32)
+            found = _labels_of(world.model, commands, film, number)
             with atomic_path(path) as part, part.open("wb") as file:
-                np.savez(file, stored=stored, chunks=chunks)
-        kept.append((path, name, group, instruction))
+                np.savez(file, **found)
+        with np.load(path) as arrays:
+            fault = str(arrays["fault"]) if "fault" in arrays else ""
+        if fault:
+            refused.append(Refused(name, EpisodeError.__name__, fault))
+        else:
+            kept.append((path, name, group, instruction))
     on_progress(len(heads), "labelling", len(heads))
-    found = _Kept([one for one in kept if _length(one[0]) > 0])
-    if not len(found):
-        raise UsageError(film.name, "has no episode of two frames at the model's rate", "give longer film")
-    return found
+    if not kept:
+        raise UsageError(
+            film.name, f"has no usable episode; the first: {refused[0].message}", "give longer film"
+        )
+    return _Kept(kept), refused
 
 
-def _length(path: Path) -> int:
-    with np.load(path) as arrays:
-        return len(arrays["chunks"])
+def _labels_of(model: "HMA", commands: Commands, film: Film, number: int) -> dict[str, Any]:
+    """Return the frames and the inferred chunks of an episode, or why it cannot be used."""
+    try:
+        stored = film.read(number)
+        if len(stored) < 2:
+            raise EpisodeError(film.name, "has fewer than two frames at the model's rate")
+    except EpisodeError as fault:
+        return {"fault": np.array(str(fault))}
+    return {"stored": stored, "chunks": infer(model, commands, stored)}
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from hma_data.lab.writers import LeRobotEpisode, write_lerobot
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST, Manifest, finish
 from hma_data.shards.reader import EpisodeReader, ShardSet
-from hma_data.shards.schema import EpisodeRow, Footer, RowLayout, flags_text
+from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, flags_text
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.storage.files import atomic_path, file_sha256
@@ -105,6 +105,7 @@ def write_shards(
     robot: Embodiment,
     made_by: dict[str, Any],
     origin: str = ORIGIN,
+    refused: Sequence[Refused] = (),
 ) -> Manifest:
     """Write the shards of episodes; a frame without commands after it, the last one, is no row.
 
@@ -114,6 +115,7 @@ def write_shards(
         robot: the real one.
         made_by: facts for the plan.
         origin: how the episodes came about, in words.
+        refused: other episodes, which go to quarantine; the first shard states them.
     """
     own = described_as(robot, origin)
     refs = [
@@ -124,6 +126,7 @@ def write_shards(
     facts = {key: value for key, value in planned.facts.items() if key != "hash"}
     plan = Plan.of(planned.units, facts | {"made_by": made_by})
     layout = RowLayout.of_plan(plan.facts, own)
+    left = tuple(refused)
     for unit in plan.units:
         (folder / unit.name).parent.mkdir(exist_ok=True)
         stats, rows = layout.empty_stats(), []
@@ -140,7 +143,8 @@ def write_shards(
                 )  # fmt: skip
                 writer.add(EpisodeRows(index, times, one.stored[:length], one.chunks, None))
                 stats["action"].merge(layout.stats({"action": one.chunks}, slice(None))["action"])
-            writer.close(Footer(plan.facts, unit.name, unit.split, tuple(rows), (), stats))
+            writer.close(Footer(plan.facts, unit.name, unit.split, tuple(rows), left, stats))
+        left = ()
     return finish(folder, [unit.name for unit in plan.units], own, spec, plan.facts, origin)
 
 

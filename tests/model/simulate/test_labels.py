@@ -150,3 +150,23 @@ def test_video_files_are_taken_at_the_rate_of_the_model(world: World, tmp_path: 
     assert isinstance(found, VideoFilm) and found.heads() == [("long", "", "")]
     shown = world.tokenizer.decode(found.read(0)).mean(axis=(1, 2, 3))
     assert len(shown) == 10 and np.abs(shown - levels[::3]).max() < 12
+
+
+@pytest.mark.slow
+def test_film_that_cannot_be_read_goes_to_quarantine(
+    world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places = tmp_path / "film of a day"
+    places.mkdir()
+    film(places)
+    whole = (places / "long.mp4").read_bytes()
+    (places / "cut.mp4").write_bytes(whole[: len(whole) // 2])
+    (places / "none.mp4").write_bytes(b"")
+    monkeypatch.setattr(
+        labels, "measure", lambda *_: labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
+    )
+    found = label_actions(places, tmp_path / "out", ROBOT, checkpoint="", check=real, world=world)
+    assert found.manifest.quarantined == 2 and verify(tmp_path / "out") == []
+    said = (tmp_path / "out" / "quarantine.jsonl").read_text()
+    assert "cut.mp4" in said and "none.mp4" in said
+    assert [row["id"] for row in ShardSet(tmp_path / "out").episodes.to_pylist()] == ["long"]
