@@ -124,10 +124,12 @@ def load(folder: StrPath, embodiments: Iterable[str] | None = None, device: str 
 
 def add_embodiment(model: "HMA", checkpoint: Checkpoint, embodiment: str) -> None:
     """Load one embodiment's stem and head beside a trunk that is already loaded."""
+    from hma_model.network.model import waves_of_stem
+
     space, stem, head = read_embodiment(checkpoint, embodiment)
-    model.add_embodiment(space)
+    model.add_embodiment(space, waves=waves_of_stem(stem) or None)
     added = model.stem(embodiment).waves
-    if added is not None and not checkpoint.config.action_waves:
+    if added is not None and "waves.weight" not in stem:  # they begin at zero
         stem = {**stem, "waves.weight": added.weight.detach()}
     model.load_embodiment(embodiment, stem, head)
 

@@ -79,7 +79,12 @@ def finetune(
     freeze_trunk: Annotated[
         bool, typer.Option("--freeze-trunk", help="Train stems and heads; keep the trunk as it is.")
     ] = False,
-    recipe: Annotated[str, typer.Option("--recipe", help="Name or YAML file.")] = "finetune",
+    recipe: Annotated[
+        str | None,
+        typer.Option(
+            "--recipe", help="Name or YAML file; finetune_tiny for the embedded model, else finetune."
+        ),
+    ] = None,
     out: Out = None,
     force: Force = False,
     json: Json = False,
@@ -91,7 +96,9 @@ def finetune(
     words = [word for word in overrides or [] if "=" in word]
     folders = [*data, *(Path(word) for word in overrides or [] if "=" not in word)]
     options: dict[str, Any] = {"out": out, "freeze_trunk": freeze_trunk, "recipe": recipe, "force": force}
-    _refuse_early(recipe, [f"data={[str(folder) for folder in folders]}", *words])
+    from hma_model.training.recipe import recipe_for
+
+    _refuse_early(recipe or recipe_for(source), [f"data={[str(folder) for folder in folders]}", *words])
     with interruptible(lambda: STOPPED):
         from hma_model.training.loop import finetune as run
         from hma_model.training.parallel import report_once

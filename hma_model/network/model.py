@@ -76,12 +76,13 @@ class HMA(nn.Module):
 
     # -- embodiments ------------------------------------------------------------------------------------
 
-    def add_embodiment(self, embodiment: Any, stats: Any = None) -> None:
+    def add_embodiment(self, embodiment: Any, stats: Any = None, waves: int | None = None) -> None:
         """Add an embodiment with a freshly initialised stem and head.
 
         Args:
             embodiment: a registry `Embodiment`, or an `ActionSpace`.
             stats: its `Stats`; without them actions are not normalised.
+            waves: octaves of waves of its commands; by default the configuration's.
 
         Raises:
             CheckpointError: the model has the id with another action space. With the same, nothing happens.
@@ -94,7 +95,7 @@ class HMA(nn.Module):
             fault = f"has {known.action_dim} dims, stride {known.stride}, or other statistics in the model"
             raise CheckpointError(space.id, fault, "use another id, or the statistics it was trained with")
         like = self.trunk.position
-        self.stems[module_key(space.id)] = Stem(self.config, space).to(like.device, like.dtype)
+        self.stems[module_key(space.id)] = Stem(self.config, space, waves).to(like.device, like.dtype)
         self.heads[module_key(space.id)] = ActionHead(self.config, space).to(like.device, like.dtype)
         self.embodiments[space.id] = space
 
@@ -139,7 +140,7 @@ class HMA(nn.Module):
         self, embodiment: str, stem: Mapping[str, Tensor], head: Mapping[str, Tensor]
     ) -> None:
         """Load results of `stem_state` and `head_state`; add the embodiment if the model lacks it."""
-        self.add_embodiment(space_of_stem(embodiment, stem))
+        self.add_embodiment(space_of_stem(embodiment, stem), waves=waves_of_stem(stem))
         check_fit(f"{embodiment}: stem", stem, self.stem_state(embodiment))
         check_fit(f"{embodiment}: head", head, self.head_state(embodiment))
         self.stem(embodiment).load_state_dict(stem)
@@ -479,3 +480,10 @@ def space_of_stem(embodiment: str, stem: Mapping[str, Tensor]) -> ActionSpace:
     values = tuple(mean.tolist()), tuple(std.tolist()), tuple(mask.bool().tolist())
     rule = "divide" if "normalizer.divide" in stem else "zero"
     return ActionSpace(embodiment, mean.numel(), chunk_dim // mean.numel(), *values, zero_variance=rule)
+
+
+def waves_of_stem(stem: Mapping[str, Tensor]) -> int:
+    """Return the octaves of waves of the commands in a stem's state."""
+    if "waves.weight" not in stem or "input.weight" not in stem:
+        return 0
+    return stem["waves.weight"].shape[-1] // (2 * stem["input.weight"].shape[-1])

@@ -264,9 +264,13 @@ class Modulation(nn.Module):
 
 
 class Stem(nn.Module):
-    """The input modules of one embodiment."""
+    """The input modules of one embodiment.
 
-    def __init__(self, config: HMAConfig, space: ActionSpace) -> None:
+    Args:
+        waves: octaves of waves of the commands; by default the configuration's.
+    """
+
+    def __init__(self, config: HMAConfig, space: ActionSpace, waves: int | None = None) -> None:
         super().__init__()
         self.normalizer = Normalizer(space)
         self.input = Linear(space.chunk_dim, config.width)
@@ -279,9 +283,9 @@ class Stem(nn.Module):
             nn.init.normal_(linear.weight, std=linear.in_features**-0.5)
             nn.init.zeros_(linear.bias)
         self.waves: Linear | None = None
-        if config.action_waves:  # it begins at zero, so it can be added to a trained stem
-            self.waves = Linear(2 * config.action_waves * space.chunk_dim, config.width, bias=False)
-            nn.init.zeros_(self.waves.weight)
+        if octaves := config.action_waves if waves is None else waves:
+            self.waves = Linear(2 * octaves * space.chunk_dim, config.width, bias=False)
+            nn.init.zeros_(self.waves.weight)  # so it can be added to a trained stem
 
     def forward(self, chunks: Tensor) -> Tensor:
         """Map raw chunks (B, T, K) to action embeddings (B, T, D)."""

@@ -268,8 +268,13 @@ class RunLog:
         done = max(self._last["step"] - self._begin, 1)
         seconds = max(sum(self._paces) / max(len(self._paces), 1), 1e-9)
         besides = max(time.monotonic() - self._opened - self._spent, 0.0) / done
-        left = (self._steps - self._last["step"]) * (seconds + besides)
+        left = (self._expected() - self._last["step"]) * (seconds + besides)
         return self._last["windows"] / seconds, human_times(time.monotonic() - self._opened, left)
+
+    def _expected(self) -> int:
+        """Return the number of steps of the run, by the share that is done: CPU seconds may end it sooner."""
+        done = self._last.get("done")
+        return min(self._steps, round(self._last["step"] / done)) if done else self._steps
 
     def _smooth(self) -> dict[str, float]:
         return {n: sum(v) / len(v) if v else math.nan for n, v in sorted(self._recent.items())}
@@ -279,7 +284,7 @@ class RunLog:
         losses = _listed(self._smooth())
         held = f", validation {_number(self._evaluation.get('loss'))}" if self._evaluation else ""
         skipped = f", {self._last['skipped']} steps skipped" if self._last.get("skipped") else ""
-        where = f"step {self._last['step']}/{self._steps}"
+        where = f"step {self._last['step']}/{self._expected()}"
         return f"{where}: loss {losses}{held}, {rate:.1f} windows/s, {times}{skipped}"
 
     def _table(self) -> "Group":
@@ -295,7 +300,7 @@ class RunLog:
             known = [_number(values.get(name)) for values in (held, ignoring)]
             table.add_row(name, f"{loss:.3f}", f"{perplexity(loss):,.1f}" if self._nats else "-", *known)
         last = self._last
-        head = f"step {last['step']:,}/{self._steps:,}   {rate:.1f} windows/s   {times}"
+        head = f"step {last['step']:,}/{self._expected():,}   {rate:.1f} windows/s   {times}"
         rest = f"lr {last['lr']:.2e}   {last.get('memory_mib', 0):,.0f} MiB"
         skipped = f"   {last['skipped']} steps skipped" if last.get("skipped") else ""
         return Group(f"{head}   {rest}{skipped}", table)

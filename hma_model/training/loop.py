@@ -23,7 +23,7 @@ from hma_data.storage.paths import StrPath, as_text
 from hma_model.checkpoint.folder import resolve
 from hma_model.training.logging import RunLog, Tracker, open_trackers, read_metrics
 from hma_model.training.parallel import join
-from hma_model.training.recipe import Recipe, load_recipe
+from hma_model.training.recipe import Recipe, load_recipe, recipe_for
 from hma_model.training.report import write_report
 from hma_model.training.run import Run
 from hma_model.training.runtime import choose_device, own_folder, run_errors, stop_on_signals
@@ -106,7 +106,7 @@ def finetune(
     out: StrPath | None = None,
     freeze_trunk: bool = False,
     overrides: Sequence[str] = (),
-    recipe: StrPath = "finetune",
+    recipe: StrPath | None = None,
     **options: Any,
 ) -> TrainResult:
     """Train new stems and heads on a checkpoint's trunk, frozen or tuned too; run it again to resume.
@@ -120,7 +120,8 @@ def finetune(
         out: str or path of the run's folder; by default the one that the overrides name.
         freeze_trunk: train only the stems and heads.
         overrides: `key=value` strings that override the recipe.
-        recipe: name, or str or path of a YAML.
+        recipe: name, or str or path of a YAML; by default `finetune_tiny` for the embedded model, else
+            `finetune`.
         options: `show`, `force`, `on_progress` of `train`.
 
     Raises:
@@ -136,7 +137,7 @@ def finetune(
         "freeze": "trunk" if freeze_trunk else "nothing",
     }
     ours = [f"{key}={yaml.safe_dump(value, default_flow_style=True)}" for key, value in given.items()]
-    return train(load_recipe(recipe, [*ours, *overrides]), out=out, **options)
+    return train(load_recipe(recipe or recipe_for(source), [*ours, *overrides]), out=out, **options)
 
 
 def _loop(

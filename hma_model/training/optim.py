@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
 from hma_data.tokenizers.training.muon import muon_step
+from hma_model.network.model import waves_of_stem
 from hma_model.training.parallel import gathered, like, local, whole
 
 if TYPE_CHECKING:
@@ -133,8 +134,8 @@ def _growing_matrices(model: "HMA") -> set[str]:
     """Return the parameters with two sides that grow with the width, by comparison with a wider model."""
     with torch.device("meta"):
         wider = type(model)(model.config.replace(width=2 * model.config.width))
-        for space in model.embodiments.values():
-            wider.add_embodiment(space)
+        for name, space in model.embodiments.items():
+            wider.add_embodiment(space, waves=waves_of_stem(model.stem_state(name)))
     shapes = {name: parameter.shape for name, parameter in wider.named_parameters()}
     grown = {n: sum(a != b for a, b in zip(p.shape, shapes[n])) for n, p in model.named_parameters()}
     return {name for name, sides in grown.items() if sides >= 2}

@@ -297,6 +297,11 @@ def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
     raise RecipeError(name, "no such recipe", remedy)
 
 
+def recipe_for(source: StrPath) -> str:
+    """Return the name of the recipe by which a model is finetuned where none is given."""
+    return "finetune_tiny" if as_text(source) == "embedded" else "finetune"
+
+
 def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
     """Parse overrides such as `["model.layers=4", "lr=1e-3"]` to nested values.
 

@@ -47,7 +47,7 @@ from hma_model.checkpoint.folder import (
 )
 from hma_model.checkpoint.weights import read_tensors, write_tensors
 from hma_model.config import HMAConfig
-from hma_model.network.model import HMA, check_fit, module_key
+from hma_model.network.model import HMA, check_fit, module_key, waves_of_stem
 from hma_model.training.recipe import Recipe, differences
 from hma_model.training.runtime import RECIPE, START
 
@@ -62,8 +62,9 @@ TRAINED_BY = {
     *("history_frames", "mask_ratio_min", "diffusion_repeats", "diffusion_sample_steps"),
     *("training_pass", "whole_share", "position_init", "latent_noise", "drop_commands"),
 }
-# fields that a run may turn on for a checkpoint, and their parameters, which change nothing at first
-ADDED = {"told_noise": "trunk.noise.", "digit_order": "readout.chain.", "action_waves": "stems."}
+# fields that a run may turn on for a checkpoint's trunk, and their parameters, which change nothing at first
+ADDED = {"told_noise": "trunk.noise.", "digit_order": "readout.chain."}
+WAVES = "action_waves"
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,9 @@ class Start:
         config = self.checkpoint.config
         changes: dict[str, Any] = {"objectives": recipe.objectives}
         for key, value in recipe.model.items():
-            if key in TRAINED_BY or (key in self._off() and not self.frozen):
+            if key == WAVES:  # `waves` looks after them: each stem may have its own
+                changes.update({} if self.frozen else {key: value})
+            elif key in TRAINED_BY or (key in self._off() and not self.frozen):
                 changes[key] = value
             elif getattr(config.replace(**{key: value}), key) != getattr(config, key):
                 fault = f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}"
@@ -157,6 +160,14 @@ class Start:
                 fault = f"has {name} with {key} {a}, the shards have {b}"
                 raise CheckpointError(self.source, fault, "give the robot of the shards another id")
         return self.checkpoint.stats(name)
+
+    def waves(self, name: str, recipe: Recipe) -> int | None:
+        """Return the octaves of waves of a robot's stem: the checkpoint's, else the recipe's, if any."""
+        if name in self.checkpoint.embodiments:
+            _, stem, _ = checkpoints.read_embodiment(self.checkpoint, name)
+            if octaves := waves_of_stem(stem):
+                return octaves
+        return recipe.model.get(WAVES)
 
     def fill(self, model: HMA) -> None:
         """Load the checkpoint's weights for the model's embodiments; freeze trunk and readout if required."""

@@ -104,7 +104,8 @@ class Run:
         require_memory(config, self.device, parts, bool(self.start and self.start.frozen))
         model = HMA(config)
         for name, shards in self.sets.items():
-            model.add_embodiment(ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name)))
+            space = ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name))
+            model.add_embodiment(space, waves=self.start.waves(name, self.recipe) if self.start else None)
         return model
 
     def _fresh_model(self) -> HMA:
@@ -203,6 +204,7 @@ class Run:
             self.cpu_seconds += float(self.world.sum(spent_cpu)[0]) / self.world.size
         return {
             "step": self.step,
+            "done": round(self.done, 6),
             "loss": loss,
             "loss_by_embodiment": by_embodiment,
             "objectives": objectives,

@@ -141,10 +141,8 @@ class Shards:
 
 def measure(question: str, row: Row, seed: int, cpu_seconds: float, shards: Shards) -> dict[str, Any]:
     """Train a row and return its line of the CSV."""
-    data, held_out = (
-        shards.of(row.robot, row.tokenizer, row.episodes),
-        ShardSet(shards.measured(question, row)),
-    )
+    data, measured = shards.pair(question, row)
+    held_out = ShardSet(measured)
     with tempfile.TemporaryDirectory() as folder:
         if row.kind == "dit":
             model, steps = _baseline(ShardSet(data), cpu_seconds, seed)

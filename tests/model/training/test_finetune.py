@@ -93,9 +93,7 @@ def test_the_network_and_the_window_are_the_checkpoints(base, leg, tmp_path):
     assert (config.width, config.mup, config.frames) == (16, True, TINY["frames"])
 
 
-@pytest.mark.parametrize(
-    ("key", "value"), [("told_noise", True), ("digit_order", "chain"), ("action_waves", 3)]
-)
+@pytest.mark.parametrize(("key", "value"), [("told_noise", True), ("digit_order", "chain")])
 def test_what_begins_at_nothing_can_be_turned_on_for_a_tuned_trunk(base, tmp_path, key, value):
     arm, still = make_shards(tmp_path / "arm", "arm"), ["steps=1", "lr=1e-12", "model.corrupt_max=0.2"]
     more = [*still, f"model.{key}={value}"]
@@ -106,6 +104,21 @@ def test_what_begins_at_nothing_can_be_turned_on_for_a_tuned_trunk(base, tmp_pat
         assert getattr(Checkpoint.open(result.checkpoint).config, key) == value
     with pytest.raises(RecipeError, match=f"model.{key}: is {value!r}, the checkpoint .* has "):
         tune(base.out, arm, tmp_path / "frozen", *more)
+
+
+def test_waves_of_the_commands_belong_to_a_stem(base, leg, tmp_path):
+    arm, still = make_shards(tmp_path / "arm", "arm"), ["steps=1", "lr=1e-12"]
+    more = [*still, "model.action_waves=3"]
+    a, b = (tune(base.out, arm, tmp_path / str(len(given)), *given) for given in (still, more))
+    assert b.losses == a.losses  # they begin at zero
+    home = tmp_path / "hub" / "team" / "model"
+    hub.push(base.checkpoint, home)
+    hub.push(tune(home, leg, tmp_path / "run", "model.action_waves=3", "steps=4").checkpoint, home, ["leg"])
+    hub.push(tune(home, leg, tmp_path / "next", "steps=1").checkpoint, home, ["leg"])  # it keeps its waves
+    pulled = hub.from_pretrained(home)
+    waves = {name: pulled.stem(name).waves for name in pulled.embodiments}
+    assert waves["arm"] is waves["hand"] is None and waves["leg"] is not None
+    assert waves["leg"].weight.abs().max() > 0 and pulled.config.action_waves == 0
 
 
 def test_from_a_hub_and_back_into_it(base, leg, tmp_path):

@@ -291,6 +291,14 @@ def test_time_left_counts_what_is_done_between_steps(tmp_path, capsys, monkeypat
     assert "s so far, 1 min 15 s left" in capsys.readouterr().err.splitlines()[-1]
 
 
+def test_cpu_seconds_that_end_a_run_sooner_are_in_the_time_left(tmp_path, capsys):
+    with RunLog(tmp_path, 1_000_000, 0) as log:
+        for step in range(1, 11):
+            log.step(facts(step, done=step / 40))
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("step 10/40") and "15 s left" in last
+
+
 def test_a_loss_that_is_no_number_leaves_the_shown_mean_one(tmp_path, capsys):
     with RunLog(tmp_path, 9, 0) as log:
         log.step(facts(1))

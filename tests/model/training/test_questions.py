@@ -60,3 +60,11 @@ def test_the_baseline_learns_and_keeps_the_prompt_out_of_its_frames(tmp_path: Pa
         given[0][:, :1], given[1], frames=3, generator=torch.Generator().manual_seed(0), steps=4
     )
     assert made.shape == given[0][:, 1:].shape and bool(made.isfinite().all())
+
+
+@pytest.mark.slow
+def test_a_row_is_trained_and_measured(tmp_path: Path) -> None:
+    shards = questions.Shards(tmp_path, None)
+    line = questions.measure("fig5a", questions.QUESTIONS["fig5a"][0], 0, 3.0, shards)
+    assert line["steps"] > 0 and line["seconds_a_frame"] > 0
+    assert all(value > 5 for value in (line["psnr_last"], line["copy"], line["loss"]))
