@@ -69,6 +69,7 @@ def episode(
     number: int,
     drawn: Collection[int] | None = None,
     commands: Floats | None = None,
+    wander: bool = True,
 ) -> Episode:
     """Simulate an episode; the same seed and number give the same one, and a longer one begins like it.
 
@@ -79,10 +80,12 @@ def episode(
         seed, number: as the recorders take them.
         drawn: frames of which the picture is drawn; by default all.
         commands: (T * stride, A) to give it; by default its own driver's.
+        wander: of a pusher's episodes, take only those that wander; the others end at the goal.
     """
     simulator = LabSimulator(robot)
-    wandering = pusht.STARTS.index("random")
-    simulator.reset(seed, number * len(pusht.STARTS) + wandering if robot in PUSHERS else number)
+    if wander and robot in PUSHERS:
+        number = number * len(pusht.STARTS) + pusht.STARTS.index("random")
+    simulator.reset(seed, number)
     pictures, parts, given, driven = [], [], [], 0
     for step in range(frames * stride):
         if step % stride == 0:
@@ -119,8 +122,16 @@ def parts_of(simulation: Simulation) -> tuple[int, Floats]:
         return 1, SIZE / 2 - ROD * np.array([[np.sin(simulation.angle), np.cos(simulation.angle)]])
     assert isinstance(simulation, pusht.FastPusher | pusht.SlowPusher)
     arena = simulation.arena
-    stem = arena.pose[:2] + rotation(arena.pose[2]) @ STEM
-    return 1, PX * np.stack([arena.agent, arena.pose[:2], stem])
+    return 1, np.concatenate([PX * arena.agent[None], _tee(arena.pose)])
+
+
+def goal_of(robot: str) -> Floats | None:
+    """Return the places (2, 2) of the T of a pusher when it lies on its goal; other robots have no goal."""
+    return _tee(np.array(pusht.GOAL)) if robot in PUSHERS else None
+
+
+def _tee(pose: Floats) -> Floats:
+    return PX * np.stack([pose[:2], pose[:2] + rotation(pose[2]) @ STEM])
 
 
 def _links(joints: Floats) -> Floats:

@@ -26,7 +26,7 @@ def policy_eval(
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes of each policy.")] = 32,
     frames: Annotated[int, typer.Option("--frames", min=4, help="Frames of an episode.")] = 40,
     judge: Annotated[
-        str, typer.Option("--judge", help="What success is: moved, reached, or with px: moved=8.")
+        str, typer.Option("--judge", help="What success is: moved, reached, placed, or with px: moved=8.")
     ] = "moved",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the page and the figures.")] = None,
@@ -77,7 +77,7 @@ def augment(
         float, typer.Option("--keep", help="Share to keep: the episodes of which the model is surest.")
     ] = 0.5,
     judge: Annotated[
-        str, typer.Option("--judge", help="Keep only successes at this: moved, reached, moved=PX.")
+        str, typer.Option("--judge", help="Keep only successes at this: moved, reached, placed, moved=PX.")
     ] = "",
     lerobot: Annotated[
         Path | None, typer.Option("--lerobot", help="Folder for them as a LeRobotDataset v3.0 as well.")

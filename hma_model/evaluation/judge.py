@@ -31,7 +31,7 @@ Score = Callable[[Floats, int], Floats]
 SPAN = 3  # last frames over which a place is the median
 EXAMPLES = 96  # recorded episodes, of which half set the judge's limit and half test it
 MOVED = {"pusht_fast": 10.0, "pusht_slow": 10.0}  # px; the T wanders further than a small block
-BLOCK_MOVED, NEAR = 5.0, 12.0  # px
+BLOCK_MOVED, NEAR, AT_GOAL = 5.0, 12.0, 5.0  # px
 SEEN = 0.5  # share of a loose part's first pixels up to which it is there
 
 
@@ -57,13 +57,20 @@ def reached(parts: Floats, driven: int) -> Floats:
     return -near
 
 
+def placed(parts: Floats, driven: int) -> Floats:
+    """Return how far the T of a pusher ends from its goal, the further of its two places, negative; (N,) px."""
+    ends = np.median(parts[:, -SPAN:, driven:], axis=1)
+    far: Floats = np.linalg.norm(ends - truth.goal_of(truth.PUSHERS[0]), axis=-1).max(axis=-1)
+    return -far
+
+
 @dataclass(frozen=True)
 class Task:
     """A task of a robot.
 
     Attributes:
         name: a key of TASKS.
-        limit: the least score of a success; of `reached` negative.
+        limit: the least score of a success; of `reached` and `placed` negative.
     """
 
     name: str
@@ -82,11 +89,12 @@ class Task:
 TASKS: dict[str, tuple[Score, str]] = {
     "moved": (moved, "some loose part ends {:g} px or more from where it lay"),
     "reached": (reached, "a moving part of the robot comes within {:g} px of where a loose part lay"),
+    "placed": (placed, "the T ends within {:g} px of its goal"),
 }
 
 
 def task_of(robot: str, words: str = "moved") -> Task:
-    """Return the task of a robot from words: `moved`, `moved=8`, `reached` or `reached=15`.
+    """Return the task of a robot from words: `moved`, `moved=8`, `reached`, `reached=15`, of pushers `placed`.
 
     Raises:
         UsageError: the words name no task.
@@ -95,13 +103,17 @@ def task_of(robot: str, words: str = "moved") -> Task:
     try:
         if name not in TASKS:
             raise ValueError
-        limit = float(number) if given else {"moved": MOVED.get(robot, BLOCK_MOVED), "reached": NEAR}[name]
+        usual = {"moved": MOVED.get(robot, BLOCK_MOVED), "reached": NEAR, "placed": AT_GOAL}
+        limit = float(number) if given else usual[name]
         if not 0 < limit < truth.SIZE:
             raise ValueError
     except ValueError:
         remedy = f"give {' or '.join(TASKS)}, if wanted with px: moved={BLOCK_MOVED:g}"
         raise UsageError("judge", f"{words!r} is no task", remedy) from None
-    return Task(name, -limit if name == "reached" else limit)
+    if name == "placed" and truth.goal_of(robot) is None:
+        known = ", ".join(truth.PUSHERS)
+        raise UsageError("judge", f"{robot} has no goal to place a part at", f"robots with one: {known}")
+    return Task(name, limit if name == "moved" else -limit)
 
 
 @dataclass(frozen=True)
@@ -167,14 +179,15 @@ def train_judge(
     """
     task = task or task_of(robot)
     probe = probe or train_probe(robot, tokenizer, stride, seed)
-    if not len(probe.loose) or (task.name == "reached" and not len(probe.own)):
+    unread = {"reached": not len(probe.own), "placed": len(probe.loose) < 2}
+    if not len(probe.loose) or unread.get(task.name):
         fault = f"cannot tell whether {task.text}: the probe does not read these parts"
         raise HMAError(f"judge of {robot}", fault, "judge another task or robot")
-    looked = {0, *range(max(frames - SPAN, 1), frames)} if task.name == "moved" else set(range(frames))
+    looked = set(range(frames)) if task.name == "reached" else {0, *range(max(frames - SPAN, 1), frames)}
     numbers = range(FIRST + EPISODES, FIRST + EPISODES + examples)
     true, read = np.empty(examples), np.empty(examples)
     for row, number in enumerate(numbers):
-        made = truth.episode(robot, frames, stride, seed, number, looked)
+        made = truth.episode(robot, frames, stride, seed, number, looked, wander=task.name != "placed")
         shown = as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures))
         true[row] = _true_score(task, probe, made.parts[None])[0]
         read[row] = _read_score(task, probe, shown[None])[0]

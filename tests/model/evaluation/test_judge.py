@@ -39,7 +39,9 @@ def written(parts: np.ndarray) -> np.ndarray:
 def episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Episodes of three parts, in half of which a loose one moves."""
 
-    def episode(robot: str, frames: int, stride: int, seed: int, number: int, drawn: Any) -> truth.Episode:
+    def episode(
+        robot: str, frames: int, stride: int, seed: int, number: int, drawn: Any, wander: bool
+    ) -> truth.Episode:
         rng = np.random.default_rng(number)
         parts = np.repeat(rng.uniform(30, 90, (1, 3, 2)), frames, axis=0)
         parts[-4:, 1] += (8 * (number % 2), 0)
@@ -55,6 +57,20 @@ def test_scores_are_of_the_loose_part_that_moves_most_and_of_the_nearest_approac
     parts[0, 3:, 2] += (3, 4)
     parts[0, 2, 0] = (50, 44)
     assert moved(parts, 1) == pytest.approx([5]) and reached(parts, 1) == pytest.approx([-6])
+
+
+def test_the_goal_is_where_a_planned_push_of_the_simulator_ends() -> None:
+    made = truth.episode("pusht_fast", 20, 4, 0, 0, {0}, wander=False)
+    task = task_of("pusht_fast", "placed")
+    assert made.parts.shape == (20, 3, 2) and task.limit == -5
+    assert (
+        task.score(made.parts[None], made.driven)[0] > -2 > task.score(made.parts[None, :4], made.driven)[0]
+    )
+
+
+def test_a_robot_without_a_goal_is_told_so() -> None:
+    with pytest.raises(UsageError, match="rails_03 has no goal .* robots with one: pusht_fast, pusht_slow"):
+        task_of("rails_03", "placed")
 
 
 def test_a_part_that_is_gone_stays_where_it_was_last_seen() -> None:
