@@ -58,7 +58,7 @@ def reached(parts: Floats, driven: int) -> Floats:
 
 
 def placed(parts: Floats, driven: int) -> Floats:
-    """Return how far the T of a pusher ends from its goal, the further of its two places, negative; (N,) px."""
+    """Return how far the T of a pusher ends from its goal (the further of its two places), negative; (N,)."""
     ends = np.median(parts[:, -SPAN:, driven:], axis=1)
     far: Floats = np.linalg.norm(ends - truth.goal_of(truth.PUSHERS[0]), axis=-1).max(axis=-1)
     return -far
@@ -94,7 +94,7 @@ TASKS: dict[str, tuple[Score, str]] = {
 
 
 def task_of(robot: str, words: str = "moved") -> Task:
-    """Return the task of a robot from words: `moved`, `moved=8`, `reached`, `reached=15`, of pushers `placed`.
+    """Return the task of a robot from words: `moved`, `moved=8`, `reached`, `reached=15`; of pushers `placed`.
 
     Raises:
         UsageError: the words name no task.
