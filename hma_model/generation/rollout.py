@@ -10,12 +10,10 @@
 All state belongs to a row (`hma_model.generation.state`). Rows begin, end and step independently of each
 other, and a row generates the same frames whatever its neighbours are.
 
-A frame costs one pass for each step of unmasking. The first pass also adds the frame before it, now finished,
-to the cache. Attention over time is causal, so the cached keys and values of a past frame never change.
+A frame costs one pass of the trunk for each step of unmasking (`hma_model.generation.passes`).
 
-B rows, n rows of a step, P frames of a prompt, h,w token grid, S = h*w, C values of a patch, D width,
-K = stride * action dim, c channels, H,W latent grid, N tokens of a frame with its action tokens, T frames of
-a pass.
+B rows, n rows of a step, P frames of a prompt, h,w token grid, S = h*w, K = stride * action dim, c channels,
+H,W latent grid.
 """
 
 from collections.abc import Sequence
@@ -28,6 +26,7 @@ from hma_data.errors import HMAError
 from hma_model.config import POLICY
 from hma_model.generation.chunks import prompt_chunks, step_chunk
 from hma_model.generation.engine import Engine
+from hma_model.generation.passes import Passes
 from hma_model.generation.state import Pass, RowState, Snapshot
 from hma_model.generation.unmask import (
     Decoding,
@@ -37,10 +36,9 @@ from hma_model.generation.unmask import (
     default_temperature,
     masked_after,
 )
-from hma_model.network.conditioning import Groups, condition
+from hma_model.network.conditioning import Groups
 from hma_model.network.model import HMA
 from hma_model.network.stem import split_tokens, unpatchify
-from hma_model.network.trunk import Conditioning, LayerCache, TimePositions, window_times
 
 
 class Rollout:
@@ -65,8 +63,8 @@ class Rollout:
             rows beside it.
 
     Attributes:
-        decoding: the settings of unmasking; they may be replaced between steps.
         state: the state of the rows.
+        passes: of the trunk over their frames.
         entropy: (n,) of the rows of the last step, twins last: mean nats a token of the trunk, by what was
             predicted when it was decided; if `decoding` measures it.
     """
@@ -90,15 +88,25 @@ class Rollout:
     ) -> None:
         self.model, self.config = model, model.config
         warmth = default_temperature(model.config) if temperature is None else temperature
-        self.decoding = Decoding(unmask_steps, warmth, order, sample_steps, guidance, noise_level)
-        check(self.decoding, self.config)
+        decoding = Decoding(unmask_steps, warmth, order, sample_steps, guidance, noise_level)
+        check(decoding, self.config)
         self.batch, self.caching, self.twins = batch, cache, guidance != 1
         self.engine = Engine(model, precision, compile and cache)
         Groups.of(embodiment, batch)  # checks that there are as many ids as rows
         names = [embodiment] * batch if isinstance(embodiment, str) else list(embodiment)
         self.state = RowState(model, names * (1 + self.twins), generator, cache)
-        self.passive: bool | None = None  # no actions at all; known from the first step on
+        self.passes = Passes(model, self.engine, self.state, cache)
+        self.decoding = decoding
         self.told = False  # some prompt had actions
+
+    @property
+    def decoding(self) -> Decoding:
+        """Return the settings of unmasking; they may be replaced between steps."""
+        return self._decoding
+
+    @decoding.setter
+    def decoding(self, given: Decoding) -> None:
+        self._decoding, self.passes.noise_level = given, given.noise_level
 
     # -- rows ---------------------------------------------------------------------------------------------
 
@@ -120,7 +128,7 @@ class Rollout:
             known: (B, P - 1 or more) bool, True where a chunk is known; by default all are.
             seeds: of each row's random numbers; by default they are drawn from the rollout's generator.
         """
-        self.passive, self.told = None, False
+        self.passes.passive, self.told = None, False
         self.reset(range(self.batch), frames, actions, known, seeds)
 
     @torch.no_grad()
@@ -169,7 +177,7 @@ class Rollout:
     def snapshot(self, rows: Sequence[int] | None = None) -> Snapshot:
         """Return a copy of the state of some rows, by default all."""
         chosen = self._chosen(rows)
-        return replace(self.state.snapshot([*chosen, *self._twins(chosen)]), passive=self.passive)
+        return replace(self.state.snapshot([*chosen, *self._twins(chosen)]), passive=self.passes.passive)
 
     def restore(self, rows: Sequence[int], snapshot: Snapshot) -> None:
         """Put rows into the state of a snapshot of as many rows, from any rollout of the same model."""
@@ -181,7 +189,7 @@ class Rollout:
             raise HMAError(
                 "snapshot", "some rows have actions and some have none", "give them always or never"
             )
-        self.passive = snapshot.passive if self.passive is None else self.passive
+        self.passes.passive = snapshot.passive if self.passes.passive is None else self.passes.passive
         self.told = self.told or bool(snapshot.known.any())
         self.state.restore(chosen, snapshot)
 
@@ -202,7 +210,7 @@ class Rollout:
     def _clashes(self, passive: bool | None) -> bool:
         """Check whether rows with and without actions meet where their frames differ in tokens."""
         differ = self.config.absent_action != "embedding"
-        return differ and None not in (self.passive, passive) and self.passive != passive
+        return differ and None not in (self.passes.passive, passive) and self.passes.passive != passive
 
     # -- a step -------------------------------------------------------------------------------------------
 
@@ -259,7 +267,7 @@ class Rollout:
         chosen = self._room(own)
         if self.caching:
             with self.engine.computing(len(chosen)):
-                self._catch_up(chosen)
+                self.passes.catch_up(chosen)
         self._take(own, chunk, None, known)
         self.state.put_seen(chosen, values.repeat(1 + self.twins, *[1] * (values.dim() - 1)))
 
@@ -280,7 +288,7 @@ class Rollout:
         if self.config.action_alignment == "current":
             self.state.put_chunk(own, 1, None, None)  # it is the one that is asked for
         with self.engine.computing(len(own)):
-            features = self._newest_features(own)
+            features = self.passes.newest_features(own)
         names = [self.state.embodiments[row] for row in own]
         groups = Groups.of(names, len(own))
         pooled = groups.sort(self.model.action_features(features.clone()))
@@ -303,25 +311,9 @@ class Rollout:
             self.state.grow(chosen)
         return chosen
 
-    def _newest_features(self, rows: list[int]) -> Tensor:
-        """Return the features (n, 1, N, D) of the newest frames."""
-        if self.caching:
-            self._catch_up(rows)
-            features = self._past_features(rows, 1, late=0)[:, -1:]
-            if self.config.action_alignment == "previous":  # else the chunk is still to be put there
-                for row in rows:
-                    self.state.pending[row] = 0
-            return features
-        times, made = self.state.times, dict[int, Tensor]()
-        for age in dict.fromkeys(times[row] for row in rows):
-            own = [row for row in rows if times[row] == age]
-            places = window_times(self.config, age, self.model.device)
-            made |= zip(own, self._known_features(own, places, None)[:, -1:])
-        return torch.stack([made[row] for row in rows])
-
     def _frame(self, rows: list[int]) -> Tensor:
         """Return the next frame (n, S) of rows, unmasked."""
-        frame, passes = self._blank(rows), self._passes(rows)
+        frame, passes = self._blank(rows), self.passes.begin(rows)
         left = tokens = self.config.tokens_per_frame
         for step in range(self.decoding.steps):
             count = left - masked_after(step, self.decoding.steps, tokens)
@@ -337,143 +329,14 @@ class Rollout:
         if self.engine.whole is not None and isinstance(frame, TokenFrame) and not self.decoding.measure:
             (part,) = passes
             seen = frame.laid_out(part.lay_out, self.model.token_readout, count)
-            made = self.engine.whole(seen, count, *self._inputs(frame, part, first)).clone()
+            made = self.engine.whole(seen, count, *self.passes.inputs(frame, part, first)).clone()
             frame.values = made if part.lanes is None else made[part.lanes]
             return
-        features, position = self._features(frame, passes, first)
+        features, position = self.passes.features(frame, passes, first)
         own = features[:, : self.config.tokens_per_frame]
         frame.unmask(self.engine.readout, own, position, count)  # type: ignore[arg-type]
 
-    def _passes(self, rows: list[int]) -> list[Pass]:
-        """Return the pass that all rows share; without a cache, one for the rows of each time."""
-        if self.caching:
-            self._catch_up(rows)
-            every = list(range(len(self.state.times)))
-            if self.engine.compiled is None or len(rows) == len(every):
-                return [self._newest(rows)]
-            # Compiled code has one shape, so idle rows compute too. Their next step writes the slots again.
-            return [replace(self._newest(every), lanes=self.state.tensor(rows))]
-        times = self.state.times
-        ages = dict.fromkeys(times[row] for row in rows)
-        return [self._whole(rows, [i for i, row in enumerate(rows) if times[row] == age]) for age in ages]
-
-    def _catch_up(self, rows: list[int]) -> None:
-        """Add all pending frames but the newest to the cache."""
-        pending = self.state.pending
-        for count in sorted({pending[row] - 1 for row in rows if pending[row] > 1}):
-            late = [row for row in rows if pending[row] == count + 1]
-            self._past_features(late, count, late=1)
-            for row in late:
-                pending[row] = 1
-
-    def _past_features(self, rows: list[int], count: int, late: int) -> Tensor:
-        """Add `count` known frames, `late` before the next one, to the cache; return their features."""
-        begin = [self.state.times[row] - count - late for row in rows]
-        return self._known_features(rows, self.state.cached_times(rows, begin, count), self._cache())
-
-    def _known_features(
-        self, rows: list[int], times: TimePositions, cache: list[LayerCache] | None
-    ) -> Tensor:
-        """Return the features (n, T, N, D) of known frames at times that all rows share, or (n, T) ones."""
-        positions = times.positions if times.positions.dim() > 1 else times.positions.unsqueeze(0)
-        past = self.state.past(rows, positions)
-        masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
-        x = self._tell(self._embed(past, masked), self._levels(rows, positions))
-        return self.engine.trunk(x, self._condition(rows, positions), times, cache)
-
-    def _newest(self, rows: list[int]) -> Pass:
-        """Return the pass over the newest frame and the next one with a cache."""
-        last = self.config.frames - 1 if self.config.time_position == "learned" else max(self.state.times)
-        begin = [max(min(self.state.times[row], last) - 1, 0) for row in rows]  # of idle rows any will do
-        times = self.state.cached_times(rows, begin, 2)
-        before = times.positions[:, :1]
-        past, levels = self.state.past(rows, before), self._levels(rows, before)
-        return Pass(past, levels, times, self._condition(rows, times.positions))
-
-    def _whole(self, rows: list[int], members: list[int]) -> Pass:
-        """Return the pass over all frames and the next one of those rows of a step that are at one time."""
-        chosen = [rows[i] for i in members]
-        times = window_times(self.config, self.state.times[chosen[0]] + 1, self.model.device)
-        before = times.positions[:-1].unsqueeze(0)
-        past, levels = self.state.past(chosen, before), self._levels(chosen, before)
-        conditioning = self._condition(chosen, times.positions.unsqueeze(0))
-        return Pass(past, levels, times, conditioning, among=self.state.tensor(members))
-
-    def _features(
-        self, frame: TokenFrame | PatchFrame, passes: list[Pass], first: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Return the new frames' features (n, N, D) and their times (1 or n, 1)."""
-        found = [self._compute(frame, part, first) for part in passes]
-        if len(found) == 1:
-            return found[0]
-        order = torch.cat([part.among for part in passes if part.among is not None]).argsort()
-        times = torch.cat([time.expand(len(features), 1) for features, time in found])
-        return torch.cat([features for features, _ in found])[order], times[order]
-
-    def _compute(self, frame: TokenFrame | PatchFrame, part: Pass, first: bool) -> tuple[Tensor, Tensor]:
-        """Compute a pass: all its frames if it is the first or there is no cache, else the new one."""
-        x, conditioning, times, layers = self._inputs(frame, part, first)
-        trunk = self.engine.compiled or self.engine.trunk
-        features, at = trunk(x, conditioning, times, layers)[:, -1], times.positions[..., -1:].view(-1, 1)
-        if part.lanes is None:
-            return features, at
-        return features[part.lanes], at if len(at) == 1 else at[part.lanes]
-
-    def _inputs(
-        self, frame: TokenFrame | PatchFrame, part: Pass, first: bool
-    ) -> tuple[Tensor, Conditioning, TimePositions, list[LayerCache] | None]:
-        """Return the inputs of the trunk for a pass."""
-        whole = first or not self.caching
-        fresh = part.past if whole or self.config.masked_input == "previous" else part.past[:, :0]
-        values = torch.cat([fresh, part.lay_out(frame.values).unsqueeze(1)], dim=1)
-        masked = torch.zeros(values.shape[:3], dtype=torch.bool, device=values.device)
-        masked[:, -1] = part.lay_out(frame.masked)
-        x = self._embed(values, masked)
-        if whole and part.levels is not None:
-            x = self._tell(x, torch.nn.functional.pad(part.levels, (0, 1)))  # nothing of the new frame
-        if not self.caching:
-            return x, part.conditioning, part.times, None
-        conditioning = part.conditioning if first else part.conditioning.last()
-        times = part.times if first else part.times.last()
-        return x if whole else x[:, -1:].contiguous(), conditioning, times, self._cache()
-
-    def _embed(self, values: Tensor, masked: Tensor) -> Tensor:
-        """Embed frames (n, T, S) of which some tokens are masked, (n, T, S) bool, as (n, T, S, D)."""
-        if self.config.kind == "discrete":
-            return self.model.embed_tokens(values)  # a masked token says so by itself
-        return self.model.embed_patches(values, masked.unsqueeze(-1))
-
-    def _levels(self, rows: list[int], positions: Tensor) -> Tensor | None:
-        """Return the noise (n, T) that the model is told of the frames at times (1 or n, T)."""
-        level = self.decoding.noise_level
-        return self.state.made(rows, positions) * level if level else None
-
-    def _tell(self, x: Tensor, levels: Tensor | None) -> Tensor:
-        return x if levels is None or self.model.trunk.noise is None else x + self.model.trunk.noise(levels)
-
-    def _cache(self) -> list[LayerCache]:
-        appended = self.config.absent_tokens if self.passive else self.config.appended_tokens
-        like = self.model.trunk.position.detach()
-        if torch.is_autocast_enabled(like.device.type):
-            like = like.to(torch.get_autocast_dtype(like.device.type))
-        before = self.state.layers
-        with torch.inference_mode(False), torch.no_grad():
-            layers = self.state.cache(self.config.tokens_per_frame + appended, like)
-        if self.engine.compiled is not None and layers is not before:
-            for layer in layers:  # static addresses: the compiled code writes them in place
-                for kept in (layer.time, layer.action):
-                    if kept is not None:
-                        torch._dynamo.mark_static_address(kept)
-        return layers
-
     # -- actions ------------------------------------------------------------------------------------------
-
-    def _condition(self, rows: list[int], positions: Tensor) -> Conditioning:
-        """Return the conditioning of rows at times (1 or n, T); it is the same in every pass."""
-        groups = Groups.of([self.state.embodiments[row] for row in rows], len(rows))
-        skips = self.passive and self.config.absent_action != "embedding"
-        given = None if skips else self.state.given(rows, positions)
-        return condition(self.model, given, groups, positions, unsort=True)
 
     def _take(
         self, rows: list[int], chunk: Tensor | None, following: Tensor | None, known: Tensor | None
@@ -481,8 +344,8 @@ class Rollout:
         """Store the chunk at the frame that it conditions; twins get none."""
         if self._clashes(chunk is None):
             raise HMAError("step", "some steps have actions and some have none", "give them always or never")
-        if self.passive is None:
-            self.passive = chunk is None and not self.told
+        if self.passes.passive is None:
+            self.passes.passive = chunk is None and not self.told
         if self.twins:
             self.state.put_chunk(self._twins(rows), 0, None, None)
         if chunk is None:

@@ -8,6 +8,7 @@ import torch
 
 from hma_data.errors import HMAError
 from hma_model.config import CONDITIONINGS
+from hma_model.generation.passes import Passes
 from hma_model.generation.rollout import Rollout
 from hma_model.network.model import HMA
 from tests.model.network_parts import ARM, small_batch, small_model
@@ -50,7 +51,7 @@ def _first_features(rollout: Rollout, chunk: torch.Tensor) -> torch.Tensor:
     """Return the features of the next frame's first pass."""
     rows = list(range(rollout.batch))
     rollout._take(rows, chunk, None, None)
-    return rollout._features(rollout._blank(rows), rollout._passes(rows), first=True)[0]
+    return rollout.passes.features(rollout._blank(rows), rollout.passes.begin(rows), first=True)[0]
 
 
 @pytest.mark.parametrize("actions", [True, False])
@@ -79,14 +80,14 @@ def test_every_pass_of_a_cached_rollout_has_the_features_of_full_recomputation(
 ) -> None:
     model = small_model(kind=kind, conditioning=conditioning, action_tokens=2, diffusion_clip=1.0)
     seen: list[list[torch.Tensor]] = []
-    plain = Rollout._features
+    plain = Passes.features
 
-    def features(self: Rollout, frame: Any, part: Any, first: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    def features(self: Passes, frame: Any, part: Any, first: bool) -> tuple[torch.Tensor, torch.Tensor]:
         found = plain(self, frame, part, first)
         seen[-1].append(found[0])
         return found
 
-    monkeypatch.setattr(Rollout, "_features", features)
+    monkeypatch.setattr(Passes, "features", features)
     if kind == "continuous":
         for parameter in model.latent_readout.diffusion.parameters():
             parameter.data *= 0.1
