@@ -94,7 +94,7 @@ TASKS: dict[str, tuple[Score, str]] = {
 
 
 def task_of(robot: str, words: str = "moved") -> Task:
-    """Return the task of a robot from words: `moved`, `moved=8`, `reached`, `reached=15`; of pushers `placed`.
+    """Return the task of a robot from words: moved, moved=8, reached or reached=15; of pushers, placed too.
 
     Raises:
         UsageError: the words name no task.
