@@ -13,6 +13,10 @@ Split = Annotated[Literal["train", "val"], typer.Option("--split", help="Split t
 UnmaskSteps = Annotated[
     int, typer.Option("--unmask-steps", min=1, help="Passes in which a discrete model decodes a frame.")
 ]
+Temperature = Annotated[
+    float | None,
+    typer.Option("--temperature", min=0, help="0 takes the likeliest token; default 0.5, of latents 0."),
+]
 SampleSteps = Annotated[
     int | None,
     typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own."),

@@ -8,6 +8,7 @@ import typer
 from hma_data.console import human_count, interruptible, print_json, progress
 from hma_data.errors import OutputError
 from hma_model.cli.hub import Json
+from hma_model.cli.options import Temperature, UnmaskSteps
 
 
 def policy_eval(
@@ -28,6 +29,8 @@ def policy_eval(
     judge: Annotated[
         str, typer.Option("--judge", help="What success is: moved, reached, placed, or with px: moved=8.")
     ] = "moved",
+    unmask_steps: UnmaskSteps = 2,
+    temperature: Temperature = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the page and the figures.")] = None,
     json: Json = False,
@@ -44,7 +47,7 @@ def policy_eval(
     with progress("policies", len(policies) * episodes * frames) as update:
         found = evaluate_policies(
             embodiment, policies, checkpoint=checkpoint, episodes=episodes, frames=frames, judge=judge,
-            seed=seed, on_progress=update,
+            seed=seed, unmask_steps=unmask_steps, temperature=temperature, on_progress=update,
         )  # fmt: skip
     page = write_report(found, out) if out else None
     if json:
@@ -82,6 +85,8 @@ def augment(
     lerobot: Annotated[
         Path | None, typer.Option("--lerobot", help="Folder for them as a LeRobotDataset v3.0 as well.")
     ] = None,
+    unmask_steps: UnmaskSteps = 2,
+    temperature: Temperature = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
     json: Json = False,
 ) -> None:
@@ -93,7 +98,9 @@ def augment(
     from hma_model.simulate.augment import augment as run
 
     name = source.resolve().name if source else ""
-    settings = Augmentation(embodiment, name, episodes, frames, commands, keep, judge, seed)
+    settings = Augmentation(
+        embodiment, name, episodes, frames, commands, keep, judge, seed, unmask_steps, temperature
+    )
     words = f"finished batches are kept in {out}; run the same command again to continue"
     with interruptible(lambda: words), progress("episodes", episodes * frames) as update:
         made = run(out, settings, checkpoint=checkpoint, shards=source, lerobot=lerobot, on_progress=update)

@@ -59,6 +59,7 @@ class Augmentation:
         keep: share of the episodes that is kept.
         judge: the task whose successes are kept, as `task_of` takes it; empty for none.
         seed: of everything.
+        unmask_steps, temperature: as of `World`.
     """
 
     embodiment: str
@@ -69,6 +70,8 @@ class Augmentation:
     keep: float = 0.5
     judge: str = ""
     seed: int = 0
+    unmask_steps: int = 2
+    temperature: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.keep <= 1:
@@ -155,7 +158,8 @@ def augment(
     folder = as_path(out)
     if lerobot is not None and as_path(lerobot).exists():
         raise OutputError(lerobot, "exists already", "remove it or choose another folder")
-    world = world or load_world(checkpoint)
+    drawn: dict[str, Any] = {"unmask_steps": settings.unmask_steps, "temperature": settings.temperature}
+    world = world or load_world(checkpoint, **drawn)
     if world.model.config.kind != "discrete" or world.model.config.views > 1:
         raise HMAError("augment", "takes models of discrete tokens and one view", "choose another checkpoint")
     made_by = (

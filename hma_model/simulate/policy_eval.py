@@ -83,6 +83,7 @@ class PolicyEvaluation:
     """Policies scored twice.
 
     Attributes:
+        sampling: how the world drew its frames.
         success, score: correlation over policies of the success rates, and of the mean scores.
         generated: accuracy of the judge on generated frames, against the simulator under the same commands.
         followed: how the scores of single episodes, as judged on generated frames, correlate with the true
@@ -91,6 +92,7 @@ class PolicyEvaluation:
 
     embodiment: str
     checkpoint: str
+    sampling: str
     seed: int
     frames: int
     judge: StateJudge
@@ -137,6 +139,7 @@ class PolicyEvaluation:
         return {
             "embodiment": self.embodiment,
             "checkpoint": self.checkpoint,
+            "sampling": self.sampling,
             "seed": self.seed,
             "frames": self.frames,
             "episodes": len(self.policies[0].true.scores),
@@ -157,6 +160,8 @@ def evaluate_policies(
     judge: str | StateJudge = "moved",
     seed: int = 0,
     world: World | None = None,
+    unmask_steps: int = 2,
+    temperature: float | None = None,
     on_progress: Progress | None = None,
 ) -> PolicyEvaluation:
     """Score policies in the simulator of a laboratory robot and inside a world model.
@@ -170,6 +175,7 @@ def evaluate_policies(
         judge: words as `task_of` takes them, or a trained judge.
         seed: of scenes, policies, judge and intervals; the same seed gives the same figures.
         world: a world instead of a checkpoint.
+        unmask_steps, temperature: of the world, as of `World`.
         on_progress: called with the frames done, and what is done.
 
     Raises:
@@ -178,7 +184,7 @@ def evaluate_policies(
     if not policies:
         raise UsageError("policies", "none is given", "give at least one; a correlation takes three")
     tell = on_progress or (lambda done, words: None)
-    world = world or load_world(checkpoint)
+    world = world or load_world(checkpoint, unmask_steps=unmask_steps, temperature=temperature)
     scenes = Scenes.of(world, embodiment, episodes, seed)
     made = [(one, read_policy(one, scenes, world)) if isinstance(one, str) else one for one in policies]
     for name, policy in made:  # what it returns is refused before minutes of work
@@ -200,6 +206,7 @@ def evaluate_policies(
     return PolicyEvaluation(
         embodiment,
         str(checkpoint),
+        f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}",
         seed,
         frames,
         judge,

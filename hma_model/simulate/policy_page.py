@@ -83,8 +83,8 @@ def html(found: PolicyEvaluation) -> str:
     """Return the page."""
     count = len(found.policies[0].true.scores)
     lead = (
-        f"{found.embodiment} in {found.checkpoint}: {count} episodes of {found.frames} frames a policy, from "
-        "the same frames in the simulator and in the world model"
+        f"{found.embodiment} in {found.checkpoint} ({found.sampling}): {count} episodes of {found.frames} "
+        "frames a policy, from the same frames in the simulator and in the world model"
     )
     page = Page("Policies inside the world model", lead)
     page.figures(
