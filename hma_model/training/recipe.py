@@ -29,6 +29,7 @@ from hma_data.errors import RecipeError, UsageError
 from hma_data.loading.views import view_count
 from hma_data.storage.paths import StrPath, as_text, shipped
 from hma_data.storage.yaml_io import parse_yaml, read_yaml
+from hma_model.checkpoint.folder import EMBEDDED_NAME
 from hma_model.config import HMAConfig
 
 if TYPE_CHECKING:
@@ -299,7 +300,7 @@ def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
 
 def recipe_for(source: StrPath) -> str:
     """Return the name of the recipe by which a model is finetuned where none is given."""
-    return "finetune_tiny" if as_text(source) == "embedded" else "finetune"
+    return "finetune_tiny" if as_text(source) == EMBEDDED_NAME else "finetune"
 
 
 def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
