@@ -43,19 +43,32 @@ SLOW_LOOK = Look(96, "Peru", "Crimson", "DodgerBlue")
 FAST_STEPS, SLOW_TICKS = 80, 720
 CAMERA_TICKS, COMMAND_TICKS = 8, 20  # of pusht_slow: from one picture, and one command, to the next
 FAST_PERIOD_S = 0.1
+NOISE, HELD = (0.1, 0.25, 0.5, 0.75, 1.0), 4  # shares of random targets, and control steps that each is held
 LEAST_S, REST_S = 4.0, 0.6  # shortest episode, and time recorded after success
 
 
 def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
     """Record `pusht_fast` as a file of robomimic's layout, `pusht_slow` as a folder of MCAP files."""
     if robot == "pusht_fast":
-        kwargs = {"observation_width": FAST_LOOK.size, "observation_height": FAST_LOOK.size}
-        env_args = {"env_name": "gym_pusht/PushT-v0", "type": 2, "env_kwargs": kwargs}
-        write_hdf5(part, (_fast_demo(seed, episode) for episode in episodes), env_args)
+        _write_fast(part, (_fast_demo(seed, episode) for episode in episodes))
     else:
         part.mkdir()
         for episode in episodes:
             _slow_bag(part / f"episode_{episode:04d}.mcap", seed, episode)
+
+
+def record_noisy(part: Path, episodes: Iterable[int], seed: int) -> None:
+    """Record `pusht_fast` with another share of NOISE of random targets in each episode, to HDF5.
+
+    So a world model also sees what bad policies do.
+    """
+    _write_fast(part, (_fast_demo(seed, n, NOISE[n // len(STARTS) % len(NOISE)]) for n in episodes))
+
+
+def _write_fast(part: Path, demos: Iterable[Demo]) -> None:
+    kwargs = {"observation_width": FAST_LOOK.size, "observation_height": FAST_LOOK.size}
+    env_args = {"env_name": "gym_pusht/PushT-v0", "type": 2, "env_kwargs": kwargs}
+    write_hdf5(part, demos, env_args)
 
 
 class Arena:
@@ -180,7 +193,8 @@ class FastPusher:
         return drive
 
 
-def _fast_demo(seed: int, episode: int) -> Demo:
+def _fast_demo(seed: int, episode: int, noise: float = 0.0) -> Demo:
+    dice, target = np.random.default_rng((seed, 2, episode)), None
     robot = FastPusher(seed, episode)
     arena, drive = robot.arena, robot.driver(episode)
     period, stop = FAST_PERIOD_S, FAST_STEPS
@@ -188,6 +202,9 @@ def _fast_demo(seed: int, episode: int) -> Demo:
     while len(rows) < stop:
         seen = arena.picture(), arena.agent, arena.state
         before, action = arena.success, drive()
+        if len(rows) % HELD == 0:
+            target = dice.uniform(15, 497, 2).astype(np.float32) if dice.random() < noise else None
+        action = action if target is None else target
         robot.advance(action)
         rows.append((*seen, action, arena.reward))
         if arena.success and not before:
@@ -199,7 +216,7 @@ def _fast_demo(seed: int, episode: int) -> Demo:
         states=states,
         rewards=rewards,
         success=arena.success,
-        facts={"start": STARTS[episode % len(STARTS)], "seed": seed},
+        facts={"start": STARTS[episode % len(STARTS)], "seed": seed, **({"noise": noise} if noise else {})},
     )
 
 

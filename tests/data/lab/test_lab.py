@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 from hma_data.errors import MissingDependencyError, OutputError, UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
-from hma_data.lab.pusht import SLOW_LOOK, Arena
+from hma_data.lab.pusht import HELD, SLOW_LOOK, Arena, record_noisy
 from hma_data.lab.tee_table import TeeTable
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
@@ -105,6 +105,17 @@ def test_environment_replays_the_recorded_actions(fast: h5py.File, demo: int) ->
         coverage.append(info["coverage"])
     np.testing.assert_allclose(np.stack(replayed[:-1]), states, atol=1e-3)
     assert (max(coverage) > env.success_threshold) == fast[f"data/demo_{demo}"].attrs["success"]
+
+
+def test_noisy_episodes_hold_random_targets_in_their_share(fast: h5py.File, tmp_path: Path) -> None:
+    record_noisy(tmp_path / "noisy.hdf5", (0, 20), seed=3)  # episodes of shares 0.1 and 1
+    with h5py.File(tmp_path / "noisy.hdf5") as file:
+        calm, wild = (np.diff(file[f"data/demo_{n}/actions"][:], axis=0).any(axis=1) for n in range(2))
+        assert [file[f"data/demo_{n}"].attrs["noise"] for n in range(2)] == [0.1, 1.0]
+    assert not wild[np.arange(len(wild)) % HELD != HELD - 1].any() and wild.mean() == pytest.approx(
+        1 / HELD, abs=0.02
+    )
+    assert calm.mean() > 0.5  # planned motion changes its target each step
 
 
 def test_the_table_is_that_of_gym_pusht() -> None:
