@@ -9,6 +9,7 @@ receipt are known, so a time range is read without the rest. A file has some tho
 """
 
 import bz2
+import logging
 import sqlite3
 import struct
 from abc import ABC, abstractmethod
@@ -22,7 +23,9 @@ from typing import BinaryIO, NamedTuple
 from mcap.exceptions import McapError
 
 from hma_data.errors import EpisodeError
+from hma_data.storage.blocks import LargeFile, expect
 from hma_data.storage.kinds import unreadable
+from hma_data.storage.remote import is_remote
 
 CACHED_BYTES = 64 << 20  # of unpacked chunks that a bag keeps
 MAX_CHUNK = 512 << 20  # most bytes of an unpacked chunk, against decompression bombs and errors
@@ -33,6 +36,7 @@ FAULTS = (
     MemoryError, sqlite3.Error, McapError,
 )  # fmt: skip
 
+log = logging.getLogger(__name__)
 Data = bytes | memoryview
 FilePlace = tuple[int, int]
 
@@ -107,6 +111,18 @@ def damaged(path: Path, fault: str) -> EpisodeError:
     return EpisodeError(path, *unreadable(path, fault, remedy))
 
 
+def without_index(path: Path, file: BinaryIO, size: int) -> None:
+    """State that a file will be read to its end because it has no index."""
+    expect(file, [(0, size)])
+    if is_remote(path):
+        log.warning(
+            "%s: has no index, so all of its %s bytes are read to find its messages — "
+            "write one (mcap recover, rosbag reindex), or copy the file here",
+            path,
+            f"{size:,}",
+        )
+
+
 class Piece(NamedTuple):
     """The records from offset `at` to `end`: one chunk, or messages outside of chunks.
 
@@ -160,21 +176,28 @@ class IndexedFile(ABC):
     def __init__(self, path: Path, chunks: "ChunkCache | None" = None) -> None:
         self.path = path
         self._chunks = chunks or ChunkCache()
+        self._file = LargeFile(path)
         self._indexed: FileIndex | None = None
 
     def records(self, wanted: RecordFilter) -> Iterator[Record]:
         """Yield the wanted messages, in the file's order; pieces without one are not read."""
-        with reading(self.path), self.path.open("rb") as file:
+        with reading(self.path), self._file.open() as file:
             index = self._index(file)
-            for piece in index.pieces:
-                within = piece.first_ns <= wanted.last_ns and piece.last_ns >= wanted.first_ns
-                if within and piece.holds(wanted.topics):
-                    yield from self._in_piece(file, index, piece, wanted)
+            pieces = [
+                piece
+                for piece in index.pieces
+                if piece.first_ns <= wanted.last_ns
+                and piece.last_ns >= wanted.first_ns
+                and piece.holds(wanted.topics)
+            ]
+            expect(file, ((piece.at, piece.end) for piece in pieces))
+            for piece in pieces:
+                yield from self._in_piece(file, index, piece, wanted)
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
         """Return each topic's last message before a time; topics without one are left out."""
         found: dict[str, Record] = {}
-        with reading(self.path), self.path.open("rb") as file:
+        with reading(self.path), self._file.open() as file:
             index = self._index(file)
             earlier = (piece for piece in index.pieces if piece.first_ns < log_ns and piece.holds(topics))
             for piece in sorted(earlier, key=lambda piece: piece.last_ns, reverse=True):
@@ -198,7 +221,7 @@ class IndexedFile(ABC):
 
     def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
         """Yield the data of the messages at those places."""
-        with reading(self.path), self.path.open("rb") as file:
+        with reading(self.path), self._file.open() as file:
             last = -1
             for offset, at in places:
                 if offset != last:
