@@ -3,14 +3,15 @@
 A reader that knows which parts it will need says so (`Blocks.expect`). While it reads such a part, the next
 blocks of expected parts are on their way. Blocks that nobody expects are fetched when they are read.
 
-One cache serves all files of a process, so memory does not grow with their number or size.
+What a reader will need again, such as the pictures of an episode of which it looks for the times first, it
+can keep. One cache serves all files of a process, so memory does not grow with their number or size.
 """
 
 import io
 import itertools
 import os
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
@@ -25,7 +26,8 @@ from hma_data.storage.remote import RemotePath, attempt
 
 BLOCK = 1 << 20  # bytes of a request
 AHEAD = 16  # expected blocks on their way while one is read
-KEPT = 256  # blocks in memory
+KEPT = 64  # blocks in memory
+PARTS = 256 << 20  # bytes of parts in memory, such as pictures, that will be read again
 REQUESTS = 8  # at once
 
 Fetch = Callable[[int, int], bytes]  # (start, end) -> the bytes between them
@@ -33,12 +35,27 @@ _numbers = itertools.count()
 
 
 class _Cache:
-    """The blocks of one process: fetched, or on their way."""
+    """The blocks of one process, fetched or on their way, and the parts that its readers keep."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(REQUESTS, "hma-blocks")
         self._blocks: OrderedDict[tuple[int, int], Future[bytes]] = OrderedDict()
+        self._parts: OrderedDict[tuple[int, Hashable], bytes] = OrderedDict()
+        self._bytes = 0
         self._lock = Lock()
+
+    def keep(self, key: tuple[int, Hashable], data: bytes) -> None:
+        """Keep a part; those kept for longest are dropped."""
+        with self._lock:
+            self._bytes += len(data) - len(self._parts.pop(key, b""))
+            self._parts[key] = data
+            while self._bytes > PARTS:
+                self._bytes -= len(self._parts.popitem(last=False)[1])
+
+    def kept(self, key: tuple[int, Hashable]) -> bytes | None:
+        """Return a part that was kept; None where it is not there any more."""
+        with self._lock:
+            return self._parts.get(key)
 
     def want(self, key: tuple[int, int], load: Callable[[], bytes]) -> Future[bytes]:
         """Return a block, or begin to fetch it; blocks not wanted for longest are dropped."""
@@ -121,6 +138,14 @@ class Blocks:
         except BaseException:
             _cache(os.getpid()).forget((self._number, number))
             raise
+
+    def keep(self, name: Hashable, data: bytes) -> None:
+        """Keep a part of the file under a name, while there is room."""
+        _cache(os.getpid()).keep((self._number, name), data)
+
+    def kept(self, name: Hashable) -> bytes | None:
+        """Return the part of that name; None where it is not kept."""
+        return _cache(os.getpid()).kept((self._number, name))
 
     def _prefetch(self, numbers: Iterable[int]) -> None:
         for number in numbers:

@@ -16,20 +16,21 @@ from abc import ABC, abstractmethod
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from mcap.exceptions import McapError
 
 from hma_data.errors import EpisodeError
-from hma_data.storage.blocks import LargeFile, expect
+from hma_data.storage.blocks import BlockFile, LargeFile, expect
 from hma_data.storage.kinds import unreadable
 from hma_data.storage.remote import is_remote
 
 CACHED_BYTES = 64 << 20  # of unpacked chunks that a bag keeps
 MAX_CHUNK = 512 << 20  # most bytes of an unpacked chunk, against decompression bombs and errors
 FOREVER = 2**64
+KEPT_FROM = 2048  # bytes of a message of a remote file that is kept in memory for `payloads`
 HEAD = 64  # bytes: the stamp of a message is within them
 FAULTS = (
     struct.error, ValueError, LookupError, OverflowError, RecursionError, EOFError, OSError, RuntimeError,
@@ -76,12 +77,14 @@ class RecordFilter:
         topics: None for all.
         first_ns, last_ns: range of the time of receipt, both ends included.
         heads: topics for which the first HEAD bytes of a message are enough; more may be returned.
+        again: whether `payloads` of these messages will be asked for.
     """
 
     topics: frozenset[str] | None = None
     first_ns: int = 0
     last_ns: int = FOREVER
     heads: frozenset[str] = frozenset()
+    again: bool = False
 
     def topic(self, name: str) -> bool:
         """Check whether messages of that topic are asked for."""
@@ -191,8 +194,16 @@ class IndexedFile(ABC):
                 and piece.holds(wanted.topics)
             ]
             expect(file, ((piece.at, piece.end) for piece in pieces))
+            if not wanted.again or not isinstance(file, BlockFile):
+                for piece in pieces:
+                    yield from self._in_piece(file, index, piece, wanted)
+                return
+            whole = replace(wanted, heads=frozenset())
             for piece in pieces:
-                yield from self._in_piece(file, index, piece, wanted)
+                for record in self._in_piece(file, index, piece, whole):
+                    if len(record.data) >= KEPT_FROM:  # so that pictures are not fetched again
+                        file.blocks.keep(record.place, bytes(record.data))
+                    yield record
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
         """Return each topic's last message before a time; topics without one are left out."""
@@ -224,6 +235,10 @@ class IndexedFile(ABC):
         with reading(self.path), self._file.open() as file:
             last = -1
             for offset, at in places:
+                kept = file.blocks.kept((offset, at)) if isinstance(file, BlockFile) else None
+                if kept is not None:
+                    yield kept
+                    continue
                 if offset != last:
                     last, view = offset, self._view(file, offset)
                 start, end = self._content(view, at)

@@ -230,17 +230,18 @@ class _EpisodeReading:
         """Yield the messages of the bag; of an episode in it, those of its time and those still in force."""
         segment, table = self._segment, self._table
         if segment is None or table is None:
-            return self._bag.records(RecordFilter(topics, heads=short))
+            return self._bag.records(RecordFilter(topics, heads=short, again=True))
         first_ns, last_ns = max(segment.first_ns - table.reach_ns, 0), segment.last_ns + table.reach_ns
         plain = topics - table.keyframes.keys()
         held = plain - {self._embodiment.primary_camera.key}
-        within = RecordFilter(plain, first_ns, last_ns, short)
+        within = RecordFilter(plain, first_ns, last_ns, short, again=True)
         parts = [iter(self._bag.before(held, first_ns)), self._bag.records(within)]
         for topic in sorted(topics & table.keyframes.keys()):
             keyframes = table.keyframes[topic]
             at = int(np.searchsorted(keyframes, first_ns, side="right")) - 1
             begin = int(keyframes[at]) if at >= 0 else 0
-            parts.append(self._bag.records(RecordFilter(frozenset({topic}), begin, last_ns)))
+            wanted = RecordFilter(frozenset({topic}), begin, last_ns, again=True)
+            parts.append(self._bag.records(wanted))
         return chain.from_iterable(parts)
 
     # -- results
