@@ -186,6 +186,15 @@ class Source(Protocol):
         ...
 
 
+@runtime_checkable
+class Expecting(Protocol):
+    """A source that is told which episodes will be read next, so that it can fetch them ahead."""
+
+    def expect(self, uri: StrPath, episode_ids: Sequence[str]) -> None:
+        """State the episodes that will be read, in their order; an error of it is ignored."""
+        ...
+
+
 @dataclass(frozen=True)
 class Recognition:
     """The signs of a format's recordings; the format's package states them as `RECOGNITION`.

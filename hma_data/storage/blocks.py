@@ -25,10 +25,10 @@ from hma_data.errors import StorageError
 from hma_data.storage.remote import RemotePath, attempt
 
 BLOCK = 1 << 20  # bytes of a request
-AHEAD = 16  # expected blocks on their way while one is read
+AHEAD = 32  # expected blocks on their way while one is read
 KEPT = 64  # blocks in memory
 PARTS = 256 << 20  # bytes of parts in memory, such as pictures, that will be read again
-REQUESTS = 8  # at once
+REQUESTS = 16  # at once
 
 Fetch = Callable[[int, int], bytes]  # (start, end) -> the bytes between them
 _numbers = itertools.count()
@@ -93,6 +93,7 @@ class Blocks:
         self._fetch = fetch
         self._number = next(_numbers)
         self._expected: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._next: Blocks | None = None
 
     def expect(self, parts: Iterable[tuple[int, int]]) -> None:
         """Add parts, from offset to offset, to those that will be read, in the file's order."""
@@ -105,9 +106,9 @@ class Blocks:
         at = int(np.searchsorted(self._expected, start // BLOCK))
         return at < len(self._expected) and int(self._expected[at]) == start // BLOCK
 
-    def begin(self) -> None:
-        """Begin to fetch the first expected blocks."""
-        self._prefetch(self._expected[:AHEAD])
+    def follow(self, following: "Blocks | None") -> None:
+        """State which file will be read after this one: near its end, the next one's blocks are fetched."""
+        self._next = following
 
     def read(self, start: int, end: int) -> bytes:
         """Return the bytes from `start` up to `end`; fewer where the file ends before.
@@ -131,8 +132,7 @@ class Blocks:
         """Return a block, and let the expected blocks after it be fetched."""
         found = self._want(number)
         if self.expects(number * BLOCK):
-            at = int(np.searchsorted(self._expected, number))
-            self._prefetch(self._expected[at + 1 : at + 1 + AHEAD])
+            self._ahead(int(np.searchsorted(self._expected, number)) + 1, AHEAD)
         try:
             return found.result()
         except BaseException:
@@ -146,6 +146,13 @@ class Blocks:
     def kept(self, name: Hashable) -> bytes | None:
         """Return the part of that name; None where it is not kept."""
         return _cache(os.getpid()).kept((self._number, name))
+
+    def _ahead(self, at: int, count: int) -> None:
+        """Begin to fetch the expected blocks from the `at`th on, here and in the files that follow."""
+        here = self._expected[at : at + count]
+        self._prefetch(here)
+        if self._next and len(here) < count:
+            self._next._ahead(0, count - len(here))
 
     def _prefetch(self, numbers: Iterable[int]) -> None:
         for number in numbers:
