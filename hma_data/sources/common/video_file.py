@@ -163,7 +163,7 @@ class VideoFile:
                 f"{self.path} has {len(self)} frames, asked for {wanted.min()} to {wanted.max()}"
             )
         unique, places = np.unique(wanted, return_inverse=True)
-        found = np.zeros((0, self.table.height, self.table.width, 3), np.uint8)
+        found: Images = np.zeros((0, self.table.height, self.table.width, 3), np.uint8)
         with _explained(str(self.path)):
             for place, index in enumerate(unique.tolist()):
                 picture = self._picture(index)
