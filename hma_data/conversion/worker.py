@@ -12,7 +12,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event, Thread
@@ -41,7 +41,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, flags_text
 from hma_data.shards.stats import Stats
 from hma_data.shards.writer import EpisodeRows, ShardWriter
-from hma_data.sources.base import EpisodeRef, Source, open_source
+from hma_data.sources.base import EpisodeRef, Expecting, Source, open_source
 from hma_data.storage.fetch import EPISODE_WAITS_S as WAITS_S
 from hma_data.storage.fetch import disk_is_full, storage_is_away, worth_another_try
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
@@ -195,6 +195,9 @@ def _decoded(job: Job, unit: ShardUnit, report: Report, attempt: Attempt) -> Ite
     earlier items are then void.
     """
     source = open_source(job.embodiment.source.format)
+    if isinstance(source, Expecting):
+        with suppress(HMAError):  # reading raises it too, for the episode at fault
+            source.expect(job.source, [ref.id for _, ref in unit.episodes])
     for place, (index, ref) in enumerate(unit.episodes):
         if ref.id in attempt.refused:
             yield Refused(ref.id, "Fatal", f"{ref.id}: reading it {attempt.refused[ref.id]}")

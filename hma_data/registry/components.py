@@ -286,6 +286,12 @@ class Hdf5Layout(SourceLayout):
     last_observation: Literal["drop"] | None = Field(
         None, description="drop: the observation after the last action is left out"
     )
+    metadata: str | None = Field(
+        None, description="JSON file beside each file; its values replace {names} in a camera's key"
+    )
+    frames_missing: int = Field(
+        0, ge=0, description="most rows at the end for which a video has no frame; they are left out"
+    )
 
 
 class LeRobotLayout(SourceLayout):

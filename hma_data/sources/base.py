@@ -15,14 +15,14 @@ from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatchcase
 from importlib import import_module
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, BinaryIO, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Episode
 from hma_data.episodes.offset import Offset
-from hma_data.errors import EpisodeError, PluginError, SourceError
+from hma_data.errors import EpisodeError, HMAError, PluginError, SourceError
 from hma_data.plugins import SOURCE_GROUP, installed
 from hma_data.registry import FORMATS, MORE, known_formats
 from hma_data.registry.components import Vector
@@ -30,6 +30,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.common.checks import Finding
 from hma_data.storage.kinds import misplaced, unreadable
 from hma_data.storage.paths import StrPath, as_text
+from hma_data.storage.remote import RangeFile, RemotePath, is_remote, place
 
 SAMPLE = 20  # episodes that inspect looks into
 PACKED = {  # the command that unpacks a file, by the end of its name
@@ -185,6 +186,15 @@ class Source(Protocol):
         ...
 
 
+@runtime_checkable
+class Expecting(Protocol):
+    """A source that is told which episodes will be read next, so that it can fetch them ahead."""
+
+    def expect(self, uri: StrPath, episode_ids: Sequence[str]) -> None:
+        """State the episodes that will be read, in their order; an error of it is ignored."""
+        ...
+
+
 @dataclass(frozen=True)
 class Recognition:
     """The signs of a format's recordings; the format's package states them as `RECOGNITION`.
@@ -257,7 +267,7 @@ def detect(uri: StrPath) -> str:
     if found := _by_uri(uri, ours):
         return found
     if _is_away(uri):
-        return _by_uri(uri, _of_packages()[0]) or "rlds"
+        return _by_uri(uri, _of_packages()[0]) or _by_listing(uri, ours) or "rlds"
     path = local_path(uri)
     files = [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file())[:2000]
     if found := by_files(path, files, ours):
@@ -324,6 +334,18 @@ def _by_uri(uri: str, known: Recognitions) -> str | None:
     return next(by_name, None) or next(by_ending, None)
 
 
+def _by_listing(uri: str, known: Recognitions) -> str | None:
+    """Return the format that the names directly below a folder of a store show."""
+    try:
+        names = [path.name for path in place(uri).iterdir()]
+    except HMAError:  # a server that lists nothing
+        return None
+    for name, recognition in known.items():
+        if any(fnmatchcase(item, pattern) for item in names for pattern in recognition.names):
+            return name
+    return next((k for k, v in known.items() if any(item.endswith(v.endings) for item in names)), None)
+
+
 def by_files(path: Path, files: Sequence[Path], known: Recognitions) -> str | None:
     """Return the format that the files of a recording on this machine show."""
     for name, recognition in known.items():
@@ -386,9 +408,24 @@ def local_path(uri: str) -> Path:
     except PermissionError as fault:
         raise SourceError(uri, *unreadable(path, str(fault), "")) from fault
     if "://" in plain:
-        remedy = "copy it here: only RLDS and LeRobot are read elsewhere"
+        remedy = "copy it here: only RLDS, LeRobot and bags are read elsewhere"
         raise SourceError(uri, "is not on this machine", remedy)
     raise SourceError(uri, "does not exist", "check the path, or source.uri in the embodiment's YAML")
+
+
+def existing_path(uri: str) -> Path:
+    """Return the path of a recording on this machine or in a store.
+
+    Raises:
+        SourceError: it does not exist, or no store is known by that scheme.
+        StorageError: the store refuses it; StorageAwayError: it does not answer.
+    """
+    if not _is_away(uri):
+        return local_path(uri)
+    path = place(uri)
+    if not path.exists():
+        raise SourceError(uri, "does not exist", "check the URI, or source.uri in the embodiment's YAML")
+    return path
 
 
 def leaves(path: Path, folder: Path) -> bool:
@@ -405,10 +442,15 @@ def leaves(path: Path, folder: Path) -> bool:
 def first_bytes(path: Path, count: int) -> bytes:
     """Return the first bytes of a file; empty when it cannot be read."""
     try:
-        with path.open("rb") as file:
+        with _opened(path) as file:
             return file.read(count)
     except OSError:
         return b""
+
+
+def _opened(path: Path) -> BinaryIO:
+    """Open a file to read a few bytes at some places."""
+    return cast(BinaryIO, RangeFile(path)) if isinstance(path, RemotePath) else path.open("rb")
 
 
 def file_fingerprint(path: Path) -> str:
@@ -418,7 +460,7 @@ def file_fingerprint(path: Path) -> str:
     """
     size = path.stat().st_size
     digest = hashlib.sha256(str(size).encode())
-    with path.open("rb") as file:
+    with _opened(path) as file:
         for offset in (0, max(0, size // 2 - 32768), max(0, size - 65536)):
             file.seek(offset)
             digest.update(file.read(65536))
@@ -485,6 +527,8 @@ def unfollowed(root: Path, told: Collection[Path] = ()) -> list[Finding]:
         root: folder of the recordings; a file has no links.
         told: paths that are reported elsewhere.
     """
+    if is_remote(root):  # stores have no links
+        return []
     outside: list[Path] = []
     gone: list[Path] = []
     home = root.resolve()

@@ -7,6 +7,8 @@ import os
 from itertools import islice
 from pathlib import Path
 
+from hma_data.storage.remote import is_remote
+
 LFS = b"version https://git-lfs.github.com/spec/"
 _RECORDED = (".hdf5", ".h5", ".bag", ".mcap", ".db3", ".mp4", ".mkv", ".avi", ".mov", ".webm")
 _DESCRIBED = ("meta/info.json", "features.json", "dataset_info.json", "metadata.yaml")
@@ -47,6 +49,8 @@ def unreadable(path: Path, fault: str, remedy: str) -> tuple[str, str]:
 
     They are those given, unless it is a Git LFS pointer or there is no permission: then that is the reason.
     """
+    if is_remote(path):
+        return fault, remedy
     mode = os.R_OK | os.X_OK if path.is_dir() else os.R_OK
     try:
         path.stat()

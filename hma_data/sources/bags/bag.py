@@ -1,6 +1,8 @@
 """Open a bag: one recording, in one file or in a ROS 2 folder of several files; detect its format."""
 
+import logging
 import os
+import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -8,9 +10,9 @@ from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
-from hma_data.errors import EpisodeError
+from hma_data.errors import EpisodeError, OutputError
 from hma_data.sources.bags.container import (
     ALL,
     MAX_CHUNK,
@@ -27,12 +29,15 @@ from hma_data.sources.bags.mcap import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.mcap import McapFile
 from hma_data.sources.bags.ros_files import SQLITE_MAGIC, Ros1File, SqliteFile
 from hma_data.sources.base import file_fingerprint, first_bytes, leaves
+from hma_data.storage.fetch import mark
+from hma_data.storage.remote import RemotePath, is_remote
 from hma_data.storage.yaml_io import read_yaml
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 MAX_EXPANSION = 200  # most times its packed size that a file may have unpacked, against decompression bombs
 Container = McapFile | Ros1File | SqliteFile
 BagPlace = tuple[int, int, int]  # of a message: the file of the bag, and two numbers for the place in it
+log = logging.getLogger(__name__)
 
 
 class Bag:
@@ -55,14 +60,17 @@ class Bag:
         self._files: list[Container] | None = None
         self._counts: Counter[Channel] | None = None
         root = root or path
-        for item in self._paths:
+        for item in () if is_remote(path) else self._paths:
             if item != root and leaves(item, root if root.is_dir() else root.parent):
                 raise EpisodeError(
                     item, "is a link to a file outside its folder", "copy the file in, or give its own path"
                 )
 
     def files(self) -> list[Container]:
-        """Return its files in recording order; packed files (.zstd) are unpacked to a temporary folder."""
+        """Return its files in recording order.
+
+        Packed files (.zstd) are unpacked to a temporary folder, and remote sqlite3 files are copied there.
+        """
         if self._files is None:
             chunks = ChunkCache()
             self._files = [_container(self._plain(path), chunks) for path in self._paths]
@@ -116,6 +124,9 @@ class Bag:
 
     def state(self) -> tuple[tuple[str, int, int], ...]:
         """Return size and time of change of its files, and of sqlite3's logs; the key for caching it."""
+        if isinstance(self.path, RemotePath):
+            found = {path: path.info() for path in self._paths if isinstance(path, RemotePath)}
+            return tuple((f"{path} {mark(info)}", int(info["size"] or 0), 0) for path, info in found.items())
         logs = (path.with_name(path.name + "-wal") for path in self._paths)
         with reading(self.path):
             stats = {path: path.stat() for path in [*self._paths, *(log for log in logs if log.is_file())]}
@@ -132,22 +143,19 @@ class Bag:
         return unpacked
 
     def _plain(self, path: Path) -> Path:
-        if path.suffix != ".zstd":
+        """Return the path, or that of the temporary file where it cannot be read in its place."""
+        packed = path.suffix == ".zstd"
+        if not packed and not (is_remote(path) and path.suffix == ".db3"):
             return path
-        import zstandard
-
         if self._unpacked is None:
             self._unpacked = tempfile.TemporaryDirectory(prefix="hma-bag-")
-        target = Path(self._unpacked.name) / path.stem
-        limit = path.stat().st_size * MAX_EXPANSION
-        with reading(path), path.open("rb") as packed, target.open("wb") as plain:
-            try:
-                for piece in zstandard.ZstdDecompressor().read_to_iter(packed):
-                    plain.write(piece)
-                    if plain.tell() > limit:
-                        raise ValueError(f"it unpacks to more than {MAX_EXPANSION} times its size")
-            except zstandard.ZstdError as fault:
-                raise ValueError(str(fault)) from fault
+        target = Path(self._unpacked.name) / (path.stem if packed else path.name)
+        with reading(path), path.open("rb") as file, target.open("wb") as plain:
+            if packed:
+                _unpack_file(file, plain, path.stat().st_size * MAX_EXPANSION)
+            else:
+                _require_space(path, target.parent)
+                shutil.copyfileobj(file, plain, 8 << 20)
         return target
 
     def _stated_counts(self) -> Counter[Channel]:
@@ -160,6 +168,27 @@ class Bag:
         return total
 
 
+def _unpack_file(packed: BinaryIO, plain: BinaryIO, limit: int) -> None:
+    import zstandard
+
+    try:
+        for piece in zstandard.ZstdDecompressor().read_to_iter(packed):
+            plain.write(piece)
+            if plain.tell() > limit:
+                raise ValueError(f"it unpacks to more than {MAX_EXPANSION} times its size")
+    except zstandard.ZstdError as fault:
+        raise ValueError(str(fault)) from fault
+
+
+def _require_space(path: Path, folder: Path) -> None:
+    """Raise OutputError where a folder has no space for the copy of a file."""
+    size, free = path.stat().st_size, shutil.disk_usage(folder).free
+    log.info("%s: sqlite3 needs a file of this machine; %s bytes are copied to %s", path, f"{size:,}", folder)
+    if size > free:
+        fault = f"must be copied here to be read: it has {size:,} bytes, and {folder} has {free:,} free"
+        raise OutputError(path, fault, "set TMPDIR to a larger disk, or write it as MCAP (ros2 bag convert)")
+
+
 def find_bags(root: Path) -> dict[str, Path]:
     """Return episode id -> bag at or under a path, in order of the ids.
 
@@ -169,19 +198,35 @@ def find_bags(root: Path) -> dict[str, Path]:
     if root.is_file() or is_bag_folder(root):
         return {root.stem if root.is_file() else root.name: root}
     found: dict[Path, str] = {}  # bag -> its id
-    for folder, folders, names in os.walk(root):
-        here = Path(folder)
-        if here != root and is_bag_folder(here):
-            found[here] = here.relative_to(root).as_posix()
-            folders.clear()
-            continue
-        bags = (here / name for name in names if _is_bag_file(here / name))
-        found |= {path: path.relative_to(root).with_suffix("").as_posix() for path in bags}
+    for path, is_folder in (_remote_bags if isinstance(root, RemotePath) else _local_bags)(root):
+        name = path.relative_to(root)
+        found[path] = (name if is_folder else name.with_suffix("")).as_posix()
     counts = Counter(found.values())
     named = {
         name if counts[name] == 1 else path.relative_to(root).as_posix(): path for path, name in found.items()
     }
     return dict(sorted(named.items()))
+
+
+def _local_bags(root: Path) -> Iterator[tuple[Path, bool]]:
+    """Yield each bag under a folder, and whether it is a folder itself."""
+    for folder, folders, names in os.walk(root):
+        here = Path(folder)
+        if here != root and is_bag_folder(here):
+            folders.clear()
+            yield here, True
+            continue
+        yield from ((here / name, False) for name in names if _is_bag_file(here / name))
+
+
+def _remote_bags(root: Path) -> Iterator[tuple[Path, bool]]:
+    """Yield the same of a store, where bag files are known by their names alone."""
+    files = [path for path in root.rglob("*") if path.name.endswith((*SUFFIXES, "metadata.yaml"))]
+    folders = {path.parent for path in files if path.name == "metadata.yaml" and is_bag_folder(path.parent)}
+    yield from ((folder, True) for folder in sorted(folders))
+    for path in files:
+        if path.suffix in SUFFIXES and folders.isdisjoint(path.parents):
+            yield path, False
 
 
 def is_bag_folder(path: Path) -> bool:

@@ -9,30 +9,35 @@ receipt are known, so a time range is read without the rest. A file has some tho
 """
 
 import bz2
+import logging
 import sqlite3
 import struct
 from abc import ABC, abstractmethod
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from mcap.exceptions import McapError
 
 from hma_data.errors import EpisodeError
+from hma_data.storage.blocks import BlockFile, LargeFile, expect
 from hma_data.storage.kinds import unreadable
+from hma_data.storage.remote import is_remote
 
 CACHED_BYTES = 64 << 20  # of unpacked chunks that a bag keeps
 MAX_CHUNK = 512 << 20  # most bytes of an unpacked chunk, against decompression bombs and errors
 FOREVER = 2**64
+KEPT_FROM = 2048  # bytes of a message of a remote file that is kept in memory for `payloads`
 HEAD = 64  # bytes: the stamp of a message is within them
 FAULTS = (
     struct.error, ValueError, LookupError, OverflowError, RecursionError, EOFError, OSError, RuntimeError,
     MemoryError, sqlite3.Error, McapError,
 )  # fmt: skip
 
+log = logging.getLogger(__name__)
 Data = bytes | memoryview
 FilePlace = tuple[int, int]
 
@@ -72,12 +77,14 @@ class RecordFilter:
         topics: None for all.
         first_ns, last_ns: range of the time of receipt, both ends included.
         heads: topics for which the first HEAD bytes of a message are enough; more may be returned.
+        again: whether `payloads` of these messages will be asked for.
     """
 
     topics: frozenset[str] | None = None
     first_ns: int = 0
     last_ns: int = FOREVER
     heads: frozenset[str] = frozenset()
+    again: bool = False
 
     def topic(self, name: str) -> bool:
         """Check whether messages of that topic are asked for."""
@@ -105,6 +112,18 @@ def damaged(path: Path, fault: str) -> EpisodeError:
     """Return the error of a file that cannot be read to its end."""
     remedy = "copy it again, or repair it (rosbag reindex, ros2 bag reindex, mcap recover)"
     return EpisodeError(path, *unreadable(path, fault, remedy))
+
+
+def without_index(path: Path, file: BinaryIO, size: int) -> None:
+    """State that a file will be read to its end because it has no index."""
+    expect(file, [(0, size)])
+    if is_remote(path):
+        log.warning(
+            "%s: has no index, so all of its %s bytes are read to find its messages — "
+            "write one (mcap recover, rosbag reindex), or copy the file here",
+            path,
+            f"{size:,}",
+        )
 
 
 class Piece(NamedTuple):
@@ -160,21 +179,36 @@ class IndexedFile(ABC):
     def __init__(self, path: Path, chunks: "ChunkCache | None" = None) -> None:
         self.path = path
         self._chunks = chunks or ChunkCache()
+        self._file = LargeFile(path)
         self._indexed: FileIndex | None = None
 
     def records(self, wanted: RecordFilter) -> Iterator[Record]:
         """Yield the wanted messages, in the file's order; pieces without one are not read."""
-        with reading(self.path), self.path.open("rb") as file:
+        with reading(self.path), self._file.open() as file:
             index = self._index(file)
-            for piece in index.pieces:
-                within = piece.first_ns <= wanted.last_ns and piece.last_ns >= wanted.first_ns
-                if within and piece.holds(wanted.topics):
+            pieces = [
+                piece
+                for piece in index.pieces
+                if piece.first_ns <= wanted.last_ns
+                and piece.last_ns >= wanted.first_ns
+                and piece.holds(wanted.topics)
+            ]
+            expect(file, ((piece.at, piece.end) for piece in pieces))
+            if not wanted.again or not isinstance(file, BlockFile):
+                for piece in pieces:
                     yield from self._in_piece(file, index, piece, wanted)
+                return
+            whole = replace(wanted, heads=frozenset())
+            for piece in pieces:
+                for record in self._in_piece(file, index, piece, whole):
+                    if len(record.data) >= KEPT_FROM:  # so that pictures are not fetched again
+                        file.blocks.keep(record.place, bytes(record.data))
+                    yield record
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
         """Return each topic's last message before a time; topics without one are left out."""
         found: dict[str, Record] = {}
-        with reading(self.path), self.path.open("rb") as file:
+        with reading(self.path), self._file.open() as file:
             index = self._index(file)
             earlier = (piece for piece in index.pieces if piece.first_ns < log_ns and piece.holds(topics))
             for piece in sorted(earlier, key=lambda piece: piece.last_ns, reverse=True):
@@ -198,9 +232,13 @@ class IndexedFile(ABC):
 
     def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
         """Yield the data of the messages at those places."""
-        with reading(self.path), self.path.open("rb") as file:
+        with reading(self.path), self._file.open() as file:
             last = -1
             for offset, at in places:
+                kept = file.blocks.kept((offset, at)) if isinstance(file, BlockFile) else None
+                if kept is not None:
+                    yield kept
+                    continue
                 if offset != last:
                     last, view = offset, self._view(file, offset)
                 start, end = self._content(view, at)

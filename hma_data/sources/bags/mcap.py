@@ -5,14 +5,15 @@ its readers take a short read for a whole record, fail on files whose summary do
 and give no places for random access.
 
 Chunks that are not packed need not be read whole: their records are walked in the file itself. Counts come
-from the file's summary. The index comes from the heads of the chunks and the message indexes behind them,
-which also works where the summary leaves the index out.
+from the file's summary. So does the index; the chunks that the summary leaves out are found by a walk over
+the file, and described by their heads and the message indexes behind them.
 """
 
 import struct
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -39,11 +40,13 @@ from hma_data.sources.bags.container import (
     decompress,
     read_exact,
     reading,
+    without_index,
 )
+from hma_data.storage.blocks import expect
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
-STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
+CHUNK_INDEX, STATISTICS, METADATA, DATA_END = 0x08, 0x0B, 0x0C, 0x0F
 FRAME = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 CHUNK_HEAD = struct.Struct("<QQQII")  # first and last time, unpacked size, checksum, length of the codec
@@ -83,6 +86,19 @@ class _Part:
     chunk: bool
 
 
+@dataclass
+class _Summary:
+    """The summary at the end of a file.
+
+    Attributes:
+        counts: messages by channel number; None where it does not state all of them.
+        chunks: offset of a chunk -> what is in it, and the offset after it and its message indexes.
+    """
+
+    counts: dict[int, int] | None = None
+    chunks: dict[int, tuple[_Part, int]] = field(default_factory=dict)
+
+
 class McapFile(IndexedFile):
     """An MCAP file."""
 
@@ -93,9 +109,9 @@ class McapFile(IndexedFile):
 
     def counts(self) -> Counter[Channel]:
         """See IndexedFile."""
-        with reading(self.path), self.path.open("rb") as file:
+        with reading(self.path), self._file.open() as file:
             index = FileIndex()
-            counted = self._summary(file, self._data_end(file), index)
+            counted = self._summary(file, self._data_end(file), index).counts
             if counted is not None and counted.keys() <= index.channels.keys():
                 total: Counter[Channel] = Counter()
                 for number, channel in index.channels.items():
@@ -105,7 +121,7 @@ class McapFile(IndexedFile):
 
     def notes(self) -> dict[str, str]:
         """Return all entries of the file's metadata records (opcode 0x0C); later ones win."""
-        with reading(self.path), self.path.open("rb") as file:
+        with reading(self.path), self._file.open() as file:
             return self._index(file).notes
 
     def _content(self, view: View, at: int) -> tuple[int, int]:
@@ -177,50 +193,60 @@ class McapFile(IndexedFile):
             raise damaged(self.path, "is cut off: it does not end with MCAP's magic bytes")
         return end
 
-    def _summary(self, file: BinaryIO, end: int, index: FileIndex) -> dict[int, int] | None:
-        """Learn the schemas and channels in the summary; return the messages by channel number.
-
-        None where the summary does not state all of them.
-        """
-        view = FileView(file, 0, end + FOOTER_SIZE)
+    def _summary(self, file: BinaryIO, end: int, index: FileIndex) -> _Summary:
+        """Return the summary; learn the schemas and channels in it."""
+        view, found = FileView(file, 0, end + FOOTER_SIZE), _Summary()
         opcode, at, stop = _record(view, end)
         if opcode != FOOTER:
             raise ValueError("there is no footer at the end")
-        start, counted = records.Footer.read(_stream(view[at:stop])).summary_start, None
+        start, complete = records.Footer.read(_stream(view[at:stop])).summary_start, True
+        expect(file, [(start, end)] if start else ())
         for opcode, _, at, stop in _records(view, start, end) if start else ():
             if opcode in (SCHEMA, CHANNEL):
                 try:
                     self._learn(index, opcode, bytes(view[at:stop]))
                 except ValueError:  # the summary need not repeat schemas; the chunks hold the missing ones
-                    return None
+                    complete = False
             elif opcode == STATISTICS:
                 stated = records.Statistics.read(_stream(view[at:stop]))
                 counts: dict[int, int] = stated.channel_message_counts
-                counted = counts if sum(counts.values()) == stated.message_count else None
-        return counted
+                found.counts = counts if sum(counts.values()) == stated.message_count else None
+            elif opcode == CHUNK_INDEX:
+                part, after = _indexed_chunk(view[at:stop])
+                found.chunks[part.at] = (part, after)
+        found.counts = found.counts if complete else None
+        return found
 
     def _make_index(self, file: BinaryIO) -> FileIndex:
-        """Walk once over the file's records; unpack chunks only where no index states what they hold."""
+        """Walk over the file's records, past the chunks that the summary describes."""
         index, parts = FileIndex(), list[_Part]()
         end = self._data_end(file)
-        view = FileView(file, 0, end)
-        for opcode, at, start, stop in _records(view, len(MAGIC), end):
+        stated = self._summary(file, end, index).chunks
+        if not stated:
+            without_index(self.path, file, end)
+        view, at = FileView(file, 0, end), len(MAGIC)
+        while at < end:
+            if at in stated:
+                part, at = stated[at]
+                parts.append(part)
+                continue
+            place = at
+            opcode, start, at = _record(view, place)
             if opcode in (DATA_END, FOOTER):
                 break
             if opcode in (SCHEMA, CHANNEL):
-                self._learn(index, opcode, view[start:stop])
+                self._learn(index, opcode, view[start:at])
             elif opcode == METADATA:
-                index.notes |= records.Metadata.read(_stream(view[start:stop])).metadata
+                index.notes |= records.Metadata.read(_stream(view[start:at])).metadata
             elif opcode == CHUNK:
-                head = _chunk_head(file, start, stop)
-                parts.append(_Part(at, stop, head.first_ns, head.last_ns, set(), True))
+                head = _chunk_head(file, start, at)
+                parts.append(_Part(place, at, head.first_ns, head.last_ns, set(), True))
             elif opcode == MESSAGE_INDEX and parts and parts[-1].chunk:
                 number, size = INDEX_HEAD.unpack(view[start : start + INDEX_HEAD.size])
                 parts[-1].channels |= {number} if size else set()
             elif opcode == MESSAGE:
                 number, _, log_ns, _ = MESSAGE_HEAD.unpack(view[start : start + MESSAGE_HEAD.size])
-                _add_loose(parts, at, stop, number, log_ns)
-        self._summary(file, end, index)
+                _add_loose(parts, place, at, number, log_ns)
         for part in parts:
             index.pieces.append(self._piece(file, index, part))
         return index
@@ -239,6 +265,22 @@ class McapFile(IndexedFile):
             last_ns=max(times, default=-1),
             topics=frozenset(topic for _, topic in held),
         )
+
+
+def _indexed_chunk(data: bytes) -> tuple[_Part, int]:
+    """Return the chunk that a record of the summary describes, and the offset after its message indexes."""
+    found = records.ChunkIndex.read(_stream(data))
+    at, end = found.chunk_start_offset, found.chunk_start_offset + found.chunk_length
+    after = end + found.message_index_length
+    bounds = sorted((*found.message_index_offsets.values(), after))
+    empty = FRAME.size + INDEX_HEAD.size  # bytes of a message index without entries
+    channels = {
+        number
+        for number, offset in found.message_index_offsets.items()
+        if offset < after and bounds[bisect_right(bounds, offset)] - offset > empty
+    }
+    part = _Part(at, end, found.message_start_time, found.message_end_time, channels, True)
+    return part, max(after, at + FRAME.size)
 
 
 def _stream(data: bytes) -> Any:

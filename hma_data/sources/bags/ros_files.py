@@ -34,7 +34,9 @@ from hma_data.sources.bags.container import (
     decompress,
     reading,
     take_last,
+    without_index,
 )
+from hma_data.storage.blocks import expect
 
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x05, 0x06, 0x07
@@ -50,7 +52,7 @@ class Ros1File(IndexedFile):
 
     def counts(self) -> Counter[Channel]:
         """See IndexedFile."""
-        with reading(self.path), self.path.open("rb") as file:
+        with reading(self.path), self._file.open() as file:
             return self._index(file).counts.copy()
 
     def _content(self, view: View, at: int) -> tuple[int, int]:
@@ -86,13 +88,14 @@ class Ros1File(IndexedFile):
     def _index_of_chunks(self, file: BinaryIO) -> FileIndex:
         """Index a bag whose recorder was killed; every chunk is unpacked for it."""
         index, at, view = FileIndex(), len(ROS1_MAGIC), _whole(file)
+        without_index(self.path, file, len(view))
         while at < len(view):
             header, start, end = _record(view, at)
             kind = _number(header, "op")
             if kind == CONNECTION:
                 _learn(index, header, view[start:end])
             elif kind == CHUNK:
-                piece = Piece(at, at, FOREVER, -1, frozenset())
+                piece = Piece(at, end, FOREVER, -1, frozenset())
                 counts: Counter[Channel] = Counter()
                 for record in self._in_piece(file, index, piece, ALL):
                     first_ns, last_ns = min(piece.first_ns, record.log_ns), max(piece.last_ns, record.log_ns)
@@ -177,6 +180,8 @@ def _add(index: FileIndex, piece: Piece, counts: Counter[Channel]) -> None:
 def _stated_index(file: BinaryIO, at: int, count: int) -> FileIndex:
     """Return the index that lies at the file's end as `count` records."""
     index, chunks, view = FileIndex(), list[tuple[Header, bytes]](), _whole(file)
+    index_at = at
+    expect(file, [(at, len(view))])
     for _ in range(count):
         header, start, at = _record(view, at)
         kind = _number(header, "op")
@@ -187,13 +192,15 @@ def _stated_index(file: BinaryIO, at: int, count: int) -> FileIndex:
         else:
             raise ValueError(f"the index holds a record of kind {kind}")
     index.counts.update(dict.fromkeys(index.channels.values(), 0))
-    for header, content in sorted(chunks, key=lambda chunk: _number(chunk[0], "chunk_pos")):
+    chunks.sort(key=lambda chunk: _number(chunk[0], "chunk_pos"))
+    ends = [_number(header, "chunk_pos") for header, _ in chunks[1:]] + [index_at]
+    for (header, content), end in zip(chunks, ends, strict=False):  # without chunks, there is one end
         counts: Counter[Channel] = Counter()
         for number, messages in COUNTS.iter_unpack(content):
             counts[index.channel(number)] += messages
         start = _number(header, "chunk_pos")
         first_ns, last_ns = _time(header, "start_time"), _time(header, "end_time")
-        _add(index, Piece(start, start, first_ns, last_ns, frozenset()), counts)
+        _add(index, Piece(start, end, first_ns, last_ns, frozenset()), counts)
     return index
 
 

@@ -2,16 +2,19 @@
 
 One pass over the primary camera's stamps and the markers' topics makes a table. The last bags and their
 tables are cached for the other episodes of the same bag, while no file changes; an episode is then read by
-its own time range. F pictures of the primary camera in order of receipt; an episode is a run of them.
+its own time range. Tables of remote bags are also kept in this machine's cache folder. F pictures of the
+primary camera in order of receipt; an episode is a run of them.
 
 A marker is a message that begins or ends an episode: `source.segments.start` and `stop`. It counts when it
 arrives, or when a field of it becomes a value.
 """
 
+import hashlib
+import json
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, astuple, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -28,12 +31,15 @@ from hma_data.sources.bags.container import Channel, Record, RecordFilter
 from hma_data.sources.bags.images import VIDEO, picture_kind
 from hma_data.sources.bags.messages import decode, head_stamp
 from hma_data.sources.bags.topic_track import TopicTrack, missing_topic, parse_key
+from hma_data.storage.files import cache_folder, write_atomic
+from hma_data.storage.remote import is_remote
 
 SECOND_NS = 10**9
 SHOWN = 8  # values of a marker in an error
 MAX_DELAY_S = 10.0  # header stamps further from receipt than this come from another clock
 KEPT_BAGS = 2
 KEPT_TABLES = 512
+TABLE = 1  # version of what is kept of a table
 Rows = NDArray[np.int64]
 
 
@@ -98,7 +104,30 @@ def parted(path: Path, root: Path, embodiment: Embodiment, segments: Segments) -
     bag = _cached(_bags.setdefault(os.getpid(), {}), (path, root, state), lambda: opened, KEPT_BAGS)
     cameras = tuple((camera.key, camera.stamp) for camera in embodiment.cameras)
     key = (path, state, segments, cameras, embodiment.primary_camera.name, embodiment.sync.stamp)
-    return bag, _cached(_tables, key, lambda: part(bag, embodiment, segments), KEPT_TABLES)
+
+    def make() -> Table:
+        return part(bag, embodiment, segments)
+
+    return bag, _cached(_tables, key, lambda: _stored(key, make) if is_remote(path) else make(), KEPT_TABLES)
+
+
+def _stored(key: Any, make: Callable[[], Table]) -> Table:
+    """Return the table of a remote bag from this machine's cache, so that its workers read the bag once."""
+    kept = cache_folder() / "bags" / f"{hashlib.sha256(repr((TABLE, key)).encode()).hexdigest()[:32]}.json"
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        values = json.loads(kept.read_bytes())
+        segments = tuple(Segment(*values) for values in values.pop("segments"))
+        keyframes = {name: np.array(ns, np.int64) for name, ns in values.pop("keyframes").items()}
+        return Table(segments=segments, keyframes=keyframes, **values)
+    table = make()
+    values = asdict(table) | {
+        "segments": [astuple(segment) for segment in table.segments],
+        "keyframes": {name: ns.tolist() for name, ns in table.keyframes.items()},
+    }
+    with suppress(OSError):
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(kept, json.dumps(values))
+    return table
 
 
 def _cached[V](cache: dict[Any, V], key: Any, make: Callable[[], V], limit: int) -> V:

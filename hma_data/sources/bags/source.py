@@ -25,7 +25,14 @@ from hma_data.sources.bags.inspect import report
 from hma_data.sources.bags.messages import decode
 from hma_data.sources.bags.segments import Rows, Table, heads, parted
 from hma_data.sources.bags.topic_track import Column, TopicTrack, camera_stream, missing_topic, parse_key
-from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values, local_path, nothing_there
+from hma_data.sources.base import (
+    SAMPLE,
+    EpisodeRef,
+    Inspection,
+    component_values,
+    existing_path,
+    nothing_there,
+)
 from hma_data.storage.paths import StrPath, as_text
 
 PART = re.compile(r"(?P<bag>.+)/(?P<number>[0-9]{4,9})")
@@ -42,7 +49,7 @@ class RosbagSource:
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""
         uri = as_text(uri)
-        return report(uri, local_path(uri), _bags(uri), episodes)
+        return report(uri, existing_path(uri), _bags(uri), episodes)
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """See Source. A bag that cannot be read has no frames here; `read` raises its error.
@@ -50,7 +57,7 @@ class RosbagSource:
         Where the embodiment divides bags, the episodes of the bag `run` are `run/0000`, `run/0001` …
         """
         uri = as_text(uri)
-        root = local_path(uri)
+        root = existing_path(uri)
         return [ref for name, path in _bags(uri).items() for ref in _refs(name, path, root, embodiment)]
 
     def episode_ids(self, uri: StrPath) -> list[str]:
@@ -65,7 +72,7 @@ class RosbagSource:
             EpisodeError: the bag is damaged, holds no episode, or lacks what the embodiment names.
         """
         uri = as_text(uri)
-        bags, root, segments = _bags(uri), local_path(uri), embodiment.source.segments
+        bags, root, segments = _bags(uri), existing_path(uri), embodiment.source.segments
         if episode_id in bags:
             path = bags[episode_id]
             bag = parted(path, root, embodiment, segments)[0] if segments else Bag(path, root)
@@ -82,7 +89,7 @@ class RosbagSource:
 
 
 def _bags(uri: str) -> dict[str, Path]:
-    path = local_path(uri)
+    path = existing_path(uri)
     if path.is_file() and path.name == "metadata.yaml":
         raise SourceError(uri, "only describes a bag", f"give the bag's folder, {path.parent}")
     bags = find_bags(path)
@@ -223,17 +230,18 @@ class _EpisodeReading:
         """Yield the messages of the bag; of an episode in it, those of its time and those still in force."""
         segment, table = self._segment, self._table
         if segment is None or table is None:
-            return self._bag.records(RecordFilter(topics, heads=short))
+            return self._bag.records(RecordFilter(topics, heads=short, again=True))
         first_ns, last_ns = max(segment.first_ns - table.reach_ns, 0), segment.last_ns + table.reach_ns
         plain = topics - table.keyframes.keys()
         held = plain - {self._embodiment.primary_camera.key}
-        within = RecordFilter(plain, first_ns, last_ns, short)
+        within = RecordFilter(plain, first_ns, last_ns, short, again=True)
         parts = [iter(self._bag.before(held, first_ns)), self._bag.records(within)]
         for topic in sorted(topics & table.keyframes.keys()):
             keyframes = table.keyframes[topic]
             at = int(np.searchsorted(keyframes, first_ns, side="right")) - 1
             begin = int(keyframes[at]) if at >= 0 else 0
-            parts.append(self._bag.records(RecordFilter(frozenset({topic}), begin, last_ns)))
+            wanted = RecordFilter(frozenset({topic}), begin, last_ns, again=True)
+            parts.append(self._bag.records(wanted))
         return chain.from_iterable(parts)
 
     # -- results

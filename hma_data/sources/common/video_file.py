@@ -162,15 +162,17 @@ class VideoFile:
             raise IndexError(
                 f"{self.path} has {len(self)} frames, asked for {wanted.min()} to {wanted.max()}"
             )
-        pictures: dict[int, Images] = {}
+        unique, places = np.unique(wanted, return_inverse=True)
+        found: Images = np.zeros((0, self.table.height, self.table.width, 3), np.uint8)
         with _explained(str(self.path)):
-            for index in np.unique(wanted):
-                pictures[int(index)] = self._picture(int(index))
-        if len({picture.shape for picture in pictures.values()}) > 1:
-            raise EpisodeError(self.path, "its pictures change size")
-        if not pictures:
-            return np.zeros((0, self.table.height, self.table.width, 3), np.uint8)
-        return np.stack([pictures[int(index)] for index in wanted])
+            for place, index in enumerate(unique.tolist()):
+                picture = self._picture(index)
+                if not place:
+                    found = np.empty((len(unique), *picture.shape), np.uint8)
+                if picture.shape != found.shape[1:]:
+                    raise EpisodeError(self.path, "its pictures change size")
+                found[place] = picture
+        return found if np.array_equal(places, np.arange(len(found))) else found[places]
 
     def close(self) -> None:
         """Close the file; the next `frames` opens it again."""
@@ -268,9 +270,12 @@ class VideoFile:
         raise EpisodeError(self.path, f"gives a frame at {frame.pts} ticks, which no packet states")
 
     def _to_rgb(self, frame: Any) -> Images:
-        picture: Images = self._reformatter.reformat(frame, format="rgb24").to_ndarray()
+        """Return a frame's picture (H, W, 3)."""
+        rgb = self._reformatter.reformat(frame, format="rgb24")
+        plane = rgb.planes[0]  # its bytes are copied once, into the array that `frames` returns
+        lines = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: rgb.height, : rgb.width * 3]
         quarters = round(frame.rotation / 90) % 4  # phones state here that they were held upright
-        return np.ascontiguousarray(np.rot90(picture, quarters)) if quarters else picture
+        return np.rot90(lines.reshape(rgb.height, rgb.width, 3), quarters)
 
 
 def is_spoilt(frame: Any, before: bool) -> bool:

@@ -4,6 +4,8 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -28,7 +30,9 @@ from hma_data.sources.hdf5.file import (
     walk,
 )
 from hma_data.sources.hdf5.source import TEXT_KEYS, as_rgb, encoded, json_of, picture_kind
+from hma_data.sources.hdf5.videos import SUFFIXES
 
+MAX_LISTED = 1_000  # files beside an HDF5 file among which videos are looked for
 LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
 _BESIDE = ("compress_len",)  # not rows over time: the bytes of ALOHA's JPEGs, (cameras, T)
@@ -110,7 +114,15 @@ def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: EpisodeGrou
     first.robots = said.get("robots")
     first.keys = {info.key: info for info in _keys(group, place)}
     first.facts = _facts(group, said, place)
+    first.facts["videos beside it"] = _videos(place.file)
     first.rate, first.facts["rate"], first.facts["timestamps"] = _rate(group, said, first.keys, str(place))
+
+
+def _videos(file: Path) -> str:
+    """Return the video files below the file's folder, as a camera's key would name them."""
+    inside = islice(file.parent.rglob("*"), MAX_LISTED)
+    found = [item.relative_to(file.parent).as_posix() for item in inside if item.suffix.lower() in SUFFIXES]
+    return listed(sorted(found))
 
 
 def _environment(handle: h5py.File) -> dict[str, Any]:

@@ -14,7 +14,8 @@ last action.
 
 Pictures are raw arrays of several shapes and number types, or one JPEG or PNG a row. Colour pictures of 8
 bits are read as they are, with their axes found from the shape. Other arrays are read as pictures only where
-`source.layout` says what their numbers mean: `layout: {axes: TCHW, pixels: 0-1}`.
+`source.layout` says what their numbers mean: `layout: {axes: TCHW, pixels: 0-1}`. Pictures may also be the
+frames of a video file beside the HDF5 file; see `videos`.
 
 T frames of an episode, n of them asked for, H×W pixels, C channels.
 """
@@ -50,6 +51,8 @@ from hma_data.sources.hdf5.file import (
     text,
     walk,
 )
+from hma_data.sources.hdf5.videos import SUFFIXES as VIDEO_SUFFIXES
+from hma_data.sources.hdf5.videos import VideoRows, is_video, video_fingerprints, video_path
 from hma_data.storage.paths import StrPath, as_text
 
 TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
@@ -97,11 +100,13 @@ class Hdf5Source:
         Raises:
             SourceError: nothing is there, the only file is damaged, or no mask has the name `source.split`.
         """
+        layout = layout_of(embodiment)
         uri, chosen = as_text(uri), embodiment.source.split if embodiment else None
         refs: list[EpisodeRef] = []
         known: set[str] = set()
-        for file, places in self._finder.by_file(uri, layout_of(embodiment).episodes):
+        for file, places in self._finder.by_file(uri, layout.episodes):
             fingerprint = file_fingerprint(file)
+            films = video_fingerprints(file, embodiment.cameras, layout) if embodiment else ""
             whole = any(place.group == WHOLE_FILE for place in places.values())
             masks = {} if whole else self._masks(file)
             known |= set(masks)
@@ -110,7 +115,7 @@ class Hdf5Source:
                 if chosen and name not in masks.get(chosen, ()):
                     continue
                 split = None if chosen else _split_of(name, masks)
-                digest = hashlib.sha256(f"{fingerprint} {place.group}".encode()).hexdigest()[:16]
+                digest = hashlib.sha256(f"{fingerprint}{films} {place.group}".encode()).hexdigest()[:16]
                 refs.append(EpisodeRef(episode_id, self._length(place, embodiment), split, digest))
         if chosen and chosen not in known:
             said = ", ".join(sorted(known)) or "none"
@@ -133,22 +138,27 @@ class Hdf5Source:
             check = partial(_check_length, layout, where, len(actions))
             times = _times(group, embodiment, layout, len(actions), where)
             check(layout.timestamps or "", len(times))
-            times = times[: len(actions)]
-            states: tuple[Signal, ...] = ()
+            observed: NDArray[np.float32] | None = None
             if embodiment.state:
-                values = _vector(group, embodiment.state, where)
-                check(embodiment.state.components[0].key, len(values))
-                states = (Signal(times, values[: len(actions)]),)
-            streams: dict[str, Stream] = {}
+                observed = _vector(group, embodiment.state, where)
+                check(embodiment.state.components[0].key, len(observed))
+            cameras: dict[str, PictureRows | VideoRows] = {}
             for camera in embodiment.cameras:
-                pictures = self._pictures(place, group, camera.key, layout, times)
-                check(camera.key, pictures.rows)
-                streams[camera.name] = pictures
+                if is_video(camera):
+                    cameras[camera.name] = VideoRows(video_path(place.file, camera, layout), times)
+                else:
+                    cameras[camera.name] = self._pictures(place, group, camera.key, layout, times)
+                check(camera.key, cameras[camera.name].rows, layout.frames_missing * is_video(camera))
+            length = min(len(actions), *(pictures.rows for pictures in cameras.values()))
+            times = times[:length]
+            for pictures in cameras.values():
+                pictures.timestamps = times
+            streams: dict[str, Stream] = dict(cameras)
             return Episode(
                 id=episode_id,
                 streams=streams,
-                actions=(Signal(times, actions),),
-                states=states,
+                actions=(Signal(times, actions[:length]),),
+                states=() if observed is None else (Signal(times, observed[:length]),),
                 instruction=_instruction(group, embodiment.source.instruction, where),
                 success=_success(group),
                 source=where,
@@ -199,13 +209,26 @@ def _split_of(demo: str, masks: dict[str, set[str]]) -> str | None:
     return next((ours for mask, ours in _SPLITS.items() if demo in masks.get(mask, ())), None)
 
 
-def _check_length(layout: Hdf5Layout, where: str, actions: int, key: str, length: int) -> None:
-    """Raise an EpisodeError where a series is not as long as the actions, or one row longer to be dropped."""
+def _check_length(
+    layout: Hdf5Layout, where: str, actions: int, key: str, length: int, missing: int = 0
+) -> None:
+    """Raise an EpisodeError where a series is not as long as the actions, or one row longer to be dropped.
+
+    Args:
+        missing: rows by which the series may be shorter.
+    """
     one_more = length == actions + 1
-    if length != actions and not (one_more and layout.last_observation == "drop"):
-        remedy = "if the last was observed after the last action, set source.layout.last_observation: drop"
-        fault = f"its series differ in length: actions {actions}, {key} {length}"
-        raise EpisodeError(where, fault, remedy if one_more else "")
+    if one_more and layout.last_observation == "drop":
+        return
+    if not max(1, actions - missing) <= length <= actions:
+        remedy = ""
+        if one_more:
+            remedy = (
+                "if the last was observed after the last action, set source.layout.last_observation: drop"
+            )
+        elif key.lower().endswith(VIDEO_SUFFIXES) and length < actions:
+            remedy = "if the video was stopped first, set source.layout.frames_missing to how many may lack"
+        raise EpisodeError(where, f"its series differ in length: actions {actions}, {key} {length}", remedy)
 
 
 def _times(group: h5py.Group, embodiment: Embodiment, layout: Hdf5Layout, length: int, where: str) -> Floats:

@@ -11,6 +11,8 @@ T frames of an episode.
 """
 
 import hashlib
+import os
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -31,7 +33,7 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Camera, Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
-from hma_data.sources.common.video_file import VideoFile
+from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.sources.lerobot.metadata import Folder, Metadata, Span, episode_name, parquet_explained
 from hma_data.storage.paths import StrPath, as_text
 
@@ -40,6 +42,7 @@ TIME_TOLERANCE = 0.25  # of a frame's period, between the time of a row and the 
 PAIRING = "source: {layout: {pairing: index}}"
 MAX_BYTES = 1 << 30  # of one column of a row group, as stored
 MAX_VALUES = 1 << 26  # of such a column: a run of equal values may be stored as one value
+_held = threading.local()  # key of a camera -> its open video: version 3 has hundreds of episodes in a file
 _SAMPLE = 4096  # bytes at each end of a video that its fingerprint covers
 
 
@@ -360,8 +363,17 @@ def _stream(meta: Metadata, index: int, camera: Camera, rows: Rows, times: Float
     if meta.features[camera.key].dtype == "image":
         return StillPictures(rows, camera.key, times, meta.folder)
     span = meta.video(index, camera.key)
-    file = VideoFile(meta.folder.path(span.path))
+    file = _open_video(meta.folder.path(span.path), camera.key)
     return _Video(file, times, frames_of_rows(file, span, times, meta.fps, by_index))
+
+
+def _open_video(path: Path, key: str) -> VideoFile:
+    """Return a camera's video; the one that this thread has open, where the episode before was in it too."""
+    held = vars(_held).setdefault(str(os.getpid()), {})
+    if key not in held or held[key].path != path or held[key].table is not frame_table(path):
+        held[key] = VideoFile(path)
+    file: VideoFile = held[key]
+    return file
 
 
 def frames_of_rows(

@@ -5,6 +5,7 @@ an episode is found without opening the other shards. Shards that it does not li
 counted. Paths are of an fsspec file system, which is local unless the URI names another.
 """
 
+import math
 import os
 import re
 from bisect import bisect_right
@@ -23,6 +24,7 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.base import local_path
 from hma_data.sources.rlds.features import Feature, read_features
 from hma_data.sources.rlds.records import Example, Framing, RecordFile, open_records
+from hma_data.storage.blocks import Blocks
 from hma_data.storage.fetch import attempt, fetch_whole, file_system, is_listless, is_local
 
 LONGEST_JSON = 64 << 20  # most bytes of a description; more is an error
@@ -131,6 +133,37 @@ class Folder:
         Raises:
             EpisodeError: there is no such episode, or its bytes are damaged or missing.
         """
+        shard, position = self._place(episode_id)
+        return Example(shard.records.read(position, episode_id), episode_id), shard.path
+
+    def expect(self, episode_ids: Iterable[str]) -> None:
+        """State which episodes will be read next, in that order; remote shards are then fetched ahead.
+
+        Where an episode lies in its shard is estimated from its number. A shard of which less than half is
+        wanted is not fetched ahead.
+
+        Raises:
+            HMAError: there is no such episode, or a shard cannot be found.
+        """
+        wanted: dict[str, tuple[Shard, list[int]]] = {}
+        for name in episode_ids if self.remote else ():
+            shard, position = self._place(name)
+            wanted.setdefault(shard.path, (shard, []))[1].append(position)
+        before: Blocks | None = None
+        for shard, positions in wanted.values():
+            first, stop, records = min(positions), max(positions) + 1, shard.records
+            if records.blocks is None or 2 * len(positions) < stop - first:
+                continue
+            size, mean = records.blocks.size, records.blocks.size / max(shard.count(), 1)
+            begin, end = max(0, int((first - 1) * mean)), min(size, math.ceil((stop + 1) * mean))
+            records.blocks.expect([(begin, end)])
+            if before:
+                before.follow(records.blocks)
+            records.blocks.follow(None)
+            before = records.blocks
+
+    def _place(self, episode_id: str) -> tuple[Shard, int]:
+        """Return the shard of an episode, and the number of its record there."""
         split, _, index = episode_id.partition("/")
         shards = self.splits.get(split, ())
         if not shards or not index.isdecimal():
@@ -140,7 +173,7 @@ class Folder:
         position = int(index) - shard.first
         if not 0 <= position < shard.count():
             raise EpisodeError(episode_id, f"is in no shard of {self.uri}")
-        return Example(shard.records.read(position, episode_id), episode_id), shard.path
+        return shard, position
 
 
 def episode_id(split: str, index: int) -> str:

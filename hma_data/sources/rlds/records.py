@@ -2,7 +2,8 @@
 
 A TFRecord is its length (uint64), the masked CRC-32C of those eight bytes, the data, and the masked CRC-32C
 of the data; all little endian (format: TensorFlow's TFRecord). A scan reads only the length and the
-checksums, 16 bytes a record. A remote file is read no further than the record that is asked for.
+checksums, 16 bytes a record. A remote file is read no further than the record that is asked for; the parts
+of it that are expected are fetched ahead, by blocks.
 
 An Example maps names to lists of bytes, float32 or int64. Parsing only finds where each list lies; byte
 strings stay views into the record. So a feature that is not read costs nothing.
@@ -14,7 +15,7 @@ import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -24,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.storage.blocks import Blocks
 from hma_data.storage.fetch import attempt, fetch, info, is_local, mark
 from hma_data.storage.kinds import LFS, unreadable
 
@@ -64,6 +66,7 @@ class RecordFile:
         self._files, self._path, self._size = files, path, size
         self._frames = EMPTY
         self._lock = Lock()
+        self.blocks = None if is_local(files) else Blocks(partial(fetch, files, path), size)
 
     def framing(self, limit: int = -1) -> Framing:
         """Return where the records lie; for a remote file at least the first `limit`, -1 for all.
@@ -78,7 +81,25 @@ class RecordFile:
 
     def _scanned(self, limit: int) -> Framing:
         stop = -1 if is_local(self._files) else limit
-        return scan_tfrecord(self._files, self._path, self._size, self._frames, stop)
+        with self._parts() as read:
+            return scan_tfrecord(read, self._path, self._size, self._frames, stop)
+
+    @contextmanager
+    def _parts(self) -> Iterator[Read]:
+        """Yield a function that reads parts: of a local file directly, of a remote one with read-ahead."""
+        if not is_local(self._files):
+            yield _Window(self._bytes, self._size)
+            return
+        handle = attempt(self._files, self._path, lambda: os.open(self._path, os.O_RDONLY))
+        try:
+            yield lambda start, end: os.pread(handle, end - start, start)
+        finally:
+            os.close(handle)
+
+    def _bytes(self, start: int, end: int) -> bytes:
+        if self.blocks and self.blocks.expects(start):
+            return self.blocks.read(start, end)
+        return fetch(self._files, self._path, start, end)
 
     def read(self, index: int, where: str) -> bytes:
         """Return the data of a record, with its checksum verified; `where` is the episode, for the error.
@@ -94,7 +115,7 @@ class RecordFile:
 
     def _picked(self, frames: Framing, index: int, where: str) -> bytes:
         offset, length = int(frames.offsets[index]), int(frames.lengths[index])
-        data = fetch(self._files, self._path, offset, offset + length)
+        data = self._bytes(offset, offset + length)
         if masked_crc(data) != frames.checks[index]:
             fault = f"the {length} bytes at byte {offset} of {self._path} fail their checksum"
             raise EpisodeError(where, fault)
@@ -139,7 +160,7 @@ def masked_crc(data: Any) -> int:
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
 
 
-def scan_tfrecord(files: Any, path: str, size: int, known: Framing = EMPTY, limit: int = -1) -> Framing:
+def scan_tfrecord(read: Read, path: str, size: int, known: Framing = EMPTY, limit: int = -1) -> Framing:
     """Return the framing of a TFRecord file: begin where `known` ends, stop after `limit` records (-1: none).
 
     Raises:
@@ -147,21 +168,20 @@ def scan_tfrecord(files: Any, path: str, size: int, known: Framing = EMPTY, limi
     """
     offsets, lengths, checks = known.offsets.tolist(), known.lengths.tolist(), known.checks.tolist()
     position, fault = offsets[-1] + lengths[-1] + FOOTER.size if offsets else 0, ""
-    with _reader(files, path, size) as read:
-        header = read(position, min(size, position + HEADER.size))
-        if not position and header[:2] == b"\x1f\x8b":
-            raise SourceError(path, "is gzip-compressed", "decompress it: gunzip")
-        if not position and header == LFS[: HEADER.size]:
-            raise SourceError(path, *unreadable(Path(path), "is a Git LFS pointer", "run git lfs pull"))
-        while position < size and len(offsets) != limit:
-            end, fault = _data_end(header, position, size)
-            if fault:
-                break
-            tail = read(end, min(size, end + FOOTER.size + HEADER.size))
-            offsets.append(position + HEADER.size)
-            lengths.append(end - position - HEADER.size)
-            checks.append(FOOTER.unpack_from(tail)[0])
-            header, position = tail[FOOTER.size :], end + FOOTER.size
+    header = read(position, min(size, position + HEADER.size))
+    if not position and header[:2] == b"\x1f\x8b":
+        raise SourceError(path, "is gzip-compressed", "decompress it: gunzip")
+    if not position and header == LFS[: HEADER.size]:
+        raise SourceError(path, *unreadable(Path(path), "is a Git LFS pointer", "run git lfs pull"))
+    while position < size and len(offsets) != limit:
+        end, fault = _data_end(header, position, size)
+        if fault:
+            break
+        tail = read(end, min(size, end + FOOTER.size + HEADER.size))
+        offsets.append(position + HEADER.size)
+        lengths.append(end - position - HEADER.size)
+        checks.append(FOOTER.unpack_from(tail)[0])
+        header, position = tail[FOOTER.size :], end + FOOTER.size
     columns = np.array(offsets, np.int64), np.array(lengths, np.int64), np.array(checks, np.uint32)
     return Framing(*columns, fault, bool(fault) or position >= size)
 
@@ -179,31 +199,18 @@ def _data_end(header: bytes, position: int, size: int) -> tuple[int, str]:
     return end, ""
 
 
-@contextmanager
-def _reader(files: Any, path: str, size: int) -> Iterator[Read]:
-    """Yield a function that reads parts of a file: a local one directly, a remote one with read-ahead."""
-    if not is_local(files):
-        yield _Window(files, path, size)
-        return
-    handle = attempt(files, path, lambda: os.open(path, os.O_RDONLY))
-    try:
-        yield lambda start, end: os.pread(handle, end - start, start)
-    finally:
-        os.close(handle)
-
-
 class _Window:
     """A reader of a remote file that serves what it can from the last range it fetched."""
 
-    def __init__(self, files: Any, path: str, size: int) -> None:
-        self._files, self._path, self._size = files, path, size
+    def __init__(self, read: Read, size: int) -> None:
+        self._read, self._size = read, size
         self._start, self._data, self._before = 0, b"", 0
 
     def __call__(self, start: int, end: int) -> bytes:
         if not self._start <= start <= end <= self._start + len(self._data):
             near = start - self._before < READ_AHEAD
             stop = min(self._size, max(end, start + READ_AHEAD) if near else end)
-            self._data, self._start = fetch(self._files, self._path, start, stop), start
+            self._data, self._start = self._read(start, stop), start
         self._before = start
         return self._data[start - self._start : end - self._start]
 

@@ -10,6 +10,7 @@ T steps.
 import hashlib
 import logging
 import math
+from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Any
 
@@ -95,6 +96,10 @@ class RldsSource:
             source=path,
             metadata=_metadata(folder, example),
         )
+
+    def expect(self, uri: StrPath, episode_ids: Sequence[str]) -> None:
+        """See `Folder.expect`."""
+        open_folder(as_text(uri)).expect(episode_ids)
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source.

@@ -52,7 +52,7 @@ def test_of_a_place_that_is_not_here_no_format_is_guessed(uri: str) -> None:
     assert of_another_format(uri, "hdf5", fault) is fault
 
 
-@pytest.mark.parametrize(("uri", "name"), [("s3://bucket/a.hdf5", "hdf5"), ("https://host/b.mcap", "rosbag")])
+@pytest.mark.parametrize(("uri", "name"), [("s3://bucket/a.hdf5", "hdf5"), ("https://host/b.h5", "hdf5")])
 def test_what_is_read_from_files_alone_says_so_of_a_store(uri: str, name: str) -> None:
     assert detect(uri) == name
     with pytest.raises(SourceError, match=f"^{uri}: is not on this machine — copy it here"):

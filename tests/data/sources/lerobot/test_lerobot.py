@@ -17,6 +17,7 @@ from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import detect, open_source
+from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.lerobot.metadata import fill
 from tests.data.hub_cache import as_snapshot
 from tests.data.videos import (
@@ -50,6 +51,23 @@ def embodiment(**changes: Any) -> Embodiment:
         section, _, key = path.partition("__")
         values[section] = {**values[section], key: value} if key else value
     return Embodiment.from_values(values, "test")
+
+
+def test_the_episodes_of_one_file_are_read_from_one_open_file_in_order(tmp_path, monkeypatch) -> None:
+    opened: list[str] = []
+    reopen = VideoFile._reopen
+
+    def counted(self: VideoFile) -> None:
+        opened.append(str(self.path))
+        reopen(self)
+
+    monkeypatch.setattr(VideoFile, "_reopen", counted)
+    folder, robot, source = make_v3(tmp_path / "v3", LENGTHS), embodiment(), open_source("lerobot")
+    for episode, ref in enumerate(source.index(str(folder), robot)):
+        stream = source.read(str(folder), ref.id, robot).streams["cam"]
+        shown = [number_of(frame) for frame in stream.frames(range(LENGTHS[episode]))]
+        assert shown == [10 * episode + i for i in range(LENGTHS[episode])]
+    assert len(opened) == len(set(opened)) == len(list(folder.rglob("*.mp4")))
 
 
 @pytest.fixture(scope="session", params=["v2.0", "v2.1", "v2.1 av1", "v3.0", "v3.0 av1"])

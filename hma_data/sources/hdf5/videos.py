@@ -1,0 +1,127 @@
+"""Read the pictures of an HDF5 file from video files beside it: frame i of a video is row i of the file.
+
+A camera whose key ends as a video file does is such a path, relative to the HDF5 file's folder:
+`videos/front.mp4`. A name in braces is replaced by its value in the JSON file that `layout.metadata` names, a
+pattern in the same folder: `recordings/MP4/{wrist_cam_serial}.mp4`. `*` stands for any characters; one file
+must match.
+
+T rows of an episode, N frames of a video.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.episode import Floats
+from hma_data.episodes.images import Images
+from hma_data.errors import EpisodeError, HMAError
+from hma_data.registry.components import Camera, Hdf5Layout
+from hma_data.sources.base import file_fingerprint, leaves
+from hma_data.sources.common.video_file import VideoFile
+from hma_data.storage.files import parse_json
+
+SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
+MAX_JSON = 16 << 20  # most bytes of the file of `layout.metadata`
+SHOWN = 12  # names in an error
+_NAME = re.compile(r"\{(\w+)\}")
+
+
+class VideoRows:
+    """A camera's Stream: the frames of a video file, `rows` in all.
+
+    Args:
+        path: of the video.
+        times: (T,) seconds of the rows; frames after the last one are not used.
+
+    Raises:
+        EpisodeError: the file is missing, damaged or no video.
+    """
+
+    def __init__(self, path: Path, times: Floats) -> None:
+        self.timestamps = times
+        self._file = VideoFile(path)
+        self.rows = len(self._file)
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See Stream."""
+        return self._file.frames(indices)
+
+
+def is_video(camera: Camera) -> bool:
+    """Check whether a camera's pictures are in a video file beside the HDF5 file."""
+    return camera.key.lower().endswith(SUFFIXES)
+
+
+def video_path(file: Path, camera: Camera, layout: Hdf5Layout) -> Path:
+    """Return the video file of a camera.
+
+    Args:
+        file: the HDF5 file.
+        camera: its key is the path; see the module.
+
+    Raises:
+        EpisodeError: there is no such file, or several; or the JSON file lacks a name of the key.
+    """
+    folder, key = file.parent, camera.key
+    if names := _NAME.findall(key):
+        values = _metadata(file, layout)
+        for name in names:
+            if not isinstance(values.get(name), str | int):
+                known = ", ".join(sorted(map(str, values))[:SHOWN]) or "nothing"
+                raise EpisodeError(file, f"{layout.metadata} has no {name!r} for {key}", f"it has {known}")
+            key = key.replace(f"{{{name}}}", str(values[name]))
+    return _one(file, folder, key, f"camera {camera.name}")
+
+
+def video_fingerprints(file: Path, cameras: Iterable[Camera], layout: Hdf5Layout) -> str:
+    """Return a text that changes when a video does; empty without videos, and where one cannot be found."""
+    found = ""
+    for camera in filter(is_video, cameras):
+        with suppress(HMAError, OSError):
+            found += f" {file_fingerprint(video_path(file, camera, layout))}"
+    return found
+
+
+def _metadata(file: Path, layout: Hdf5Layout) -> dict[str, Any]:
+    if not layout.metadata:
+        remedy = "set source.layout.metadata to the JSON file with its value, such as metadata_*.json"
+        raise EpisodeError(file, "a camera's key has a name in braces", remedy)
+    path = _one(file, file.parent, layout.metadata, "source.layout.metadata")
+    try:
+        if path.stat().st_size > MAX_JSON:
+            raise ValueError(f"it has more than {MAX_JSON:,} bytes")
+        values = parse_json(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as fault:
+        raise EpisodeError(path, f"cannot be read as JSON: {fault}", "copy it again") from fault
+    return values if isinstance(values, dict) else {}
+
+
+def _one(file: Path, folder: Path, pattern: str, what: str) -> Path:
+    """Return the one file below the folder that matches.
+
+    Raises:
+        EpisodeError: none does, several do, or it lies outside of the folder.
+    """
+    if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
+        raise EpisodeError(file, f"{what}: {pattern} leads out of its folder", "give a path below it")
+    path = folder / pattern
+    if not path.is_file():
+        found = sorted(item for item in folder.glob(pattern) if item.is_file())
+        if len(found) != 1:
+            fault = f"{len(found)} files match" if found else "there is no"
+            beside = sorted(
+                item.relative_to(folder).as_posix()
+                for item in folder.rglob("*")
+                if item.suffix.lower() in (*SUFFIXES, ".json")
+            )
+            remedy = f"beside it are {', '.join(beside[:SHOWN]) or 'no videos'}"
+            raise EpisodeError(file, f"{what}: {fault} {pattern}", remedy)
+        [path] = found
+    if leaves(path, folder):
+        raise EpisodeError(path, "is a link to a file outside its folder", "copy the file in")
+    return path

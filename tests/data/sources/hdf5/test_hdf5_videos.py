@@ -1,0 +1,147 @@
+"""HDF5 whose pictures are in video files beside it, as in DROID's raw recordings."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
+from hma_data.episodes.align import to_clip
+from hma_data.errors import EpisodeError
+from hma_data.registry.embodiment import Embodiment, find
+from hma_data.shards.reader import ShardSet
+from hma_data.sources.base import detect, open_source
+from tests.conftest import BlockTokenizer
+from tests.data.videos import encode, number_of
+
+T = 12
+SERIALS = {"wrist": "11", "ext1": "22", "ext2": "33"}
+FIRST = {"wrist": 0, "ext1": 20, "ext2": 40}  # the number that a camera's first frame shows
+HDF5 = open_source("hdf5")
+
+
+def droid(root: Path, name: str, frames: int = T, **record: Any) -> Path:
+    """Write an episode as DROID's trajectory_writer.py, schema.py and svo2mp4.py do; return its folder."""
+    folder = root / "success" / "2023-07-07" / name
+    folder.mkdir(parents=True)
+    with h5py.File(folder / "trajectory.h5", "w") as file:
+        file.attrs["current_task"], file.attrs["success"] = "Move the mug", True
+        for place, width in {
+            "action/cartesian_position": 6, "action/gripper_position": 0, "action/joint_velocity": 7,
+            "observation/robot_state/cartesian_position": 6, "observation/robot_state/gripper_position": 0,
+            "observation/robot_state/joint_positions": 7,
+        }.items():  # fmt: skip
+            shape = (T, width) if width else (T,)
+            data = np.arange(np.prod(shape), dtype=float).reshape(shape) / 100
+            file.create_dataset(place, data=data, maxshape=(None, *shape[1:]), chunks=(1, *shape[1:]))
+        file["observation/timestamp/skip_action"] = np.arange(T) < 2
+        for serial in SERIALS.values():
+            file[f"observation/camera_type/{serial}"] = np.full(T, 0 if serial == "11" else 1)
+    with h5py.File(folder / "trajectory_im128.h5", "w") as file:
+        file["observation/image"] = np.zeros((T, 2, 2, 3), np.uint8)
+    for camera, serial in SERIALS.items():
+        numbers = range(FIRST[camera], FIRST[camera] + frames)
+        encode(folder / "recordings" / "MP4" / f"{serial}.mp4", numbers, fps=60)
+        encode(folder / "recordings" / "MP4" / f"{serial}-stereo.mp4", [0], fps=60)
+    values = {f"{camera}_cam_serial": serial for camera, serial in SERIALS.items()}
+    values |= {"wrist_mp4_path": f"success/2023-07-07/{name}/recordings/MP4/11.mp4", "scene_id": 3}
+    (folder / f"metadata_LAB+ab12+{name}.json").write_text(json.dumps(values | record))
+    return folder
+
+
+@pytest.fixture
+def robot() -> Embodiment:
+    return find("droid_raw")
+
+
+def test_each_row_has_the_frame_of_its_number_by_the_yaml_alone(robot, tmp_path: Path) -> None:
+    droid(tmp_path, "Fri_Jul__7_09:42:23_2023")
+    droid(tmp_path, "Fri_Jul__7_09:50:00_2023")
+    assert detect(str(tmp_path)) == "hdf5"
+    names = [ref.id for ref in HDF5.index(str(tmp_path), robot) if ref.id.endswith("/trajectory")]
+    assert len(names) == 2
+    episode = HDF5.read(str(tmp_path), names[0], robot)
+    cameras = {"primary": "ext1", "exterior_2": "ext2", "wrist": "wrist"}
+    for name, camera in cameras.items():
+        shown = [number_of(frame) for frame in episode.streams[name].frames([0, 5, 11, 2])]
+        assert shown == [FIRST[camera] + i for i in (0, 5, 11, 2)]
+    assert (episode.instruction, episode.success) == ("Move the mug", True)
+    clip = to_clip(episode, robot)
+    assert len(clip) == T and clip.states.shape == (T, 14)
+    np.testing.assert_allclose(clip.actions[3], [*np.arange(18, 24) / 100, 0.03], rtol=1e-6)
+
+
+def test_the_shipped_yaml_converts_a_folder_of_episodes(robot, tmp_path: Path) -> None:
+    for minute in range(3):
+        droid(tmp_path / "raw", f"Fri_Jul__7_09:4{minute}:00_2023", frames=T - (minute == 1))
+    summary = convert(
+        robot, str(tmp_path / "raw"), BlockTokenizer(), tmp_path / "out", settings=Settings(val_fraction=0)
+    )
+    shards = ShardSet(tmp_path / "out")
+    assert shards.episodes["rows"].to_pylist() == [T, T - 1, T] and not summary.reasons
+    assert all(name.endswith("/trajectory") for name in shards.episodes["id"].to_pylist())
+
+
+@pytest.mark.parametrize(("frames", "said"), [(T - 2, "frames_missing"), (T + 1, "last_observation")])
+def test_other_numbers_of_frames_are_refused_with_the_remedy(robot, tmp_path, frames, said) -> None:
+    droid(tmp_path, "a", frames)
+    with pytest.raises(EpisodeError, match=rf"actions {T}, .*serial.*\.mp4 {frames} — .*{said}"):
+        HDF5.read(str(tmp_path), "success/2023-07-07/a/trajectory", robot)
+
+
+def test_another_video_is_another_recording(robot, tmp_path) -> None:
+    folder = droid(tmp_path, "a")
+    before = HDF5.index(str(tmp_path), robot)[0].fingerprint
+    encode(folder / "recordings" / "MP4" / "22.mp4", range(5, 5 + T), fps=60)
+    assert HDF5.index(str(tmp_path), robot)[0].fingerprint != before
+
+
+def spoil(folder: Path, how: str) -> None:
+    [metadata] = folder.glob("metadata_*.json")
+    if how == "no video":
+        (folder / "recordings" / "MP4" / "33.mp4").unlink()
+    elif how == "no metadata":
+        metadata.unlink()
+    elif how == "two metadata":
+        (folder / "metadata_2.json").write_text("{}")
+    elif how == "no serial":
+        metadata.write_text('{"wrist_cam_serial": "11"}')
+    elif how == "no json":
+        metadata.write_text("{")
+    elif how == "outside":
+        metadata.write_text('{"ext1_cam_serial": "../../../../other"}')
+    elif how == "link":
+        (folder.parent / "elsewhere.mp4").write_bytes((folder / "recordings/MP4/22.mp4").read_bytes())
+        (folder / "recordings" / "MP4" / "22.mp4").unlink()
+        (folder / "recordings" / "MP4" / "22.mp4").symlink_to(folder.parent / "elsewhere.mp4")
+    elif how == "damaged":
+        (folder / "recordings" / "MP4" / "22.mp4").write_bytes(b"\0" * 900)
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ("no video", r"exterior_2: there is no recordings/MP4/33.mp4 — beside it are .*22.mp4"),
+        ("no metadata", r"there is no metadata_\*.json"),
+        ("two metadata", r"2 files match metadata_\*.json"),
+        ("no serial", r"has no 'ext1_cam_serial' for .* — it has wrist_cam_serial"),
+        ("no json", "cannot be read as JSON"),
+        ("outside", "leads out of its folder"),
+        ("link", "is a link to a file outside"),
+        ("damaged", "22.mp4: cannot be decoded as video"),
+    ],
+)
+def test_what_is_missing_is_named(robot, tmp_path, how: str, said: str) -> None:
+    spoil(droid(tmp_path, "a"), how)
+    with pytest.raises(EpisodeError, match=said):
+        HDF5.read(str(tmp_path), "success/2023-07-07/a/trajectory", robot)
+    assert HDF5.index(str(tmp_path), robot)  # quarantined later, by name
+
+
+def test_inspect_names_the_videos_as_a_key_would(tmp_path) -> None:
+    droid(tmp_path, "a")
+    assert "recordings/MP4/22.mp4" in HDF5.inspect(str(tmp_path)).facts["videos beside it"]
