@@ -11,12 +11,13 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from hma_data.bench import Bench, in_fresh_process, make_robot, peak_rss_mib, rss_mib
-from hma_data.bench.peers import run_peer
+from hma_data.bench.peers import PEERS, run_peer
+from hma_data.loading.mixture import Draw
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
@@ -158,4 +159,5 @@ BENCH = Bench(
         "runs": 3,
     },
     run,
+    choices={"draw": get_args(Draw), "cases": ("mixture", "random"), "peers": tuple(PEERS)},
 )

@@ -73,6 +73,8 @@ class Augmentation:
     def __post_init__(self) -> None:
         if not 0 < self.keep <= 1:
             raise UsageError("--keep", f"is {self.keep:g}", "give a share above 0, at most 1")
+        if self.judge:
+            task_of(self.embodiment, self.judge)
 
 
 @dataclass(frozen=True)
@@ -195,12 +197,18 @@ class _Maker:
         if kind not in ("replay", "perturb"):
             return read_policy(commands, self.scenes)
         try:
-            return Replay(float(number) if given else 0.0, std)
+            share = float(number) if given else 0.0
         except ValueError:
-            raise UsageError("--commands", f"{commands!r} is unknown", "give perturb=SHARE") from None
+            share = np.nan
+        if not 0 <= share < np.inf:
+            raise UsageError("--commands", f"{commands!r} is unknown", "give perturb=SHARE, such as 0.3")
+        return Replay(share, std)
 
     def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:
         """Return the rows of episodes that are long enough, with the first frames that leave room."""
+        if shards.embodiment.id != self.settings.embodiment:
+            fault = f"is of {shards.embodiment.id}, not of {self.settings.embodiment}"
+            raise UsageError(shards.folder, fault, "name shards of the robot")
         span = (self.prompt_frames + self.settings.frames - 1) * shards.embodiment.stride
         rows = [
             row | {"room": row["length"] * shards.manifest.frame_stride - span}

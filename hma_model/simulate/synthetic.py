@@ -77,11 +77,11 @@ def digests(world: "World", embodiment: str) -> dict[str, str]:
 
 
 def begun(folder: Path, name: str, made_by: dict[str, Any]) -> Path:
-    """Return the folder of finished work in an output; refuse that of other settings."""
+    """Return the folder of finished work in an output; refuse work of other settings."""
     work, text = folder / name, json.dumps(made_by, indent=1)
     work.mkdir(exist_ok=True)
     path = work / SETTINGS
-    if path.exists() and path.read_text(encoding="utf-8") != text:
+    if any(work.glob("*.npz")) and path.exists() and path.read_text(encoding="utf-8") != text:
         raise OutputError(folder, "was begun with other settings", "give the same ones, or another folder")
     with atomic_path(path) as part:
         part.write_text(text, encoding="utf-8")
