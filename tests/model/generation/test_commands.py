@@ -47,8 +47,8 @@ def test_actions_outside_the_range_are_told_once_of_each_embodiment(
     assert (
         said == "arm: an action is outside the range seen in training (actions.1 -1 to 1). This is said once"
     )
-    assert told(model, wide * 10)[0].startswith("crane: ")
-    assert told(model, wide * 10) == []
+    assert told(model, wide * 20)[0].startswith("crane: ")
+    assert told(model, wide * 20) == []
 
 
 def test_commands_of_unknown_range_have_no_bounds() -> None:
