@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.conversion.output import locked
-from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.errors import HMAError, UsageError
 from hma_data.lab.simulator import simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
@@ -37,6 +37,7 @@ from hma_model.simulate.synthetic import (
     begun,
     digests,
     finished,
+    require_new,
     write_as_lerobot,
     write_shards,
 )
@@ -155,8 +156,8 @@ def augment(
             is no better than chance, or no episode is left.
     """
     folder = as_path(out)
-    if lerobot is not None and as_path(lerobot).exists():
-        raise OutputError(lerobot, "exists already", "remove it or choose another folder")
+    if lerobot is not None:
+        require_new(as_path(lerobot))
     world = world or load_world(checkpoint)
     if world.model.config.kind != "discrete" or world.model.config.views > 1:
         raise HMAError("augment", "takes models of discrete tokens and one view", "choose another checkpoint")
