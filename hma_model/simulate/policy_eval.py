@@ -214,8 +214,7 @@ def evaluate_policies(
         work = None
         if folder:
             facts = {"embodiment": embodiment, "episodes": episodes, "frames": frames, "seed": seed}
-            facts |= {"judge": asdict(judge.task)} | digests(world, embodiment)
-            work = begun(folder, WORK, facts)
+            work = begun(folder, WORK, {**facts, "judge": asdict(judge.task), **digests(world, embodiment)})
         scored: list[Scored] = []
         for name, policy in made:
             path = work / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz" if work else None
@@ -317,14 +316,14 @@ def _keep(one: Scored, path: Path) -> None:
     arrays = {f"{name}_{key}": value for name in OUTCOMES for key, value in vars(outcomes[name]).items()}
     shown = {"true_pictures": one.true_pictures, "model_pictures": one.model_pictures}
     with atomic_path(path) as part, part.open("wb") as file:
-        np.savez(file, shown=one.shown, **arrays, **shown)
+        np.savez(file, **(arrays | shown | {"shown": np.array(one.shown)}))
 
 
 def _kept(name: str, path: Path) -> Scored:
     with np.load(path) as arrays:
-        outcomes = [Outcomes(arrays[f"{key}_scores"], arrays[f"{key}_success"]) for key in OUTCOMES]
-        pictures = arrays["true_pictures"], arrays["model_pictures"]
-        return Scored(name, *outcomes, tuple(arrays["shown"].tolist()), *pictures)
+        outcomes: Any = {key: Outcomes(arrays[f"{key}_scores"], arrays[f"{key}_success"]) for key in OUTCOMES}
+        pictures: Any = {key: arrays[key] for key in ("true_pictures", "model_pictures")}
+        return Scored(name, shown=tuple(arrays["shown"].tolist()), **outcomes, **pictures)
 
 
 def _matrices(scored: Sequence[Scored], key: str) -> list[Scores]:

@@ -1,4 +1,4 @@
-"""Commands of minutes that end by SIGKILL: the same command continues, to the same bytes."""
+"""`hma augment` and `hma evaluate` end by SIGKILL: the same command continues, to the same bytes."""
 
 import subprocess
 import sys
@@ -27,22 +27,20 @@ def run(words: list[str], folder: Path, until: str = "") -> None:
     assert process.wait(300) == (-9 if until else 0)
 
 
+@pytest.mark.timeout(900)
 def test_killed_commands_continue_and_give_the_same_bytes(tmp_path: Path) -> None:
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    for folder in (whole, cut):
+    for folder, killed in ((whole, False), (cut, True)):
         folder.mkdir()
-        for robot in ROBOTS:
-            words = ["augment", robot, robot, "--episodes", "32", "--frames", "10", "--keep", "1"]
-            if folder == cut:
+        for robot in ROBOTS if folder == whole else ROBOTS[:1]:
+            words = ["augment", robot, robot, "--episodes", "20", "--frames", "8", "--keep", "1"]
+            if killed:
                 run(words, folder, until=f"{robot}/.augment/*.npz")
             run(words, folder)
-        words = ["evaluate", "embedded", *ROBOTS, "--split", "train", "--windows", "2", "--out", "out"]
-        if folder == cut:
+        words = ["evaluate", "embedded", *(str(whole / robot) for robot in ROBOTS), "--split", "train"]
+        words += ["--windows", "2", "--out", "out"]
+        if killed:
             run(words, folder, until="out/parts/*.json")
         run(words, folder)
-        words = ["policy-eval", ROBOTS[0], "still", "random", "--episodes", "8", "--frames", "8"]
-        words += ["--out", "policies"]
-        if folder == cut:
-            run(words, folder, until="policies/.policies/*.npz")
-        run(words, folder)
-    assert contents(cut) == contents(whole)
+    assert contents(cut / ROBOTS[0]) == contents(whole / ROBOTS[0])
+    assert contents(cut / "out") == contents(whole / "out")
