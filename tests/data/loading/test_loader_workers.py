@@ -72,6 +72,25 @@ def test_forked_workers_give_the_same_batches(sets: list[Path]) -> None:
     run_fresh(FORKING, *sets)
 
 
+LEAVING = """
+import sys, warnings
+from itertools import islice
+from tests.data.loading.test_loader_workers import dataset
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    for _ in range(3):
+        batches = dataset(sys.argv[1:]).batches(2, "spawn")
+        list(islice(batches, 20))
+        batches.close()
+"""
+
+
+@pytest.mark.slow
+def test_workers_that_are_left_while_they_send_end_quietly(sets: list[Path]) -> None:
+    assert run_fresh(LEAVING, *sets) == ""
+
+
 def test_a_run_stopped_with_some_workers_goes_on_with_others(sets: list[Path]) -> None:
     whole = seen(iter(dataset(sets)), 30)
     state, found = dataset(sets).state_dict(), []
