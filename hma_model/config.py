@@ -237,6 +237,11 @@ class HMAConfig:
         return self.action_tokens if self.absent_action == "tokens" else 0
 
     @property
+    def predicts_video(self) -> bool:
+        """Return whether an objective of the training predicts frames."""
+        return any(OBJECTIVES[name].predicts_video for name, weight in self.objectives.items() if weight)
+
+    @property
     def vocab_size(self) -> int:
         """Return the number of ids of a stored token; this number is also the id that means masked."""
         return math.prod(self.factored)

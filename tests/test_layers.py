@@ -19,6 +19,7 @@ ROOMS = (
     "hma_model.demo", "hma_model.bench", "hma_model.cli", "hma_model",
 )  # fmt: skip
 DOORS = {  # HMA.generate; HMA.from_pretrained and push_to_hub: imported when they are called
+    ("hma_model.network.model", "hma_model.generation.commands"),
     ("hma_model.network.model", "hma_model.generation.rollout"),
     ("hma_model.network.model", "hma_model.hub.publish"),
 }

@@ -4,7 +4,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
@@ -33,6 +33,7 @@ class Bench:
         defaults: its settings.
         run: takes the settings; returns one mapping for each case: the values that distinguish the case, and
             the figures, each named with its unit (`frames_per_second`, `peak_rss_mib`).
+        choices: what some settings, or the items of some lists, must be one of.
         fault: takes these, and returns what is wrong with them, or nothing; with a fault `hma bench` exits 1.
     """
 
@@ -40,6 +41,7 @@ class Bench:
     defaults: dict[str, Any]
     run: Callable[[dict[str, Any]], list[dict[str, Any]]]
     fault: Callable[[list[dict[str, Any]]], str] = lambda rows: ""
+    choices: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def load(name: str) -> Bench:
@@ -54,8 +56,10 @@ def load(name: str) -> Bench:
 def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """Return the defaults changed by `key=value` words; each value has the type of its default.
 
+    No number is negative, and none is 0 unless its default is.
+
     Raises:
-        UsageError: there is no such setting, or a value is not of its type.
+        UsageError: there is no such setting, or a value is not allowed.
     """
     from hma_data.storage.yaml_io import parse_yaml
 
@@ -69,9 +73,28 @@ def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, 
         if kind is float and type(value) is int:
             value = float(value)
         if type(value) is not kind and settings[key] is not None:
-            raise UsageError(f"bench {name}: {word}", f"must be {kind.__name__}, like {settings[key]!r}")
+            listed = f"[{', '.join(map(str, settings[key] or ['NAME']))}]" if kind is list else ""
+            raise UsageError(
+                f"bench {name}: {word}", f"must be {kind.__name__}, like {listed or settings[key]}"
+            )
+        _check_range(f"bench {name}: {word}", value, zero=not settings[key] or key == "seed")
+        known = bench.choices.get(key)
+        unknown = [one for one in (value if kind is list else [value]) if known and one not in known]
+        if known and unknown:
+            raise UsageError(
+                f"bench {name}: {key}", f"{unknown[0]!r} is unknown", f"known: {', '.join(known)}"
+            )
         settings[key] = value
     return settings
+
+
+def _check_range(where: str, value: Any, zero: bool) -> None:
+    if (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and not (value > 0 or (value == 0 and zero))
+    ):
+        raise UsageError(where, "is too small", f"give {'0 or more' if zero else 'more than 0'}")
 
 
 def report(name: str, settings: dict[str, Any], results: list[dict[str, Any]]) -> dict[str, Any]:

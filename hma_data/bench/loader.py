@@ -6,25 +6,35 @@ page cache.
 """
 
 import os
+import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from hma_data.bench import Bench, in_fresh_process, make_robot, peak_rss_mib, rss_mib
-from hma_data.bench.peers import run_peer
+from hma_data.bench.peers import PEERS, run_peer
+from hma_data.loading.mixture import Draw
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Run the cases, then the peers: `mixture` streams batches of all sets, `random` reads one set anyhow."""
     with tempfile.TemporaryDirectory() as folder:
         sets = [make_set(Path(folder) / str(i), i, settings) for i in range(settings["embodiments"])]
-        results = [in_fresh_process(_load, case, sets, settings) for case in settings["cases"]]
-        return results + [in_fresh_process(run_peer, name, sets[0], settings) for name in settings["peers"]]
+        results = [_timed(_load, case, sets, settings) for case in settings["cases"]]
+        return results + [_timed(run_peer, name, sets[0], settings) for name in settings["peers"]]
+
+
+def _timed(work: Callable[..., dict[str, Any]], name: str, *given: Any) -> dict[str, Any]:
+    """Return the figures of a case out of a process of its own; say how long it took."""
+    began = time.monotonic()
+    figures = in_fresh_process(work, name, *given)
+    print(f"{name}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
+    return figures
 
 
 def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
@@ -158,4 +168,5 @@ BENCH = Bench(
         "runs": 3,
     },
     run,
+    choices={"draw": get_args(Draw), "cases": ("mixture", "random"), "peers": tuple(PEERS)},
 )

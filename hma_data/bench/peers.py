@@ -24,7 +24,10 @@ def run_peer(name: str, folder: Path, settings: dict[str, Any]) -> dict[str, Any
     try:
         return {"case": f"peer {name}", **_measure(name, folder, settings)}
     except ImportError as fault:
-        return {"case": f"peer {name}", "left_out": f"{fault.name} is not installed"}
+        return {
+            "case": f"peer {name}",
+            "left_out": f"{fault.name} is not installed: pip install {PACKAGES.get(name, name)}",
+        }
 
 
 def _measure(name: str, folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
@@ -144,6 +147,7 @@ def _one_by_one(data: Any) -> Samples:
     return read
 
 
+PACKAGES = {"lance": "pylance", "streaming": "mosaicml-streaming"}  # of other names than their modules
 PEERS: dict[str, Callable[[Path, Any], Samples]] = {
     "datasets": _datasets,
     "lance": _lance,

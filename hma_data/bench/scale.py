@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hma_data.bench import Bench, in_fresh_process, make_robot, peak_rss_mib
+from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
     from hma_data.conversion.plan import Plan, ShardUnit
@@ -33,6 +34,11 @@ SOURCE = "made-up"
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Run the steps, each over all embodiments."""
+    if not all(count for _, count, *_ in _robots(settings)):
+        fault = (
+            f"{settings['episodes']} episodes leave none for some of {settings['embodiments']} embodiments"
+        )
+        raise UsageError("bench scale", fault, "give more episodes, or fewer embodiments")
     with tempfile.TemporaryDirectory(dir=settings["folder"] or None) as folder:
         in_fresh_process(_make, folder, settings)
         return [in_fresh_process(_measured, step, folder, settings) for step in STEPS]

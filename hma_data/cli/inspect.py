@@ -113,7 +113,8 @@ def _row(key: dict[str, Any]) -> list[Any]:
 
 
 def _print_checks(report: dict[str, Any]) -> None:
-    """Print every check with its result, and one line for each finding."""
+    """Print the checks with their results, one line for each finding, and one of what was not looked at."""
+    from hma_data.inspection.inspect import NOT_LOOKED
     from hma_data.sources.common.survey import CHECKS
 
     findings: dict[str, list[str]] = {}
@@ -122,11 +123,14 @@ def _print_checks(report: dict[str, Any]) -> None:
         said = f"{finding['severity']}: {finding['message']}{remedy}"
         findings.setdefault(finding["check"], []).append(said)
     titles = {**CHECKS, "fits": "the embodiment fits", "usable": "episodes the embodiment can use"}
+    done = {check: result for check, result in report["checks"].items() if result != NOT_LOOKED}
     print_lines(
         (titles.get(check, check), line)
-        for check, result in report["checks"].items()
+        for check, result in done.items()
         for line in findings.get(check, [result])
     )
+    if others := [titles.get(check, check) for check in report["checks"] if check not in done]:
+        print(f"{NOT_LOOKED}: {', '.join(others)}")
 
 
 def doctor(

@@ -8,6 +8,7 @@ import typer
 from typer import Argument, Option
 
 from hma_data.console import Update, human_bytes, human_count, print_json, print_table, progress
+from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
     from hma_data.shards.manifest import Manifest
@@ -195,6 +196,9 @@ def shards_merge(
     from hma_data.conversion.rewrite import merge
     from hma_data.cpu import usable_cores
 
+    places = [folder.resolve() for folder in folders]
+    if twice := next((folder for folder, place in zip(folders, places) if places.count(place) > 1), None):
+        raise UsageError(twice, "is given twice", "give each set once")
     with progress("merge") as update:
         manifest = merge(folders, out, workers or usable_cores(), _in(update))
     _report(out, manifest, json)

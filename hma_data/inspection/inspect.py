@@ -29,6 +29,7 @@ from hma_data.sources.common.survey import CHECKS, alike, sampled
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import is_remote, place
 
+NOT_LOOKED = "not looked at"  # the result of a check that the recording does not allow
 TRIED = 20  # episodes tried until one can be read
 SQUARE = 256  # pixels: the side of most tokenizers' pictures
 WINDOW = 12  # frames of the model's window, by default
@@ -82,7 +83,7 @@ def inspect_recording(
 
 def _results(made: Iterable[str], found: Iterable[Finding]) -> dict[str, str]:
     """Return the result of each check: ok, the worst severity found, or "not looked at" where impossible."""
-    told = dict.fromkeys(CHECKS, "not looked at") | dict.fromkeys(made, "ok")
+    told = dict.fromkeys(CHECKS, NOT_LOOKED) | dict.fromkeys(made, "ok")
     for finding in sorted(found, key=lambda one: SEVERITIES.index(one.severity)):
         told[finding.check] = finding.severity
     return told

@@ -23,7 +23,7 @@ from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import token_column
 from hma_data.sources.base import open_source
 from hma_data.sources.common.choice import ids_for_robot
-from hma_data.storage.files import part_of
+from hma_data.storage.files import atomic_path
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
@@ -94,14 +94,16 @@ class View:
         self._stream.log("about", document, static=True)
 
     def save(self, out: StrPath) -> None:
-        """Write an .rrd file; it is whole or absent."""
-        out = as_path(out)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        part = part_of(out)
-        self._stream.save(part, default_blueprint=self._blueprint())
-        self._stream.flush()
-        self._stream.disconnect()
-        part.replace(out)
+        """Write an .rrd file; it is whole or absent.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        with atomic_path(as_path(out)) as part:
+            part.touch()  # of a place that cannot be written, Rerun's own error would tell nothing
+            self._stream.save(part, default_blueprint=self._blueprint())
+            self._stream.flush()
+            self._stream.disconnect()
 
     def open(self) -> None:
         """Open the viewer on this machine's display."""

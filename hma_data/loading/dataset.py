@@ -11,8 +11,10 @@ where a lane stands. A run can therefore be resumed exactly from one number per 
 B batch, T frames, h·w grid, c·H·W latents, A action dims, K = stride·A.
 """
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
+from multiprocessing.util import Finalize
 from typing import Any
 
 import numpy as np
@@ -269,6 +271,7 @@ class MixtureDataset(IterableDataset[Batch]):
             multiprocessing_context=context,
             prefetch_factor=2,
             pin_memory=cuda.is_available(),  # so that copies to the GPU need not be waited for
+            worker_init_fn=_end_at_once,
         )
         for batch in self._in_order(iter(loader)):
             lane, draws = self._step % self.lanes, self._draws(self._step)
@@ -448,6 +451,11 @@ class _Carrier(IterableDataset[Any]):
             yield from self._dataset.blocks(info.id, info.num_workers)
         except HMAError as fault:
             yield fault
+
+
+def _end_at_once(worker: int) -> None:
+    """Let a worker end without the interpreter's finalization, which aborts a thread that sends a batch."""
+    Finalize(None, os._exit, args=(0,), exitpriority=-100)
 
 
 def _check_windows(decoder: Decoder, frames: int) -> None:

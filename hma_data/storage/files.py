@@ -13,7 +13,7 @@ import threading
 import uuid
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +54,12 @@ def atomic_path(final: Path) -> Iterator[Path]:
             part.replace(final)
             sync_folder(final.parent)
     except OSError as fault:
-        raise OutputError(where, f"cannot be written: {fault.strerror or fault}", remedy) from fault
+        below_file = isinstance(fault, FileExistsError | NotADirectoryError)
+        reason = "its folder is a file" if below_file else fault.strerror or fault
+        raise OutputError(where, f"cannot be written: {reason}", remedy) from fault
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(NotADirectoryError):  # the folder is a file
+            part.unlink(missing_ok=True)
 
 
 def write_atomic(final: Path, content: str | bytes) -> None:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hma_data.bench import Bench
-from hma_data.errors import HMAError
+from hma_data.errors import HMAError, UsageError
 from hma_model.bench.speed import check_settings, numbers_of
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ def play(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a result for each number of viewers; raise UsageError for a wrong setting."""
     check_settings("play", {**settings, "viewers": None})
     counts = numbers_of("play", "viewers", settings, [1, 2, 4])
+    if min(counts) < 1:
+        raise UsageError("bench play", f"viewers={settings['viewers']} is not allowed", "give at least 1")
     command = [sys.executable, "-m", "hma_model.cli", "play", settings["checkpoint"], "--no-browser"]
     with _served([*command, *settings["options"].split()]) as (address, pid):
         return [asyncio.run(measure(address, pid, count, settings)) for count in counts]

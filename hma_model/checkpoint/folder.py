@@ -100,6 +100,11 @@ class Checkpoint:
         trunk, version = str(values.get("trunk_sha256")), int(values["format_version"])
         return cls(folder, config, present, trunk, digest(values.get("tokenizer") or {}), version)
 
+    @property
+    def name(self) -> str:
+        """Return its folder, or `embedded`, as an error names it."""
+        return EMBEDDED_NAME if self.folder == EMBEDDED else str(self.folder)
+
     def trunk(self) -> Path:
         """Return the path of trunk.safetensors, after checking its SHA-256.
 
@@ -121,7 +126,7 @@ class Checkpoint:
         check_id(embodiment, self.folder)
         if embodiment not in self.embodiments:
             known = f"it has: {', '.join(self.embodiments) or 'none'}"
-            raise CheckpointError(self.folder, f"has no embodiment {embodiment!r}", known)
+            raise CheckpointError(self.name, f"has no embodiment {embodiment!r}", known)
         return inside(self.folder, f"embodiments/{embodiment}/{part}")
 
     def card(self, embodiment: str) -> dict[str, Any]:

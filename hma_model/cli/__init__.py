@@ -197,7 +197,7 @@ def generate(
         raise UsageError("--out", f"{out} is none of .mp4, .webp and .gif")
     opened = _opened(checkpoint, data)
     from hma_model.evaluation.rollout_video import rollout_video, write_video
-    from hma_model.simulate.commands import Commands
+    from hma_model.generation.commands import Commands
 
     model, tokenizer, shards = opened
     film = rollout_video(
@@ -208,7 +208,7 @@ def generate(
     write_video(out, film)
     commands = Commands.of(model, shards.embodiment.id)
     if outside := commands.outside(film.actions.reshape(-1, len(commands.names))):
-        print(f"actions are outside the range seen in training ({outside})", file=sys.stderr)
+        print(outside, file=sys.stderr)
     about = f"{len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
     print(f"wrote {out}: {about}")
 

@@ -1,6 +1,7 @@
 """Define the verb `hma evaluate`: the table of metrics, and the page."""
 
 import json as json_text
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -110,7 +111,7 @@ def evaluate(
         if out is not None:
             from hma_model.evaluation.report import write_results
 
-            page = write_results(parts, out, " ".join(["hma", *sys.argv[1:]]))
+            page = write_results(parts, out, shlex.join(["hma", *sys.argv[1:]]))
     if json:
         for part in parts:
             print(json_text.dumps(part.found, ensure_ascii=False))

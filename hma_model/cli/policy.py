@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from hma_data.console import human_count, interruptible, print_json, progress
-from hma_data.errors import OutputError
 from hma_model.cli.hub import Json
 from hma_model.cli.options import Temperature, UnmaskSteps
 
@@ -37,17 +36,20 @@ def policy_eval(
 ) -> None:
     """Score policies in a robot's simulator and inside the world model, and compare the two.
 
+    With --out, finished policies are kept, and the same command continues.
+
     Example: hma policy-eval rails_03 scripted scripted:noise=0.5 random still --out policies
     """
     from hma_model.simulate.policy_eval import evaluate_policies
     from hma_model.simulate.policy_page import show, write_report
 
-    if out and out.is_file():  # before minutes of work
-        raise OutputError(out, "is a file", "name a folder")
-    with progress("policies", len(policies) * episodes * frames) as update:
+    words = "nothing is kept; with --out, finished policies are"
+    if out:
+        words = f"finished policies are kept in {out}; run the same command again to continue"
+    with interruptible(lambda: words), progress("policies", len(policies) * episodes * frames) as update:
         found = evaluate_policies(
             embodiment, policies, checkpoint=checkpoint, episodes=episodes, frames=frames, judge=judge,
-            seed=seed, unmask_steps=unmask_steps, temperature=temperature, on_progress=update,
+            seed=seed, out=out, unmask_steps=unmask_steps, temperature=temperature, on_progress=update,
         )  # fmt: skip
     page = write_report(found, out) if out else None
     if json:

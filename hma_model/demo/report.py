@@ -1,6 +1,7 @@
 """Write the report of the demo: one page that opens with the rollouts of both robots."""
 
 import platform
+import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -63,7 +64,7 @@ def write_report(made: Demo) -> Path:
     page.section("The same on your own data", about)
     page.commands(OWN_DATA.format(tokenizer=made.tokenizer))
     page.section("This report")
-    page.commands(" ".join(["hma", *sys.argv[1:]]))
+    page.commands(shlex.join(["hma", *sys.argv[1:]]))
     path, html = made.out / "report.html", page.html()
     write_atomic(path, html)
     total = human_seconds(sum(made.seconds.values()))

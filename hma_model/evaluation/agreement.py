@@ -60,7 +60,7 @@ class Accuracy:
         return self.low is not None and self.low > 0.5
 
     def __str__(self) -> str:
-        counts = f"{self.count} episodes, {self.successes} successes"
+        counts = f"{self.count} episodes, {self.successes} success{'es' * (self.successes != 1)}"
         if self.balanced is None:
             return f"{self.share:.0%} right; all episodes end alike ({counts})"
         return f"balanced {self.balanced:.0%} ({self.low:.0%} to {self.high:.0%}; {counts})"

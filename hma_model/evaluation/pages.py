@@ -30,6 +30,7 @@ _STYLE = """
 body { margin:0 auto; max-width:1080px; padding:2rem 1.25rem 4rem; background:var(--paper);
   color:var(--ink); font:16px/1.55 system-ui, sans-serif }
 h1 { font-size:1.9rem; margin:0 0 .3rem } h2 { font-size:1.25rem; margin:2.6rem 0 .4rem }
+h1, h2, h3, p, figcaption, span { overflow-wrap:anywhere }
 p { max-width:48rem } .soft, figcaption, th { color:var(--soft) } a { color:var(--accent) }
 .figures { display:grid; grid-template-columns:repeat(auto-fit, minmax(160px, 1fr)); gap:.75rem;
   margin:1.4rem 0 }

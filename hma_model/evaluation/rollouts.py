@@ -16,6 +16,7 @@ from hma_data.loading.dataset import Batch
 from hma_data.loading.views import FIRST, Cameras, view_count
 from hma_data.shards.reader import ShardSet
 from hma_model.checkpoint.folder import Checkpoint
+from hma_model.generation.rollout import generate
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -89,9 +90,9 @@ def rollout(
     generator = torch.Generator().manual_seed(seed)
     known: Tensor | None = batch.action_mask[:, : first + count].to(model.device)
     passive = model.config.absent_action != "embedding" and not batch.action_mask[:, : first + count].any()
-    predicted = model.generate(
-        given, None if passive else chunks, batch.embodiment, count, generator=generator,
-        known=None if passive else known, **sampling,
+    predicted = generate(
+        model, given, None if passive else chunks, batch.embodiment, count, None if passive else known,
+        generator=generator, **sampling,
     )  # fmt: skip
     if truth is None:
         truth = decode(tokenizer, stored[:, : first + count])

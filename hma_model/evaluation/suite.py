@@ -228,7 +228,10 @@ def _folder(out: Path) -> Path:
         raise OutputError(file, "is a file, not a folder", "name another folder")
     if out.is_dir() and any(out.iterdir()) and not (out / PARTS).is_dir():
         raise OutputError(out, "holds something else than an evaluation", "name a new folder")
-    (out / PARTS).mkdir(parents=True, exist_ok=True)
+    try:
+        (out / PARTS).mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise OutputError(out, f"cannot be written: {fault.strerror}", "choose another --out") from fault
     return out
 
 

@@ -236,6 +236,9 @@ class Rollout:
         Returns:
             (n, h, w) int64 tokens, or (n, c, H, W) float32 latents as stored.
         """
+        if not self.config.predicts_video:
+            fault = f"was not trained to predict frames, but for {', '.join(self.config.objectives)}"
+            raise HMAError(vars(self.model).get("origin", "the model"), fault, "choose another checkpoint")
         own = self._begun(rows)
         chosen = self._room(own)
         self._take(own, chunk, following, known)

@@ -65,7 +65,8 @@ def at_hand(checkpoint: StrPath, embodiments: Iterable[str] | None = None) -> li
     source = Checkpoint.open(checkpoint)
     wanted = set(source.embodiments if embodiments is None else embodiments)
     lacking = {name for name in wanted if not (source.folder / "embodiments" / name / FILM).is_file()}
-    return [shards.folder for shards in source.shards() if shards.embodiment.id in lacking]
+    sets = source.shards() if source.config.predicts_video else []
+    return [shards.folder for shards in sets if shards.embodiment.id in lacking]
 
 
 def _shown(checkpoint: Path, shards: "ShardSet") -> tuple[bytes, bytes]:

@@ -369,13 +369,18 @@ class HMA(nn.Module):
         Returns:
             (B, frames, h, w) int64 tokens, or (B, frames, c, H, W) float32 latents as stored.
         """
+        from hma_model.generation.commands import warn_outside
         from hma_model.generation.rollout import generate
 
-        return generate(
+        made = generate(
             self, prompt, actions, embodiment, frames, mask=known, unmask_steps=unmask_steps,
             temperature=temperature, generator=generator, order=order, cache=cache, sample_steps=sample_steps,
             guidance=guidance, noise_level=noise_level, precision=precision, compile=compile,
         )  # fmt: skip
+        if actions is not None:
+            used = prompt.shape[1] + frames - 1
+            warn_outside(self, actions[:, :used], embodiment, None if known is None else known[:, :used])
+        return made
 
     # -- parts that training and decoding share -----------------------------------------------------------
 

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from hma_data.errors import HMAError, UsageError
-from hma_model.config import OBJECTIVES
 from hma_model.simulate.arenas import Arena, Floats, Scenes
 from hma_model.simulate.policies import split_options
 from hma_model.simulate.world import World, load_world, require_actor
@@ -86,8 +85,7 @@ class Acting:
     def __init__(self, world: World, scenes: Scenes, horizon: int = 1, where: str = "the model") -> None:
         config = world.model.config
         require_actor(config, where)
-        trained = [OBJECTIVES[name] for name, weight in config.objectives.items() if weight]
-        if horizon > 1 and not any(one.predicts_video for one in trained):
+        if horizon > 1 and not config.predicts_video:
             raise UsageError(where, "predicts no video to look ahead in", "give horizon=1")
         self._follower, self._horizon = Follower(world, scenes, where), horizon
 

@@ -18,7 +18,7 @@ from hma_data.errors import HMAError
 from hma_data.lab import FAMILY, truth
 from hma_data.lab.scripted import SeenState, State, state_of
 from hma_data.lab.simulator import LabSimulator, simulated
-from hma_model.simulate.commands import described
+from hma_model.generation.commands import described
 from hma_model.simulate.scenes import Dimension, LabRobot, LabScene, Prompt
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.conversion.output import locked
-from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.errors import HMAError, UsageError
 from hma_data.lab.simulator import simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
@@ -37,6 +37,7 @@ from hma_model.simulate.synthetic import (
     begun,
     digests,
     finished,
+    require_new,
     write_as_lerobot,
     write_shards,
 )
@@ -76,6 +77,8 @@ class Augmentation:
     def __post_init__(self) -> None:
         if not 0 < self.keep <= 1:
             raise UsageError("--keep", f"is {self.keep:g}", "give a share above 0, at most 1")
+        if self.judge:
+            task_of(self.embodiment, self.judge)
 
 
 @dataclass(frozen=True)
@@ -156,8 +159,8 @@ def augment(
             is no better than chance, or no episode is left.
     """
     folder = as_path(out)
-    if lerobot is not None and as_path(lerobot).exists():
-        raise OutputError(lerobot, "exists already", "remove it or choose another folder")
+    if lerobot is not None:
+        require_new(as_path(lerobot))
     drawn: dict[str, Any] = {"unmask_steps": settings.unmask_steps, "temperature": settings.temperature}
     world = world or load_world(checkpoint, **drawn)
     if world.model.config.kind != "discrete" or world.model.config.views > 1:
@@ -199,12 +202,18 @@ class _Maker:
         if kind not in ("replay", "perturb"):
             return read_policy(commands, self.scenes)
         try:
-            return Replay(float(number) if given else 0.0, std)
+            share = float(number) if given else 0.0
         except ValueError:
-            raise UsageError("--commands", f"{commands!r} is unknown", "give perturb=SHARE") from None
+            share = np.nan
+        if not 0 <= share < np.inf:
+            raise UsageError("--commands", f"{commands!r} is unknown", "give perturb=SHARE, such as 0.3")
+        return Replay(share, std)
 
     def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:
         """Return the rows of episodes that are long enough, with the first frames that leave room."""
+        if shards.embodiment.id != self.settings.embodiment:
+            fault = f"is of {shards.embodiment.id}, not of {self.settings.embodiment}"
+            raise UsageError(shards.folder, fault, "name shards of the robot")
         span = (self.prompt_frames + self.settings.frames - 1) * shards.embodiment.stride
         rows = [
             row | {"room": row["length"] * shards.manifest.frame_stride - span}

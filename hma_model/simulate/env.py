@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, UsageError
 from hma_data.storage.paths import StrPath
-from hma_model.simulate.commands import Floats
+from hma_model.generation.commands import Floats
 from hma_model.simulate.prompts import Prompt, read_prompt
 from hma_model.simulate.world import Picture, World, load_world
 
@@ -113,8 +113,7 @@ class Episodes:
             return self.commands.clip(values)
         if outside and not self.warned:
             self.warned = True
-            said = f"{self.embodiment}: an action is outside the range seen in training ({outside})"
-            warnings.warn(f"{said}; clip=True clips actions to it. This is said once", stacklevel=4)
+            warnings.warn(f"{outside}; clip=True clips actions to it. This is said once", stacklevel=4)
         return values
 
     def seen(self, picture: Picture) -> Picture:

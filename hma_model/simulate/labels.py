@@ -31,7 +31,7 @@ from hma_data.storage.files import atomic_path
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.config import INVERSE, OBJECTIVES
-from hma_model.simulate.commands import Commands, Floats, described
+from hma_model.generation.commands import Commands, Floats, described
 from hma_model.simulate.pictures import fitted
 from hma_model.simulate.synthetic import Made, begun, digests, finished, write_shards
 from hma_model.simulate.world import World, load_world
@@ -138,16 +138,16 @@ def label_actions(
     robot = described(model, embodiment)
     if robot is None:
         raise HMAError(embodiment, "has no YAML that describes its commands", "load a checkpoint")
-    shown = film_of(world, film, embodiment, robot.effective_hz)
-    error = measure(world, commands, _labelled(model, embodiment, check), on_progress)
-    made_by: dict[str, Any] = {
-        "by": "hma label-actions",
-        "inferred_actions": True,
-        "embodiment": embodiment,
-        "film": shown.name,
-    }
-    made_by |= {"error": error.to_json()} | digests(world, embodiment)
     with locked(folder):
+        shown = film_of(world, film, embodiment, robot.effective_hz)
+        error = measure(world, commands, _labelled(model, embodiment, check), on_progress)
+        made_by: dict[str, Any] = {
+            "by": "hma label-actions",
+            "inferred_actions": True,
+            "embodiment": embodiment,
+            "film": shown.name,
+        }
+        made_by |= {"error": error.to_json()} | digests(world, embodiment)
         manifest = finished(folder, made_by)
         if manifest is None:
             work = begun(folder, WORK, made_by)
@@ -322,7 +322,9 @@ def film_of(world: World, place: StrPath, embodiment: str, hz: float) -> Film:
     )
     if not videos:
         raise UsageError(
-            path, "is no shard set and holds no video files", f"give {', '.join(VIDEOS)}, or shards"
+            path,
+            "is no shard set and no folder with video files",
+            f"give a folder of {', '.join(VIDEOS)}, or a shard set",
         )
     return VideoFilm(world, path, videos, embodiment, hz)
 

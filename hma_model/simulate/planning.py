@@ -160,8 +160,9 @@ class Planning:
         temperature: float = 0.0,
     ) -> None:
         if min(horizon, samples, steps, receding) < 1 or receding > horizon:
-            raise UsageError("policy plan", "has a number below 1, or looks less often than it plans ahead",
-                             "give numbers of at least 1, and receding up to horizon")  # fmt: skip
+            fault = "has a number below 1, or looks less often than it plans ahead"
+            remedy = "give numbers of at least 1, and receding up to horizon"
+            raise UsageError(f"policy plan:{solver}", fault, remedy)
         own = World(world.model, world.tokenizer, unmask_steps=unmask_steps, temperature=temperature)
         self._follower = Follower(own, scenes, "policy plan")
         self.cost = Cost(own, scenes.name)

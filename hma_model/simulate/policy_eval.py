@@ -8,19 +8,27 @@ and once in the world model from the same frames, where a judge reads the outcom
 commands that it gave in the model are also played to the simulator. So the judge's word on generated frames
 is compared with what truly comes of the same commands.
 
+With an output folder, what came of each policy lies in a folder of it until the page is written, so the same
+call continues.
+
 M policies, N episodes, T frames after the prompt, S pixels a side.
 """
 
+import hashlib
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.conversion.output import locked
 from hma_data.errors import UsageError
-from hma_data.storage.paths import StrPath
+from hma_data.storage.files import atomic_path
+from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.agreement import (
     Accuracy,
     Bools,
@@ -33,11 +41,14 @@ from hma_model.evaluation.agreement import (
 from hma_model.evaluation.judge import StateJudge, task_of, train_judge
 from hma_model.simulate.arenas import Arena, Floats, ModelArena, Picture, Scenes, TrueArena
 from hma_model.simulate.policies import Judged, Policy, begin, checked, read_policy
+from hma_model.simulate.synthetic import begun, digests
 from hma_model.simulate.world import World, load_world
 
 Scores = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 EPISODES, FRAMES = 32, 40
+WORK = ".policies"  # folder of finished policies in an output
+OUTCOMES = ("true", "model", "replayed")
 SHOWN = 8  # pictures that are kept of an episode
 
 
@@ -107,7 +118,7 @@ class PolicyEvaluation:
         rows = []
         for one in self.policies:
             row: dict[str, Any] = {"policy": one.policy}
-            for name in ("true", "model", "replayed"):
+            for name in OUTCOMES:
                 outcomes: Outcomes = getattr(one, name)
                 rate = outcomes.success.astype(np.float64)
                 row |= {
@@ -132,7 +143,8 @@ class PolicyEvaluation:
         episodes = {
             one.policy: {
                 name: {"scores": value.scores.round(3).tolist(), "success": value.success.tolist()}
-                for name, value in (("true", one.true), ("model", one.model), ("replayed", one.replayed))
+                for name in OUTCOMES
+                for value in [getattr(one, name)]
             }
             for one in self.policies
         }
@@ -159,6 +171,7 @@ def evaluate_policies(
     frames: int = FRAMES,
     judge: str | StateJudge = "moved",
     seed: int = 0,
+    out: StrPath | None = None,
     world: World | None = None,
     unmask_steps: int = 2,
     temperature: float | None = None,
@@ -174,48 +187,73 @@ def evaluate_policies(
         frames: T.
         judge: words as `task_of` takes them, or a trained judge.
         seed: of scenes, policies, judge and intervals; the same seed gives the same figures.
+        out: folder that keeps finished policies until `write_report` has written there; None keeps nothing.
         world: a world instead of a checkpoint.
         unmask_steps, temperature: of the world, as of `World`.
         on_progress: called with the frames done, and what is done.
 
     Raises:
         HMAError: a policy fails, the robot has no simulator, or the judge is no better than chance.
+        OutputError: the folder cannot be written, or was begun with other settings.
     """
     if not policies:
         raise UsageError("policies", "none is given", "give at least one; a correlation takes three")
-    tell = on_progress or (lambda done, words: None)
-    world = world or load_world(checkpoint, unmask_steps=unmask_steps, temperature=temperature)
-    scenes = Scenes.of(world, embodiment, episodes, seed)
-    made = [(one, read_policy(one, scenes, world)) if isinstance(one, str) else one for one in policies]
-    for name, policy in made:  # what it returns is refused before minutes of work
-        if not isinstance(policy, Judged):
-            _try(name, policy, TrueArena(scenes.take(range(1)), world.picture_shape[0]))
-    if not isinstance(judge, StateJudge):
-        task = task_of(embodiment, judge)
-        tell(0, "training the judge")
-        judge = train_judge(embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed)
-    for _, policy in made:
-        if isinstance(policy, Judged):
-            policy.judged(judge)
-    scored: list[Scored] = []
-    for name, policy in made:
-        begun = len(scored) * frames * episodes
-        told = partial(_tell, tell, begun, name)
-        scored.append(score_policy(name, policy, world, scenes, judge, frames, told))
-    success, scores = _matrices(scored, "success"), _matrices(scored, "scores")
-    return PolicyEvaluation(
-        embodiment,
-        str(checkpoint),
-        f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}",
-        seed,
-        frames,
-        judge,
-        tuple(scored),
-        Correlation(**correlations(success[0], success[1], seed)),
-        Correlation(**correlations(scores[0], scores[1], seed)),
-        accuracy(success[2].ravel() > 0, success[1].ravel() > 0, seed),
-        _correlation(scores[1].ravel(), scores[2].ravel()),
-    )
+    names = [one if isinstance(one, str) else one[0] for one in policies]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise UsageError(f"policy {twice}", "is given twice", "give each once")
+    folder = None if out is None else as_path(out)
+    with locked(folder) if folder else nullcontext():
+        tell = on_progress or (lambda done, words: None)
+        world = world or load_world(checkpoint, unmask_steps=unmask_steps, temperature=temperature)
+        sampling = f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}"
+        scenes = Scenes.of(world, embodiment, episodes, seed)
+        made = [(one, read_policy(one, scenes, world)) if isinstance(one, str) else one for one in policies]
+        for name, policy in made:  # what it returns is refused before minutes of work
+            if not isinstance(policy, Judged):
+                _try(name, policy, TrueArena(scenes.take(range(1)), world.picture_shape[0]))
+        if not isinstance(judge, StateJudge):
+            task = task_of(embodiment, judge)
+            tell(0, "training the judge")
+            judge = train_judge(embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed)
+        for _, policy in made:
+            if isinstance(policy, Judged):
+                policy.judged(judge)
+        work = None
+        if folder:
+            facts = {"embodiment": embodiment, "episodes": episodes, "frames": frames, "seed": seed}
+            facts |= {"judge": asdict(judge.task), "sampling": sampling, **digests(world, embodiment)}
+            work = begun(folder, WORK, facts)
+        scored: list[Scored] = []
+        for name, policy in made:
+            told = partial(_tell, tell, len(scored) * frames * episodes, name)
+            score = partial(score_policy, name, policy, world, scenes, judge, frames, told)
+            scored.append(_once(name, work, score))
+        success, scores = _matrices(scored, "success"), _matrices(scored, "scores")
+        return PolicyEvaluation(
+            embodiment,
+            str(checkpoint),
+            sampling,
+            seed,
+            frames,
+            judge,
+            tuple(scored),
+            Correlation(**correlations(success[0], success[1], seed)),
+            Correlation(**correlations(scores[0], scores[1], seed)),
+            accuracy(success[2].ravel() > 0, success[1].ravel() > 0, seed),
+            _correlation(scores[1].ravel(), scores[2].ravel()),
+        )
+
+
+def _once(name: str, work: Path | None, score: Callable[[], Scored]) -> Scored:
+    """Return the results of a policy: those kept in a folder of work, else new ones, which are kept there."""
+    if work is None:
+        return score()
+    path = work / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
+    found = _kept(name, path) if path.exists() else None
+    if found is None:
+        found = score()
+        _keep(found, path)
+    return found
 
 
 def _try(name: str, policy: Policy, arena: Arena) -> None:
@@ -289,9 +327,24 @@ def run(
     return pictures, commands
 
 
+def _keep(one: Scored, path: Path) -> None:
+    outcomes = {name: getattr(one, name) for name in OUTCOMES}
+    arrays = {f"{name}_{key}": value for name in OUTCOMES for key, value in vars(outcomes[name]).items()}
+    shown = {"true_pictures": one.true_pictures, "model_pictures": one.model_pictures}
+    with atomic_path(path) as part, part.open("wb") as file:
+        np.savez(file, **(arrays | shown | {"shown": np.array(one.shown)}))
+
+
+def _kept(name: str, path: Path) -> Scored:
+    with np.load(path) as arrays:
+        outcomes: Any = {key: Outcomes(arrays[f"{key}_scores"], arrays[f"{key}_success"]) for key in OUTCOMES}
+        pictures: Any = {key: arrays[key] for key in ("true_pictures", "model_pictures")}
+        return Scored(name, shown=tuple(arrays["shown"].tolist()), **outcomes, **pictures)
+
+
 def _matrices(scored: Sequence[Scored], key: str) -> list[Scores]:
     """Return "success" or "scores" in the simulator, in the model, and as replayed; (M, N) each."""
     return [
         np.stack([getattr(getattr(one, where), key) for one in scored]).astype(np.float64)
-        for where in ("true", "model", "replayed")
+        for where in OUTCOMES
     ]

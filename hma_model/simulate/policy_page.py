@@ -1,6 +1,7 @@
 """Show an evaluation of policies: as a table on a terminal, and as a page with pictures of episodes."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from hma_data.console import print_table
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.storage.files import atomic_path
 from hma_model.evaluation.pages import COLOURS, MARKERS, Page, label_axes, svg_bytes
-from hma_model.simulate.policy_eval import PolicyEvaluation, Scored
+from hma_model.simulate.policy_eval import WORK, PolicyEvaluation, Scored
 
 COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same commands, sim.")
 CHOSEN = 2  # episodes of each kind on the page
@@ -70,12 +71,13 @@ def show(found: PolicyEvaluation) -> None:
 
 
 def write_report(found: PolicyEvaluation, folder: Path) -> Path:
-    """Write results.json and report.html; return the path of the page."""
+    """Write results.json and report.html; return the path of the page. Finished policies are then removed."""
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / "report.html"
     for path, text in ((folder / "results.json", json.dumps(found.to_json(), indent=1)), (page, html(found))):
         with atomic_path(path) as part:
             part.write_text(text, encoding="utf-8")
+    shutil.rmtree(folder / WORK, ignore_errors=True)
     return page
 
 

@@ -27,7 +27,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.evaluate import cameras_for
-from hma_model.simulate.commands import card, described
+from hma_model.generation.commands import card, described
 from hma_model.simulate.pictures import read_picture
 
 if TYPE_CHECKING:

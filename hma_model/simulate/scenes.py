@@ -285,7 +285,7 @@ def drivable(
         if name not in checkpoint.embodiments:
             known = ", ".join(checkpoint.embodiments)
             raise UsageError(
-                shards.folder, f"{checkpoint.folder} does not know the robot {name}", f"known: {known}"
+                shards.folder, f"{checkpoint.name} does not know the robot {name}", f"known: {known}"
             )
         require_tokenizer(checkpoint.config, shards.spec, shards.folder)
         cameras = checkpoint.card(name).get("data", {}).get("cameras") or "first"

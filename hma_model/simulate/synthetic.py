@@ -77,11 +77,11 @@ def digests(world: "World", embodiment: str) -> dict[str, str]:
 
 
 def begun(folder: Path, name: str, made_by: dict[str, Any]) -> Path:
-    """Return the folder of finished work in an output; refuse that of other settings."""
+    """Return the folder of finished work in an output; refuse work of other settings."""
     work, text = folder / name, json.dumps(made_by, indent=1)
     work.mkdir(exist_ok=True)
     path = work / SETTINGS
-    if path.exists() and path.read_text(encoding="utf-8") != text:
+    if any(work.glob("*.npz")) and path.exists() and path.read_text(encoding="utf-8") != text:
         raise OutputError(folder, "was begun with other settings", "give the same ones, or another folder")
     with atomic_path(path) as part:
         part.write_text(text, encoding="utf-8")
@@ -148,13 +148,22 @@ def write_shards(
     return finish(folder, [unit.name for unit in plan.units], own, spec, plan.facts, origin)
 
 
+def require_new(folder: Path) -> None:
+    """Refuse a folder that exists already, or that cannot be made."""
+    if folder.exists():
+        raise OutputError(folder, "exists already", "remove it or choose another folder")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise OutputError(folder, f"cannot be written: {fault.strerror}", "choose another folder") from fault
+
+
 def write_as_lerobot(folder: Path, shards: Path, tokenizer: "Tokenizer") -> None:
     """Write the episodes of synthetic shards as a LeRobotDataset, with its embodiment beside it."""
     made, size = ShardSet(shards), tokenizer.spec.image_size
     own = embodiment_of(made.embodiment, ORIGIN, (size, size))
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)
-    part.parent.mkdir(parents=True, exist_ok=True)
     write_lerobot(part, own, _decoded(made, own, tokenizer))
     (part / "embodiment.yaml").write_text(own.to_yaml(), encoding="utf-8")
     facts = json.dumps(made.manifest.plan["made_by"], indent=1)

@@ -25,11 +25,11 @@ from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import OBJECTIVES, POLICY
 from hma_model.evaluation.evaluate import decode
+from hma_model.generation.commands import Commands, described
 from hma_model.generation.engine import products_in
 from hma_model.generation.rollout import Rollout
 from hma_model.generation.state import Snapshot as Snapshot
 from hma_model.generation.unmask import Decoding, check, default_temperature
-from hma_model.simulate.commands import Commands, described
 from hma_model.simulate.pictures import Picture, fitted, picture_shape
 
 if TYPE_CHECKING:

@@ -292,7 +292,8 @@ def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
             return path
     known = sorted(path.stem for path in (folder / "train").glob("*.yaml"))
     hint = _meant(Path(name).stem, known).removeprefix(", ")
-    remedy = f"{hint} Give a YAML file or one of {', '.join(known)}".lstrip()
+    remedy = f"{hint} Give" if hint else "give"
+    remedy = f"{remedy} a YAML file or one of {', '.join(known)}"
     if where is not None:
         raise RecipeError(where, f"extends {name!r}: no such recipe", remedy)
     raise RecipeError(name, "no such recipe", remedy)

@@ -30,12 +30,17 @@ def view_run(out: StrPath, window: int = 0, data: Sequence[StrPath] = ()) -> Vie
 
     Raises:
         CheckpointError: there is no checkpoint.
-        UsageError: neither figures nor shards are there, or no such window.
+        UsageError: neither figures nor shards are there, the data is of other robots, or no such window.
     """
     out, checkpoint = as_path(out), Checkpoint.open(out)
     sets = [ShardSet(folder) for folder in data] if data else checkpoint.shards()
     shards = next((one for one in sets if one.embodiment.id in checkpoint.embodiments), None)
+    if not checkpoint.config.predicts_video:
+        sets, shards = [], None
     figures = _figures(read_metrics(out))
+    if data and shards is None:
+        names = ", ".join(checkpoint.embodiments)
+        raise UsageError(data[0], f"is of no robot of the checkpoint, which has: {names}")
     if shards is None and not figures:
         raise UsageError(out, "has no metrics.jsonl and none of its shards are here", "name a shard set too")
     if shards is None:

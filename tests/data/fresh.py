@@ -8,8 +8,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 
-def run_fresh(program: str, *arguments: object) -> None:
-    """Run Python code with `sys.argv[1:]` as given; it fails the test by an exception."""
+def run_fresh(program: str, *arguments: object) -> str:
+    """Run Python code with `sys.argv[1:]` as given; return its stderr. It fails the test by an exception."""
     done = subprocess.run(
         [sys.executable, "-c", program, *map(str, arguments)],
         cwd=ROOT,
@@ -19,3 +19,4 @@ def run_fresh(program: str, *arguments: object) -> None:
         timeout=200,
     )
     assert done.returncode == 0, done.stderr
+    return done.stderr

@@ -64,7 +64,8 @@ def _lines(words: Sequence[str], where: str, error: type[HMAError]) -> Iterator[
         try:
             lines = Path(word[1:]).expanduser().read_text("utf-8").splitlines()
         except (OSError, UnicodeDecodeError) as fault:
-            raise error(where, f"{word[1:]} cannot be read: {fault}", "name a text file of ids") from fault
+            reason = getattr(fault, "strerror", None) or fault
+            raise error(where, f"{word[1:]} cannot be read: {reason}", "name a text file of ids") from fault
         for number, line in enumerate(lines, 1):
             if line.strip() and not line.startswith("#"):
                 yield line.strip(), f"{line.strip()!r} in line {number} of {word[1:]}"

@@ -14,17 +14,23 @@ from hma_data.errors import UsageError
 from hma_data.sources.base import open_source
 
 TOY = bench.Bench(
-    "a toy", {"frames": 4, "share": 0.5, "name": "x", "kinds": ["a"]}, lambda settings: [settings]
+    "a toy",
+    {"frames": 4, "share": 0.5, "name": "x", "kinds": ["a"], "workers": 0},
+    lambda settings: [settings],
+    choices={"kinds": ("a", "b", "c")},
 )
 
 
 def test_settings_keep_the_type_of_their_default() -> None:
-    settings = bench.settings_of(TOY, "toy", ["frames=7", "share=1", "name=two", "kinds=[b, c]"])
-    assert settings == {"frames": 7, "share": 1.0, "name": "two", "kinds": ["b", "c"]}
+    settings = bench.settings_of(TOY, "toy", ["frames=7", "share=1", "name=two", "kinds=[b, c]", "workers=0"])
+    assert settings == {"frames": 7, "share": 1.0, "name": "two", "kinds": ["b", "c"], "workers": 0}
     assert type(settings["share"]) is float
 
 
-@pytest.mark.parametrize("word", ["frames", "speed=3", "frames=many", "kinds=a", "frames=[", "=3"])
+@pytest.mark.parametrize(
+    "word",
+    ["frames", "speed=3", "frames=many", "frames=0", "share=-1", "kinds=a", "kinds=[a, d]", "frames=[", "=3"],
+)
 def test_a_word_that_is_no_setting_is_refused(word: str) -> None:
     with pytest.raises(UsageError, match="bench toy"):
         bench.settings_of(TOY, "toy", [word])

@@ -59,6 +59,8 @@ def test_a_peer_must_give_our_windows_and_a_missing_one_is_named(
     wrong = {"shifted": lambda store, rows: lambda numbers: (rows[0][numbers - 1], rows[1][numbers])}
     monkeypatch.setattr(peers, "PEERS", {**right, **wrong, "lance": missing})
     assert peers.run_peer("whole", folder, settings)["windows_per_second"] > 0
-    assert peers.run_peer("lance", folder, settings)["left_out"] == "lance is not installed"
+    assert (
+        peers.run_peer("lance", folder, settings)["left_out"] == "lance is not installed: pip install pylance"
+    )
     with pytest.raises(RuntimeError, match="shifted gives other windows"):
         peers.run_peer("shifted", folder, settings)

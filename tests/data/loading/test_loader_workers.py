@@ -72,6 +72,20 @@ def test_forked_workers_give_the_same_batches(sets: list[Path]) -> None:
     run_fresh(FORKING, *sets)
 
 
+LEAVING = """
+from hma_data.bench.loader import BENCH
+
+if __name__ == "__main__":
+    small = {"frames": 20_000, "shard_frames": 20_000, "windows": 1_000, "embodiments": 2, "runs": 1}
+    BENCH.run(BENCH.defaults | small | {"workers": 2, "cases": ["mixture"]})
+"""
+
+
+@pytest.mark.slow
+def test_workers_that_are_left_while_they_send_do_not_abort() -> None:
+    assert "terminate called" not in run_fresh(LEAVING)
+
+
 def test_a_run_stopped_with_some_workers_goes_on_with_others(sets: list[Path]) -> None:
     whole = seen(iter(dataset(sets)), 30)
     state, found = dataset(sets).state_dict(), []

@@ -68,6 +68,6 @@ def test_the_verb_tells_of_actions_outside_the_range_seen_in_training(
     command = ["generate", "model", "shards", "--out", str(tmp_path / "film.webp")]
     for low, high, told in ((-1e9, 1e9, False), (5e8, 1e9, True)):
         ends = np.array([[low] * 2, [high] * 2], np.float32)
-        monkeypatch.setattr("hma_model.simulate.commands._seen", lambda *names, ends=ends: ends)
+        monkeypatch.setattr("hma_model.generation.commands._seen", lambda *names, ends=ends: ends)
         assert main(command) == 0
         assert ("outside the range seen in training (" in capsys.readouterr().err) == told

@@ -137,7 +137,7 @@ def test_what_cannot_be_labelled_is_refused(world: World, tmp_path: Path) -> Non
     with pytest.raises(UsageError, match="no labelled film of it is known — .*--check SHARDS"):
         run()
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UsageError, match="empty: is no shard set and holds no video files"):
+    with pytest.raises(UsageError, match="empty: is no shard set and no folder with video files"):
         run(tmp_path / "empty")
     (tmp_path / "out").write_text("")
     with pytest.raises(OutputError, match="out: is a file"):

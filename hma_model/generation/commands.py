@@ -3,11 +3,15 @@
 A action dims, K = stride · A values of a chunk.
 """
 
+import math
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_data.registry.embodiment import Embodiment, find
@@ -50,7 +54,7 @@ class Commands:
         robot = described(model, embodiment)
         space = model.embodiments[embodiment]
         seen = _seen(model, embodiment)
-        low, high = np.full((2, space.action_dim), (-np.inf, np.inf), np.float32).T if seen is None else seen
+        low, high = np.full((space.action_dim, 2), (-np.inf, np.inf), np.float32).T if seen is None else seen
         names: list[str] = [f"action_{i}" for i in range(space.action_dim)]
         if robot is not None:
             names, at = robot.action.names(), 0
@@ -103,7 +107,7 @@ class Commands:
         return unknown
 
     def outside(self, commands: Floats) -> str:
-        """Return in words which commands (..., A) leave the range seen in training, and the range."""
+        """Say which of the commands (..., A) leave the range seen in training, and the range; "" for none."""
         if self.seen is None:
             return ""
         low, high = self.seen
@@ -111,11 +115,40 @@ class Commands:
         with np.errstate(invalid="ignore"):
             beyond = ((commands < low - slack) | (commands > high + slack)).reshape(-1, len(low)).any(axis=0)
         said = [f"{self.names[i]} {low[i]:g} to {high[i]:g}" for i in np.flatnonzero(beyond)]
-        return ", ".join(said)
+        about = f"an action is outside the range seen in training ({', '.join(said)})"
+        return f"{self.embodiment}: {about}" if said else ""
 
     def clip(self, commands: Floats) -> Floats:
         """Return commands (..., A) inside the range seen in training; NaN stays."""
         return commands if self.seen is None else np.clip(commands, *self.seen)
+
+
+def warn_outside(
+    model: "HMA", actions: Tensor, embodiments: str | Sequence[str], known: Tensor | None = None
+) -> None:
+    """Warn of known actions outside the range seen in training; once of each embodiment of a model.
+
+    Args:
+        model: any.
+        actions: (B, T, K) raw.
+        embodiments: one id for all, or one a sample.
+        known: (B, T) bool; by default all are.
+    """
+    if "origin" not in vars(model):  # only a checkpoint has the range
+        return
+    if known is not None:
+        actions = actions.masked_fill(~known[..., None], math.nan)
+    watched: dict[str, Commands | None] = vars(model).setdefault("watched_commands", {})
+    names = [embodiments] * len(actions) if isinstance(embodiments, str) else list(embodiments)
+    for name in sorted(set(names)):
+        own = watched[name] if name in watched else Commands.of(model, name)
+        if own is not None:
+            mine = [row for row, one in enumerate(names) if one == name]
+            rows = actions[mine, :, : own.stride * len(own.names)].numpy(force=True)
+            said = own.outside(rows.reshape(-1, len(own.names)))
+            watched[name] = None if said else own
+            if said:
+                warnings.warn(f"{said}. This is said once", stacklevel=4)
 
 
 def described(model: "HMA", embodiment: str) -> Embodiment | None:
