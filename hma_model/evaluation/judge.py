@@ -201,18 +201,24 @@ def train_judge(
 
 
 def best_limit(read: Floats, success: Bools, limit: float) -> float:
-    """Return the limit of scores (N,) that best tells successes; of several, the one nearest to the true one.
+    """Return the limit of scores (N,) that tells successes, as near to the true one as the examples allow.
 
-    Best has the highest balanced accuracy. If all episodes end alike, the true limit stays.
+    Of all limits whose balanced accuracy is within one standard error of the highest, it is the nearest: where
+    few examples lie between failure and success, many limits tell them about as well. If all episodes end
+    alike, the true limit stays.
     """
     if success.all() or not success.any():
         return limit
     ordered = np.unique(read)
     tried = np.concatenate([[limit], (ordered[1:] + ordered[:-1]) / 2])
     said = read >= tried[:, None]
-    balanced = (said[:, success].mean(axis=1) + (~said[:, ~success]).mean(axis=1)) / 2
-    best = tried[balanced >= balanced.max() - 1e-12]
-    return float(best[np.abs(best - limit).argmin()])
+    rates = np.stack([said[:, success].mean(axis=1), (~said[:, ~success]).mean(axis=1)])
+    balanced = rates.mean(axis=0)
+    counts = np.array([success.sum(), (~success).sum()])
+    top = rates[:, balanced.argmax()]
+    error = np.sqrt((top * (1 - top) / counts).sum()) / 2
+    good = tried[balanced >= balanced.max() - error - 1e-12]
+    return float(good[np.abs(good - limit).argmin()])
 
 
 def _read_score(task: Task, probe: Probe, pictures: Images) -> Floats:

@@ -79,17 +79,25 @@ def test_a_part_that_is_gone_stays_where_it_was_last_seen() -> None:
     assert last_seen(places, areas)[0, :, 0, 0].tolist() == [0, 2, 2, 6, 6]
 
 
-def test_the_limit_is_the_best_of_all() -> None:
+def test_the_limit_is_the_nearest_of_those_that_tell_about_best() -> None:
     rng = np.random.default_rng(1)
-    success = rng.random(40) < 0.4
-    read = rng.normal(5, 2, 40) + 3 * success
+    success = rng.random(200) < 0.4
+    read = rng.normal(5, 2, 200) + 3 * success
 
     def balanced(limit: float) -> float:
         said = read >= limit
         return float(said[success].mean() + (~said[~success]).mean()) / 2
 
-    assert balanced(best_limit(read, success, 5.0)) == max(map(balanced, np.linspace(0, 15, 3001)))
-    assert best_limit(read, np.ones(40, bool), 5.0) == 5.0
+    tried = np.linspace(0, 15, 3001)
+    top = max(tried, key=balanced)
+    right, wrong = (read >= top)[success].mean(), (read >= top)[~success].mean()
+    error = (right * (1 - right) / success.sum() + wrong * (1 - wrong) / (~success).sum()) ** 0.5 / 2
+    found = best_limit(read, success, 2.0)
+    assert balanced(found) >= balanced(top) - error
+    gap = 0.2  # limits lie between what was read
+    nearer = [one for one in tried if abs(one - 2.0) < abs(found - 2.0) - gap]
+    assert nearer and all(balanced(one) < balanced(top) - error for one in nearer)
+    assert best_limit(read, np.ones(200, bool), 5.0) == 5.0
 
 
 def test_a_judge_tells_its_accuracy_on_episodes_that_it_was_not_fitted_to(episodes: None) -> None:
