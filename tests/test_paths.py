@@ -412,6 +412,7 @@ INNER = {  # take what a public function has made of a path already
     "hma_data.shards.verify": {"check_rows", "check_shard"},
     "hma_data.sources.base": {
         "of_another_format",
+        "existing_path",
         "local_path",
         "leaves",
         "first_bytes",

@@ -203,9 +203,9 @@ def train_judge(
 def best_limit(read: Floats, success: Bools, limit: float) -> float:
     """Return the limit of scores (N,) that tells successes, as near to the true one as the examples allow.
 
-    Of all limits whose balanced accuracy is within one standard error of the highest, it is the nearest: where
-    few examples lie between failure and success, many limits tell them about as well. If all episodes end
-    alike, the true limit stays.
+    Of all limits whose balanced accuracy is within one standard error of the highest, it is the nearest:
+    where few examples lie between failure and success, many limits tell them about as well. If all episodes
+    end alike, the true limit stays.
     """
     if success.all() or not success.any():
         return limit

@@ -3,6 +3,7 @@
 B batch, T frames, P frames of the prompt, h,w grid, S pixels a side, C cameras.
 """
 
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypedDict, Unpack
 
@@ -16,7 +17,7 @@ from hma_data.loading.dataset import Batch
 from hma_data.loading.views import FIRST, Cameras, view_count
 from hma_data.shards.reader import ShardSet
 from hma_model.checkpoint.folder import Checkpoint
-from hma_model.generation.rollout import generate
+from hma_model.generation.commands import OutsideRangeWarning
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -90,10 +91,12 @@ def rollout(
     generator = torch.Generator().manual_seed(seed)
     known: Tensor | None = batch.action_mask[:, : first + count].to(model.device)
     passive = model.config.absent_action != "embedding" and not batch.action_mask[:, : first + count].any()
-    predicted = generate(
-        model, given, None if passive else chunks, batch.embodiment, count, None if passive else known,
-        generator=generator, **sampling,
-    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OutsideRangeWarning)  # nobody chose these commands
+        predicted = model.generate(
+            given, None if passive else chunks, batch.embodiment, count, generator=generator,
+            known=None if passive else known, **sampling,
+        )  # fmt: skip
     if truth is None:
         truth = decode(tokenizer, stored[:, : first + count])
     finite = np.ones(predicted.shape[:2], np.bool_)

@@ -123,6 +123,10 @@ class Commands:
         return commands if self.seen is None else np.clip(commands, *self.seen)
 
 
+class OutsideRangeWarning(UserWarning):
+    """Commands lie outside the range seen in training."""
+
+
 def warn_outside(
     model: "HMA", actions: Tensor, embodiments: str | Sequence[str], known: Tensor | None = None
 ) -> None:
@@ -148,7 +152,7 @@ def warn_outside(
             said = own.outside(rows.reshape(-1, len(own.names)))
             watched[name] = None if said else own
             if said:
-                warnings.warn(f"{said}. This is said once", stacklevel=4)
+                warnings.warn(f"{said}. This is said once", OutsideRangeWarning, stacklevel=4)
 
 
 def described(model: "HMA", embodiment: str) -> Embodiment | None:

@@ -1,6 +1,7 @@
 """`hma shards …`: exit codes, one line an error, JSON."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -56,7 +57,10 @@ def test_verify_ends_with_1_when_it_finds_something(made: Path, tmp_path: Path) 
 
 
 def test_every_verb_that_makes_a_set_makes_a_sound_one(made: Path, tmp_path: Path) -> None:
-    facts = json.loads(run("merge", made, made, "--out", tmp_path / "m", "--json").stdout)
+    again = shutil.copytree(made, tmp_path / "again")
+    facts = json.loads(run("merge", made, again, "--out", tmp_path / "m", "--json").stdout)
+    twice = run("merge", made, made, "--out", tmp_path / "twice", code=1)
+    assert "is given twice" in str(twice.exception)
     assert facts["episodes"] == 10
     said = run("split", tmp_path / "m", "--val-fraction", 0.4, "--seed", 2, "--out", tmp_path / "s").stdout
     assert "10 episodes" in said
