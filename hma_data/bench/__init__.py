@@ -34,7 +34,9 @@ class Bench:
         run: takes the settings; returns one mapping for each case: the values that distinguish the case, and
             the figures, each named with its unit (`frames_per_second`, `peak_rss_mib`).
         choices: what some settings, or the items of some lists, must be one of.
-        fault: takes these, and returns what is wrong with them, or nothing; with a fault `hma bench` exits 1.
+        zeros: settings that may be 0 though their default is not.
+        fault: takes these mappings, and returns what is wrong with them, or nothing; with a fault
+            `hma bench` exits 1.
     """
 
     about: str
@@ -42,6 +44,7 @@ class Bench:
     run: Callable[[dict[str, Any]], list[dict[str, Any]]]
     fault: Callable[[list[dict[str, Any]]], str] = lambda rows: ""
     choices: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    zeros: tuple[str, ...] = ()
 
 
 def load(name: str) -> Bench:
@@ -77,7 +80,7 @@ def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, 
             raise UsageError(
                 f"bench {name}: {word}", f"must be {kind.__name__}, like {listed or settings[key]}"
             )
-        _check_range(f"bench {name}: {word}", value, zero=not settings[key] or key == "seed")
+        _check_range(f"bench {name}: {word}", value, zero=not settings[key] or key in ("seed", *bench.zeros))
         known = bench.choices.get(key)
         unknown = [one for one in (value if kind is list else [value]) if known and one not in known]
         if known and unknown:

@@ -277,4 +277,5 @@ BENCH = Bench(
     },
     run,
     fault,
+    zeros=("episodes",),
 )

@@ -6,6 +6,7 @@ A action dims, K = stride · A values of a chunk.
 import math
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hma_data.errors import HMAError
+from hma_data.errors import CheckpointError, HMAError
 from hma_data.registry.embodiment import Embodiment, find
 from hma_model.checkpoint.folder import Checkpoint
 
@@ -145,7 +146,7 @@ def warn_outside(
     watched: dict[str, Commands | None] = vars(model).setdefault("watched_commands", {})
     names = [embodiments] * len(actions) if isinstance(embodiments, str) else list(embodiments)
     for name in sorted(set(names)):
-        own = watched[name] if name in watched else Commands.of(model, name)
+        own = watched[name] if name in watched else _known(model, name)
         if own is not None:
             mine = [row for row, one in enumerate(names) if one == name]
             rows = actions[mine, :, : own.stride * len(own.names)].numpy(force=True)
@@ -153,6 +154,13 @@ def warn_outside(
             watched[name] = None if said else own
             if said:
                 warnings.warn(f"{said}. This is said once", OutsideRangeWarning, stacklevel=4)
+
+
+def _known(model: "HMA", embodiment: str) -> Commands | None:
+    """Return the commands of an embodiment; None if the checkpoint that tells them is no longer there."""
+    with suppress(CheckpointError):
+        return Commands.of(model, embodiment)
+    return None
 
 
 def described(model: "HMA", embodiment: str) -> Embodiment | None:

@@ -491,4 +491,4 @@ def waves_of_stem(stem: Mapping[str, Tensor]) -> int:
     """Return the octaves of waves of the commands in a stem's state."""
     if "waves.weight" not in stem or "input.weight" not in stem:
         return 0
-    return stem["waves.weight"].shape[-1] // (2 * stem["input.weight"].shape[-1])
+    return stem["waves.weight"].shape[-1] // max(2 * stem["input.weight"].shape[-1], 1)
