@@ -7,22 +7,21 @@ What a reader will need again, such as the pictures of an episode of which it lo
 can keep. One cache serves all files of a process, so memory does not grow with their number or size.
 """
 
-import io
 import itertools
 import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
-from typing import Any, BinaryIO, cast
+from typing import BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import StorageError
-from hma_data.storage.remote import RemotePath, attempt
+from hma_data.storage.remote import RemotePath, SeekableFile, fetch_range
 
 BLOCK = 1 << 20  # bytes of a request
 AHEAD = 32  # expected blocks on their way while one is read
@@ -133,11 +132,9 @@ class Blocks:
         found = self._want(number)
         if self.expects(number * BLOCK):
             self._ahead(int(np.searchsorted(self._expected, number)) + 1, AHEAD)
-        try:
-            return found.result()
-        except BaseException:
+        if found.exception():  # waits for it
             _cache(os.getpid()).forget((self._number, number))
-            raise
+        return found.result()
 
     def keep(self, name: Hashable, data: bytes) -> None:
         """Keep a part of the file under a name, while there is room."""
@@ -164,44 +161,24 @@ class Blocks:
         return _cache(os.getpid()).want((self._number, number), lambda: self._fetch(start, end))
 
 
-class BlockFile(io.RawIOBase):
+class BlockFile(SeekableFile):
     """A position in a file that is read by blocks; as many as one likes share their blocks."""
 
     def __init__(self, blocks: Blocks) -> None:
+        super().__init__(blocks.size)
         self.blocks = blocks
-        self._at, self._begin, self._held = 0, 0, b""  # position; the block that was read last
+        self._begin, self._held = 0, b""  # the block that was read last
 
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._at
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self.blocks.size}[whence]
-        return self._at
-
-    def read(self, size: int | None = -1) -> bytes:
-        """Return exactly `size` bytes, or fewer at the end of the file."""
-        size = self.blocks.size if size is None or size < 0 else size
+    def _bytes(self, count: int) -> bytes:
         number = self._at // BLOCK
-        if self._at % BLOCK + size > BLOCK or self._at >= self.blocks.size:
-            data = self.blocks.read(self._at, self._at + size)
+        if self._at % BLOCK + count > BLOCK or self._at >= self._size:
+            data = self.blocks.read(self._at, self._at + count)
         else:
             if self._begin != number * BLOCK or not self._held:
                 self._begin, self._held = number * BLOCK, self.blocks.block(number)
-            data = self._held[self._at - self._begin : self._at - self._begin + size]
+            data = self._held[self._at - self._begin : self._at - self._begin + count]
         self._at += len(data)
         return data
-
-    def readinto(self, buffer: Any) -> int:
-        view = memoryview(buffer).cast("B")
-        data = self.read(len(view))
-        view[: len(data)] = data
-        return len(data)
 
 
 class LargeFile:
@@ -235,20 +212,10 @@ def remote_blocks(path: RemotePath) -> Blocks:
         FileNotFoundError: it is not there.
         StorageError: it cannot be read, or the store does not state its length.
     """
-    found, files, key = path.info(), path.files, path.key
-    if found.get("size") is None:
+    size = path.info().get("size")
+    if size is None:
         raise StorageError(path, "its server does not state its length", "copy the file here")
-
-    def fetch(start: int, end: int) -> bytes:
-        def ask() -> bytes:
-            data = bytes(files.cat_file(key, start=start, end=end))
-            if len(data) != end - start:
-                raise ConnectionError(f"{len(data)} bytes came where {end - start} were asked for")
-            return data
-
-        return attempt(path, "read", ask)
-
-    return Blocks(fetch, int(found["size"]))
+    return Blocks(partial(fetch_range, path), int(size))
 
 
 def expect(file: BinaryIO, parts: Iterable[tuple[int, int]]) -> None:

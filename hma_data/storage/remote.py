@@ -329,17 +329,27 @@ def _put(to: RemotePath, upload: Callable[[str], Any]) -> None:
 # -- reading by ranges
 
 
-class RangeFile(io.RawIOBase):
-    """A remote file that can be read at any position.
+def fetch_range(path: RemotePath, start: int, stop: int) -> bytes:
+    """Return the bytes of a remote file from `start` up to `stop`, which lies inside it.
 
-    The end of the file is read at once and the rest on request; a sequential reader is read ahead of.
+    Raises:
+        StorageError: the store refuses it; StorageAwayError: it does not answer.
     """
 
-    def __init__(self, path: RemotePath, size: int | None = None) -> None:
-        self._path, self._files, self._key = path, path.files, path.key
-        self._at, self._last = 0, -1
-        self._size = int(path.info()["size"]) if size is None else size
-        self._begin, self._kept = 0, b""
+    def ask() -> bytes:
+        data = bytes(path.files.cat_file(path.key, start=start, end=stop))
+        if len(data) != stop - start:
+            raise ConnectionError(f"{len(data)} bytes came where {stop - start} were asked for")
+        return data
+
+    return attempt(path, "read", ask)
+
+
+class SeekableFile(io.RawIOBase):
+    """A position in a file of `size` bytes; subclasses read from it."""
+
+    def __init__(self, size: int) -> None:
+        self._at, self._size = 0, size
 
     def readable(self) -> bool:
         return True
@@ -354,15 +364,31 @@ class RangeFile(io.RawIOBase):
         self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
         return self._at
 
+    def read(self, size: int | None = -1) -> bytes:
+        """Return exactly `size` bytes, or fewer at the end of the file."""
+        return bytes(self._bytes(self._size if size is None or size < 0 else size))
+
     def readinto(self, buffer: Any) -> int:
         view = memoryview(buffer).cast("B")
         data = self._bytes(len(view))
         view[: len(data)] = data
         return len(data)
 
-    def read(self, size: int | None = -1) -> bytes:
-        """Return exactly `size` bytes, or fewer at the end of the file."""
-        return bytes(self._bytes(self._size if size is None or size < 0 else size))
+    def _bytes(self, count: int) -> bytes | memoryview:
+        """Return up to `count` bytes from the position on, and move behind them."""
+        raise NotImplementedError
+
+
+class RangeFile(SeekableFile):
+    """A remote file that can be read at any position.
+
+    The end of the file is read at once and the rest on request; a sequential reader is read ahead of.
+    """
+
+    def __init__(self, path: RemotePath, size: int | None = None) -> None:
+        super().__init__(int(path.info()["size"]) if size is None else size)
+        self._path, self._last = path, -1
+        self._begin, self._kept = 0, b""
 
     def _bytes(self, count: int) -> memoryview:
         begin, end = self._at, min(self._at + count, self._size)
@@ -374,18 +400,9 @@ class RangeFile(io.RawIOBase):
                 stop = min(max(end, begin + AHEAD), self._size)
             elif end > self._size - TAIL:
                 start, stop = min(begin, max(0, self._size - TAIL)), self._size
-            self._kept, self._begin = self._fetch(start, stop), start
+            self._kept, self._begin = fetch_range(self._path, start, stop), start
         self._at = self._last = end
         return memoryview(self._kept)[begin - self._begin : end - self._begin]
-
-    def _fetch(self, start: int, stop: int) -> bytes:
-        def ask() -> bytes:
-            data = bytes(self._files.cat_file(self._key, start=start, end=stop))
-            if len(data) != stop - start:
-                raise ConnectionError(f"{len(data)} bytes came where {stop - start} were asked for")
-            return data
-
-        return attempt(self._path, "read", ask)
 
 
 def parquet_input(path: Path) -> Any:

@@ -21,6 +21,26 @@ needs_int8 = pytest.mark.skipif(
 )
 
 
+type Graphs = list[torch.fx.GraphModule]
+
+
+@pytest.fixture
+def graphs(monkeypatch: pytest.MonkeyPatch) -> Graphs:
+    """The graphs that torch.compile records from here on; they run as they are."""
+    compile, found = torch.compile, []
+
+    def backend(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> torch.fx.GraphModule:
+        found.append(graph)
+        return graph
+
+    def traced(function: object, **how: object) -> object:
+        return compile(function, backend=backend, fullgraph=True, dynamic=False)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(torch, "compile", traced)
+    torch._dynamo.reset()
+    return found
+
+
 def _frames(model: HMA, **how: object) -> torch.Tensor:
     batch = small_batch(model.config, ["arm", "hand.v1"], frames=8)
     rollout = Rollout(model, batch.embodiment, 2, **how)  # type: ignore[arg-type]
@@ -137,39 +157,18 @@ def test_what_a_rollout_returns_can_be_changed_and_trained_on() -> None:
 @pytest.mark.parametrize(("guidance", "temperature"), [(1.0, 0.0), (2.0, 0.5)])
 @pytest.mark.parametrize(("order", "digits"), [("random", "chain"), ("confidence", "together")])
 def test_trunk_head_and_unmasking_compile_to_one_graph_of_each_pass(
-    order: str, digits: str, guidance: float, temperature: float, monkeypatch: pytest.MonkeyPatch
+    order: str, digits: str, guidance: float, temperature: float, graphs: Graphs
 ) -> None:
     model = small_model(masked_input="previous", digit_order=digits, told_noise=True)
     how = {"order": order, "guidance": guidance, "temperature": temperature, "noise_level": 0.2}
-    compile, graphs = torch.compile, []
-
-    def backend(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> torch.fx.GraphModule:
-        graphs.append(graph)
-        return graph
-
-    def traced(function: object, **how: object) -> object:
-        return compile(function, backend=backend, fullgraph=True, dynamic=False)  # type: ignore[call-overload]
-
-    monkeypatch.setattr(torch, "compile", traced)
-    torch._dynamo.reset()
     made = _frames(model, compile=True, **how)
     assert torch.equal(made, _frames(model, **how))
     assert len(graphs) == 2  # over two frames, and over one
 
 
 @pytest.mark.slow
-def test_new_prompts_and_rows_that_begin_anew_compile_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, compile, graphs = small_model(), torch.compile, []
-
-    def backend(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> torch.fx.GraphModule:
-        graphs.append(graph)
-        return graph
-
-    def traced(function: object, **how: object) -> object:
-        return compile(function, backend=backend, fullgraph=True, dynamic=False)  # type: ignore[call-overload]
-
-    monkeypatch.setattr(torch, "compile", traced)
-    torch._dynamo.reset()
+def test_new_prompts_and_rows_that_begin_anew_compile_nothing_more(graphs: Graphs) -> None:
+    model = small_model()
     batch = small_batch(model.config, ["arm", "hand.v1"], frames=8)
     rollout = Rollout(model, batch.embodiment, 2, compile=True, unmask_steps=12)
 
