@@ -11,17 +11,17 @@ where a lane stands. A run can therefore be resumed exactly from one number per 
 B batch, T frames, h·w grid, c·H·W latents, A action dims, K = stride·A.
 """
 
-import os
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from multiprocessing.util import Finalize
 from typing import Any
 
 import numpy as np
 from torch import cuda
-from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
+from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
-from hma_data.errors import HMAError, ShardError, UsageError
+from hma_data.errors import ShardError, UsageError
 from hma_data.loading.mixture import TEMPERATURES, Draw, Mixture
 from hma_data.loading.pools import UnitAssignment, WindowSequence, pool_size
 from hma_data.loading.rows import MIB, Batch, Decoder, as_batch, assemble
@@ -30,7 +30,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import Ints, Short
 from hma_data.storage.paths import StrPath
 
-AHEAD, AHEAD_BYTES = 8, 8 * MIB  # most batches of a lane that are cut together, and their windows
+AHEAD, AHEAD_BYTES = 32, 8 * MIB  # most batches of a lane that are cut together, and their windows
 
 __all__ = ["Batch", "MixtureDataset", "WindowDataset", "as_batch", "open_sets"]
 
@@ -149,7 +149,7 @@ class WindowDataset(Dataset[Batch]):
 class MixtureDataset(IterableDataset[Batch]):
     """An endless stream of batches over a mixture of shard sets.
 
-    Iterate it directly, or `batches(workers)` for decoding in other processes; both can be
+    Iterate it directly, or `batches(workers)` for batches made ahead by threads; both can be
     resumed with `state_dict` and `load_state_dict`. A torch DataLoader, or torchdata's
     StatefulDataLoader, with batch_size=None gives the same batches in the same order.
 
@@ -252,11 +252,11 @@ class MixtureDataset(IterableDataset[Batch]):
             if batch is not None:
                 yield batch
 
-    def batches(self, workers: int = 0, context: str = "spawn") -> Iterator[Batch]:
-        """Yield the same batches, decoded by `workers` processes; `state_dict` counts what is yielded here.
+    def batches(self, workers: int = 0) -> Iterator[Batch]:
+        """Yield the same batches, made ahead by `workers` threads; `state_dict` counts what is yielded here.
 
-        Args:
-            context: how the processes start: spawn, fork, forkserver.
+        Reading, decompressing and copying release the interpreter's lock, and a thread's batches need not be
+        sent to another process. A lane is made by one thread at a time, so more threads than lanes wait.
 
         Raises:
             ShardError: a shard is missing or damaged.
@@ -264,55 +264,44 @@ class MixtureDataset(IterableDataset[Batch]):
         if not workers:
             yield from self
             return
-        loader = DataLoader(
-            _Carrier(self),
-            batch_size=None,
-            num_workers=workers,
-            multiprocessing_context=context,
-            prefetch_factor=2,
-            pin_memory=cuda.is_available(),  # so that copies to the GPU need not be waited for
-            worker_init_fn=_end_at_once,
-        )
-        for batch in self._in_order(iter(loader)):
+        for batch in self._made_ahead(workers):
             lane, draws = self._step % self.lanes, self._draws(self._step)
             self._step, self._taken = self._step + 1, _counted(self._taken, lane, draws)
             yield batch
 
-    def blocks(self, worker: int, workers: int) -> Iterator[Batch]:
-        """Yield a worker's share of the batches, as blocks: batches of a lane that are cut together, in one.
+    def _made_ahead(self, workers: int) -> Iterator[Batch]:
+        """Yield the batches; while those of a lane are taken, its next ones are made."""
+        pool, blocks = ThreadPoolExecutor(workers, "batches"), self._blocks()
+        try:
+            begun = deque(pool.submit(self._made, *next(blocks)) for _ in range(self.lanes))
+            while True:
+                made = []
+                for _ in range(self.lanes):
+                    made.append(begun.popleft().result())
+                    begun.append(pool.submit(self._made, *next(blocks)))
+                    yield made[-1][0]
+                for batches in list(zip(*made, strict=True))[1:]:
+                    yield from batches
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
-        A batch takes a millisecond to another process, and so does a block.
+    def _blocks(self) -> Iterator[tuple[int, Ints, Ints]]:
+        """Yield what the batches are made from that are cut together: lane, draws, and what was taken before.
+
+        The blocks are those of the first batch of each lane, then the next ones of each lane, and so on.
         """
-        number = 0
+        step, taken = self._step, self._taken.copy()
         while True:
             for i in range(self.lanes):
-                if number % workers == worker:
-                    lane, draws = (self._step + i) % self.lanes, self._drawn_ahead(self._step + i)
-                    yield next(self._cut(lane, draws, self._taken[lane], len(draws)))
-                number += 1
-            for _ in range(self.lanes * self._some):
-                lane, draws = self._step % self.lanes, self._draws(self._step)
-                self._step, self._taken = self._step + 1, _counted(self._taken, lane, draws)
+                lane, draws = (step + i) % self.lanes, self._drawn_ahead(step + i)
+                yield lane, draws, taken[lane].copy()
+                taken = _counted(taken, lane, draws)
+            step += self.lanes * self._some
 
-    def _split(self, block: Batch) -> Iterator[Batch]:
-        robots = [self.sets[name].embodiment for name in block.embodiment]
-        widths = [robot.action_dim * robot.stride for robot in robots]
-        for start in range(0, len(widths), self.batch_size):
-            end = start + self.batch_size
-            yield block.part(start, end, max(widths[start:end]))
-
-    def _in_order(self, blocks: Iterator[Batch | HMAError]) -> Iterator[Batch]:
-        """Yield the batches of blocks: the first of each lane, then the second of each lane, and so on."""
-        while True:
-            begun = []
-            for _ in range(self.lanes):
-                block = next(blocks)
-                if isinstance(block, HMAError):
-                    raise block
-                begun.append(self._split(block))
-                yield next(begun[-1])
-            for batches in zip(*begun):
-                yield from batches
+    def _made(self, lane: int, draws: Ints, taken: Ints) -> list[Batch]:
+        batches = self._cut(lane, draws, taken, self.batch_size)
+        pin = cuda.is_available()  # so that copies to the GPU need not be waited for
+        return [batch.pin_memory() if pin else batch for batch in batches]
 
     def realised(self) -> list[dict[str, float | str | int]]:
         """Return what this rank has drawn of each embodiment beside what was intended: `Mixture.table`."""
@@ -436,26 +425,6 @@ class MixtureDataset(IterableDataset[Batch]):
         self._step, self._taken = step, taken
         self._ahead.clear()  # cut after other windows
         self._origin = state.get("origin") if get_worker_info() else None
-
-
-class _Carrier(IterableDataset[Any]):
-    """A dataset that yields blocks of batches, and its errors as items: torch passes on only their text."""
-
-    def __init__(self, dataset: MixtureDataset) -> None:
-        self._dataset = dataset
-
-    def __iter__(self) -> Iterator[Batch | HMAError]:
-        info = get_worker_info()
-        assert info is not None
-        try:
-            yield from self._dataset.blocks(info.id, info.num_workers)
-        except HMAError as fault:
-            yield fault
-
-
-def _end_at_once(worker: int) -> None:
-    """Let a worker end without the interpreter's finalization, which aborts a thread that sends a batch."""
-    Finalize(None, os._exit, args=(0,), exitpriority=-100)
 
 
 def _check_windows(decoder: Decoder, frames: int) -> None:

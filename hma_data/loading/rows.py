@@ -3,9 +3,10 @@
 n windows, B batch, T frames, S values a frame, h·w grid, c·H·W latents, A action dims, K = stride·A.
 """
 
+import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,7 @@ class Decoder:
         self._names = shards.shards(split)
         self._kept: OrderedDict[int, Rows] = OrderedDict()
         self._keep = max(2, cache_bytes // max(1, self.group_bytes))
+        self._lock = threading.Lock()  # of what is kept; threads decode side by side
 
     @property
     def group_bytes(self) -> int:
@@ -184,18 +186,25 @@ class Decoder:
         return Rows.join([own, after.first(self.index.span - 1)])
 
     def _group(self, group: int) -> Rows:
-        if group not in self._kept:
-            shard, number = (int(v) for v in self.index.groups[group])
-            values = self.shards.read(self._names[shard], [number], [*self.views.columns, *self._columns])
-            self._check(self._names[shard], values)
-            pictures = [values[name] for name in self.views.columns]
-            tokens = pictures[0] if len(pictures) == 1 else np.stack(pictures, axis=1)
-            actions, episode, frame, *known = (values[name] for name in self._columns)
-            self._kept[group] = Rows(tokens, actions, episode, frame, known[0] if known else None)
+        with self._lock:
+            rows = self._kept.get(group)
+        if rows is None:
+            rows = self._decoded(group)
+        with self._lock:
+            self._kept[group] = rows
+            self._kept.move_to_end(group)
             while len(self._kept) > self._keep:
                 self._kept.popitem(last=False)
-        self._kept.move_to_end(group)
-        return self._kept[group]
+        return rows
+
+    def _decoded(self, group: int) -> Rows:
+        shard, number = (int(v) for v in self.index.groups[group])
+        values = self.shards.read(self._names[shard], [number], [*self.views.columns, *self._columns])
+        self._check(self._names[shard], values)
+        pictures = [values[name] for name in self.views.columns]
+        tokens = pictures[0] if len(pictures) == 1 else np.stack(pictures, axis=1)
+        actions, episode, frame, *known = (values[name] for name in self._columns)
+        return Rows(tokens, actions, episode, frame, known[0] if known else None)
 
     def _check(self, shard: str, values: dict[str, NDArray[Any]]) -> None:
         """Raise ShardError for tokens or actions that would spoil the training without an error."""
@@ -216,7 +225,11 @@ class Decoder:
             raise ShardError(f"{folder}/{shard}", fault, f"run: hma shards verify {folder}")
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_kept": OrderedDict()}  # a worker decodes its own
+        kept = {key: value for key, value in self.__dict__.items() if key != "_lock"}
+        return {**kept, "_kept": OrderedDict()}  # another process decodes its own
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _lock=threading.Lock())
 
 
 def _check_stride(shards: ShardSet) -> None:
@@ -265,11 +278,6 @@ class Batch:
     def pin_memory(self) -> "Batch":
         """Return the same batch in pinned memory; a DataLoader with pin_memory=True calls this."""
         return self._map(Tensor.pin_memory)
-
-    def part(self, start: int, end: int, width: int) -> "Batch":
-        """Return some of the windows, without a copy, with action chunks of `width` values."""
-        part = self._map(lambda value: value[start:end])
-        return replace(part, embodiment=self.embodiment[start:end], actions=part.actions[..., :width])
 
     def _map(self, change: Any) -> "Batch":
         values = {f.name: getattr(self, f.name) for f in fields(self)}

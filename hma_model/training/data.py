@@ -8,7 +8,7 @@ W, so a run may continue with another number of ranks.
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from hma_data.errors import RecipeError, TrainingError, UsageError
+from hma_data.errors import RecipeError, UsageError
 from hma_data.loading.dataset import Batch, MixtureDataset
 from hma_data.loading.mixture import Mixture
 from hma_data.shards.reader import ShardSet
@@ -100,20 +100,11 @@ class TrainData:
 
         Raises:
             ShardError: a shard is missing or damaged.
-            TrainingError: a worker has ended.
         """
         if not self._batches:
             self._batches = [data.batches(self._workers) for data in self._data]
         for number, batches in zip(self.own, self._batches):
-            try:
-                batch = next(batches)
-            except (RuntimeError, ConnectionError, EOFError) as fault:  # torch's DataLoader has lost a worker
-                if isinstance(fault, RuntimeError) and "DataLoader worker" not in str(fault):
-                    raise
-                said = f"a process that decodes batches has ended ({type(fault).__name__})"
-                remedy = "use fewer workers if memory is short, and run the same command to continue"
-                raise TrainingError("workers", said, remedy) from fault
-            yield number, batch
+            yield number, next(batches)
 
     def realised(self) -> list[dict[str, Any]]:
         """Return `Mixture.table`: the samples this rank drew of each embodiment, beside the intended ones."""

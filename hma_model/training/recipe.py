@@ -172,7 +172,7 @@ class Recipe(_Settings):
     parallel: Literal["ddp", "fsdp"] = Field("ddp", description="with torchrun: how ranks hold the network")
     compile: bool = Field(False, description="torch.compile of the trunk's blocks")
     checkpointing: bool = Field(False, description="recompute activations: less memory, a third more time")
-    workers: Count = Field(0, ge=0, le=512, description="processes that decode batches, a rank")
+    workers: Count = Field(1, ge=0, le=512, description="threads that make batches ahead, a rank")
     eval_every: Steps = Field(250, description="steps between evaluations; 0 only at the end")
     eval_windows: Count = Field(64, ge=1, description="validation windows an embodiment")
     pictures: Steps = Field(1, description="windows of a robot that an evaluation rolls out for a picture")

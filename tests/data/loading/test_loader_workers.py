@@ -1,6 +1,7 @@
 """The stream of batches: the same with any workers, in any DataLoader, over stops and ranks."""
 
 import copy
+import threading
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -15,7 +16,6 @@ from hma_data.bench.loader import make_set
 from hma_data.loading.dataset import Batch, MixtureDataset, WindowDataset, as_batch
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
-from tests.data.fresh import run_fresh
 from tests.data.loading.test_pools import SMALL
 
 FRAMES, SIZE = 6, 8
@@ -48,42 +48,29 @@ def windows_of(batch: Batch) -> list[tuple[str, int, int]]:
     return list(zip(batch.embodiment, batch.episode.tolist(), batch.frame.tolist(), strict=True))
 
 
-@pytest.mark.parametrize(
-    ("workers", "context"), [(1, WORKERS), pytest.param(2, "spawn", marks=pytest.mark.slow), (3, WORKERS)]
-)
-def test_any_number_of_workers_gives_the_same_batches(sets: list[Path], workers: int, context: str) -> None:
-    data = dataset(sets)
-    assert seen(data.batches(workers, context), 14) == seen(iter(dataset(sets)), 14)
-    assert data.state_dict()["step"] == 14
+@pytest.mark.parametrize("workers", [1, 2, 3, 9])
+@pytest.mark.parametrize("begun", [0, 3])
+def test_any_number_of_workers_gives_the_same_batches(sets: list[Path], workers: int, begun: int) -> None:
+    data, alone = dataset(sets, lanes=3), dataset(sets, lanes=3)
+    assert seen(iter(data), begun) == seen(iter(alone), begun)
+    found, expected = list(islice(data.batches(workers), 110)), list(islice(alone, 110))
+    assert seen(iter(found), 110) == seen(iter(expected), 110)
+    for one, other in zip(found, expected, strict=True):
+        assert one.tokens is not None and other.tokens is not None
+        assert torch.equal(one.tokens, other.tokens) and torch.equal(one.actions, other.actions)
+    assert data.state_dict() == alone.state_dict()
 
 
-FORKING = """
-import sys
-from tests.data.loading.test_loader_workers import dataset, seen
-
-sets = sys.argv[1:]
-data = dataset(sets)
-assert seen(data.batches(3, "fork"), 14) == seen(iter(dataset(sets)), 14)
-"""
-
-
-@pytest.mark.slow
-def test_forked_workers_give_the_same_batches(sets: list[Path]) -> None:
-    run_fresh(FORKING, *sets)
-
-
-LEAVING = """
-from hma_data.bench.loader import BENCH
-
-if __name__ == "__main__":
-    small = {"frames": 20_000, "shard_frames": 20_000, "windows": 1_000, "embodiments": 2, "runs": 1}
-    BENCH.run(BENCH.defaults | small | {"workers": 2, "cases": ["mixture"]})
-"""
-
-
-@pytest.mark.slow
-def test_workers_that_are_left_while_they_send_do_not_abort() -> None:
-    assert "terminate called" not in run_fresh(LEAVING)
+def test_workers_end_with_their_batches(sets: list[Path]) -> None:
+    before = set(threading.enumerate())
+    batches = dataset(sets).batches(2)
+    next(batches)
+    begun = [thread for thread in threading.enumerate() if thread not in before]
+    assert begun
+    batches.close()  # type: ignore[attr-defined]
+    for thread in begun:
+        thread.join(60)
+        assert not thread.is_alive()
 
 
 def test_a_run_stopped_with_some_workers_goes_on_with_others(sets: list[Path]) -> None:
@@ -92,7 +79,7 @@ def test_a_run_stopped_with_some_workers_goes_on_with_others(sets: list[Path]) -
     for workers, count in ((2, 7), (0, 5), (3, 9), (1, 9)):
         data = dataset(sets)
         data.load_state_dict(copy.deepcopy(state))
-        found += seen(data.batches(workers, WORKERS), count)
+        found += seen(data.batches(workers), count)
         state = data.state_dict()
     assert found == whole
 

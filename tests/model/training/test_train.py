@@ -125,8 +125,7 @@ def test_a_killed_run_goes_on_bit_for_bit(recipe, tmp_path, killed_after):
     assert [{k: v for k, v in e.items() if k != "seconds"} for e in again.evaluations] == strip
 
 
-@pytest.mark.slow
-def test_worker_processes_change_nothing(recipe, tmp_path, quick_workers):
+def test_workers_change_nothing(recipe, tmp_path):
     alone = train(recipe(steps=3), out=tmp_path / "alone", show=False)
     helped = train(recipe(steps=3, workers=1), out=tmp_path / "helped", show=False)
     assert helped.losses == alone.losses
