@@ -7,6 +7,7 @@ Each case runs in its own process. The fastest step after a warm-up counts, beca
 can only slow a step down.
 """
 
+import os
 import time
 from statistics import median
 from types import SimpleNamespace
@@ -167,8 +168,10 @@ def _shares(model: "HMA", settings: dict[str, Any]) -> dict[str, float]:
     """
     from torch.profiler import ProfilerActivity, profile
 
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # it calls a machine without a GPU an error
     cuda = model.device.type == "cuda"
-    with profile(activities=[ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]) as found:
+    device = ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU
+    with profile(activities=[device], acc_events=True) as found:
         step_seconds(model, {**settings, "steps": 0})
     spent = {"products": 0.0, "attention": 0.0, "other": 0.0}
     for one in found.key_averages():

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from hma_model.network import product
 from hma_model.network.product import Linear, after_gelu, after_norm
+from tests.data.fresh import run_fresh
 
 ROWS, INPUTS, OUTPUTS = (3, 50), 24, 40
 
@@ -56,3 +57,18 @@ def test_frozen_weights_and_autocast():
     torch.testing.assert_close(x.grad, linear.weight.sum(0).expand_as(x), rtol=1e-4, atol=1e-4)
     with torch.autocast("cpu", torch.bfloat16):
         assert linear(x).dtype == torch.bfloat16
+
+
+KEPT = """
+import os, sys
+import hma_model.network.product
+assert os.environ["ONEDNN_PRIMITIVE_CACHE_CAPACITY"] == sys.argv[1]
+"""
+
+
+@pytest.mark.parametrize("given", [None, "7"])
+def test_few_products_are_kept_unless_the_user_says_otherwise(given, monkeypatch):
+    monkeypatch.delenv("ONEDNN_PRIMITIVE_CACHE_CAPACITY", raising=False)
+    if given:
+        monkeypatch.setenv("ONEDNN_PRIMITIVE_CACHE_CAPACITY", given)
+    run_fresh(KEPT, given or "64")
