@@ -185,13 +185,14 @@ class ShardSet:
     def _opened(self, shard: str) -> pq.ParquetFile:
         path = self.folder / shard
         if not isinstance(path, RemotePath):
-            return pq.ParquetFile(path, pre_buffer=False)
+            return pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True)
         listed = self.listed[shard]
         whole = sum(item.bytes for item in self.listed.values())
         if self._cache and whole <= limit_bytes() and (kept := kept_shard(path, listed.sha256, listed.bytes)):
-            return pq.ParquetFile(kept, pre_buffer=False)
+            return pq.ParquetFile(kept, pre_buffer=False, page_checksum_verification=True)
         metadata = _footer(path, listed.bytes, listed.sha256)
-        return pq.ParquetFile(RangeFile(path, listed.bytes), pre_buffer=True, metadata=metadata)
+        given = RangeFile(path, listed.bytes)
+        return pq.ParquetFile(given, pre_buffer=True, metadata=metadata, page_checksum_verification=True)
 
     @cached_property
     def listed(self) -> dict[str, ShardFile]:

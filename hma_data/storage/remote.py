@@ -10,6 +10,7 @@ import os
 import re
 import stat
 import threading
+from abc import abstractmethod
 from collections.abc import Callable, Generator
 from contextlib import suppress
 from fnmatch import fnmatchcase
@@ -374,9 +375,9 @@ class SeekableFile(io.RawIOBase):
         view[: len(data)] = data
         return len(data)
 
+    @abstractmethod
     def _bytes(self, count: int) -> bytes | memoryview:
         """Return up to `count` bytes from the position on, and move behind them."""
-        raise NotImplementedError
 
 
 class RangeFile(SeekableFile):

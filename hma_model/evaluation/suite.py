@@ -13,7 +13,6 @@ bytes of results.json.
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -31,7 +30,7 @@ from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import finite, to_json, write_atomic
+from hma_data.storage.files import finite, kept_arrays, to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.evaluation.evaluate import Settings, measure
@@ -251,9 +250,10 @@ def _kept(folder: Path, mark: str, label: str, shards: ShardSet) -> Part | None:
     stem = folder / PARTS / f"{shards.embodiment.id}-{mark}"
     try:
         content = json.loads(stem.with_suffix(".json").read_bytes())
-        with np.load(stem.with_suffix(".npz")) as arrays:
-            predicted = dict(arrays)
-    except (OSError, ValueError, zipfile.BadZipFile):
+    except (OSError, ValueError):
+        return None
+    predicted = kept_arrays(stem.with_suffix(".npz"))
+    if predicted is None:
         return None
     rows = {name: np.array(values, float) for name, values in content["by_window"].items()}
     found = content["found"] | {"checkpoint": label, "data": str(shards.folder)}

@@ -23,7 +23,7 @@ from hma_data.lab.simulator import simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import atomic_path
+from hma_data.storage.files import atomic_path, kept_arrays
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.judge import StateJudge, task_of, train_judge
 from hma_model.evaluation.probe import Probe, train_probe
@@ -231,7 +231,7 @@ class _Maker:
         batches = []
         for begin in range(0, count, BATCH):
             path = work / f"batch-{begin:06d}.npz"
-            if not path.exists():
+            if kept_arrays(path) is None:
                 self._train(on_progress)
                 numbers = range(begin, min(begin + BATCH, count))
                 batch = self._make(numbers, lambda at, b=begin: on_progress(b * frames + at, "episodes"))  # type: ignore[misc]

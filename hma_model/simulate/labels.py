@@ -27,7 +27,7 @@ from hma_data.shards.manifest import MANIFEST, Manifest
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import Refused
 from hma_data.sources.common.video_file import VideoFile, frame_table
-from hma_data.storage.files import atomic_path
+from hma_data.storage.files import atomic_path, kept_arrays
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.config import INVERSE, OBJECTIVES
@@ -247,7 +247,7 @@ def _label(
     heads, kept, refused = film.heads(), [], list[Refused]()
     for number, (name, group, instruction) in enumerate(heads):
         path = work / f"episode-{number:06d}.npz"
-        if not path.exists():
+        if kept_arrays(path) is None:
             on_progress(number, "labelling", len(heads))
             found = _labels_of(world.model, commands, film, number)
             with atomic_path(path) as part, part.open("wb") as file:

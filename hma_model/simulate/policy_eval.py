@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from hma_data.conversion.output import locked
 from hma_data.errors import UsageError
-from hma_data.storage.files import atomic_path
+from hma_data.storage.files import atomic_path, kept_arrays
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.agreement import (
     Accuracy,
@@ -249,7 +249,7 @@ def _once(name: str, work: Path | None, score: Callable[[], Scored]) -> Scored:
     if work is None:
         return score()
     path = work / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
-    found = _kept(name, path) if path.exists() else None
+    found = _kept(name, path)
     if found is None:
         found = score()
         _keep(found, path)
@@ -335,11 +335,14 @@ def _keep(one: Scored, path: Path) -> None:
         np.savez(file, **(arrays | shown | {"shown": np.array(one.shown)}))
 
 
-def _kept(name: str, path: Path) -> Scored:
-    with np.load(path) as arrays:
-        outcomes: Any = {key: Outcomes(arrays[f"{key}_scores"], arrays[f"{key}_success"]) for key in OUTCOMES}
-        pictures: Any = {key: arrays[key] for key in ("true_pictures", "model_pictures")}
-        return Scored(name, shown=tuple(arrays["shown"].tolist()), **outcomes, **pictures)
+def _kept(name: str, path: Path) -> Scored | None:
+    """Return the results of a policy that are kept in a file; None if there are none, or they are damaged."""
+    arrays = kept_arrays(path)
+    if arrays is None:
+        return None
+    outcomes: Any = {key: Outcomes(arrays[f"{key}_scores"], arrays[f"{key}_success"]) for key in OUTCOMES}
+    pictures: Any = {key: arrays[key] for key in ("true_pictures", "model_pictures")}
+    return Scored(name, shown=tuple(arrays["shown"].tolist()), **outcomes, **pictures)
 
 
 def _matrices(scored: Sequence[Scored], key: str) -> list[Scores]:
