@@ -12,6 +12,7 @@ after success, or else after a fixed time.
 """
 
 from collections.abc import Callable, Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mca
 SUCCESS = 0.95  # share of the goal that the T covers
 LAG_S = 0.2  # delay of the pusher's spring (k_v / k_p of the environment) behind a moving target
 SPEED = 300.0  # px/s of planned motion
+PLACED_PX = 4.0  # mean distance of the T's corners from the goal at which a driver that looks has done
 STARTS = ("near", "random", "near", "far", "near")
 EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps; episodes are a minute apart
 
@@ -178,19 +180,55 @@ class FastPusher:
 
     def driver(self, episode: int) -> Callable[[], NDArray[np.float32]]:
         """Return the recorder's driver of an episode, which returns the next command (2,)."""
-        arena, policy = self.arena, _policy(self.arena, self.rng, episode, fly=False)
-        period, setpoint = FAST_PERIOD_S, arena.agent
+        arena = self.arena
+        targets = Targets(_policy(arena, self.rng, episode, fly=False), arena.agent)
+        return lambda: targets.held if arena.success else targets.next(arena.pose, arena.agent)
 
-        def drive() -> NDArray[np.float32]:
-            nonlocal setpoint
-            if arena.success:
-                return _within(setpoint).astype(np.float32)
-            ahead, _ = policy.act(arena.pose, arena.agent, period)
-            target = _within(ahead + (ahead - setpoint) * ((LAG_S - period / 2) / period))
-            setpoint = ahead
-            return target.astype(np.float32)
 
-        return drive
+class Targets:
+    """The commands of pusht_fast under which the pusher goes where a policy wants it.
+
+    Args:
+        policy: gives the setpoints.
+        agent: (2,) where the pusher is.
+    """
+
+    def __init__(self, policy: Planned | Wandering, agent: Floats) -> None:
+        self._policy, self._setpoint = policy, agent
+
+    @property
+    def held(self) -> NDArray[np.float32]:
+        """Return the command (2,) that lets the pusher stay at the last setpoint."""
+        return _within(self._setpoint).astype(np.float32)
+
+    def next(self, pose: Floats, agent: Floats) -> NDArray[np.float32]:
+        """Return the next command (2,), for a pose (3,) of the T and a place (2,) of the pusher."""
+        ahead, _ = self._policy.act(pose, agent, FAST_PERIOD_S)
+        lead = (LAG_S - FAST_PERIOD_S / 2) / FAST_PERIOD_S
+        target = _within(ahead + (ahead - self._setpoint) * lead)
+        self._setpoint = ahead
+        return target.astype(np.float32)
+
+
+def pusher_of(agent: Floats, rng: np.random.Generator) -> Callable[[Floats, Floats], NDArray[np.float32]]:
+    """Return a driver of pusht_fast that looks: from the pose (3,) of the T and the place of the pusher.
+
+    It plans as the recorder's does, and stays where it is once the T lies on its goal.
+    """
+    goal = np.array(GOAL)
+    targets = Targets(Planned(tee(), goal, agent, SPEED, False, rng), agent)
+
+    def drive(pose: Floats, agent: Floats) -> NDArray[np.float32]:
+        off = np.linalg.norm(tee().placed(pose) - tee().placed(goal), axis=-1).mean()
+        return targets.held if off < PLACED_PX else targets.next(pose, agent)
+
+    return drive
+
+
+@cache
+def tee() -> Tee:
+    """Return the T of both robots."""
+    return Arena(FAST_LOOK, "far", np.random.default_rng(0)).tee
 
 
 def _fast_demo(seed: int, episode: int, noise: float = 0.0) -> Demo:

@@ -1,8 +1,9 @@
 """Drive a laboratory robot by its recorder's manoeuvres, from its state in the simulator or off pictures.
 
-The driver of the family and of `planar_arm` needs a pose, and where the blocks lie. `SeenState` finds both
+The driver of the family and of `planar_arm` needs a pose, and where the blocks lie. `SeenPose` finds both
 from the places of the parts in a picture: it looks for the pose whose parts lie there, and between pictures
-lets the commands move it. What no place shows, such as a hoist or a magnet, only the commands move.
+lets the commands move it. What no place shows, such as a hoist or a magnet, only the commands move. The
+pose of `pusht_fast` is the place of its pusher, and two points of the T are its blocks: `SeenPush`.
 
 Q values of a pose, A of a command, P own parts, B blocks; places are px of a picture of 128 by 128.
 """
@@ -10,17 +11,19 @@ Q values of a pose, A of a command, P own parts, B blocks; places are px of a pi
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.lab import FAMILY, planar_arm, truth
+from hma_data.lab import FAMILY, planar_arm, pusht, truth
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.driver import Driver
 from hma_data.lab.family.world import REACH, World
 from hma_data.lab.simulator import Simulation
 
 Floats = NDArray[np.float64]
+PUSHER = "pusht_fast"
 STARTS, ROUNDS = 24, 8  # random poses that a first search begins from, and steps of a search
 DAMPING, NUDGE = 1.0, 1e-3  # px² of the search; of a pose whose axes are scaled to the width of their limits
 CLOSE = 1e-4  # step in that scale at which a search ends
@@ -37,13 +40,16 @@ class State:
 
 def steerable(robot: str) -> bool:
     """Check whether a robot can be driven from a state, rather than by its simulator alone."""
-    return robot == "planar_arm" or FAMILY.fullmatch(robot) is not None
+    return robot in ("planar_arm", PUSHER) or FAMILY.fullmatch(robot) is not None
 
 
 def state_of(simulation: Simulation) -> State:
     """Return the true state of a robot that is steerable."""
     if isinstance(simulation, World):
         return State(simulation.pose, simulation.blocks, simulation.held >= 0)
+    if isinstance(simulation, pusht.FastPusher):
+        _, places = truth.parts_of(simulation)
+        return State(simulation.arena.agent, places[1:], False)
     assert isinstance(simulation, planar_arm.Arm)
     return State(simulation.joints, truth.PX * simulation.blocks[:, :2], False)
 
@@ -53,6 +59,9 @@ def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[Stat
     if FAMILY.fullmatch(robot):
         drive = Driver(Body.of(robot), pose, rng)
         return lambda state: drive(state.pose, state.blocks, state.holding).astype(np.float32)
+    if robot == PUSHER:
+        push = pusht.pusher_of(pose, rng)
+        return lambda state: push(truth.tee_pose(state.blocks), state.pose)
     arm = SimpleNamespace(joints=pose, blocks=np.zeros((1, 2)))
     next_command = planar_arm.driver(arm, rng)  # type: ignore[arg-type]
 
@@ -63,13 +72,52 @@ def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[Stat
     return command
 
 
-class SeenState:
-    """The state of a steerable robot, as places of parts tell it.
+class SeenState(Protocol):
+    """The state of a steerable robot, as pictures and commands tell it."""
+
+    @property
+    def state(self) -> State:
+        """Return the state as it is now."""
+
+    def move(self, command: NDArray[np.float32]) -> None:
+        """Take a command (A,) that was given, until the next picture."""
+
+    def see(self, places: Floats) -> None:
+        """Take the places (P + B, 2) of a new picture."""
+
+
+def seen_state(robot: str, own: NDArray[np.int64], places: Floats) -> SeenState:
+    """Return the state of a steerable robot in a first picture.
 
     Args:
         robot: its name.
         own: numbers of the own parts whose places can be trusted.
-        places: (P + B, 2), as a probe reads them off the first picture.
+        places: (P + B, 2), as a probe reads them off the picture.
+    """
+    return SeenPush(places) if robot == PUSHER else SeenPose(robot, own, places)
+
+
+class SeenPush:
+    """The state of pusht_fast: the pusher follows its target with the lag of its spring."""
+
+    def __init__(self, places: Floats) -> None:
+        self._agent, self._tee = places[0] / truth.PX, places[1:]
+
+    @property
+    def state(self) -> State:
+        return State(self._agent, self._tee, False)
+
+    def move(self, command: NDArray[np.float32]) -> None:
+        self._agent = self._agent + (command - self._agent) * (1 - np.exp(-pusht.FAST_PERIOD_S / pusht.LAG_S))
+
+    def see(self, places: Floats) -> None:
+        self._agent, self._tee = places[0] / truth.PX, places[1:]
+
+
+class SeenPose:
+    """The state of a robot of the family or `planar_arm`; the arguments are those of `seen_state`.
+
+    Args:
         seed: of the poses that the first search begins from.
     """
 
@@ -85,7 +133,6 @@ class SeenState:
 
     @property
     def state(self) -> State:
-        """Return the state as it is now."""
         holding = False
         if self._body is not None and self._body.grip and self._body.holds(self.pose):
             tip, _ = self._body.mechanism.tip(self.pose)
@@ -93,14 +140,12 @@ class SeenState:
         return State(self.pose, self._blocks, holding)
 
     def move(self, command: NDArray[np.float32]) -> None:
-        """Take a command (A,) that was given, until the next picture."""
         if self._body is None:
             self.pose = self.pose + command / planar_arm.HZ
         else:
             self.pose = self._body.moved(self.pose, command.astype(np.float64))
 
     def see(self, places: Floats) -> None:
-        """Take the places (P + B, 2) of a new picture."""
         self.pose = self._search(self.pose, places)
         self._blocks = places[len(places) - len(self._blocks) :]
 

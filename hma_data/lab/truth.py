@@ -122,15 +122,22 @@ def parts_of(simulation: Simulation) -> tuple[int, Floats]:
         return 1, SIZE / 2 - ROD * np.array([[np.sin(simulation.angle), np.cos(simulation.angle)]])
     assert isinstance(simulation, pusht.FastPusher | pusht.SlowPusher)
     arena = simulation.arena
-    return 1, np.concatenate([PX * arena.agent[None], _tee(arena.pose)])
+    return 1, np.concatenate([PX * arena.agent[None], tee_places(arena.pose)])
 
 
 def goal_of(robot: str) -> Floats | None:
     """Return the places (2, 2) of the T of a pusher when it lies on its goal; other robots have no goal."""
-    return _tee(np.array(pusht.GOAL)) if robot in PUSHERS else None
+    return tee_places(np.array(pusht.GOAL)) if robot in PUSHERS else None
 
 
-def _tee(pose: Floats) -> Floats:
+def tee_pose(places: Floats) -> Floats:
+    """Return the pose (3,) x, y, angle of a pusher's T, in px of its arena, whose places (2, 2) these are."""
+    along = places[1] - places[0]
+    return np.append(places[0] / PX, np.arctan2(along[1], along[0]) - np.arctan2(STEM[1], STEM[0]))
+
+
+def tee_places(pose: Floats) -> Floats:
+    """Return the places (2, 2) of a pusher's T at a pose (3,) in px of its arena."""
     return PX * np.stack([pose[:2], pose[:2] + rotation(pose[2]) @ STEM])
 
 

@@ -4,6 +4,7 @@ A probe has about 3,600 weights: convolutions make one map a part, the softmax o
 the picture, and its mean is the part's place (Sun et al. 2018, integral regression). A linear layer, at first
 the identity, corrects the places from one another. It learns from true pictures as the tokenizer shows them,
 with slight noise, and from episodes that nothing is measured on. Its own error is that on other episodes.
+The T of a pusher is found by its shape (`hma_model.evaluation.tee`).
 
 A picture may lose a limb and still have small errors of its pixels. `wholeness` therefore counts the pixels
 of each part's colour, wherever they are. A true picture of another time has some 0.9.
@@ -21,6 +22,7 @@ from torch import Tensor, nn
 
 from hma_data.episodes.images import opencv, prepare
 from hma_data.lab import truth
+from hma_model.evaluation.tee import TeeFinder
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -74,6 +76,7 @@ class Probe:
         spread: (P,) mean distance in px of the true places from their median.
         background: (SIDE, SIDE, 3), the median of the true pictures.
         colors: (P, 3), of the parts.
+        tee: finds the T whose places are the last two; None for a robot without one.
     """
 
     network: nn.Module
@@ -82,6 +85,7 @@ class Probe:
     spread: Floats
     background: Floats
     colors: Floats
+    tee: TeeFinder | None = None
 
     @property
     def readable(self) -> NDArray[np.bool_]:
@@ -104,15 +108,24 @@ class Probe:
         flat = _small(pictures.reshape(-1, *pictures.shape[-3:]))
         found = torch.cat([self.network(_pixels(part)) for part in np.array_split(flat, len(flat) // 64 + 1)])
         places: Floats = (found.double().numpy() + 1) * (truth.SIZE / 2)
+        if self.tee is not None:
+            for row, pixels in enumerate(self._colored(flat)[..., -1]):
+                seen = self.tee.find(pixels)
+                places[row, -2:] = places[row, -2:] if seen is None else seen
         return places.reshape(*pictures.shape[:-3], *places.shape[1:])
 
     def areas(self, pictures: Images) -> Floats:
         """Return (…, P), how many pixels of (…, S, S, 3) have a part's colour and not the background's."""
-        flat = _small(pictures.reshape(-1, *pictures.shape[-3:])).astype(np.float32)
+        flat = _small(pictures.reshape(-1, *pictures.shape[-3:]))
         stands = np.linalg.norm(flat - self.background, axis=-1) > DISTANCE
-        near = [np.linalg.norm(flat - color, axis=-1) <= DISTANCE for color in self.colors]
-        counts = np.stack([(stands & part).sum(axis=(1, 2), dtype=np.float64) for part in near], axis=-1)
-        return counts.reshape(*pictures.shape[:-3], len(near))
+        counts: Floats = (stands[..., None] & self._colored(flat)).sum(axis=(1, 2), dtype=np.float64)
+        return counts.reshape(*pictures.shape[:-3], len(self.colors))
+
+    def _colored(self, small: Images) -> NDArray[np.bool_]:
+        """Return (N, SIDE, SIDE, P), which pixels have a part's colour."""
+        pixels = small.astype(np.float32)
+        near = [np.linalg.norm(pixels - color, axis=-1) <= DISTANCE for color in self.colors]
+        return np.stack(near, axis=-1)
 
     def wholeness(self, pictures: Images, true: Images) -> Floats:
         """Return how much of the robot of true pictures (…, S, S, 3) others show; 1 is all of it.
@@ -166,11 +179,17 @@ def train_probe(robot: str, tokenizer: "Tokenizer", stride: int, seed: int = 0) 
     pictures = np.concatenate([episode.pictures for episode in made])
     parts = np.concatenate([episode.parts[kept] for episode in made])
     shown = as_shown(tokenizer, as_seen(robot, tokenizer, pictures))
-    return fit(shown, parts, made[0].driven, HELD_OUT / EPISODES, seed)
+    return fit(shown, parts, made[0].driven, HELD_OUT / EPISODES, seed, tee=TeeFinder.of(robot))
 
 
 def fit(
-    pictures: Images, parts: Floats, driven: int, held_out: float = 0.2, seed: int = 0, steps: int = STEPS
+    pictures: Images,
+    parts: Floats,
+    driven: int,
+    held_out: float = 0.2,
+    seed: int = 0,
+    steps: int = STEPS,
+    tee: TeeFinder | None = None,
 ) -> Probe:
     """Train a probe on pictures whose state is known.
 
@@ -181,14 +200,16 @@ def fit(
         held_out: share of the pictures, the last ones, on which the error is measured.
         seed: of the training.
         steps: of the training.
+        tee: of a pusher.
     """
     used = round(len(pictures) * (1 - held_out))
     small = _small(pictures)
     network = _trained(small[:used], parts[:used], seed, steps)
     spread = np.linalg.norm(parts - np.median(parts, axis=0), axis=-1).mean(axis=0)
     background = np.median(small[:used], axis=0).astype(np.float32)
-    colors = _colors(small[:used], parts[:used])
-    untested = Probe(network, driven, spread, spread, background, colors)
+    within = parts if tee is None else tee.within(parts)
+    colors = _colors(small[:used], within[:used])
+    untested = Probe(network, driven, spread, spread, background, colors, tee)
     error = state_errors(untested, pictures[used:], parts[used:]).mean(axis=0)
     return replace(untested, error=error)
 
@@ -213,7 +234,7 @@ def _trained(small: Images, parts: Floats, seed: int, steps: int) -> nn.Module:
 
 
 def _colors(small: Images, parts: Floats) -> Floats:
-    """Return the (P, 3) median colours of pictures at the true places of the parts."""
+    """Return the (P, 3) median colours of pictures at places within the parts."""
     x, y = np.clip(parts * (SIDE / truth.SIZE), 0, SIDE - 1).astype(int).transpose(2, 0, 1)
     found: Floats = np.median(small[np.arange(len(small))[:, None], y, x], axis=0).astype(np.float32)
     return found

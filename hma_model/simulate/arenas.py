@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError
 from hma_data.lab import FAMILY, truth
-from hma_data.lab.scripted import SeenState, State, state_of
+from hma_data.lab.scripted import SeenState, State, seen_state, state_of
 from hma_data.lab.simulator import LabSimulator, simulated
 from hma_model.generation.commands import described
 from hma_model.simulate.scenes import Dimension, LabRobot, LabScene, Prompt
@@ -237,7 +237,7 @@ class ModelArena:
             raise HMAError(self.scenes.name, "nothing reads its state off pictures", "give another policy")
         if self._seen is None:
             places = self._probe.read(self.pictures)
-            self._seen = [SeenState(self.scenes.name, self._probe.own, one) for one in places]
+            self._seen = [seen_state(self.scenes.name, self._probe.own, one) for one in places]
         return [seen.state for seen in self._seen]
 
     def observed(self) -> Floats | None:

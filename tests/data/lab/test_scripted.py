@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from hma_data.lab import family, planar_arm, truth
+from hma_data.lab import family, planar_arm, pusht, truth
 from hma_data.lab.family.mechanisms import wrapped
-from hma_data.lab.scripted import SeenState, driver, state_of, steerable
+from hma_data.lab.scripted import driver, seen_state, state_of, steerable
 from hma_data.lab.simulator import LabSimulator
 
 ROBOTS = ("rails_03", "arm2_07", "mover_10", "planar_arm")
@@ -28,7 +28,7 @@ def test_a_pose_is_found_off_places_and_followed(robot: str) -> None:
     simulator = LabSimulator(robot)
     simulator.reset(1, 0)
     driven, places = truth.parts_of(simulator.simulation)
-    seen = SeenState(robot, np.arange(driven), places)
+    seen = seen_state(robot, np.arange(driven), places)
     stride = simulator.embodiment.stride
     for step in range(6 * stride):
         command = simulator.recorded()
@@ -40,4 +40,41 @@ def test_a_pose_is_found_off_places_and_followed(robot: str) -> None:
     shown = 2 if robot == "arm2_07" else len(true.pose)  # its gripper holds a block more or less open
     np.testing.assert_allclose(wrapped(seen.state.pose - true.pose)[:shown], 0, atol=0.02)
     np.testing.assert_allclose(seen.state.blocks, true.blocks, atol=1e-9)
-    assert steerable(robot) and not steerable("pusht_fast")
+    assert steerable(robot) and not steerable("pusht_slow")
+
+
+@pytest.mark.parametrize("number", [3, 8])  # from afar, so that the goal is not reached before the end
+def test_a_pusher_that_looks_commands_what_the_recorder_does(number: int) -> None:
+    simulator = LabSimulator("pusht_fast")
+    simulator.reset(0, number)
+    drive = driver("pusht_fast", state_of(simulator.simulation).pose, pusht.FastPusher(0, number).rng)
+    for _ in range(40):
+        wanted = simulator.recorded()
+        np.testing.assert_allclose(drive(state_of(simulator.simulation)), wanted, atol=1e-3)
+        simulator.advance(wanted)
+
+
+def test_a_pusher_is_seen_and_followed_between_pictures() -> None:
+    simulator = LabSimulator("pusht_fast")
+    simulator.reset(0, 0)
+    seen = seen_state("pusht_fast", np.arange(1), truth.parts_of(simulator.simulation)[1])
+    for step in range(24):
+        command = simulator.recorded()
+        simulator.advance(command)
+        seen.move(command)
+        true = state_of(simulator.simulation)
+        assert np.linalg.norm(seen.state.pose - true.pose) < 25  # px of 512, of up to 120 on the way
+        if step % 4 == 3:
+            seen.see(truth.parts_of(simulator.simulation)[1])
+            np.testing.assert_allclose(seen.state.pose, true.pose, atol=1e-9)
+            np.testing.assert_allclose(seen.state.blocks, true.blocks, atol=1e-9)
+
+
+def test_the_pose_of_a_tee_is_read_off_its_places() -> None:
+    simulator = LabSimulator("pusht_fast")
+    for number in range(8):
+        simulator.reset(5, number)
+        arena = simulator.simulation.arena
+        pose = truth.tee_pose(truth.parts_of(simulator.simulation)[1][1:])
+        np.testing.assert_allclose(pose[:2], arena.pose[:2], atol=1e-9)
+        assert abs(wrapped(pose[2:] - arena.pose[2:])[0]) < 1e-9
