@@ -139,6 +139,9 @@ class Recipe(_Settings):
 
     start: Place | None = Field(None, description="a checkpoint to start from: folder, run, URI or hub repo")
     freeze: Literal["nothing", "trunk"] = Field("nothing", description="what keeps the checkpoint's weights")
+    new_stem: Literal["like", "fresh"] = Field(
+        "like", description="with start: a new robot begins with the stem of its like, or with a fresh one"
+    )
     # a token's digits: the tokenizer's, or split into this many values (FSQ's levels) or joined up to them
     digits: Count = Field(0, ge=0, description="0: the tokenizer's; 8 splits 512 into 8 · 8 · 8; 512 joins")
     # what the bias of the token readout starts with: the log frequencies of the training tokens

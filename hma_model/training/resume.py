@@ -2,7 +2,8 @@
 
 A run that starts from a checkpoint keeps its own copy in `.start/`, so it can resume even if the source
 changes. Robots that the checkpoint has continue from their stem and head, with the statistics these were
-trained with; other robots get fresh ones. From a hub only the trunk and the robots of the data are fetched.
+trained with; other robots get fresh ones, or begin with the stem of their like (`hma_model.training.alike`).
+From a hub only the trunk, the robots of the data, and a few that may be like them are fetched.
 With a frozen trunk, the run's checkpoints keep the same files of the trunk and, if the source is on this
 machine, of all other robots. With a tuned trunk they leave out the other robots, which belong to the old one.
 
@@ -48,6 +49,7 @@ from hma_model.checkpoint.folder import (
 from hma_model.checkpoint.weights import read_tensors, write_tensors
 from hma_model.config import HMAConfig
 from hma_model.network.model import HMA, check_fit, module_key, waves_of_stem
+from hma_model.training.alike import FETCHED, candidates
 from hma_model.training.recipe import Recipe, differences
 from hma_model.training.runtime import RECIPE, START
 
@@ -99,8 +101,15 @@ class Start:
             source = str(found.folder)
         try:
             known = hub.embodiment_ids(hub.open_store(source, revision).files())
-            wanted = [name for name in known if name in sets or (frozen and local)]
-            hub.pull(source, wanted, place, revision)
+            wanted = {name for name in known if name in sets or (frozen and local)}
+            fresh = set(sets) - set(known)
+            if fresh and recipe.new_stem == "like":
+                rows = hub.list_embodiments(source, revision)
+                cards = {row["embodiment"]: row for row in rows if not row["problems"]}
+                for name in fresh:
+                    likes = candidates(cards, sets[name].embodiment)
+                    wanted |= set(likes if local else likes[:FETCHED])
+            hub.pull(source, sorted(wanted), place, revision)
         except HubError as fault:
             if local or "://" in source:
                 raise

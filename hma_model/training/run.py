@@ -7,6 +7,7 @@ writes files.
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from hma_model.evaluation import evaluate
 from hma_model.evaluation.metrics import perplexity
 from hma_model.evaluation.rollout_video import newest_sheets, write_sheets
 from hma_model.network.model import HMA
-from hma_model.training import guards, optim
+from hma_model.training import alike, guards, optim
 from hma_model.training.data import TrainData
 from hma_model.training.parallel import ParallelModel, World, gathered
 from hma_model.training.recipe import Recipe
@@ -92,6 +93,7 @@ class Run:
         self.cpu_seconds = 0.0  # of the steps, the mean over the ranks
         self.spike_detector = guards.GradientSpikeDetector(recipe.spike)
         self.evaluation: dict[str, Any] = {}  # the figures of the last one
+        self.likes: dict[str, str] = {}  # new robot -> the robot with whose stem it began
         self.notes: list[str] = []  # texts for the user that nobody has shown yet
         self._baseline: evaluate.Means | None = None
         self._twin: HMA | None = None
@@ -144,9 +146,11 @@ class Run:
 
     @torch.no_grad()
     def begin(self) -> None:
-        """Set a fresh readout's bias to the training tokens' log frequencies, so no step must learn them."""
-        plain = self.recipe.readout_bias == "zero" or self.model.config.kind != "discrete"
-        if plain or self.start:
+        """Begin with what no step must learn: token frequencies in the readout's bias, or like stems."""
+        if self.start:
+            self._begin_alike(self.start.checkpoint)
+            return
+        if self.recipe.readout_bias == "zero" or self.model.config.kind != "discrete":
             return
         drawn = zip(self.train_data.mixture.p, self.sets.values())
         given: Any = {"cameras": self.recipe.cameras, "factored": self.model.config.factored}
@@ -155,6 +159,19 @@ class Run:
         bias = np.log(np.concatenate(digits * self.model.config.merge**2))
         own = self.model.token_readout.linear.bias
         own.copy_(torch.from_numpy(bias).to(own))
+
+    def _begin_alike(self, start: Checkpoint) -> None:
+        """Give new robots the stems of like ones, where these have a lower loss."""
+        cameras, objective = self.recipe.cameras, self.objective.name
+        for name, shards in self.sets.items():
+            if name in start.embodiments or self.recipe.new_stem == "fresh":
+                continue
+            choose = partial(alike.choose, self.model, name, start, shards, cameras, objective)
+            if begun := self.world.once(choose):
+                alike.take(self.model, name, start, begun.stem)
+                self.likes[name] = begun.stem
+                better = f"loss {begun.loss:.3g}, with a fresh one {begun.fresh:.3g}"
+                self.notes.append(f"{name} begins with the stem of {begun.stem}: {better}")
 
     def prepare(self, kept: TrainingState | None) -> None:
         """Distribute the model over the ranks, and make its optimizer and average, from `kept` if given."""
@@ -265,7 +282,7 @@ class Run:
         """Compute the held-out loss of the main objective, and return the line of metrics.jsonl.
 
         For forward and full it is nats a token of each fully masked frame, given the true past and actions,
-        with the loss of the training tokens' frequencies as a baseline. For passive, policy and inverse it is
+        with the loss of the training token frequencies as a baseline. For passive, policy and inverse it is
         the training loss on held-out windows, under masks that are the same at every evaluation.
         """
         model = self.shown()
@@ -371,6 +388,8 @@ class Run:
         if self.start:
             training["from_trunk_sha256"] = self.start.checkpoint.trunk_sha256
             training["trunk"] = "frozen" if self.start.frozen else "tuned"
+            if name in self.likes:
+                training["stem_from"] = self.likes[name]
             if is_repository(addressed(self.start.source)[0]):
                 training["from"] = self.start.source
         return {"data": data, "metrics": metrics, "training": training}
@@ -411,6 +430,9 @@ class Run:
         require_network(checkpoint.config, self.model.config, self.out)
         notes = self._adopt(checkpoint)
         kept.fill(self.model)
+        for name in set(self.sets) & set(checkpoint.embodiments):
+            if like := checkpoint.card(name).get("training", {}).get("stem_from"):
+                self.likes[name] = like
         self.step, self.skipped, self.seconds = state.step, state.skipped, state.seconds
         self.cpu_seconds = state.cpu_seconds
         self.evaluation = state.evaluation

@@ -1,0 +1,113 @@
+"""A new robot begins with the stem of its like: which one, and at another stride."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hma_data.shards.reader import ShardSet
+from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.folder import action_stats
+from hma_model.checkpoint.io import Checkpoint
+from hma_model.config import ActionSpace
+from hma_model.evaluation.losses import validation_losses, windows
+from hma_model.hub import publish as hub
+from hma_model.network.stem import Stem
+from hma_model.training import alike
+from hma_model.training.loop import TrainResult, finetune, train
+from hma_model.training.recipe import make_recipe
+from tests.model.robots import CONFIG
+from tests.model.runs import TINY, weights
+from tests.model.shards import make_shards
+
+SHORT = ["steps=1", "lr=1e-12", "warmup=1", "eval_every=0", "report=false", "pictures=0", "device=cpu"]
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory) -> TrainResult:
+    """A run on two robots of two dims, and one of three."""
+    folder = tmp_path_factory.mktemp("base")
+    robots = [("arm", 2, 0), ("cart", 2, 7), ("hand", 3, 1)]
+    data = [str(make_shards(folder / name, name, dims=dims, seed=seed)) for name, dims, seed in robots]
+    return train(make_recipe({**TINY, "data": data, "steps": 30, "lr": 1e-2}), out=folder / "run", show=False)
+
+
+@pytest.fixture
+def twin(tmp_path) -> Path:
+    """The same recordings as arm's, under another name."""
+    return make_shards(tmp_path / "twin", "twin", seed=0)
+
+
+def tune(base, data, out, *changes, freeze=True) -> TrainResult:
+    return finetune(base, [data], out=out, freeze_trunk=freeze, overrides=[*SHORT, *changes], show=False)
+
+
+@given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 3), st.integers(0, 3))
+def test_a_command_that_is_held_means_the_same_at_every_stride(steps, own_steps, waves, own_waves):
+    torch.manual_seed(0)
+    spaces = [ActionSpace("a", 2, n, (1.0, 2.0), (3.0, 4.0), (True, False)) for n in (steps, own_steps)]
+    theirs, own = (Stem(CONFIG, space, n) for space, n in zip(spaces, (waves, own_waves)))
+    if theirs.waves is not None:
+        kept = theirs.waves.weight.detach().view(-1, 2 * steps, 2, waves)
+        torch.nn.init.normal_(kept[..., : min(waves, own_waves)])
+    fitted = alike._fitted(theirs.state_dict(), own.state_dict(), steps, own_steps)
+    own.load_state_dict(fitted)
+    held = torch.randn(3, 4, 2)
+    a, b = (stem(held.repeat(1, 1, n)) for stem, n in ((theirs, steps), (own, own_steps)))
+    assert torch.allclose(a, b, atol=1e-5)
+
+
+def test_each_command_goes_where_its_time_is():
+    weight = torch.arange(4.0).view(1, 4, 1)  # four steps of one dim
+    assert alike._resampled(weight, 4, 2).flatten().tolist() == [0 + 1, 2 + 3]
+    assert alike._resampled(weight + 1, 4, 8).flatten().tolist() == [0, 1, 0, 2, 0, 3, 0, 4]
+
+
+def test_the_stem_with_the_lowest_loss_is_taken(base, twin, tmp_path):
+    opened, shards = Checkpoint.open(base.checkpoint), ShardSet(twin)
+    model = checkpoint.load(base.checkpoint)
+    model.add_embodiment(shards.embodiment, action_stats(shards.manifest.stats, "twin"))
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    begun = alike.choose(model, "twin", opened, shards, "first", "forward")
+    assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
+    given: dict = {"batch_size": alike.WINDOWS}
+
+    def loss() -> float:
+        found = windows(shards, "train", alike.FRAMES, alike.WINDOWS, **given)
+        return validation_losses(model, found)[0].mean()
+
+    losses = {"": loss()}
+    for name in ("arm", "cart"):
+        alike.take(model, "twin", opened, name)
+        losses[name] = loss()
+    assert begun is not None and begun.fresh == losses[""]
+    assert (begun.loss, begun.stem) == min((value, name) for name, value in losses.items())
+
+
+def test_a_new_robot_begins_with_it_and_the_card_says_so(base, twin, tmp_path):
+    home = tmp_path / "hub" / "team" / "model"
+    hub.push(base.checkpoint, home)
+    like, fresh = (tune(home, twin, tmp_path / way, f"new_stem={way}") for way in ("like", "fresh"))
+    cards = [Checkpoint.open(run.checkpoint).card("twin")["training"] for run in (like, fresh)]
+    source = cards[0]["stem_from"]
+    assert source in ("arm", "cart") and "stem_from" not in cards[1]
+    found = weights(like.checkpoint)
+    for name in ("input.weight", "output.weight", "norm.weight"):
+        parts = (found[f"embodiments/{one}/stem.safetensors:{name}"] for one in ("twin", source))
+        assert torch.allclose(*parts, atol=1e-6), name
+    again = tune(home, twin, tmp_path / "like", "new_stem=like", "steps=1")
+    assert Checkpoint.open(again.checkpoint).card("twin")["training"]["stem_from"] == source
+
+
+def test_only_robots_with_as_many_dims_are_tried_the_nearest_rate_first():
+    cards: dict = {
+        "slow": {"action_dim": 2, "hz": 1.0}, "near": {"action_dim": 2, "hz": 9.0},
+        "wide": {"action_dim": 3, "hz": 10.0}, "odd": {"action_dim": 2, "hz": "x"}, "none": {},
+    }  # fmt: skip
+
+    class Robot:
+        action_dim, effective_hz = 2, 10.0
+
+    assert alike.candidates(cards, Robot()) == ["near", "slow", "odd"]  # type: ignore[arg-type]
