@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hma_data.lab import FAMILY, planar_arm, pusht, truth
 from hma_data.lab.family.bodies import Body
-from hma_data.lab.family.driver import Driver
+from hma_data.lab.family.driver import Driver, Reacher
 from hma_data.lab.family.world import REACH, World
 from hma_data.lab.simulator import Simulation
 
@@ -52,6 +52,16 @@ def state_of(simulation: Simulation) -> State:
         return State(simulation.arena.agent, places[1:], False)
     assert isinstance(simulation, planar_arm.Arm)
     return State(simulation.joints, truth.PX * simulation.blocks[:, :2], False)
+
+
+def reacher(robot: str) -> Callable[[State], NDArray[np.float32]]:
+    """Return a driver of a robot of the family that goes to the block that lies nearest.
+
+    Raises:
+        UsageError: the robot is none of the family.
+    """
+    drive = Reacher(Body.of(robot))
+    return lambda state: drive(state.pose, state.blocks, state.holding).astype(np.float32)
 
 
 def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[State], NDArray[np.float32]]:

@@ -292,12 +292,12 @@ def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -
         ours["weights_sha256"] = theirs["weights_sha256"]
     differing = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key)]
     if differing:
-        key = differing[0]
-        fault = (
-            f"was trained on tokenizer {ours.get('name')!r}, this is {spec.name!r}: "
-            f"{key} is {ours.get(key)!r} there and {theirs.get(key)!r} here"
-        )
-        raise CheckpointError(where, fault, f"use the tokenizer named in its {CONFIG}")
+        key, name = differing[0], ours.get("name")
+        fault = f"was trained on tokenizer {name!r}, this is {spec.name!r}"
+        if "name" in differing:
+            raise CheckpointError(where, fault, f"convert the recordings with --tokenizer {name}")
+        fault = f"{fault}: {key} is {ours.get(key)!r} there and {theirs.get(key)!r} here"
+        raise CheckpointError(where, fault, f"use the tokenizer described in its {CONFIG}")
 
 
 def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:

@@ -17,13 +17,17 @@ import numpy as np
 from hma_data.errors import HMAError, UsageError
 from hma_model.simulate.arenas import Arena, Floats, Scenes
 from hma_model.simulate.policies import split_options
+from hma_model.simulate.scenes import Prompt
 from hma_model.simulate.world import World, load_world, require_actor
 
-OPTIONS: dict[str, type] = {"horizon": int, "temperature": float, "unmask_steps": int}
+OPTIONS: dict[str, type] = {"horizon": int, "memory": int, "temperature": float, "unmask_steps": int}
 
 
 class Follower:
     """The sessions of a world that follow an arena: they see its pictures and what was commanded between.
+
+    Args:
+        memory: pictures that they remember, the newest among them; None for as many as the model can.
 
     Attributes:
         world: of the sessions.
@@ -34,8 +38,9 @@ class Follower:
         HMAError: the world lacks the robot, or knows it with other commands.
     """
 
-    def __init__(self, world: World, scenes: Scenes, where: str) -> None:
+    def __init__(self, world: World, scenes: Scenes, where: str, memory: int | None = None) -> None:
         self.world, self.commands, self.sessions = world, world.commands(scenes.name), list[int]()
+        self._memory = memory
         own, robot = self.commands, scenes.robot.embodiment
         if (own.stride, len(own.names)) != (robot.stride, robot.action_dim):
             fault = f"takes {own.stride} commands of {len(own.names)} values of {scenes.name} in a chunk"
@@ -46,23 +51,36 @@ class Follower:
         for session in self.sessions:
             self.world.close(session)
         name, seed = arena.scenes.name, arena.scenes.seed
+        self._prompts = [self._newest(prompt) for prompt in arena.prompts]
         self.sessions = [
             self.world.open(name, prompt.frames, prompt.chunks, seed=seed + row)
-            for row, prompt in enumerate(arena.prompts)
+            for row, prompt in enumerate(self._prompts)
         ]
         self._taken: list[Floats] = []  # commands (N, A) since the last picture
 
     def look(self, arena: Arena) -> None:
         """See the arena's pictures if they are new."""
-        if arena.fresh and self._taken:
-            chunks = np.stack(self._taken, axis=1)
+        if not arena.fresh or not self._taken:
+            return
+        chunks = np.stack(self._taken, axis=1)
+        if self._memory is None:
             self.world.observe(self.by_session(arena.pictures), self.by_session(chunks))
-            self._taken = []
+        else:
+            for row, session in enumerate(self.sessions):
+                frames = np.concatenate([self._prompts[row].frames, arena.pictures[row][None]])
+                known = np.concatenate([self._prompts[row].chunks, chunks[row].reshape(1, -1)])
+                self._prompts[row] = prompt = self._newest(Prompt(frames, known))
+                self.world.reset(session, prompt.frames, prompt.chunks)
+        self._taken = []
 
     def take(self, commands: Floats) -> Floats:
         """Note commands (N, A) that are given, and return them."""
         self._taken.append(commands)
         return commands
+
+    def _newest(self, prompt: Prompt) -> Prompt:
+        first = max(0, len(prompt.frames) - (self._memory or len(prompt.frames)))
+        return Prompt(prompt.frames[first:], prompt.chunks[first:])
 
     def by_session(self, values: Iterable[Any]) -> dict[int, Any]:
         """Return values of the scenes by their sessions."""
@@ -76,18 +94,29 @@ class Acting:
         world: of the model that acts.
         scenes: whose robot it has.
         horizon: chunks between two looks; above 1 for models that also predict video.
+        memory: pictures that it goes by. With 1 it sees neither the past nor its own commands: a policy that
+            was cloned from few episodes else goes on with what it did last.
         where: its name, for errors.
 
     Raises:
         HMAError: the model was not trained to act, lacks the robot, or knows it with other commands.
     """
 
-    def __init__(self, world: World, scenes: Scenes, horizon: int = 1, where: str = "the model") -> None:
+    def __init__(
+        self,
+        world: World,
+        scenes: Scenes,
+        horizon: int = 1,
+        where: str = "the model",
+        memory: int | None = None,
+    ) -> None:
         config = world.model.config
         require_actor(config, where)
         if horizon > 1 and not config.predicts_video:
             raise UsageError(where, "predicts no video to look ahead in", "give horizon=1")
-        self._follower, self._horizon = Follower(world, scenes, where), horizon
+        if memory is not None and memory < 1:
+            raise UsageError(where, f"memory={memory} is not allowed", "give 1 or more")
+        self._follower, self._horizon = Follower(world, scenes, where, memory), horizon
 
     def begin(self, arena: Arena) -> None:
         self._follower.begin(arena)
@@ -114,7 +143,7 @@ class Acting:
 
 
 def read_acting(words: str, scenes: Scenes) -> Acting:
-    """Return the policy of `CHECKPOINT` or `CHECKPOINT,horizon=2,temperature=0.5,unmask_steps=2`."""
+    """Return the policy of `CHECKPOINT` or `CHECKPOINT,memory=1,horizon=2,temperature=0.5,unmask_steps=2`."""
     checkpoint, options = split_options("hma", words, OPTIONS)
-    horizon = options.pop("horizon", 1)
-    return Acting(load_world(checkpoint, **options), scenes, horizon, f"policy hma:{checkpoint}")
+    horizon, memory = options.pop("horizon", 1), options.pop("memory", None)
+    return Acting(load_world(checkpoint, **options), scenes, horizon, f"policy hma:{checkpoint}", memory)

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from hma_data.errors import HMAError, UsageError
-from hma_data.lab.scripted import driver, steerable
+from hma_data.lab import FAMILY
+from hma_data.lab.scripted import driver, reacher, steerable
 from hma_model.simulate.arenas import Arena, Floats, Scenes
 
 if TYPE_CHECKING:
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
     from hma_model.simulate.world import World
 
 WAYS = (
-    "give scripted, scripted:noise=0.5, random, still, hma:CHECKPOINT, plan:cem, lerobot:FOLDER_OR_REPO, or "
-    "MODULE:NAME of a Python function or class"
+    "give scripted, scripted:noise=0.5, reach, random, still, hma:CHECKPOINT, plan:cem, "
+    "lerobot:FOLDER_OR_REPO, or MODULE:NAME of a Python function or class"
 )
 
 
@@ -73,8 +74,10 @@ def read_policy(words: str, scenes: Scenes, world: "World | None" = None) -> Pol
         return read_planning(rest, scenes, world)
     if words in ("random", "still"):
         return Random() if words == "random" else Still()
-    if kind == "scripted":
-        return Scripted(_noise(words, rest))
+    if kind in ("scripted", "reach"):
+        if kind == "reach" and not FAMILY.fullmatch(scenes.name):
+            raise UsageError("policy reach", f"{scenes.name} has no driver that reaches", "give scripted")
+        return Scripted(_noise(words, kind, rest), kind == "reach")
     if rest:
         return Called(_named(words))
     raise UsageError("policy", f"{words!r} is unknown", WAYS)
@@ -104,14 +107,14 @@ def split_options(kind: str, words: str, known: Mapping[str, type]) -> tuple[str
     return what, options
 
 
-def _noise(words: str, rest: str) -> float:
+def _noise(words: str, kind: str, rest: str) -> float:
     name, _, value = rest.partition("=")
     try:
         share = float(value) if rest else 0.0
     except ValueError:
         share = np.nan
     if (rest and name != "noise") or not 0 <= share <= 1:
-        raise UsageError("policy", f"{words!r} is unknown", "give scripted:noise=SHARE, from 0 to 1")
+        raise UsageError("policy", f"{words!r} is unknown", f"give {kind}:noise=SHARE, from 0 to 1")
     return share
 
 
@@ -159,7 +162,7 @@ class Random:
 
 
 class Scripted:
-    """The manoeuvres of the recorder, of which a share of the chunks is random.
+    """The manoeuvres of the recorder, or a reach for the nearest block; a share of the chunks is random.
 
     They go by the robot's state: in the simulator by the true one, in the model by what a probe reads off its
     pictures. Robots of which no state can be read so are driven by the simulator's own driver, and in the
@@ -167,16 +170,19 @@ class Scripted:
 
     Args:
         noise: the share of chunks with random commands.
+        reach: go to the nearest block, rather than by random manoeuvres.
     """
 
-    def __init__(self, noise: float = 0.0) -> None:
-        self.noise, self._random = noise, Random()
+    def __init__(self, noise: float = 0.0, reach: bool = False) -> None:
+        self.noise, self.reach, self._random = noise, reach, Random()
 
     def begin(self, arena: Arena) -> None:
         self._random.begin(arena)
         self._coins = arena.scenes.rng(2)
         self._drivers: list[Callable[..., Floats]] = []
-        if steerable(arena.scenes.name):
+        if self.reach:
+            self._drivers = [reacher(arena.scenes.name) for _ in arena.pictures]
+        elif steerable(arena.scenes.name):
             begun = zip(arena.states(), arena.scenes.rng(3), strict=True)
             self._drivers = [driver(arena.scenes.name, state.pose, rng) for state, rng in begun]
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.lab.family.bodies import Body
-from hma_data.lab.family.driver import Driver
+from hma_data.lab.family.driver import Driver, Reacher
 from hma_data.lab.family.look import SIZE, Floats
 from hma_data.lab.family.mechanisms import MAKERS, Axis
 from hma_data.lab.family.world import World, start
@@ -158,13 +158,22 @@ def _write_bag(path: Path, body: Body, seed: int, number: int) -> None:
     write_mcap(path, messages, {"robot": body.name, **facts})
 
 
-def episode(body: Body, seed: int, number: int) -> Demo:
-    """Simulate an episode of about SECONDS; the same seed and number give the same bytes."""
+def record_reaching(part: Path, robot: str, episodes: Iterable[int], seed: int, seconds: float = 2.0) -> None:
+    """Record episodes in which the robot goes to the nearest block, to HDF5: what a policy can learn."""
+    body = Body.of(robot)
+    env_args = {"env_name": robot, "type": 2, "env_kwargs": {"control_freq": body.hz}}
+    write_hdf5(part, (episode(body, seed, n, Reacher(body), seconds) for n in episodes), env_args)
+
+
+def episode(
+    body: Body, seed: int, number: int, reach: Reacher | None = None, seconds: float = SECONDS
+) -> Demo:
+    """Simulate an episode, with random manoeuvres or a reach; the same arguments give the same bytes."""
     world, rng = start(body, seed, number)
-    drive = driver(world, rng)
+    drive = driver(world, rng, reach)
     lay = world.blocks.copy()
     rows: list[tuple[Any, ...]] = []
-    for _ in range(round(SECONDS * body.hz)):
+    for _ in range(round(seconds * body.hz)):
         seen = world.picture(), world.pose.copy(), world.state
         before = world.blocks.copy()
         command = drive()
@@ -181,9 +190,11 @@ def episode(body: Body, seed: int, number: int) -> Demo:
     )
 
 
-def driver(world: World, rng: np.random.Generator) -> Callable[[], NDArray[np.float32]]:
+def driver(
+    world: World, rng: np.random.Generator, reach: Reacher | None = None
+) -> Callable[[], NDArray[np.float32]]:
     """Return the recorder's driver, which returns the next command (A,)."""
-    drive = Driver(world.body, world.pose, rng)
+    drive = reach or Driver(world.body, world.pose, rng)
     return lambda: drive(world.pose, world.blocks, world.held >= 0).astype(np.float32)
 
 

@@ -1,7 +1,8 @@
-"""Drive the family's robots by random manoeuvres of 0.3 to 1.5 s.
+"""Drive the family's robots by random manoeuvres of 0.3 to 1.5 s, or straight to a block.
 
 A manoeuvre goes to a pose (to a block, or anywhere), holds a velocity, weaves, or rests. Axes commanded by
 velocity turn back at their limits. A gripper closes round a block in its reach, and opens again later.
+`Reacher` has one aim, the block that lies nearest, and looks at each step: a task that can be learned.
 """
 
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from hma_data.lab.family.mechanisms import wrapped
 MANOEUVRES = ("block", "anywhere", "hold", "weave", "rest")
 CHANCES = (0.27, 0.26, 0.22, 0.15, 0.1)
 Manoeuvre = Callable[[Floats], Floats]  # pose (Q,) -> velocities (A,)
+GAIN, NUDGE, DAMPING = 2.0, 1e-4, 1.0  # of a reach: 1/s; of a pose, in widths of its limits; px²
 
 
 class Driver:
@@ -129,13 +131,8 @@ class Driver:
         return drive
 
     def _steer(self, pose: Floats) -> Floats:
-        """Return the speed and turn rate of a car that goes to the goal's place."""
         assert self._goal is not None
-        way = self._goal[:2] - pose[:2]
-        far = float(np.hypot(*way))
-        bearing = float(wrapped(np.arctan2(way[1], way[0]) - pose[2:3])[0])
-        ahead = self._tops[0] * min(1.0, far / 12) * max(0.25, np.cos(bearing))
-        return np.array([ahead, 4.0 * bearing if far > 3 else 0.0])
+        return steered(self._body, pose, self._goal[:2])
 
     def _hold(self) -> Manoeuvre:
         count = len(self._tops)
@@ -152,3 +149,48 @@ class Driver:
 
     def _rest(self) -> Manoeuvre:
         return lambda pose: np.zeros(len(self._tops))
+
+
+class Reacher:
+    """The commander of a body whose tip goes to the block that lies nearest, and stays there.
+
+    Blocks lie where they were when it first looked: a block that is pushed away is not followed.
+    """
+
+    def __init__(self, body: Body) -> None:
+        self._body = body
+        self._width = body.limits[1] - body.limits[0]
+        self._aim: Floats | None = None
+
+    def __call__(self, pose: Floats, blocks: Floats, holding: bool) -> Floats:
+        """Return the next command (A,) at a pose (Q,) among blocks (B, 2)."""
+        body, (tip, _) = self._body, self._body.mechanism.tip(pose)
+        if self._aim is None:
+            self._aim = blocks[np.linalg.norm(blocks - tip, axis=1).argmin()].copy()
+        low, high = body.ranges
+        if body.car:
+            return np.clip(steered(body, pose, self._aim), low, high)
+        velocity = GAIN * self._way(pose, self._aim - tip)
+        lag = np.array([axis.lag for axis in body.axes])
+        follows = np.array([axis.target for axis in body.axes])
+        command = np.where(follows, pose + velocity * lag, velocity)
+        if body.grip:
+            command[-1] = float(body.grip == "gripper")  # open, or off
+        return np.clip(command, low, high)
+
+    def _way(self, pose: Floats, miss: Floats) -> Floats:
+        """Return the change of the pose (Q,) that brings the tip nearer by (2,): damped least squares."""
+        here, _ = self._body.mechanism.tip(pose)
+        nudges = np.diag(self._width * NUDGE)
+        slope = np.stack([(self._body.mechanism.tip(pose + n)[0] - here) / NUDGE for n in nudges], axis=1)
+        change: Floats = slope.T @ np.linalg.solve(slope @ slope.T + DAMPING * np.eye(2), miss)
+        return change * self._width
+
+
+def steered(body: Body, pose: Floats, point: Floats) -> Floats:
+    """Return the speed and turn rate of a car that goes to a point (2,)."""
+    way = point - pose[:2]
+    far = float(np.hypot(*way))
+    bearing = float(wrapped(np.arctan2(way[1], way[0]) - pose[2:3])[0])
+    ahead = body.commands[0].speed * min(1.0, far / 12) * max(0.25, np.cos(bearing))
+    return np.array([ahead, 4.0 * bearing if far > 3 else 0.0])
