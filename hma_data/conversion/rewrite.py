@@ -60,6 +60,7 @@ from hma_data.tokenizers.base import TokenizerSpec
 
 OnProgress = Callable[[int, int], None]
 AGAIN = "run the same hma convert again"
+MARKS = ("synthetic", "inferred_actions")  # of sets that no robot recorded, in `made_by` of their plans
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class _Job:
     """The description of a shard set to make of others, which share embodiment, tokenizer and row layout.
 
     Attributes:
+        embodiment: of the new set; it may lack the state that some of the sets have.
         episodes: in the order of their new numbers: the fields of `EpisodeRow`, with the place in the old
             set, and `set`, which of the sets. A split is kept; an empty one is chosen anew.
         together: episodes that share this text go into one split; empty means the episode's own id.
@@ -76,6 +78,7 @@ class _Job:
     """
 
     sets: Sequence[ShardSet]
+    embodiment: Embodiment
     settings: Settings
     episodes: pa.Table
     together: pa.Array
@@ -97,7 +100,7 @@ class _Job:
             }
         )
         plan = make_plan(
-            Records.of_table(EpisodeRef, refs), first.embodiment, first.spec, self.settings, self.source
+            Records.of_table(EpisodeRef, refs), self.embodiment, first.spec, self.settings, self.source
         )
         if not self.made_by:
             return plan
@@ -124,15 +127,14 @@ class _Job:
                     written += frames
                     on_progress(written, plan.frames)
             names = [unit.name for unit in plan.units]
-            manifest = finish(out, names, first.embodiment, first.spec, plan.facts, self.source)
+            manifest = finish(out, names, self.embodiment, first.spec, plan.facts, self.source)
             remove_notes(out)
             return manifest
 
 
 def _make_shard(job: _Job, plan: Plan, out: Path, unit: ShardUnit, refused: Sequence[Refused]) -> None:
-    layout = job.sets[0].manifest.layout
     readers = [EpisodeReader(shards, shards.columns()) for shards in job.sets]
-    layout = replace(layout, camera_rows=False)
+    layout = replace(job.sets[0].manifest.layout, embodiment=job.embodiment, camera_rows=False)
     stats = layout.empty_stats()
     rows: list[EpisodeRow] = []
     with ShardWriter(out / unit.name, layout.schema, layout.tokenizer) as writer:
@@ -166,7 +168,7 @@ def _rows_of(index: int, views: Mapping[str, dict[str, NDArray[Any]]], layout: R
     """Return the rows of an episode from its columns by camera."""
     tokens = token_column(layout.tokenizer)[0]
     first, *further = layout.token_columns.items()
-    own = views[first[0]]
+    own = {key: value for key, value in views[first[0]].items() if layout.stateful or "state" not in key}
     return EpisodeRows(
         episode_index=index,
         timestamps=own["timestamp"],
@@ -190,7 +192,8 @@ def merge(
 ) -> Manifest:
     """Merge several sets of the same embodiment and tokenizer into one; every episode keeps its split.
 
-    An id that occurs in several sets is prefixed with the number of its set: `2/demo_0`.
+    If one of the sets has no state, such as a synthetic one, the merged set has none. An id that occurs in
+    several sets is prefixed with the number of its set: `2/demo_0`.
 
     Args:
         folders: str or path of each set, or its URI.
@@ -206,11 +209,16 @@ def merge(
     for other in sets[1:]:
         _check_alike(first, other)
     episodes, refused = _joined([_rows(shards) for shards in sets], [_refused(shards) for shards in sets])
-    made_by = {"merge": [shards.manifest.plan["hash"] for shards in sets]}
+    made_by: dict[str, Any] = {"merge": [shards.manifest.plan["hash"] for shards in sets]}
+    for mark in MARKS:  # of some of the episodes is of the set
+        if any(shards.manifest.plan.get("made_by", {}).get(mark) for shards in sets):
+            made_by[mark] = True
+    stateless = any(shards.embodiment.state is None for shards in sets)
+    embodiment = _stateless(first) if stateless else first.embodiment
     sources = list(dict.fromkeys(shards.manifest.source for shards in sets))
     source = sources[0] if len(sources) == 1 else f"merged of {len(sources)} recordings, first {sources[0]}"
     settings = replace(_settings(first), limit=None, only=(), exclude=())
-    job = _Job(sets, settings, episodes, pa.repeat("", len(episodes)), source, refused, made_by)
+    job = _Job(sets, embodiment, settings, episodes, pa.repeat("", len(episodes)), source, refused, made_by)
     return job.run(out, workers, on_progress)
 
 
@@ -276,7 +284,8 @@ def split(
     together = rows["group"] if by == "episode" else _together(rows, by)
     episodes = _with_columns(rows, split=pa.repeat("", len(rows)), set=pa.repeat(0, len(rows)))
     made_by = {} if by == "episode" else {"split_by": by}
-    job = _Job([shards], settings, episodes, together, shards.manifest.source, _refused(shards), made_by)
+    refused, source = _refused(shards), shards.manifest.source
+    job = _Job([shards], shards.embodiment, settings, episodes, together, source, refused, made_by)
     return job.run(out, workers, on_progress)
 
 
@@ -313,10 +322,18 @@ def _check_out(out: StrPath, folders: Sequence[StrPath]) -> None:
             raise UsageError("--out", fault, "give a new folder")
 
 
+def _stateless(shards: ShardSet) -> Embodiment:
+    values = {key: value for key, value in shards.embodiment.to_dict().items() if key != "state"}
+    return Embodiment.from_values(values, f"embodiment {shards.embodiment.id}")
+
+
 def _check_alike(first: ShardSet, other: ShardSet) -> None:
+    same = [shards.embodiment for shards in (first, other)]
+    if any(embodiment.state is None for embodiment in same):
+        same = [_stateless(shards) for shards in (first, other)]
     pairs = {
         "embodiment": (first.embodiment.id, other.embodiment.id),
-        "content of the embodiment's YAML": (first.embodiment.digest, other.embodiment.digest),
+        "content of the embodiment's YAML": (same[0].digest, same[1].digest),
         "stride": (first.embodiment.stride, other.embodiment.stride),
         "tokenizer": (f"{first.spec.name} {first.spec.digest}", f"{other.spec.name} {other.spec.digest}"),
         "cameras": (first.manifest.cameras, other.manifest.cameras),

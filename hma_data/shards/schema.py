@@ -325,6 +325,11 @@ class RowLayout:
         return {"action": self.embodiment.action_dim} | ({"state": state.dims} if state else {})
 
     @property
+    def stateful(self) -> bool:
+        """Check whether rows hold the robot's state."""
+        return "state" in self.widths
+
+    @property
     def schema(self) -> pa.Schema:
         """Return the columns of a shard."""
         return arrow_schema(

@@ -245,7 +245,9 @@ class _Maker:
     def _train(self, on_progress: Callable[[float, str], None]) -> None:
         """Train the judge, or the probe alone, if they are asked for."""
         settings = self.settings
-        stateful = settings.commands.startswith(("scripted", "lerobot:")) and simulated(settings.embodiment)
+        stateful = settings.commands.startswith(("scripted", "reach", "lerobot:")) and simulated(
+            settings.embodiment
+        )
         needed = bool(settings.judge) or stateful
         if self.probe is not None or not needed:
             return
