@@ -342,7 +342,10 @@ def _check_alike(first: ShardSet, other: ShardSet) -> None:
     for what, (mine, theirs) in pairs.items():
         if mine != theirs:
             fault = f"cannot be merged with {first.folder}: its {what} is {theirs}, there it is {mine}"
-            raise ShardError(other.folder, fault, "merge sets of one embodiment and one tokenizer")
+            remedy = "merge sets of one embodiment and one tokenizer"
+            if what == "frame stride":
+                remedy = "convert the recordings of the other with --frames strided"
+            raise ShardError(other.folder, fault, remedy)
 
 
 def _settings(shards: ShardSet) -> Settings:

@@ -80,10 +80,17 @@ class Augmentation:
         if self.judge:
             task_of(self.embodiment, self.judge)
 
+    @property
+    def recorded(self) -> bool:
+        """Check whether the commands are recorded ones, also with noise, rather than a policy's."""
+        return self.commands.partition("=")[0] in ("replay", "perturb")
+
 
 @dataclass(frozen=True)
 class Batch:
     """Episodes of one pass: stored frames (n, P + T, …), chunks (n, P + T - 1, K), and what to choose by.
+
+    Of a policy's episodes P is one: what was commanded before is none of its own.
 
     Attributes:
         nats: (n,) mean entropy of the generated tokens' predictions, in nats a token.
@@ -197,9 +204,9 @@ class _Maker:
         self._long = [] if shards is None else self._long_enough(shards)
 
     def _policy(self, commands: str) -> Policy:
-        kind, given, number = commands.partition("=")
+        _, given, number = commands.partition("=")
         std = self.world.model.embodiments[self.robot.id].std
-        if kind not in ("replay", "perturb"):
+        if not self.settings.recorded:
             return read_policy(commands, self.scenes)
         try:
             share = float(number) if given else 0.0
@@ -281,9 +288,12 @@ class _Maker:
         success: NDArray[np.bool_] = np.ones(count, np.bool_)
         if self.judge is not None:
             success = self.judge.success(self.judge.score(np.stack(pictures, axis=1)))
+        first, before = _prompt_tokens(self.world, begun.prompts), [prompt.chunks for prompt in begun.prompts]
+        if not self.settings.recorded:  # what was commanded before is none of the policy's
+            first, before = first[:, -1:], [chunks[:0] for chunks in before]
         return Batch(
-            np.concatenate([_prompt_tokens(self.world, begun.prompts), np.stack(kept, axis=1)], axis=1),
-            np.concatenate([np.stack([prompt.chunks for prompt in begun.prompts]), own], axis=1),
+            np.concatenate([first, np.stack(kept, axis=1)], axis=1),
+            np.concatenate([np.stack(before), own], axis=1),
             np.stack(nats).mean(axis=0),
             success,
             np.array(begun.groups),

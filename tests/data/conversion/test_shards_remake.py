@@ -189,6 +189,22 @@ def test_merge_refuses_another_embodiment(made: Path, tmp_path: Path, change: tu
     assert not (tmp_path / "all").exists()
 
 
+def test_a_set_without_states_merges_with_one_that_has_them(tmp_path: Path) -> None:
+    state = "state: {components: [{key: actions, dims: 3, names: [a, b, c]}]}\n"
+    full = make(tmp_path / "full", [14, 15, 16], yaml=ARM_YAML + state)
+    bare = make(tmp_path / "bare", [11, 12, 13])
+    assert ShardSet(full).embodiment.state is not None
+    for number, both in enumerate(([full, bare], [bare, full])):
+        merge(both, tmp_path / str(number))
+        assert verify(tmp_path / str(number)) == []
+        merged = ShardSet(tmp_path / str(number))
+        assert merged.embodiment.state is None and set(merged.manifest.stats) == {"action"}
+        found = episodes(tmp_path / str(number))
+        for place, folder in enumerate(both, start=1):
+            for name, stored in episodes(folder).items():
+                assert found[f"{place}/{name}"][1:] == stored[1:]
+
+
 def test_merge_refuses_a_folder_that_holds_something_else(made: Path, tmp_path: Path) -> None:
     (tmp_path / "all").mkdir()
     (tmp_path / "all" / "thesis.txt").write_text("mine")

@@ -1,11 +1,12 @@
 """Drivers from a state: the recorder's own commands from the true one, and states found off places."""
 
+import h5py
 import numpy as np
 import pytest
 
 from hma_data.lab import family, planar_arm, pusht, truth
 from hma_data.lab.family.mechanisms import wrapped
-from hma_data.lab.scripted import driver, seen_state, state_of, steerable
+from hma_data.lab.scripted import driver, reacher, seen_state, state_of, steerable
 from hma_data.lab.simulator import LabSimulator
 
 ROBOTS = ("rails_03", "arm2_07", "mover_10", "planar_arm")
@@ -78,3 +79,30 @@ def test_the_pose_of_a_tee_is_read_off_its_places() -> None:
         pose = truth.tee_pose(truth.parts_of(simulator.simulation)[1][1:])
         np.testing.assert_allclose(pose[:2], arena.pose[:2], atol=1e-9)
         assert abs(wrapped(pose[2:] - arena.pose[2:])[0]) < 1e-9
+
+
+@pytest.mark.parametrize("robot", ["mover_04", "mover_06", "mover_10", "gantry_05", "crane_01", "arm4_04"])
+def test_a_reach_ends_at_the_block_that_lay_nearest(robot: str) -> None:
+    body, ends = family.Body.of(robot), []
+    for number in range(6):
+        world, _ = family.start(body, 0, number)
+        tip, lay = body.mechanism.tip(world.pose)[0], world.blocks.copy()
+        nearest = lay[np.linalg.norm(lay - tip, axis=1).argmin()]
+        drive = reacher(robot)
+        for _ in range(3 * body.hz):
+            command = drive(state_of(world))
+            assert (command >= body.ranges[0] - 1e-4).all() and (command <= body.ranges[1] + 1e-4).all()
+            world.advance(command)
+        ends.append(np.linalg.norm(body.mechanism.tip(world.pose)[0] - nearest))
+    assert np.median(ends) < 2.0  # arms cannot reach every place
+
+
+def test_recorded_reaches_are_those_of_the_driver(tmp_path) -> None:
+    family.record_reaching(tmp_path / "a.hdf5", "mover_04", range(2), 5)
+    with h5py.File(tmp_path / "a.hdf5") as file:
+        actions = file["data/demo_1/actions"][:]
+    world, drive = family.start(family.Body.of("mover_04"), 5, 1)[0], reacher("mover_04")
+    for action in actions:
+        np.testing.assert_allclose(drive(state_of(world)), action, atol=1e-5)
+        world.advance(action)
+    assert len(actions) == 20

@@ -49,6 +49,32 @@ def test_it_commands_what_the_history_of_pictures_and_commands_says() -> None:
     assert not np.allclose(given[0], given[0][:1])  # the scenes differ, and so do the commands
 
 
+@pytest.mark.parametrize("memory", [1, 3])
+def test_with_a_short_memory_it_goes_by_the_newest_pictures_alone(memory: int) -> None:
+    world = actor("policy")
+    arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
+    policy, stride = Acting(world, arena.scenes, memory=memory), arena.scenes.stride
+    frames = np.stack([prompt.frames for prompt in arena.prompts])
+    chunks = np.stack([prompt.chunks for prompt in arena.prompts])
+    begin("it", policy, arena)
+    for _ in range(3):
+        tokens = np.stack([world.tokenizer.encode(one[-memory:]) for one in frames]).astype(np.int64)
+        told = np.concatenate([chunks, np.zeros_like(chunks[:, :1])], axis=1)[:, -memory:]
+        known = torch.ones(told.shape[:2], dtype=torch.bool)
+        wanted = world.model.predict_actions(torch.from_numpy(tokens), ROBOT, torch.from_numpy(told), known)
+        given = []
+        for _ in range(stride):
+            given.append(checked("it", policy, arena))
+            arena.step(given[-1])
+        made = np.stack(given, axis=1).reshape(2, -1)
+        low, high = (np.tile(end, stride) for end in (world.commands(ROBOT).low, world.commands(ROBOT).high))
+        said = wanted[:, -1].numpy()
+        said = np.clip(said, low, high) if world.commands(ROBOT).seen is not None else said
+        np.testing.assert_allclose(made, said, atol=1e-3)
+        frames = np.concatenate([frames, arena.pictures[:, None]], axis=1)
+        chunks = np.concatenate([chunks, made[:, None]], axis=1)
+
+
 def test_what_it_imagines_ahead_is_forgotten() -> None:
     scenes = Scenes.of(actor("full"), ROBOT, 2, 0)
     runs = []

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from hma_data.conversion.job import convert
-from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.conversion.plan import Settings
+from hma_data.conversion.rewrite import merge
+from hma_data.errors import HMAError, OutputError, ShardError, UsageError
 from hma_data.lab import family, record
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
@@ -62,6 +64,25 @@ def test_replayed_episodes_hold_the_recorders_commands_and_say_that_they_are_syn
         np.testing.assert_array_equal(columns["tokens"][:known].reshape(stored.shape), stored)
 
 
+def test_synthetic_episodes_merge_with_recorded_ones_and_the_whole_says_so(
+    world: World, tmp_path: Path
+) -> None:
+    recording, robot = record(ROBOT, tmp_path, 2), family.embodiment(ROBOT)
+    for frames in ("strided", "all"):
+        convert(robot, recording, world.tokenizer, tmp_path / frames, settings=Settings(frames=frames))
+    made = augment(tmp_path / "made", asked(), world=world)
+    whole = merge([tmp_path / "strided", tmp_path / "made"], tmp_path / "whole")
+    assert verify(tmp_path / "whole") == [] and robot.state is not None and whole.embodiment.state is None
+    assert whole.plan["made_by"]["synthetic"] is True and len(episodes(tmp_path / "whole")) == 6
+    flags = ShardSet(tmp_path / "whole").episodes["flags"].to_pylist()
+    assert sum("generated_frames" in text for text in flags) == len(episodes(tmp_path / "made")) == 4
+    again = merge([tmp_path / "strided", tmp_path / "strided"], tmp_path / "twice")
+    assert "synthetic" not in again.plan["made_by"] and again.embodiment.state is not None
+    assert made.frame_stride == whole.frame_stride > 1
+    with pytest.raises(ShardError, match="frame stride .* --frames strided"):
+        merge([tmp_path / "all", tmp_path / "made"], tmp_path / "mixed")
+
+
 @pytest.mark.slow
 def test_perturbed_commands_lie_around_the_recorded_ones(world: World, tmp_path: Path) -> None:
     augment(tmp_path / "one", asked(), world=world)
@@ -70,7 +91,9 @@ def test_perturbed_commands_lie_around_the_recorded_ones(world: World, tmp_path:
     gaps = np.concatenate([(one["action"] - other["action"])[3:] for one, other in pairs])
     assert 0 < np.abs(gaps).mean() < 0.5 * 30
     augment(tmp_path / "still", asked(commands="still"), world=world)
-    assert not any(one["action"][3:].any() for one in episodes(tmp_path / "still"))  # velocities
+    still = episodes(tmp_path / "still")
+    assert not any(one["action"].any() for one in still)  # velocities; the recorder's before are left out
+    assert {len(one["action"]) for one in still} == {FRAMES}
 
 
 def test_a_stopped_run_continues_and_gives_the_same_bytes(world: World, tmp_path: Path) -> None:
