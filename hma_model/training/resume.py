@@ -30,6 +30,7 @@ import numpy as np
 
 from hma_data.errors import CheckpointError, HubError, RecipeError
 from hma_data.loading.views import view_count
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import file_sha256, finite, read_json, to_json
 from hma_model.checkpoint import io as checkpoints
@@ -170,13 +171,22 @@ class Start:
                 raise CheckpointError(self.source, fault, "give the robot of the shards another id")
         return self.checkpoint.stats(name)
 
-    def waves(self, name: str, recipe: Recipe) -> int | None:
-        """Return the octaves of waves of a robot's stem: the checkpoint's, else the recipe's, if any."""
+    def waves(self, robot: Embodiment, recipe: Recipe) -> int | None:
+        """Return the octaves of waves of a robot's stem; None for those of the network.
+
+        They are the checkpoint's; of a robot that it lacks the recipe's, else the most that a like robot has.
+        """
+        name, own = robot.id, recipe.model.get(WAVES)
         if name in self.checkpoint.embodiments:
-            _, stem, _ = checkpoints.read_embodiment(self.checkpoint, name)
-            if octaves := waves_of_stem(stem):
-                return octaves
-        return recipe.model.get(WAVES)
+            return self._waves(name) or own
+        if own is not None or recipe.new_stem == "fresh":
+            return own
+        cards = {one: self.checkpoint.card(one) for one in self.checkpoint.embodiments}
+        return max(map(self._waves, candidates(cards, robot)), default=0) or None
+
+    def _waves(self, name: str) -> int:
+        _, stem, _ = checkpoints.read_embodiment(self.checkpoint, name)
+        return waves_of_stem(stem)
 
     def fill(self, model: HMA) -> None:
         """Load the checkpoint's weights for the model's embodiments; freeze trunk and readout if required."""

@@ -107,7 +107,8 @@ class Run:
         model = HMA(config)
         for name, shards in self.sets.items():
             space = ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name))
-            model.add_embodiment(space, waves=self.start.waves(name, self.recipe) if self.start else None)
+            waves = self.start.waves(shards.embodiment, self.recipe) if self.start else None
+            model.add_embodiment(space, waves=waves)
         return model
 
     def _fresh_model(self) -> HMA:
@@ -282,7 +283,7 @@ class Run:
         """Compute the held-out loss of the main objective, and return the line of metrics.jsonl.
 
         For forward and full it is nats a token of each fully masked frame, given the true past and actions,
-        with the loss of the training token frequencies as a baseline. For passive, policy and inverse it is
+        with the loss of the training tokens' frequencies as a baseline. For passive, policy and inverse it is
         the training loss on held-out windows, under masks that are the same at every evaluation.
         """
         model = self.shown()

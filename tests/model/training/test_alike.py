@@ -101,6 +101,14 @@ def test_a_new_robot_begins_with_it_and_the_card_says_so(base, twin, tmp_path):
     assert Checkpoint.open(again.checkpoint).card("twin")["training"]["stem_from"] == source
 
 
+def test_a_new_stem_has_the_waves_of_its_like(base, twin, tmp_path):
+    arm = make_shards(tmp_path / "arm", "arm")
+    waved = tune(base.out, arm, tmp_path / "waved", "model.action_waves=3", "steps=2", "lr=1e-2")
+    like, fresh = (tune(waved.out, twin, tmp_path / way, f"new_stem={way}") for way in ("like", "fresh"))
+    key = "embodiments/twin/stem.safetensors:waves.weight"
+    assert weights(like.checkpoint)[key].shape[1] == 2 * 3 * 4 and key not in weights(fresh.checkpoint)
+
+
 def test_only_robots_with_as_many_dims_are_tried_the_nearest_rate_first():
     cards: dict = {
         "slow": {"action_dim": 2, "hz": 1.0}, "near": {"action_dim": 2, "hz": 9.0},
