@@ -70,6 +70,7 @@ __all__ = [
 
 DRAWS = 5  # of other windows' actions, and of Gaussian ones
 FOLLOWS_DB = 0.5  # gain of the last frame's PSNR from which a model is said to follow its actions
+HEARS = 1.2  # and times the loss with shuffled ones from which it is said to hear them
 PAPER_BATCH = 4  # the paper's perplexity is a mean over batches of so many windows
 Floats = NDArray[np.float64]
 
@@ -236,6 +237,10 @@ def verdict(found: Mapping[str, Any]) -> str:
     said = f"{gain:+.1f} dB on the last frame, true less shuffled actions"
     if gain >= FOLLOWS_DB:
         return f"follows its actions: {said}"
+    loss, shuffled_loss = found.get("loss"), found.get("shuffled_loss")
+    if loss and shuffled_loss and shuffled_loss >= HEARS * loss:
+        nats = f"{loss:.2f} nats a token, {shuffled_loss:.2f} with shuffled ones"
+        return f"hears its actions ({nats}), but its rollouts show little of it yet: {said}"
     return f"does not follow its actions yet ({said})"
 
 

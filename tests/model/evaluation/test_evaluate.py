@@ -320,6 +320,9 @@ def test_the_verdict_says_whether_the_model_follows_its_actions() -> None:
         "follows its actions: +2.1 dB on the last frame"
     )
     assert verdict({"psnr_action_gain_last": 0.1}).startswith("does not follow its actions yet (+0.1 dB")
+    heard = {"psnr_action_gain_last": 0.1, "loss": 2.0, "shuffled_loss": 4.0}
+    assert verdict(heard).startswith("hears its actions (2.00 nats a token, 4.00 with shuffled ones), but")
+    assert verdict(heard | {"shuffled_loss": 2.1}).startswith("does not follow its actions yet")
 
 
 # -- intervals, other commands, words
