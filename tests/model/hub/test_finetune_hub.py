@@ -28,10 +28,18 @@ def tune(source, leg, out, freeze=True):
 
 
 @pytest.mark.parametrize("freeze", [True, False])
-def test_of_a_repository_the_trunk_alone_is_fetched_for_a_new_robot(published, leg, tmp_path, freeze):
+def test_of_a_repository_trunk_and_cards_are_fetched_for_a_new_robot(published, leg, tmp_path, freeze):
     result = tune(REPO, leg, tmp_path / "run", freeze)
-    assert set(published.served()) == {"config.json", "trunk.safetensors"}
+    cards = {f"embodiments/{name}/card.json" for name in ("arm", "hand")}
+    assert set(published.served()) == {"config.json", "trunk.safetensors"} | cards
     assert Checkpoint.open(result.checkpoint).embodiments == ("leg",)
+
+
+def test_a_robot_that_may_be_like_a_new_one_is_fetched_with_the_trunk(published, tmp_path):
+    result = tune(REPO, make_shards(tmp_path / "twin", "twin", dims=2, seed=3), tmp_path / "run", False)
+    stems = {name for name in published.served() if name.endswith("stem.safetensors")}
+    assert stems == {"embodiments/arm/stem.safetensors"}
+    assert Checkpoint.open(result.checkpoint).embodiments == ("twin",)
 
 
 def test_a_robot_that_the_repository_knows_is_fetched_with_the_trunk(published, tmp_path):
