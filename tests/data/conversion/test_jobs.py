@@ -141,6 +141,7 @@ def test_added_episodes_become_new_shards_and_the_old_stay(toy_arm: Embodiment, 
     assert contents(out) == after
 
 
+@pytest.mark.slow
 def test_an_extension_stopped_anywhere_ends_with_the_same_bytes(toy_arm: Embodiment, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     for folder in (first, second):

@@ -83,6 +83,7 @@ def test_taef2_keeps_its_known_quality_on_a_whole_frame(real_data, taef2):
     assert 10 * torch.log10(4 / (pixels - made).square().mean()) == pytest.approx(37.4, abs=0.7)
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_taef2_gives_photographs_of_hands_back(real_data, taef2):
     import cv2
