@@ -16,7 +16,7 @@ def policy_eval(
         list[str],
         typer.Argument(
             metavar="POLICY…",
-            help="scripted, scripted:noise=SHARE, random, still, hma:CHECKPOINT, plan:cem, "
+            help="scripted, reach, either with :noise=SHARE, random, still, hma:CHECKPOINT, plan:cem, "
             "lerobot:FOLDER_OR_REPO, or MODULE:NAME of a Python function or class: picture to command.",
         ),
     ],

@@ -238,14 +238,15 @@ class _Maker:
         batches = []
         for begin in range(0, count, BATCH):
             path = work / f"batch-{begin:06d}.npz"
-            if kept_arrays(path) is None:
+            arrays = kept_arrays(path)
+            if arrays is None:
                 self._train(on_progress)
                 numbers = range(begin, min(begin + BATCH, count))
                 batch = self._make(numbers, lambda at, b=begin: on_progress(b * frames + at, "episodes"))  # type: ignore[misc]
+                arrays = vars(batch)
                 with atomic_path(path) as part, part.open("wb") as file:
-                    np.savez(file, **vars(batch))
-            with np.load(path) as arrays:
-                batches.append(Batch(**arrays))
+                    np.savez(file, **arrays)
+            batches.append(Batch(**arrays))
             on_progress(min(begin + BATCH, count) * frames, "episodes")
         return batches
 

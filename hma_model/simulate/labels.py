@@ -247,14 +247,13 @@ def _label(
     heads, kept, refused = film.heads(), [], list[Refused]()
     for number, (name, group, instruction) in enumerate(heads):
         path = work / f"episode-{number:06d}.npz"
-        if kept_arrays(path) is None:
+        found = kept_arrays(path)
+        if found is None:
             on_progress(number, "labelling", len(heads))
             found = _labels_of(world.model, commands, film, number)
             with atomic_path(path) as part, part.open("wb") as file:
                 np.savez(file, **found)
-        with np.load(path) as arrays:
-            fault = str(arrays["fault"]) if "fault" in arrays else ""
-        if fault:
+        if fault := str(found.get("fault", "")):
             refused.append(Refused(name, EpisodeError.__name__, fault))
         else:
             kept.append((path, name, group, instruction))

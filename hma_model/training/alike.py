@@ -48,12 +48,12 @@ def candidates(cards: Mapping[str, Mapping[str, Any]], robot: "Embodiment") -> l
     """Return the ids of the robots with as many action dims, those of the nearest rate first.
 
     Args:
-        cards: id -> at least `action_dim` and `hz`, frames a second; those of a hub may be damaged.
+        cards: id -> at least `action_dim` and `effective_hz`; those of a hub may be damaged.
         robot: the new robot.
     """
 
     def apart(name: str) -> float:
-        hz = cards[name].get("hz")
+        hz = cards[name].get("effective_hz")
         return abs(math.log(hz / robot.effective_hz)) if isinstance(hz, int | float) and hz > 0 else math.inf
 
     return sorted((name for name in cards if cards[name].get("action_dim") == robot.action_dim), key=apart)
@@ -79,7 +79,6 @@ def choose(
     length = min(FRAMES, model.config.frames)
     batches = list(windows(shards, "train", length, WINDOWS, batch_size=WINDOWS, cameras=cameras))
     cards = {one: checkpoint.card(one) for one in checkpoint.embodiments}
-    rates = {one: {**card, "hz": card.get("effective_hz")} for one, card in cards.items()}
     own = _states(model, name)
 
     def loss() -> float:
@@ -88,7 +87,7 @@ def choose(
 
     fresh = lowest = loss()
     chosen = ""
-    for like in candidates(rates, shards.embodiment):
+    for like in candidates(cards, shards.embodiment):
         take(model, name, checkpoint, like)
         tried = loss()
         if tried < lowest:

@@ -103,14 +103,21 @@ class Start:
         try:
             known = hub.embodiment_ids(hub.open_store(source, revision).files())
             wanted = {name for name in known if name in sets or (frozen and local)}
+            likes: set[str] = set()
             fresh = set(sets) - set(known)
             if fresh and recipe.new_stem == "like":
-                rows = hub.list_embodiments(source, revision)
-                cards = {row["embodiment"]: row for row in rows if not row["problems"]}
+                rows = [row for row in hub.list_embodiments(source, revision) if not row["problems"]]
+                cards = {row["embodiment"]: {**row, "effective_hz": row["hz"]} for row in rows}
                 for name in fresh:
-                    likes = candidates(cards, sets[name].embodiment)
-                    wanted |= set(likes if local else likes[:FETCHED])
-            hub.pull(source, sorted(wanted), place, revision)
+                    some = [one for one in candidates(cards, sets[name].embodiment) if one in known]
+                    likes |= set(some if local else some[:FETCHED])
+            try:
+                hub.pull(source, sorted(wanted | likes), place, revision)
+            except CheckpointError as fault:
+                if not likes - wanted:
+                    raise
+                remedy = f"{fault.remedy}, or with new_stem=fresh go without the robots like yours"
+                raise CheckpointError(fault.where, fault.fault, remedy) from fault
         except HubError as fault:
             if local or "://" in source:
                 raise

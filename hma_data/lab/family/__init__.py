@@ -47,8 +47,7 @@ def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
     """Record a robot as a file of robomimic's layout, or as a folder of MCAP files; see `hma_data.lab`."""
     body = Body.of(robot)
     if not _in_bags(robot):
-        env_args = {"env_name": robot, "type": 2, "env_kwargs": {"control_freq": body.hz}}
-        write_hdf5(part, (episode(body, seed, number) for number in episodes), env_args)
+        _write_file(part, body, (episode(body, seed, number) for number in episodes))
         return
     part.mkdir()
     for number in episodes:
@@ -161,8 +160,12 @@ def _write_bag(path: Path, body: Body, seed: int, number: int) -> None:
 def record_reaching(part: Path, robot: str, episodes: Iterable[int], seed: int, seconds: float = 2.0) -> None:
     """Record episodes in which the robot goes to the nearest block, to HDF5: what a policy can learn."""
     body = Body.of(robot)
-    env_args = {"env_name": robot, "type": 2, "env_kwargs": {"control_freq": body.hz}}
-    write_hdf5(part, (episode(body, seed, n, Reacher(body), seconds) for n in episodes), env_args)
+    _write_file(part, body, (episode(body, seed, n, Reacher(body), seconds) for n in episodes))
+
+
+def _write_file(part: Path, body: Body, demos: Iterable[Demo]) -> None:
+    env_args = {"env_name": body.name, "type": 2, "env_kwargs": {"control_freq": body.hz}}
+    write_hdf5(part, demos, env_args)
 
 
 def episode(

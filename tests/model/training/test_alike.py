@@ -1,5 +1,6 @@
 """A new robot begins with the stem of its like: which one, and at another stride."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hma_data.errors import CheckpointError
 from hma_data.shards.reader import ShardSet
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import action_stats
@@ -101,6 +103,17 @@ def test_a_new_robot_begins_with_it_and_the_card_says_so(base, twin, tmp_path):
     assert Checkpoint.open(again.checkpoint).card("twin")["training"]["stem_from"] == source
 
 
+def test_a_damaged_like_robot_is_named_with_the_way_without_it(base, twin, tmp_path):
+    damaged = shutil.copytree(base.checkpoint, tmp_path / "damaged one")
+    stem = damaged / "embodiments/arm/stem.safetensors"
+    content = bytearray(stem.read_bytes())
+    content[-9] ^= 4
+    stem.write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"embodiments/arm/stem\.safetensors: .*new_stem=fresh"):
+        tune(damaged, twin, tmp_path / "run", freeze=False)
+    assert tune(damaged, twin, tmp_path / "run", "new_stem=fresh", freeze=False).step == 1
+
+
 def test_a_new_stem_has_the_waves_of_its_like(base, twin, tmp_path):
     arm = make_shards(tmp_path / "arm", "arm")
     waved = tune(base.out, arm, tmp_path / "waved", "model.action_waves=3", "steps=2", "lr=1e-2")
@@ -111,8 +124,9 @@ def test_a_new_stem_has_the_waves_of_its_like(base, twin, tmp_path):
 
 def test_only_robots_with_as_many_dims_are_tried_the_nearest_rate_first():
     cards: dict = {
-        "slow": {"action_dim": 2, "hz": 1.0}, "near": {"action_dim": 2, "hz": 9.0},
-        "wide": {"action_dim": 3, "hz": 10.0}, "odd": {"action_dim": 2, "hz": "x"}, "none": {},
+        "slow": {"action_dim": 2, "effective_hz": 1.0}, "near": {"action_dim": 2, "effective_hz": 9.0},
+        "wide": {"action_dim": 3, "effective_hz": 10.0}, "none": {},
+        "odd": {"action_dim": 2, "effective_hz": "x"},
     }  # fmt: skip
 
     class Robot:
