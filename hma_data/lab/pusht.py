@@ -28,6 +28,7 @@ LAG_S = 0.2  # delay of the pusher's spring (k_v / k_p of the environment) behin
 SPEED = 300.0  # px/s of planned motion
 PLACED_PX = 4.0  # mean distance of the T's corners from the goal at which a driver that looks has done
 STARTS = ("near", "random", "near", "far", "near")
+PLAY = ("random", "near", "random", "far", "random")
 EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps; episodes are a minute apart
 
 
@@ -41,6 +42,7 @@ class Look(NamedTuple):
 
 
 FAST_LOOK = Look(128, "LightSlateGray", "RoyalBlue", "RoyalBlue")
+PLAY_LOOK = FAST_LOOK._replace(size=96)
 SLOW_LOOK = Look(96, "Peru", "Crimson", "DodgerBlue")
 FAST_STEPS, SLOW_TICKS = 80, 720
 CAMERA_TICKS, COMMAND_TICKS = 8, 20  # of pusht_slow: from one picture, and one command, to the next
@@ -67,8 +69,13 @@ def record_noisy(part: Path, episodes: Iterable[int], seed: int) -> None:
     _write_fast(part, (_fast_demo(seed, n, NOISE[n // len(STARTS) % len(NOISE)]) for n in episodes))
 
 
-def _write_fast(part: Path, demos: Iterable[Demo]) -> None:
-    kwargs = {"observation_width": FAST_LOOK.size, "observation_height": FAST_LOOK.size}
+def record_play(part: Path, episodes: Iterable[int], seed: int) -> None:
+    """Record `pusht_fast` at 96 px, as gym-pusht's own recordings are, to HDF5; most episodes wander."""
+    _write_fast(part, (_fast_demo(seed, n, look=PLAY_LOOK, starts=PLAY) for n in episodes), PLAY_LOOK)
+
+
+def _write_fast(part: Path, demos: Iterable[Demo], look: Look = FAST_LOOK) -> None:
+    kwargs = {"observation_width": look.size, "observation_height": look.size}
     env_args = {"env_name": "gym_pusht/PushT-v0", "type": 2, "env_kwargs": kwargs}
     write_hdf5(part, demos, env_args)
 
@@ -145,8 +152,8 @@ class Arena:
         self.success = self.success or coverage > SUCCESS
 
 
-def _policy(arena: Arena, rng: np.random.Generator, episode: int, fly: bool) -> Planned | Wandering:
-    if STARTS[episode % len(STARTS)] == "random":
+def _policy(arena: Arena, rng: np.random.Generator, start: str, fly: bool) -> Planned | Wandering:
+    if start == "random":
         return Wandering(arena.agent, fly, rng)
     return Planned(arena.tee, arena.goal, arena.agent, SPEED, fly, rng)
 
@@ -161,9 +168,12 @@ def _within(target: Floats) -> Floats:
 class FastPusher:
     """pusht_fast: an arena whose commands are targets of the pusher, one each 0.1 s."""
 
-    def __init__(self, seed: int, episode: int) -> None:
+    def __init__(
+        self, seed: int, episode: int, look: Look = FAST_LOOK, starts: tuple[str, ...] = STARTS
+    ) -> None:
         self.rng = np.random.default_rng((seed, 0, episode))
-        self.arena = Arena(FAST_LOOK, STARTS[episode % len(STARTS)], self.rng)
+        self.start = starts[episode % len(starts)]
+        self.arena = Arena(look, self.start, self.rng)
 
     @property
     def observed(self) -> NDArray[np.float32]:
@@ -178,10 +188,10 @@ class FastPusher:
         """Simulate 0.1 s with the target at (x, y)."""
         self.arena.advance(command.astype(np.float64), round(FAST_PERIOD_S / TICK_S))
 
-    def driver(self, episode: int) -> Callable[[], NDArray[np.float32]]:
-        """Return the recorder's driver of an episode, which returns the next command (2,)."""
+    def driver(self) -> Callable[[], NDArray[np.float32]]:
+        """Return the recorder's driver of the episode, which returns the next command (2,)."""
         arena = self.arena
-        targets = Targets(_policy(arena, self.rng, episode, fly=False), arena.agent)
+        targets = Targets(_policy(arena, self.rng, self.start, fly=False), arena.agent)
         return lambda: targets.held if arena.success else targets.next(arena.pose, arena.agent)
 
 
@@ -231,10 +241,12 @@ def tee() -> Tee:
     return Arena(FAST_LOOK, "far", np.random.default_rng(0)).tee
 
 
-def _fast_demo(seed: int, episode: int, noise: float = 0.0) -> Demo:
+def _fast_demo(
+    seed: int, episode: int, noise: float = 0.0, look: Look = FAST_LOOK, starts: tuple[str, ...] = STARTS
+) -> Demo:
     dice, target = np.random.default_rng((seed, 2, episode)), None
-    robot = FastPusher(seed, episode)
-    arena, drive = robot.arena, robot.driver(episode)
+    robot = FastPusher(seed, episode, look, starts)
+    arena, drive = robot.arena, robot.driver()
     period, stop = FAST_PERIOD_S, FAST_STEPS
     rows: list[tuple[Any, ...]] = []
     while len(rows) < stop:
@@ -254,7 +266,7 @@ def _fast_demo(seed: int, episode: int, noise: float = 0.0) -> Demo:
         states=states,
         rewards=rewards,
         success=arena.success,
-        facts={"start": STARTS[episode % len(STARTS)], "seed": seed, **({"noise": noise} if noise else {})},
+        facts={"start": robot.start, "seed": seed, **({"noise": noise} if noise else {})},
     )
 
 
@@ -266,7 +278,8 @@ class SlowPusher:
 
     def __init__(self, seed: int, episode: int) -> None:
         self.rng = np.random.default_rng((seed, 1, episode))
-        self.arena = Arena(SLOW_LOOK, STARTS[episode % len(STARTS)], self.rng)
+        self.start = STARTS[episode % len(STARTS)]
+        self.arena = Arena(SLOW_LOOK, self.start, self.rng)
         self.setpoint = self.arena.agent
         self.velocity: Floats = np.zeros(2)
 
@@ -294,9 +307,9 @@ class SlowPusher:
         self.take(command)
         self.run(CAMERA_TICKS)
 
-    def commander(self, episode: int) -> Callable[[], Floats]:
-        """Return the recorder's driver of an episode; it returns (3,) a command for COMMAND_TICKS."""
-        arena, policy = self.arena, _policy(self.arena, self.rng, episode, fly=True)
+    def commander(self) -> Callable[[], Floats]:
+        """Return the recorder's driver of the episode; it returns (3,) a command for COMMAND_TICKS."""
+        arena, policy = self.arena, _policy(self.arena, self.rng, self.start, fly=True)
         period = COMMAND_TICKS * TICK_S
 
         def command() -> Floats:
@@ -307,9 +320,9 @@ class SlowPusher:
 
         return command
 
-    def driver(self, episode: int) -> Callable[[], NDArray[np.float32]]:
+    def driver(self) -> Callable[[], NDArray[np.float32]]:
         """Return a driver that returns (3,) the command in force at each picture, as it is recorded."""
-        commander, due = self.commander(episode), self.arena.ticks
+        commander, due = self.commander(), self.arena.ticks
         held: Floats = np.zeros(3)
 
         def drive() -> NDArray[np.float32]:
@@ -333,7 +346,7 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
     import cv2
 
     robot = SlowPusher(seed, episode)
-    arena, rng, command, stop = robot.arena, robot.rng, robot.commander(episode), SLOW_TICKS
+    arena, rng, command, stop = robot.arena, robot.rng, robot.commander(), SLOW_TICKS
     messages: list[Message] = []
     for tick, event in _slow_schedule(rng):
         if tick >= stop:

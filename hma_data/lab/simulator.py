@@ -127,12 +127,12 @@ def _planar_arm(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver
 
 def _pusht_fast(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
     pusher = pusht.FastPusher(seed, episode)
-    return pusher, pusher.driver(episode)
+    return pusher, pusher.driver()
 
 
 def _pusht_slow(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
     pusher = pusht.SlowPusher(seed, episode)
-    return pusher, pusher.driver(episode)
+    return pusher, pusher.driver()
 
 
 _BEGINNINGS: dict[str, Callable[[str, int, int], tuple[Simulation, Driver]]] = {

@@ -9,36 +9,42 @@
     hma policy-eval pusht_fast scripted scripted:noise=0.1 scripted:noise=0.25 scripted:noise=0.5 random \\
         still --checkpoint runs/pushes --judge placed --frames 20 --out policies
 
-The noisy half has episodes in which 10 to 100 % of the commands are random: a model that has seen good
-pushes alone is kind to bad policies. docs/results-log.md has the figures, and how ours was trained.
+The noisy part has episodes in which 10 to 100 % of the commands are random: a model that has seen good
+pushes alone is kind to bad policies. `--play N` records a third part, in pictures of 96 px, in which most
+episodes wander: gym-pusht as people record it themselves. docs/results-log.md has the figures, and how
+ours was trained.
 """
 
 import argparse
+from functools import partial
 from pathlib import Path
 
-from hma_data.lab import pusht, record
+from hma_data.lab import pusht
 from hma_data.storage.files import part_of
-
-NAME = "pusht_fast.hdf5"
 
 
 def main() -> None:
-    """Record both halves; a half that is there is kept."""
+    """Record the parts; a part that is there is kept."""
     parser = argparse.ArgumentParser(description="Record pushes of good and of bad drivers")
     parser.add_argument("out", type=Path)
     parser.add_argument("--planned", type=int, default=1200, help="episodes of the recorder's own driver")
     parser.add_argument("--noisy", type=int, default=900, help="episodes with random commands among its own")
+    parser.add_argument("--play", type=int, default=0, help="episodes at 96 px, most of which wander")
     parser.add_argument("--seed", type=int, default=7)
     given = parser.parse_args()
-    planned, noisy = given.out / "planned", given.out / "noisy" / NAME
-    if not (planned / NAME).exists():
-        record("pusht_fast", planned, given.planned, given.seed)
-    if not noisy.exists():
-        noisy.parent.mkdir(parents=True, exist_ok=True)
-        part = part_of(noisy)
-        pusht.record_noisy(part, range(given.noisy), given.seed + 4)
-        part.replace(noisy)
-    print(f"{planned / NAME}: {given.planned} episodes; {noisy}: {given.noisy}")
+    planned = partial(pusht.record, robot="pusht_fast")
+    for name, record, count, seed in (
+        ("planned", planned, given.planned, given.seed),
+        ("noisy", pusht.record_noisy, given.noisy, given.seed + 4),
+        ("play", pusht.record_play, given.play, given.seed + 8),
+    ):
+        file = given.out / name / "pusht_fast.hdf5"
+        if count and not file.exists():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            part = part_of(file)
+            record(part, episodes=range(count), seed=seed)
+            part.replace(file)
+            print(f"{file}: {count} episodes")
 
 
 if __name__ == "__main__":

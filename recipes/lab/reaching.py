@@ -16,15 +16,45 @@
         --judge reached --frames 20 --episodes 64 --out policies
 
 What is made begins at real frames of the robot at play, and the driver acts in the model, by what its
-pictures show. docs/results-log.md has the figures.
+pictures show. With --lerobot the reaches are written as a LeRobotDataset besides, on which lerobot trains
+policies of its own; a policy that was stopped early is worse than one that was not:
+
+    python recipes/lab/reaching.py build/reach --lerobot
+    lerobot-train --dataset.repo_id=lab/mover_04 --dataset.root=build/reach/lerobot --output_dir=runs/act \
+        --policy.type=act --policy.device=cpu --policy.push_to_hub=false --policy.chunk_size=10 \
+        --policy.n_action_steps=2 --policy.dim_model=128 --policy.dim_feedforward=512 \
+        --policy.pretrained_backbone_weights=null --policy.optimizer_lr=3e-4 \
+        --policy.optimizer_lr_backbone=3e-4 --batch_size=16 --steps=1600 --save_freq=100
+    hma policy-eval mover_04 lerobot:runs/act/checkpoints/{000100,000400,001600}/pretrained_model \
+        reach reach:noise=0.5 still --judge reached --frames 20 --episodes 64 --out policies
+
+docs/results-log.md has the figures.
 """
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from hma_data.lab import family, record, whole
+from hma_data.lab.writers import LeRobotEpisode, write_lerobot
 
 ROBOT, SEED = "mover_04", 51
+
+
+def reaches(count: int) -> Iterator[LeRobotEpisode]:
+    """Yield the recorded reaches as episodes for lerobot."""
+    body = family.Body.of(ROBOT)
+    for number in range(count):
+        demo = family.episode(body, SEED, number, family.Reacher(body), family.REACH_S)
+        pictures = {"observation.images.top": demo.observations["image"]}
+        yield LeRobotEpisode(
+            pictures,
+            demo.actions,
+            demo.observations["joint_pos"].astype(np.float32),
+            "go to the nearest block",
+        )
 
 
 def main() -> None:
@@ -33,6 +63,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--reaches", type=int, default=1000)
     parser.add_argument("--play", type=int, default=90, help="episodes of random manoeuvres")
+    parser.add_argument("--lerobot", action="store_true", help="write the reaches for lerobot, too")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     (given.out / f"{ROBOT}.yaml").write_text(family.embodiment(ROBOT).to_yaml(), encoding="utf-8")
@@ -45,6 +76,11 @@ def main() -> None:
     if not final.exists():
         record(ROBOT, given.out, given.play, SEED + 10)
     print(f"{final}: {given.play} episodes")
+    final = given.out / "lerobot"
+    if given.lerobot and not final.exists():
+        with whole(final) as part:
+            write_lerobot(part, family.embodiment(ROBOT), reaches(given.reaches))
+        print(f"{final}: {given.reaches} episodes")
 
 
 if __name__ == "__main__":

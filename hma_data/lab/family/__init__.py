@@ -25,7 +25,7 @@ from hma_data.lab.family.world import World, start
 from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mcap
 from hma_data.registry.embodiment import Embodiment
 
-SECONDS, MOVED = 8.0, 5.0  # of an episode; for success
+SECONDS, REACH_S, MOVED = 8.0, 2.0, 5.0  # of an episode; of a reach; for success
 TRUNK: tuple[str, ...] = (
     "arm1_02", "arm1_03", "arm2_02", "arm2_07", "arm2_12", "arm2_50", "arm3_01", "arm3_04",
     "arm3_08", "arm3_11", "arm4_01", "arm4_04", "mover_02", "mover_04", "mover_06", "mover_10",
@@ -157,7 +157,9 @@ def _write_bag(path: Path, body: Body, seed: int, number: int) -> None:
     write_mcap(path, messages, {"robot": body.name, **facts})
 
 
-def record_reaching(part: Path, robot: str, episodes: Iterable[int], seed: int, seconds: float = 2.0) -> None:
+def record_reaching(
+    part: Path, robot: str, episodes: Iterable[int], seed: int, seconds: float = REACH_S
+) -> None:
     """Record episodes in which the robot goes to the nearest block, to HDF5: what a policy can learn."""
     body = Body.of(robot)
     _write_file(part, body, (episode(body, seed, n, Reacher(body), seconds) for n in episodes))

@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 from hma_data.errors import MissingDependencyError, OutputError, UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
-from hma_data.lab.pusht import HELD, SLOW_LOOK, Arena, record_noisy
+from hma_data.lab.pusht import HELD, PLAY, SLOW_LOOK, Arena, record_noisy, record_play
 from hma_data.lab.tee_table import TeeTable
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
@@ -116,6 +116,15 @@ def test_noisy_episodes_hold_random_targets_in_their_share(fast: h5py.File, tmp_
         1 / HELD, abs=0.02
     )
     assert calm.mean() > 0.5  # planned motion changes its target each step
+
+
+def test_play_is_recorded_at_the_size_of_gym_pusht(tmp_path: Path) -> None:
+    record_play(tmp_path / "play.hdf5", range(2), seed=3)
+    with h5py.File(tmp_path / "play.hdf5") as file:
+        demos = [file[f"data/demo_{number}"] for number in range(2)]
+        assert [demo["obs/image"].shape[1:] for demo in demos] == [(96, 96, 3)] * 2
+        assert [demo.attrs["start"] for demo in demos] == [*PLAY[:2]]
+        assert '"observation_width": 96' in file["data"].attrs["env_args"]
 
 
 def test_the_table_is_that_of_gym_pusht() -> None:
