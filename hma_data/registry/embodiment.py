@@ -344,10 +344,15 @@ def _unknown_key(path: str, values: dict[str, Any]) -> Problem:
     known: type[BaseModel] = _KEYS_AT.get(parent, Embodiment)
     if parent == "source.layout":
         known, of = LAYOUTS[values["source"]["format"]], f" of format {values['source']['format']}"
-    keys = [field.alias or name for name, field in known.model_fields.items()]
-    near = get_close_matches(path.rpartition(".")[2], keys, n=1)
+    keys, key = _keys(known), path.rpartition(".")[2]
+    places = [place for place, model in _KEYS_AT.items() if key in _keys(model)]
+    near = get_close_matches(key, keys, n=1) or [f"{place}.{key}" for place in places]
     hint = f", did you mean {near[0]!r}?" if near else ""
     return Problem(path, f"unknown key{of}{hint}", allowed=", ".join(keys) or "none")
+
+
+def _keys(model: type[BaseModel]) -> list[str]:
+    return [field.alias or name for name, field in model.model_fields.items()]
 
 
 _KEYS_AT: dict[str, type[SpecModel]] = {

@@ -197,6 +197,8 @@ def test_an_unknown_camera_names_the_known() -> None:
         ("stride", -1, r"stride: .*greater than or equal to 1 \(is -1\)"),
         ("strides", 2, r"strides: unknown key, did you mean 'stride'\?"),
         ("camera", [], r"camera: unknown key, did you mean 'cameras'\?"),
+        ("segments", {"gap_s": 1}, r"segments: unknown key, did you mean 'source.segments'\?"),
+        ("max_skew_ms", 20, r"max_skew_ms: unknown key, did you mean 'sync.max_skew_ms'\?"),
         ("frequency_hz", -2, r"frequency_hz: must lie between 0 and 100000 Hz \(is -2\)"),
         ("frequency_hz", 0, "frequency_hz: must lie between"),
         ("frequency_hz", True, "frequency_hz: must be a number, not true or false"),
