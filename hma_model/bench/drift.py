@@ -107,17 +107,19 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _samplings(text: str) -> dict[str, dict[str, Any]]:
-    """Return the options of each way of sampling by the words that name it."""
+    """Return the options of each way of sampling, by those of its words that not all have, or by all of them."""
     from hma_model.generation.rollout import Rollout
 
     known = [name for name in inspect.signature(Rollout.__init__).parameters if name not in OWN]
     ways: dict[str, dict[str, Any]] = {}
-    for way in text.split("/"):
-        ways[way.strip()] = options = {}
-        for word in way.split(","):
-            key, given, value = word.strip().partition("=")
+    worded = [[word.strip() for word in way.split(",")] for way in text.split("/")]
+    for words in worded:
+        own = [word for word in words if not all(word in others for others in worded)]
+        ways[",".join(own or words)] = options = {}
+        for word in words:
+            key, given, value = word.partition("=")
             if key not in known or not given:
-                fault = f"{word.strip()!r} is no option of a rollout"
+                fault = f"{word!r} is no option of a rollout"
                 raise UsageError("bench drift", fault, f"write key=value; keys: {', '.join(known)}")
             options[key] = parse_yaml(value, f"bench drift: {key}", UsageError)
     return ways

@@ -108,6 +108,12 @@ def test_a_wrong_setting_is_named(change, message):
         drift.run(drift.BENCH.defaults | change)
 
 
+def test_ways_of_sampling_are_told_apart_by_the_words_that_differ() -> None:
+    ways = drift._samplings("unmask_steps=2,temperature=0.5/unmask_steps=2, temperature=0.5, noise_level=0.1")
+    assert list(ways) == ["unmask_steps=2,temperature=0.5", "noise_level=0.1"]
+    assert ways["noise_level=0.1"] == {"unmask_steps": 2, "temperature": 0.5, "noise_level": 0.1}
+
+
 @pytest.mark.slow
 def test_rollouts_are_measured_and_drawn_and_repeat_themselves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
