@@ -107,7 +107,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _samplings(text: str) -> dict[str, dict[str, Any]]:
-    """Return the options of each way of sampling, by those of its words that not all have, or by all of them."""
+    """Return the options of each way of sampling, by those of its words that not all have, or by all."""
     from hma_model.generation.rollout import Rollout
 
     known = [name for name in inspect.signature(Rollout.__init__).parameters if name not in OWN]
