@@ -35,12 +35,14 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from hma_data.lab import family, record, whole
 from hma_data.lab.writers import LeRobotEpisode, write_lerobot
 
 ROBOT, SEED = "mover_04", 51
+CAMERA, SIDE = "observation.images.top", 64  # px of the pictures for lerobot, so that a CPU can train on them
 
 
 def reaches(count: int) -> Iterator[LeRobotEpisode]:
@@ -48,13 +50,11 @@ def reaches(count: int) -> Iterator[LeRobotEpisode]:
     body = family.Body.of(ROBOT)
     for number in range(count):
         demo = family.episode(body, SEED, number, family.Reacher(body), family.REACH_S)
-        pictures = {"observation.images.top": demo.observations["image"]}
-        yield LeRobotEpisode(
-            pictures,
-            demo.actions,
-            demo.observations["joint_pos"].astype(np.float32),
-            "go to the nearest block",
-        )
+        pictures = [
+            cv2.resize(one, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for one in demo.observations["image"]
+        ]
+        pose = demo.observations["joint_pos"].astype(np.float32)
+        yield LeRobotEpisode({CAMERA: np.stack(pictures)}, demo.actions, pose, "go to the nearest block")
 
 
 def main() -> None:
@@ -79,7 +79,9 @@ def main() -> None:
     final = given.out / "lerobot"
     if given.lerobot and not final.exists():
         with whole(final) as part:
-            write_lerobot(part, family.embodiment(ROBOT), reaches(given.reaches))
+            robot = family.embodiment(ROBOT)
+            camera = robot.cameras[0].model_copy(update={"size": (SIDE, SIDE)})
+            write_lerobot(part, robot.model_copy(update={"cameras": (camera,)}), reaches(given.reaches))
         print(f"{final}: {given.reaches} episodes")
 
 
