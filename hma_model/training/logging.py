@@ -274,7 +274,7 @@ class RunLog:
     def _expected(self) -> int:
         """Return the number of steps of the run, by the share that is done: CPU seconds may end it sooner."""
         done = self._last.get("done")
-        return min(self._steps, round(self._last["step"] / done)) if done else self._steps
+        return min(self._steps, round(self._last["step"] / min(done, 1))) if done else self._steps
 
     def _smooth(self) -> dict[str, float]:
         return {n: sum(v) / len(v) if v else math.nan for n, v in sorted(self._recent.items())}

@@ -297,6 +297,10 @@ def test_cpu_seconds_that_end_a_run_sooner_are_in_the_time_left(tmp_path, capsys
             log.step(facts(step, done=step / 40))
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("step 10/40") and "15 s left" in last
+    with RunLog(tmp_path, 1_000_000, 0) as log:
+        log.step(facts(10, done=1.01))  # the last step went beyond them
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("step 10/10") and ", 0 s left" in last
 
 
 def test_a_loss_that_is_no_number_leaves_the_shown_mean_one(tmp_path, capsys):
