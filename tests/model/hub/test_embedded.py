@@ -59,7 +59,7 @@ def test_the_embedded_trunk_is_the_one_of_the_recipe() -> None:
     # docs/results-log.md
     own = folder.Checkpoint.open("embedded")
     own.trunk()
-    assert own.trunk_sha256 == "2d107285aaed30ab9147641a6db241fe33e9c792c46481d833b1900a0ac709e0"
+    assert own.trunk_sha256 == "4c31563f92f7a2646c640a001f306e6e5410e5fbf9e14401ffdff655bcd8329d"
     assert set(own.embodiments) == ROBOTS
     assert not set(own.embodiments) & set(HELD_OUT)
     for embodiment in own.embodiments:
