@@ -20,13 +20,15 @@ pictures show. With --lerobot the reaches are written as a LeRobotDataset beside
 policies of its own; a policy that was stopped early is worse than one that was not:
 
     python recipes/lab/reaching.py build/reach --lerobot
-    lerobot-train --dataset.repo_id=lab/mover_04 --dataset.root=build/reach/lerobot --output_dir=runs/act \
-        --policy.type=act --policy.device=cpu --policy.push_to_hub=false --policy.chunk_size=10 \
-        --policy.n_action_steps=2 --policy.dim_model=128 --policy.dim_feedforward=512 \
-        --policy.pretrained_backbone_weights=null --policy.optimizer_lr=3e-4 \
-        --policy.optimizer_lr_backbone=3e-4 --batch_size=16 --steps=1600 --save_freq=100
-    hma policy-eval mover_04 lerobot:runs/act/checkpoints/{000100,000400,001600}/pretrained_model \
-        reach reach:noise=0.5 still --judge reached --frames 20 --episodes 64 --out policies
+    uv run --with accelerate lerobot-train --dataset.repo_id=lab/mover_04 --dataset.root=build/reach/lerobot \
+        --output_dir=runs/diffusion --policy.type=diffusion --policy.device=cpu --policy.push_to_hub=false \
+        --policy.pretrained_backbone_weights=null --policy.use_group_norm=true --policy.crop_shape=null \
+        --policy.n_obs_steps=1 --policy.horizon=8 --policy.n_action_steps=2 '--policy.down_dims=[64,128]' \
+        --policy.drop_n_last_frames=0 --policy.noise_scheduler_type=DDIM --policy.num_inference_steps=10 \
+        --policy.optimizer_lr=5e-4 --policy.scheduler_warmup_steps=50 --batch_size=16 --steps=6000 \
+        --save_freq=500 --num_workers=0 --dataset.video_backend=pyav
+    hma policy-eval mover_04 lerobot:runs/diffusion/checkpoints/00{05,10,20,30,40}00/pretrained_model \
+        reach still --judge reached --frames 20 --episodes 64 --out policies
 
 docs/results-log.md has the figures.
 """
