@@ -44,7 +44,8 @@ def main() -> None:
             part = part_of(file)
             record(part, episodes=range(count), seed=seed)
             part.replace(file)
-            print(f"{file}: {count} episodes")
+        if file.exists():
+            print(file)
 
 
 if __name__ == "__main__":

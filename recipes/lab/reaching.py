@@ -17,7 +17,7 @@
 
 What is made begins at real frames of the robot at play, and the driver acts in the model, by what its
 pictures show. With --lerobot the reaches are written as a LeRobotDataset besides, on which lerobot trains
-policies of its own; a policy that was stopped early is worse than one that was not:
+policies of its own, which are better or worse by the steps that they had:
 
     python recipes/lab/reaching.py build/reach --lerobot
     uv run --with accelerate lerobot-train --dataset.repo_id=lab/mover_04 --dataset.root=build/reach/lerobot \

@@ -26,11 +26,7 @@ def main() -> None:
     if (spec.grid, tuple(spec.factored or ())) != (model.config.grid, model.config.factored):
         parser.error(f"{given.tokenizer} has other tokens than {given.checkpoint}")
     model.config = model.config.replace(tokenizer=spec.to_json())
-    robots = stored.embodiments
-    yaml = {name: stored.embodiment(name).to_yaml() for name in robots}
-    stats = {name: stored.stats(name) for name in robots}
-    cards = {name: stored.card(name) for name in robots}
-    io.save(model, given.out, embodiment_yaml=yaml, stats=stats, cards=cards)
+    io.save_like(model, given.out, stored)
 
 
 if __name__ == "__main__":

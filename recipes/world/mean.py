@@ -30,11 +30,14 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--data", nargs="*", default=[], help="shard sets with a val split, one a robot")
     given = parser.parse_args()
-    stored = Checkpoint.open(given.after)
+    first, stored = Checkpoint.open(given.before), Checkpoint.open(given.after)
     robots = stored.embodiments
     before, after = (HMA.from_pretrained(one, embodiments=robots) for one in (given.before, given.after))
     if before.config != after.config:
         parser.error(f"{given.before} and {given.after} are different networks")
+    for name in robots:
+        if first.stats(name) != stored.stats(name):
+            parser.error(f"{name} has other statistics in {given.before} than in {given.after}")
     earlier = before.state_dict()
     after.load_state_dict(
         {
@@ -42,15 +45,13 @@ def main() -> None:
             for name, value in after.state_dict().items()
         }
     )
-    yaml = {name: stored.embodiment(name).to_yaml() for name in robots}
-    stats = {name: stored.stats(name) for name in robots}
     cards = {name: {**stored.card(name), "metrics": {}} for name in robots}
     for data in map(ShardSet, given.data):
         found = windows(data, "val", after.config.frames, WINDOWS)
         losses, accuracy = (one.by_embodiment() for one in validation_losses(after.eval(), found))
         for name, loss in losses.items():
             cards[name]["metrics"] = {"val_loss": loss, "accuracy": accuracy[name]}
-    io.save(after, given.out, embodiment_yaml=yaml, stats=stats, cards=cards)
+    io.save_like(after, given.out, stored, cards)
 
 
 if __name__ == "__main__":
