@@ -36,6 +36,7 @@ class Rows:
 
     def __post_init__(self) -> None:
         self._of_span: tuple[int, NDArray[np.float32], NDArray[np.bool_] | None] | None = None
+        self._begins: Ints | None = None
 
     @classmethod
     def join(cls, several: "Sequence[Rows]") -> "Rows":
@@ -56,20 +57,30 @@ class Rows:
         return Rows(*kept)
 
     def cut(
-        self, first: Ints, last: Ints | None, index: WindowIndex, view: Ints | None = None
+        self,
+        first: Ints,
+        last: Ints | None,
+        index: WindowIndex,
+        view: Ints | None = None,
+        draws: Ints | None = None,
     ) -> dict[str, NDArray[Any]]:
         """Return the windows that start at rows `first` (n,).
 
         Args:
             last: (n,) last rows of their episodes, beyond which windows are padded; None pads no window.
             view: (n,) which of the V cameras each window takes; None takes all.
+            draws: (n,) a random number of at least 0 for each window, for `earlier`.
 
         Returns:
             tokens (n, T, S) or (n, T, V, S), actions (n, T, K), episode (n,) and frame (n,). Where the set
             has marks or windows may be padded, also known (n, T) bool. Where windows may be padded, also
-            inside (n, T) bool, True for frames of the episode.
+            inside (n, T) bool, True for frames of the episode. With `draws` also earlier (n, 1, S) or
+            (n, 1, V, S), a frame of the episode, of those here up to the window's first.
         """
         found: dict[str, NDArray[Any]] = {"episode": self.episode[first], "frame": self.frame[first]}
+        if draws is not None:
+            begins = self._episode_begins()[first]
+            found["earlier"] = self._frames((begins + draws % (first - begins + 1))[:, None], view)
         if last is not None:
             return found | self._padded(first, last, index, view)
         found["tokens"] = self._frames(first[:, None] + index.offsets, view)
@@ -78,6 +89,14 @@ class Rows:
         if known is not None:
             found["known"] = np.all(known[first].reshape(len(first), index.frames, -1), axis=2)
         return found
+
+    def _episode_begins(self) -> Ints:
+        """Return for each row the first row here of its episode, (N,); it is made once."""
+        if self._begins is None:
+            follows = (np.diff(self.episode) == 0) & (np.diff(self.frame) > 0)
+            begins = np.flatnonzero(np.concatenate([[True], ~follows]))
+            self._begins = np.repeat(begins, np.diff(begins, append=len(self)))
+        return self._begins
 
     def _spans(self, span: int) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
         """Return the actions and marks of every run of `span` rows, see `_spans`; they are made once."""
@@ -256,6 +275,8 @@ class Batch:
         camera: (B,) int64, index of the camera among those of the shard set; of stacked views, the first's.
         frame_mask: (B, T) bool, False where a short episode was padded; such frames give no loss. None where
             episodes are not padded.
+        earlier: (B, h, w) int64 or (B, c, H, W) float32, a frame of the window's episode, drawn from those up
+            to the window's first. None unless asked for.
     """
 
     embodiment: list[str]
@@ -267,6 +288,7 @@ class Batch:
     frame: Tensor | None = None
     camera: Tensor | None = None
     frame_mask: Tensor | None = None
+    earlier: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.embodiment)
@@ -314,20 +336,26 @@ def assemble(
         known[start:end] = cut.get("known", True)
         inside[start:end] = cut.get("inside", True)
     tokens = np.concatenate([cut["tokens"] for cut in cuts])
+    earlier = np.concatenate([cut["earlier"] for cut in cuts]) if "earlier" in cuts[0] else None
     where = {key: np.concatenate([cut[key] for cut in cuts]) for key in ("episode", "frame", "camera")}
     discrete, size = spec.kind == "discrete", size or count
+
+    def pictures(values: NDArray[Any]) -> Tensor:
+        taken = stacked(values, spec, views)
+        return torch.from_numpy(np.ascontiguousarray(taken, np.int64 if discrete else np.float32))
+
     for start in range(0, count, size):
         at = place[start : start + size]
-        taken = stacked(tokens[at], spec, views)
-        pictures = torch.from_numpy(np.ascontiguousarray(taken, np.int64 if discrete else np.float32))
+        taken = pictures(tokens[at])
         yield Batch(
             embodiment=names[start : start + size],
             actions=torch.from_numpy(actions[at, :, : widths[at].max()]),
             action_mask=torch.from_numpy(known[at]),
-            tokens=pictures if discrete else None,
-            latents=None if discrete else pictures,
+            tokens=taken if discrete else None,
+            latents=None if discrete else taken,
             **{key: torch.from_numpy(values[at].astype(np.int64)) for key, values in where.items()},
             frame_mask=torch.from_numpy(inside[at]) if short == "pad" else None,
+            earlier=None if earlier is None else pictures(earlier[at])[:, 0],
         )
 
 

@@ -39,7 +39,8 @@ class TokenizerSpec:
         dtype: dtype of the stored values: uint16, uint32 or float16; uint8 for pixels.
         resize_filter: filter that resizes pictures to `image_size`; it is part of the spec because it
             changes the tokens.
-        weights_sha256: SHA-256 of the weights' file; empty when there are no weights.
+        weights_sha256: SHA-256 of the weights' file, or of the file whose encoder it kept; empty when there
+            are no weights.
     """
 
     name: str

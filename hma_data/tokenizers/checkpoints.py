@@ -239,11 +239,21 @@ def _one_line(fault: object, length: int = 160) -> str:
 
 
 def save_weights(
-    path: Path, form: str, config: BaseModel, tensors: dict[str, Tensor], facts: dict[str, Any]
+    path: Path,
+    form: str,
+    config: BaseModel,
+    tensors: dict[str, Tensor],
+    facts: dict[str, Any],
+    tokens_sha256: str = "",
 ) -> None:
-    """Write parameters as float16 with the network's shape and `facts` in the metadata, atomically."""
+    """Write parameters as float16 with the network's shape and `facts` in the metadata, atomically.
+
+    `tokens_sha256` is the digest of the file whose encoder these weights keep: both make the same tokens.
+    """
     halves = {name: tensor.detach().half().contiguous() for name, tensor in sorted(tensors.items())}
     metadata = {"format": form, "config": json.dumps(config.model_dump()), "training": json.dumps(facts)}
+    if tokens_sha256:
+        metadata["tokens_sha256"] = tokens_sha256
     content = save(halves, metadata)
     # The library writes the header in an order that varies; sort it, so that equal weights are equal files.
     end = 8 + int.from_bytes(content[:8], "little")
@@ -253,7 +263,9 @@ def save_weights(
 
 
 def read_weights[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[C, Tensors, str]:
-    """Read a weights' file; return the network's shape, its parameters (float16) and the file's SHA-256.
+    """Read a weights' file; return the network's shape, its parameters (float16) and its tokens' digest.
+
+    The digest is the file's SHA-256, or that of the file whose encoder it kept.
 
     Raises:
         TokenizerError: there is no such file, or it is not safetensors, truncated, or of another network.
@@ -268,4 +280,4 @@ def read_weights[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[
     except ValueError as error:
         fault = f"its metadata does not describe the network: {_one_line(error)}"
         raise TokenizerError(path, fault, remedy) from error
-    return shape, tensors, file_sha256(path)
+    return shape, tensors, metadata.get("tokens_sha256") or file_sha256(path)

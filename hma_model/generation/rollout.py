@@ -155,10 +155,11 @@ class Rollout:
         names = list(embodiments or [self.state.embodiments[row] for row in chosen])
         given = prompt_chunks(self.model, names, actions, known, values.shape[1])
         last = slice(max(values.shape[1] - self.config.frames, 0), None)
-        self.state.begin(chosen, names, values[:, last], given.frames(last), seeds)
+        first = values[:, 0]
+        self.state.begin(chosen, names, values[:, last], first, given.frames(last), seeds)
         if self.twins:
             free = replace(given, known=torch.zeros_like(given.known))
-            self.state.begin(self._twins(chosen), names, values[:, last], free.frames(last), seeds)
+            self.state.begin(self._twins(chosen), names, values[:, last], first, free.frames(last), seeds)
         self.told = self.told or actions is not None
 
     def fork(self, n: int) -> "Rollout":

@@ -197,6 +197,7 @@ class HMA(nn.Module):
         embodiment: str | Sequence[str],
         action_mask: Tensor | None = None,
         true: Tensor | None = None,
+        first: Tensor | None = None,
     ) -> Tensor:
         """Compute the scores of every token of a window.
 
@@ -207,6 +208,7 @@ class HMA(nn.Module):
             action_mask: (B, T) bool, True where a chunk is known; by default all are.
             true: (B, T, h, w) int64 tokens whose digits a chain's later digits are given; by default those
                 are the likeliest.
+            first: (B, h, w) int64, what a model that is `told_first` is told; by default the first frame.
 
         Returns:
             (B, T, h, w, F, V) float32, low digit first; with `merge`, of the trunk's tokens and their digits.
@@ -214,7 +216,7 @@ class HMA(nn.Module):
         self._require("discrete", "video_logits")
         groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
         conditioning = self._condition(actions, action_mask, groups, times)
-        x = self.embed_tokens(groups.sort(self.frame_values(tokens)))
+        x = self.embed_tokens(groups.sort(self.frame_values(tokens)), first=self._first(first, groups))
         given = None if true is None else to_digits(groups.sort(self.frame_values(true)), self.config.digits)
         scores = self.token_readout(self.video_features(self.trunk(x, conditioning, times)), given)
         return groups.unsort(self.token_readout.split(scores)).unflatten(2, self.config.token_grid)
@@ -226,6 +228,7 @@ class HMA(nn.Module):
         actions: Tensor | None,
         embodiment: str | Sequence[str],
         action_mask: Tensor | None = None,
+        first: Tensor | None = None,
     ) -> Tensor:
         """Compute the conditions of the diffusion head.
 
@@ -233,6 +236,8 @@ class HMA(nn.Module):
             latents: (B, T, c, H, W), already multiplied by the configuration's `latent_scale`.
             mask: (B, T, H, W) bool, True for latent pixels the model may not see.
             actions, embodiment, action_mask: as in `video_logits`.
+            first: (B, c, H, W) as stored, what a model that is `told_first` is told; by default the first
+                frame.
 
         Returns:
             (B, T, H/p, W/p, D).
@@ -241,7 +246,7 @@ class HMA(nn.Module):
         groups, times = Groups.of(embodiment, len(latents)), self.time_positions(latents.shape[1])
         conditioning = self._condition(actions, action_mask, groups, times)
         patches, pixels = patchify(latents, self.config.patch), patchify(mask.unsqueeze(2), self.config.patch)
-        x = self.embed_patches(groups.sort(patches), groups.sort(pixels))
+        x = self.embed_patches(groups.sort(patches), groups.sort(pixels), first=self._first(first, groups))
         conditions = self.latent_readout(
             self.video_features(self.trunk(x, conditioning, times)), times.positions
         )
@@ -408,25 +413,46 @@ class HMA(nn.Module):
             return merge_tokens(frames.long(), config.merge, config.vocab_size)
         return patchify(frames.float() * config.latent_scale, config.patch)
 
-    def embed_tokens(self, tokens: Tensor, previous: Sequence[int] | None = None) -> Tensor:
+    def _first(self, frame: Tensor | None, groups: Groups) -> Tensor | None:
+        """Return the values (B, S, …) of first frames, sorted by embodiment."""
+        return None if frame is None else groups.sort(self.frame_values(frame.unsqueeze(1))[:, 0])
+
+    def embed_tokens(
+        self, tokens: Tensor, previous: Sequence[int] | None = None, first: Tensor | None = None
+    ) -> Tensor:
         """Embed ids (B, T, S) as (B, T, S, D).
 
         Args:
             tokens: the configuration's `mask_id` means masked.
             previous: (T,) for each frame the index of the frame before it, or -1; by default the frames
                 follow one another.
+            first: (B, S) what a model that is `told_first` is told; by default the first of the frames.
         """
-        assert isinstance(self.trunk.embed, TokenEmbedding)
-        return self.trunk.embed(tokens, range(-1, tokens.shape[1] - 1) if previous is None else previous)
+        embed = self.trunk.embed
+        assert isinstance(embed, TokenEmbedding)
+        x = embed(tokens, range(-1, tokens.shape[1] - 1) if previous is None else previous)
+        if self.trunk.first is None:
+            return x
+        return x + self.trunk.first(embed((tokens[:, 0] if first is None else first).unsqueeze(1), [-1]))
 
-    def embed_patches(self, patches: Tensor, masked: Tensor, previous: Sequence[int] | None = None) -> Tensor:
+    def embed_patches(
+        self,
+        patches: Tensor,
+        masked: Tensor,
+        previous: Sequence[int] | None = None,
+        first: Tensor | None = None,
+    ) -> Tensor:
         """Embed scaled patches (B, T, S, c*p*p) with masks of pixels (B, T, S, p*p or 1) as (B, T, S, D).
 
-        `previous` is that of `embed_tokens`.
+        `previous` is that of `embed_tokens`, and so is `first`, (B, S, c*p*p).
         """
-        assert isinstance(self.trunk.embed, LatentEmbedding)
-        order = range(-1, patches.shape[1] - 1) if previous is None else previous
-        return self.trunk.embed(patches, masked, order)
+        embed = self.trunk.embed
+        assert isinstance(embed, LatentEmbedding)
+        x = embed(patches, masked, range(-1, patches.shape[1] - 1) if previous is None else previous)
+        if self.trunk.first is None:
+            return x
+        seen = (patches[:, 0] if first is None else first).unsqueeze(1)
+        return x + self.trunk.first(embed(seen, torch.zeros_like(masked[:, :1]), [-1]))
 
     def video_features(self, features: Tensor) -> Tensor:
         """Return the features (B, T, S, D) of (B, T, N, D) without the action tokens."""

@@ -116,6 +116,8 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
 
     context = getattr(batch, "context", None)  # the frames that the model sees, if not the true ones
     seen = frames if context is None else model.frame_values(context)
+    earlier = getattr(batch, "earlier", None)
+    first = frames[:, 0] if earlier is None else model.frame_values(earlier.unsqueeze(1))[:, 0]
     paired = layout.past < len(order)
     if paired:
         video = draw_pairs_mask(config, size, count, layout.past, generator)
@@ -141,7 +143,7 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
         given = align(config, batch.actions, known, count)
         given = given.frames(order) if paired else given
     conditioning = condition(model, given, groups, times.positions)
-    x = _embed(model, seen, video, layout, groups, generator)
+    x = _embed(model, seen, first, video, layout, groups, generator)
     features = model.trunk(x, conditioning, times)
 
     video_loss = action_loss = logits = None
@@ -183,6 +185,7 @@ def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
 def _embed(
     model: "HMA",
     frames: Tensor,
+    first: Tensor,
     video: VideoMask,
     layout: Layout,
     groups: Groups,
@@ -191,13 +194,13 @@ def _embed(
     """Mask, corrupt and embed the frames; return the samples sorted by embodiment."""
     if model.config.kind == "discrete":
         corrupted = corrupt_tokens(model.config, frames, video, generator)
-        x = model.embed_tokens(groups.sort(corrupted), layout.previous)
+        x = model.embed_tokens(groups.sort(corrupted), layout.previous, groups.sort(first))
     else:
         masked = video.masked.to(frames.device).unsqueeze(-1)
         if spread := model.config.latent_noise:
             rate = spread * video.corruption.to(frames.device)[..., None, None]
             frames = frames + rate * randn(frames.shape, generator, frames.device)
-        x = model.embed_patches(groups.sort(frames), groups.sort(masked), layout.previous)
+        x = model.embed_patches(groups.sort(frames), groups.sort(masked), layout.previous, groups.sort(first))
     if model.trunk.noise is not None:
         x = x + model.trunk.noise(groups.sort(video.corruption.to(x.device)))
     return x

@@ -29,7 +29,14 @@ _LAYOUT: dict[str, Any] = {
     "add_at": "layers",
 }
 _EXPORTED = ("time_position", "action_alignment", "temporal_norm", "final_norm")  # what an export needs
-_OURS = ("merge", "masked_input", "told_noise", "digit_order", "action_waves")  # and what must be off
+_OURS = (
+    "merge",
+    "masked_input",
+    "told_noise",
+    "told_first",
+    "digit_order",
+    "action_waves",
+)  # and what must be off
 _CONTINUOUS_NEEDS: dict[str, Any] = {
     "action_loss": "diffusion", "latent_scale": LATENT_SCALE, "diffusion_train_steps": 1000,
     "diffusion_target": "noise",

@@ -45,6 +45,7 @@ class TrainData:
         recipe: states mixture, windows and seed.
         sets: shard sets by embodiment.
         world: the ranks.
+        earlier: whether windows come with an earlier frame of their episode.
 
     Attributes:
         passes: passes of a step, of all ranks together.
@@ -55,9 +56,12 @@ class TrainData:
         ShardError: a set has no window.
     """
 
-    def __init__(self, recipe: "Recipe", sets: Mapping[str, ShardSet], world: World) -> None:
+    def __init__(
+        self, recipe: "Recipe", sets: Mapping[str, ShardSet], world: World, earlier: bool = False
+    ) -> None:
         self.passes, size = share(recipe, world.size)
         self.own = range(world.rank, self.passes, world.size)
+        self._earlier = earlier
         self._workers = -(-recipe.workers // len(self.own))
         self._data = [self._dataset(recipe, sets, size, self.own[0])]
         self._batches: list[Iterator[Batch]] = []
@@ -84,6 +88,7 @@ class TrainData:
                 world=self.passes,
                 memory_mib=max(MEMORY_MIB // self.passes, 1),
                 cameras=recipe.cameras,
+                earlier=self._earlier,
             )
         except UsageError as fault:
             remedy = fault.remedy or f"the data has {', '.join(sets)}"

@@ -22,7 +22,7 @@ from hma_data.storage.files import remove_partial, to_json, write_atomic
 from hma_data.storage.paths import addressed, is_repository
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import Checkpoint, action_stats, training_checkpoints
-from hma_model.config import OBJECTIVES, ActionSpace
+from hma_model.config import OBJECTIVES, ActionSpace, HMAConfig
 from hma_model.evaluation import evaluate
 from hma_model.evaluation.metrics import perplexity
 from hma_model.evaluation.rollout_video import newest_sheets, write_sheets
@@ -76,7 +76,7 @@ class Run:
         self.recipe = recipe
         often = max(recipe.objectives, key=lambda name: recipe.objectives[name])
         self.objective = OBJECTIVES[often]  # whose loss the evaluations compute
-        self.train_data = TrainData(recipe, self.sets, self.world)
+        self.train_data = TrainData(recipe, self.sets, self.world, self._config().told_first)
         self.digests = data_digests(self.sets)
         self.stats = {name: shards.manifest.stats for name, shards in self.sets.items()}
         if self.start:
@@ -99,9 +99,13 @@ class Run:
         self._twin: HMA | None = None
         self._sheet_seconds = [0.0]  # of each evaluation's pictures
 
+    def _config(self) -> HMAConfig:
+        if self.start:
+            return self.start.network(self.recipe)
+        return self.recipe.network(next(iter(self.sets.values())).spec)
+
     def _network(self) -> HMA:
-        spec = next(iter(self.sets.values())).spec
-        config = self.start.network(self.recipe) if self.start else self.recipe.network(spec)
+        config = self._config()
         parts = self.world.size if self.recipe.parallel == "fsdp" else 1
         require_memory(config, self.device, parts, bool(self.start and self.start.frozen))
         model = HMA(config)

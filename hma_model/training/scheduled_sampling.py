@@ -66,7 +66,8 @@ def forwarded(
     first = 1 + (draws[1] * (frames - 1 - depth)).long()
     context, rows = true[chosen].clone(), torch.arange(int(chosen.sum()), device=true.device)
     names = [name for name, taken in zip(batch.embodiment, chosen.tolist()) if taken]
-    own = Batch(names, batch.actions[chosen], batch.action_mask[chosen])
+    earlier = None if batch.earlier is None else batch.earlier[chosen]
+    own = Batch(names, batch.actions[chosen], batch.action_mask[chosen], earlier=earlier)
     training = model.training
     model.eval()
     for offset in range(depth):
@@ -90,13 +91,14 @@ def _predicted(
     if config.kind == "discrete":
         hidden = context.clone()
         hidden[rows, at] = config.vocab_size
-        digits = model.video_logits(hidden, actions, names, known)[rows, at].argmax(-1)
+        scores = model.video_logits(hidden, actions, names, known, first=batch.earlier)
+        digits = scores[rows, at].argmax(-1)
         tokens = from_digits(digits, config.digits).flatten(1)
         return split_tokens(tokens, config.merge, config.vocab_size, config.token_grid)
     scaled = context.float() * config.latent_scale
     mask = torch.zeros(context.shape[:2] + context.shape[3:], dtype=torch.bool, device=context.device)
     mask[rows, at] = True
-    conditions = model.video_conditions(scaled, mask, actions, names, known)[rows, at]
+    conditions = model.video_conditions(scaled, mask, actions, names, known, batch.earlier)[rows, at]
     diffusion = model.latent_readout.diffusion
     patches = diffusion.sample(conditions.flatten(0, 2), steps=SAMPLE_STEPS, generator=generator)
     whole = patches.view(len(at), 1, -1, config.patch_dim)

@@ -35,6 +35,8 @@ class TrainingRecipe(_Strict):
             can be resumed with another `fall` and another `steps`, as long as the rates of the past
             steps stay the same.
         ema: decay of the averaged weights; the averaged weights are the ones that are kept.
+        decoder_only: whether the encoder stays as it is. Shards and models of the tokenizer that the
+            training starts from then stay valid; only pictures that are decoded change.
         threads: number of torch threads; it changes only the last bits of the result.
     """
 
@@ -47,6 +49,7 @@ class TrainingRecipe(_Strict):
     warmup_steps: int = Field(ge=0, default=100)
     fall: list[tuple[NonNegativeInt, Share]] = Field(default_factory=list)
     ema: float = Field(ge=0, lt=1, default=0.998)
+    decoder_only: bool = False
     threads: int = Field(gt=0, default=1)
 
     @model_validator(mode="after")
@@ -122,7 +125,8 @@ class TokenizerRecipe(_Strict):
     """A whole training, described well enough to repeat it.
 
     Attributes:
-        start: path of the weights of an earlier training to start from; by default the corpus's linear code.
+        start: path of the weights of an earlier training to start from, of a network that is no larger; by
+            default the corpus's linear code.
     """
 
     job: Literal["tokenizer"]
@@ -134,6 +138,12 @@ class TokenizerRecipe(_Strict):
     training: TrainingRecipe
     loss: LossRecipe
     sources: list[FileSource | DrawnSource] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _keeps_an_encoder(self) -> "TokenizerRecipe":
+        if self.training.decoder_only and self.start is None:
+            raise ValueError("training.decoder_only keeps the encoder of `start`: name that file")
+        return self
 
     def digest(self) -> str:
         """Return the SHA-256 of all values except the corpus's location and what training measures."""
@@ -153,6 +163,8 @@ class TokenizerRecipe(_Strict):
             values.pop("start", None)
         if "loss" in values and not self.loss.edges:
             values["loss"].pop("edges", None)
+        if "training" in values and not self.training.decoder_only:
+            values["training"].pop("decoder_only", None)
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 

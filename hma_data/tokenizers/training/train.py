@@ -18,6 +18,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
+from operator import gt
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,10 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hma_data.errors import RecipeError
+from hma_data.errors import RecipeError, TokenizerError
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
+from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.checkpoints import fill, read_weights, save_weights
 from hma_data.tokenizers.embedded import Autoencoder, FsqAutoencoder, FsqConfig, VaeAutoencoder, VaeConfig
 from hma_data.tokenizers.network import open_device
@@ -107,14 +109,33 @@ def start_linear(network: Autoencoder, crops: Tensor) -> None:
         decoder.head.weight.mul_(0.1)
 
 
-def start_from(network: Autoencoder, source: StrPath) -> None:
-    """Set a network's weights to those of a file that a training wrote (str or path).
+def start_from(network: Autoencoder, source: StrPath) -> str:
+    """Set a network's weights to those of a file that a training wrote, of a network that is no larger.
+
+    What the network has more of begins without a say: it decodes as the smaller one does.
+
+    Args:
+        network: the network to set.
+        source: str or path of the file.
+
+    Returns:
+        The digest of the tokens that the file's encoder makes, see `tokens_sha256`.
 
     Raises:
         TokenizerError: there is no such file, or its weights are of another network.
     """
     path = as_path(source).expanduser()
-    fill(network, read_weights(path, network.format, network.shape)[1], path)
+    _, tensors, sha256 = read_weights(path, network.format, network.shape)
+    grown = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    for name, old in tensors.items():
+        new = grown.get(name)
+        if new is None or old.shape[2:] != new.shape[2:] or any(map(gt, old.shape, new.shape)):
+            raise TokenizerError(path, f"does not fit into the recipe's network: {name}", OTHER)
+        inner = tuple(map(slice, old.shape))
+        new[inner[0]] = 0  # what is there does not hear what is new
+        new[inner] = old
+    fill(network, grown, path)
+    return sha256
 
 
 class Run:
@@ -123,12 +144,14 @@ class Run:
     def __init__(self, recipe: TokenizerRecipe, pools: list[Pool], device: torch.device) -> None:
         self.recipe, self.pools, self.step, self.seconds = recipe, pools, 0, 0.0
         torch.manual_seed(recipe.seed)
-        config = recipe.network
+        config, tokens = recipe.network, ""
         network = FsqAutoencoder(config) if isinstance(config, FsqConfig) else VaeAutoencoder(config)
         if recipe.start is None:
             start_linear(network, self.batch(START, 256))
         else:
-            start_from(network, recipe.start)
+            tokens = start_from(network, recipe.start)
+        network.encoder.requires_grad_(not recipe.training.decoder_only)
+        self.tokens_sha256 = tokens if recipe.training.decoder_only else ""
         self.device = device
         self.network: Autoencoder = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = {name: p.detach().clone() for name, p in self.network.named_parameters()}
@@ -169,7 +192,7 @@ class Run:
             network.load_state_dict(self.average)
             scale = round(1 / float(network.encoder(self.batch(END, 128)).std()), 4)
             config = config.model_copy(update={"latent_scale": scale})
-        save_weights(path, self.network.format, config, self.average, facts)
+        save_weights(path, self.network.format, config, self.average, facts, self.tokens_sha256)
 
     def save(self, path: Path) -> None:
         """Write what `resume` needs, atomically."""
@@ -229,6 +252,8 @@ def _optimizers(network: Autoencoder, recipe: TrainingRecipe) -> list[torch.opti
     matrices: list[nn.Parameter] = []
     others: list[nn.Parameter] = []
     for name, parameter in network.named_parameters():
+        if not parameter.requires_grad:
+            continue
         inner = ".at" in name or ".down" in name or ".up" in name
         (matrices if inner and parameter.ndim == 4 else others).append(parameter)
     return [

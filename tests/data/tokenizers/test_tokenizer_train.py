@@ -20,7 +20,7 @@ from hma_data.tokenizers.training.eval import psnr_db
 from hma_data.tokenizers.training.frames import draw_batch, load_pools
 from hma_data.tokenizers.training.muon import Muon, orthogonal
 from hma_data.tokenizers.training.recipe import DrawnSource, load_recipe
-from hma_data.tokenizers.training.train import train
+from hma_data.tokenizers.training.train import start_from, train
 from tests.data.tokenizer_files import draw_scene, drawn_corpus
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
@@ -131,6 +131,58 @@ def test_a_stopped_training_may_be_given_another_end_but_no_other_past(tmp_path)
     assert train(recipe, out, sooner, report=lambda _: None)["steps"] == 5
 
 
+GROWN = {"network.decoder_blocks": [1, 2, 3], "network.fine_width": 6, "network.hidden": 12}
+
+
+def test_a_training_may_start_from_a_smaller_network_and_decodes_as_it_did(tmp_path):
+    train(write_recipe(tmp_path), tmp_path / "small", report=lambda _: None)
+    small, _, _ = opened = read_weights(tmp_path / "small", FsqAutoencoder.format, FsqConfig)
+    grown = load_recipe(write_recipe(tmp_path), GROWN).network
+    assert isinstance(grown, FsqConfig) and grown != small
+    before, after = FsqAutoencoder(small), FsqAutoencoder(grown)
+    start_from(after, tmp_path / "small")
+    before.load_state_dict({name: tensor.float() for name, tensor in opened[1].items()})
+    pictures = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    with torch.no_grad():
+        assert torch.equal(before.encode(pictures), after.encode(pictures))
+        ids = before.encode(pictures)
+        torch.testing.assert_close(after.decode(ids), before.decode(ids), rtol=0, atol=1e-5)
+
+
+def test_a_larger_network_is_no_start(tmp_path):
+    train(write_recipe(tmp_path), tmp_path / "large", GROWN, report=lambda _: None)
+    with pytest.raises(TokenizerError, match="does not fit into the recipe's network"):
+        train(write_recipe(tmp_path), tmp_path / "w", {"start": str(tmp_path / "large")})
+
+
+def test_a_decoder_that_learns_alone_leaves_the_tokens_as_they_are(tmp_path):
+    train(write_recipe(tmp_path), tmp_path / "first", report=lambda _: None)
+    settings = {
+        "start": str(tmp_path / "first"),
+        **GROWN,
+        "network.hidden": SMALL.hidden,
+        "training.decoder_only": True,
+    }
+    train(write_recipe(tmp_path), tmp_path / "second", settings, report=lambda _: None)
+    train(
+        write_recipe(tmp_path),
+        tmp_path / "third",
+        {**settings, "start": str(tmp_path / "second")},
+        report=str,
+    )
+    first, *later = (get_tokenizer("fsq-8", weights=tmp_path / name) for name in ("first", "second", "third"))
+    pictures = scenes(3, 128)
+    ids = first.encode(pictures)
+    for tokenizer in later:
+        assert tokenizer.spec == first.spec
+        assert np.array_equal(tokenizer.encode(pictures), ids)
+        assert not np.array_equal(tokenizer.decode(ids), first.decode(ids))
+    train(
+        write_recipe(tmp_path), tmp_path / "fourth", {"start": str(tmp_path / "second"), **GROWN}, report=str
+    )
+    assert get_tokenizer("fsq-8", weights=tmp_path / "fourth").spec != first.spec
+
+
 def test_a_state_of_another_training_is_refused(tmp_path):
     (tmp_path / "w.state").write_bytes(b"junk")
     with pytest.raises(RecipeError, match=r"w\.state"):
@@ -164,6 +216,7 @@ def test_the_shipped_recipe_is_valid_and_makes_the_shipped_network():
         ({"training.fall": [[5, 0.5], [4000, 0]]}, "training"),
         ({"training.fall": [[5, 1], [7, 0]]}, "training"),
         ({"sources": []}, "sources"),
+        ({"training.decoder_only": True}, "name that file"),
     ],
 )
 def test_recipe_faults_name_the_key(overrides, named):
