@@ -142,6 +142,7 @@ def test_added_episodes_become_new_shards_and_the_old_stay(toy_arm: Embodiment, 
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_an_extension_stopped_anywhere_ends_with_the_same_bytes(toy_arm: Embodiment, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     for folder in (first, second):
@@ -316,6 +317,7 @@ def shards_in(out: Path) -> int:
     return len(list(out.rglob("*.parquet")))
 
 
+@pytest.mark.slow
 def test_a_killed_job_is_continued_to_the_same_bytes(
     script: Path, toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
 ) -> None:

@@ -1,5 +1,6 @@
 """Infer on inspections of any content: a YAML that parses and asks, or one line of error."""
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -36,6 +37,7 @@ KEYS = st.builds(
 FACTS = ["dataset", "simulator", "controller", "layout", "instruction", "timestamps", "rate", "tasks"]
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(
     found=st.builds(

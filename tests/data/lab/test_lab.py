@@ -341,6 +341,7 @@ def test_missing_physics_say_how_to_install_them(tmp_path: Path, monkeypatch: py
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_bags_tell_success(tmp_path: Path) -> None:
     folder = record("pusht_slow", tmp_path, 5, seed=0)
     robot, source = find("pusht_slow"), open_source("rosbag")

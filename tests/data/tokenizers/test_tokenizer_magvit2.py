@@ -218,6 +218,7 @@ def test_frames_are_encoded_as_the_network_does(tiny):
     assert np.abs(tiny.decode(tiny.network.to_ids(latents).numpy()) - expected).max() <= 0.51
 
 
+@pytest.mark.slow
 def test_a_frame_has_the_same_ids_in_any_company_and_on_any_number_of_threads(tiny):
     pictures = frames(5)
     before = torch.get_num_threads()

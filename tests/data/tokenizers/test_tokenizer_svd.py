@@ -45,11 +45,13 @@ def test_without_diffusers_the_command_that_installs_it_is_named(tmp_path, monke
         get_tokenizer("svd-vae", weights=str(tmp_path))
 
 
+@pytest.mark.slow
 def test_sizes_are_read_off_the_weights(folder, theirs):
     derived = derive_svd_config(load_file(folder / NAME))
     assert all(tuple(np.atleast_1d(theirs.config[k])) == tuple(np.atleast_1d(v)) for k, v in derived.items())
 
 
+@pytest.mark.slow
 def test_latents_are_the_unscaled_mean_of_the_posterior(tokenizer, theirs):
     pictures = frames(2)
     pixels = torch.from_numpy(pictures).permute(0, 3, 1, 2).float() / 127.5 - 1
@@ -61,6 +63,7 @@ def test_latents_are_the_unscaled_mean_of_the_posterior(tokenizer, theirs):
     assert tokenizer.spec.latent_scale == 0.18215
 
 
+@pytest.mark.slow
 def test_frames_are_decoded_one_by_one(tokenizer, theirs):
     latents = tokenizer.encode(frames(2))
     with torch.inference_mode():
@@ -69,6 +72,7 @@ def test_frames_are_decoded_one_by_one(tokenizer, theirs):
     assert np.abs(tokenizer.decode(latents) - expected).max() <= 0.51
 
 
+@pytest.mark.slow
 def test_it_keeps_the_contract(tokenizer):
     spec = tokenizer.spec
     assert isinstance(tokenizer, Tokenizer) and TokenizerSpec.from_json(spec.to_json()) == spec
@@ -79,12 +83,14 @@ def test_it_keeps_the_contract(tokenizer):
     assert {"encoder", "decoder"} <= {name for name, _ in tokenizer.network.named_children()}
 
 
+@pytest.mark.slow
 def test_another_scale_in_the_config_is_kept(folder, tmp_path):
     save_file(load_file(folder / NAME), tmp_path / NAME)
     (tmp_path / "config.json").write_text(json.dumps({"scaling_factor": 0.5}))
     assert get_tokenizer("svd-vae", weights=str(tmp_path)).spec.latent_scale == 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "named"),
     [

@@ -55,6 +55,7 @@ def taef2(real_data) -> Tokenizer:
     return get_tokenizer("taef2", weights=str(real_data / "weights"))
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_taef2_gives_a_robots_frames_back(real_data, taef2):
     import av

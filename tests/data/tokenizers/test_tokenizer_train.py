@@ -75,6 +75,7 @@ def test_training_learns(tmp_path):
     assert last > first
 
 
+@pytest.mark.slow
 def test_training_again_gives_the_same_weights(tmp_path):
     recipe = write_recipe(tmp_path)
     facts = [train(recipe, tmp_path / name, report=lambda _: None) for name in ("a", "b")]
@@ -83,6 +84,7 @@ def test_training_again_gives_the_same_weights(tmp_path):
     assert {**facts[0], "seconds": 0} == {**facts[1], "seconds": 0}
 
 
+@pytest.mark.slow
 def test_crops_drawn_ahead_train_the_same_weights(tmp_path):
     recipe = write_recipe(tmp_path)
     for workers in (0, 1, 3):
@@ -114,6 +116,7 @@ def test_a_stopped_training_goes_on_as_if_it_had_not_been(tmp_path):
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
 
+@pytest.mark.slow
 def test_a_stopped_training_may_be_given_another_end_but_no_other_past(tmp_path):
     class Stopped(Exception):
         pass

@@ -127,6 +127,7 @@ def test_training_measures_the_scale_of_the_latents(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_a_training_stopped_while_its_rate_falls_goes_on_with_the_same_noise(tmp_path):
     recipe = _recipe(tmp_path)
     train(recipe, tmp_path / "whole", report=lambda _: None)

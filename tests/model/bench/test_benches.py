@@ -70,6 +70,7 @@ def test_the_work_of_a_frame_is_that_of_its_products() -> None:
     assert work.rate_of(products, torch.device("cpu")) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cache", [True, False])
 def test_latents_are_measured_in_either_precision(cache: bool) -> None:
     case = {"kind": "continuous", "cache": cache, "batch": 1, "decode": False, "ddim_steps": 2}

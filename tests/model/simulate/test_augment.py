@@ -64,6 +64,7 @@ def test_replayed_episodes_hold_the_recorders_commands_and_say_that_they_are_syn
         np.testing.assert_array_equal(columns["tokens"][:known].reshape(stored.shape), stored)
 
 
+@pytest.mark.slow
 def test_synthetic_episodes_merge_with_recorded_ones_and_the_whole_says_so(
     world: World, tmp_path: Path
 ) -> None:

@@ -94,6 +94,7 @@ def test_a_model_is_scored_and_the_report_written(world: World, judge: StateJudg
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_an_interrupted_evaluation_continues_after_its_last_finished_policy(
     world: World, judge: StateJudge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -67,6 +67,7 @@ def test_the_run_stops_with_episode_and_frames_and_goes_on_from_repaired_shards(
     assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
 
 
+@pytest.mark.slow
 def test_steps_left_out_are_counted_everywhere_and_go_on_being_counted(tmp_path, capsys):
     hurt = make_hurt(tmp_path / "hurt")
     skipping = recipe(hurt, nonfinite="skip", report=True)

@@ -99,7 +99,8 @@ def close(one: Path, other: Path) -> None:
         assert torch.allclose(value.float(), b[name].float(), rtol=1e-3, atol=2e-5), name
 
 
-@pytest.mark.parametrize("mode", ["ddp", pytest.param("fsdp", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["ddp", "fsdp"])
 def test_two_ranks_give_the_curve_and_the_weights_of_one(recipe, alone, tmp_path, mode):
     told = spread(recipe(parallel=mode), tmp_path / "run")
     assert curve(tmp_path / "run") == pytest.approx([loss for _, loss in alone.losses], rel=1e-4), told
