@@ -69,7 +69,9 @@ def _cluster(engine: str, nodes: int) -> Iterator[None]:
     if engine != "ray":
         yield
         return
-    import ray
+    from hma_data.conversion.engines.ray import import_ray
+
+    ray = import_ray()
     from ray.cluster_utils import Cluster
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from hma_data.conversion.engines import Limits, Retry
+from hma_data.conversion.engines.ray import UV_ENVIRONMENT, import_ray
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import HMAError, MissingDependencyError, TokenizerError
@@ -27,7 +28,7 @@ ROOT = Path(__file__).parents[3]
 @pytest.fixture(scope="module")
 def cluster():
     """Two nodes; the second may be killed, and comes back."""
-    import ray
+    ray = import_ray()
     from ray.cluster_utils import Cluster
 
     os.environ["PYTHONPATH"] = f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"
@@ -39,11 +40,11 @@ def cluster():
     made.shutdown()
 
 
-def do(units: list[Unit], notes: Path, workers: int = 2):
+def do(units: list[Unit], notes: Path, workers: int = 2, limits: Limits = LIMITS):
     from hma_data.conversion.engines.ray import run
 
     events: list = []
-    results = dict(run(units, MakeWork(notes), workers, lambda n, event: events.append((n, event)), LIMITS))
+    results = dict(run(units, MakeWork(notes), workers, lambda n, event: events.append((n, event)), limits))
     return results, events
 
 
@@ -65,8 +66,7 @@ def test_a_process_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None
 @on_a_cluster
 def test_an_actor_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None:
     def lose() -> None:
-        until = time.monotonic() + 60
-        while not list(tmp_path.glob("long-*")) and time.monotonic() < until:
+        while not list(tmp_path.glob("long-*")):
             time.sleep(0.05)
         for pid in actors_of(os.getpid()):
             if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::Worker"):
@@ -74,7 +74,8 @@ def test_an_actor_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None:
 
     thread = threading.Thread(target=lose, daemon=True)
     thread.start()
-    results, events = do([Unit("long", ("a",), "a", "nap"), PLAIN[0]], tmp_path)
+    patient = Limits(quiet_s=200, kills=4)  # only the kill may end the first attempt
+    results, events = do([Unit("long", ("a",), "a", "hang", times=1), PLAIN[0]], tmp_path, limits=patient)
     thread.join(60)
     assert results == {"long": ["a"], "u0": ["a", "b"]}
     reasons = [event.reason for _, event in events if isinstance(event, Retry)]
@@ -243,11 +244,25 @@ def test_a_cluster_that_does_not_answer_is_one_error(
         def init(**settings: object) -> None:
             raise Exception("timed out\nof many lines")
 
-    monkeypatch.setattr(engine, "_ray", NoRay)
+    monkeypatch.setattr(engine, "import_ray", NoRay)
     monkeypatch.setenv("RAY_ADDRESS", address)
     with pytest.raises(HMAError) as caught:
         do(PLAIN, tmp_path)
     assert str(caught.value).startswith(said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stated", "seen"), [(None, "False"), ("1", "True")])
+def test_actors_take_their_nodes_environment_unless_the_user_says_otherwise(
+    stated: str | None, seen: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(UV_ENVIRONMENT, raising=False)
+    if stated:
+        monkeypatch.setenv(UV_ENVIRONMENT, stated)
+    program = "from hma_data.conversion.engines.ray import *; ray = import_ray()\n"
+    program += f"print(ray._private.ray_constants.{UV_ENVIRONMENT})"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip() == seen, done.stderr
 
 
 def test_without_ray_the_error_says_how_to_install_it(

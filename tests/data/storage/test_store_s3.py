@@ -324,10 +324,11 @@ def test_a_shard_cut_short_is_an_error_and_no_hang(toy_arm, toy_recording, out, 
 # -- kills
 
 COMMAND = f"""
-import sys, time
+import os, sys, time
 from pathlib import Path
 from hma_data.conversion import worker as shard_work
 import hma_data.conversion.job
+from hma_data.storage.remote import place
 from hma_data.registry.embodiment import Embodiment
 from hma_data.conversion.plan import Settings
 from hma_data.sources.hdf5.source import Hdf5Source
@@ -336,6 +337,9 @@ from tests.conftest import BlockTokenizer
 read = Hdf5Source.read
 def slowly(self, uri, episode_id, embodiment):
     time.sleep(0.1)
+    if "STOP_AT" in os.environ:  # so many shards: whoever wants to kill the job then is never too late
+        if sum("shard-" in name for name in place(sys.argv[2]).listing()) >= int(os.environ["STOP_AT"]):
+            time.sleep(600)
     return read(self, uri, episode_id, embodiment)
 Hdf5Source.read = slowly
 shard_work.get_tokenizer = lambda *a, **k: BlockTokenizer()
@@ -348,12 +352,14 @@ if __name__ == "__main__":
 """
 
 
-def job(folder: Path, recording: Path, out: RemotePath, workers: int, seed: int = 0) -> subprocess.Popen:
+def job(
+    folder: Path, recording: Path, out: RemotePath, workers: int, seed: int = 0, **more: str
+) -> subprocess.Popen:
     script = folder / "job.py"
     script.write_text(COMMAND)
     return subprocess.Popen(
         [sys.executable, str(script), str(recording), str(out), str(workers), str(seed)],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": str(ROOT), **more},
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -364,9 +370,8 @@ def job(folder: Path, recording: Path, out: RemotePath, workers: int, seed: int 
 @pytest.mark.slow
 def test_a_killed_job_is_continued_by_the_same_command(toy_recording, out, whole, proxy, tmp_path) -> None:
     for wanted in (1, 3):
-        process = job(tmp_path, toy_recording, out, workers=0)
-        end = time.monotonic() + 60
-        while process.poll() is None and time.monotonic() < end:
+        process = job(tmp_path, toy_recording, out, workers=0, STOP_AT=str(wanted))
+        while process.poll() is None:
             if sum("shard-" in name for name in out.listing()) >= wanted:
                 process.send_signal(signal.SIGKILL)
             time.sleep(0.02)
