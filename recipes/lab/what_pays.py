@@ -45,6 +45,7 @@ ROWS: dict[str, list[str]] = {
     "clean past": ["model.corrupt_max=0"],
     "past corrupted up to 0.2": ["model.corrupt_max=0.2"],
     "told noise": ["model.told_noise=true"],
+    "told the first frame": ["model.told_first=true"],
     "digits of 512 and 64": ["digits=512"],
     "digit after digit": ["model.digit_order=chain"],
     "waves of the commands": ["model.action_waves=5"],
