@@ -92,12 +92,12 @@ def recorded_frames(shards: ShardSet, batch: Batch, row: int) -> Images:
     """
     assert batch.episode is not None and batch.frame is not None
     robot, spec, manifest = shards.embodiment, shards.spec, shards.manifest
-    camera = robot.primary_camera if len(manifest.cameras) == 1 else robot.camera(manifest.cameras[0])
+    seen = 0 if batch.camera is None else int(batch.camera[row])
+    camera = robot.primary_camera if len(manifest.cameras) == 1 else robot.camera(manifest.cameras[seen])
     number = int(batch.episode[row])
     (episode,) = (one for one in shards.episodes.to_pylist() if one["episode_index"] == number)
     uri = episode.get("source") or manifest.source
     clip = to_clip(open_source(robot.source.format).read(str(uri), episode["id"], robot), robot)
     begin, length = int(batch.frame[row]) * manifest.frame_stride, batch.actions.shape[1]
     rows = begin + np.arange(length) * robot.stride
-    seen = clip.frames_at(camera.name, rows)
-    return prepare(seen, camera, spec.image_size, spec.resize_filter)
+    return prepare(clip.frames_at(camera.name, rows), camera, spec.image_size, spec.resize_filter)

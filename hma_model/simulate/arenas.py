@@ -219,7 +219,7 @@ class ModelArena:
         for row, prompt in enumerate(prompts):
             mask = np.arange(len(prompts)) == row
             given = {"frames": prompt.frames, "chunks": prompt.chunks}
-            seed = [scenes.seed + row] * len(prompts)
+            seed = [scenes.seed + scenes.numbers[row]] * len(prompts)
             self.pictures, _ = self._env.reset(seed=seed, options={"prompt": given, "reset_mask": mask})
         self._seen: list[SeenState] | None = None
 

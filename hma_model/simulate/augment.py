@@ -8,6 +8,7 @@ Finished batches lie in a folder of the output until the shards are written, so 
 N episodes, P frames of a prompt, T generated frames, A action dims, K = stride · A.
 """
 
+import hashlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -25,9 +26,11 @@ from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import atomic_path, kept_arrays
 from hma_data.storage.paths import StrPath, as_path
+from hma_model.evaluation.evaluate import cameras_for
 from hma_model.evaluation.judge import StateJudge, task_of, train_judge
 from hma_model.evaluation.probe import Probe, train_probe
 from hma_model.simulate.arenas import Arena, Floats, ModelArena, Scenes, TrueArena
+from hma_model.simulate.pictures import seen_cameras
 from hma_model.simulate.policies import Policy, read_policy
 from hma_model.simulate.policy_eval import run
 from hma_model.simulate.prompts import default_frames, read_prompt
@@ -45,6 +48,7 @@ from hma_model.simulate.world import World, load_world
 
 WORK = ".augment"
 BATCH = 16  # episodes that step in one pass
+DRAWS = 100  # of a beginning, until one is found whose commands are all known
 
 
 @dataclass(frozen=True)
@@ -175,14 +179,16 @@ def augment(
     made_by = (
         {"by": "hma augment", "synthetic": True} | asdict(settings) | digests(world, settings.embodiment)
     )
+    begins = None if shards is None else ShardSet(shards)
+    if begins is not None:
+        made_by |= {"source_sha256": hashlib.sha256(begins.manifest.to_text().encode()).hexdigest()}
     with locked(folder):
         found = finished(folder, made_by)
         if found is None:
-            maker = _Maker(world, settings, None if shards is None else ShardSet(shards))
+            maker = _Maker(world, settings, begins)
             batches = maker.run(begun(folder, WORK, made_by), on_progress)
-            found = write_shards(
-                folder, _chosen(batches, settings), world.tokenizer.spec, maker.robot, made_by
-            )
+            chosen, spec = _chosen(batches, settings), world.tokenizer.spec
+            found = write_shards(folder, chosen, spec, maker.robot, made_by, camera=maker.camera)
             shutil.rmtree(folder / WORK)
     if lerobot is not None:
         write_as_lerobot(as_path(lerobot), folder, world.tokenizer)
@@ -202,6 +208,10 @@ class _Maker:
         self.judge: StateJudge | None = None
         self.probe: Probe | None = None
         self._long = [] if shards is None else self._long_enough(shards)
+        if shards is None:
+            self.camera = self.robot.primary_camera.name
+        else:
+            (self.camera,) = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
 
     def _policy(self, commands: str) -> Policy:
         _, given, number = commands.partition("=")
@@ -314,22 +324,35 @@ class _Maker:
         scenes, known = self.scenes.take(numbers), self.prompt_frames
         prompts, told, groups = [], [], []
         for number in numbers:
-            row = self._long[number % len(self._long)]
-            rng = np.random.default_rng((self.settings.seed, 5, number))
-            start = (
-                int(rng.integers(row["room"])) // shards.manifest.frame_stride * shards.manifest.frame_stride
-            )
-            given = {"shards": shards.folder, "episode": row["episode_index"], "start": start}
-            frames, chunks = read_prompt(
-                self.world.model, scenes.name, given | {"frames": known + self.settings.frames}
-            )
-            assert chunks is not None
+            row, frames, chunks = self._window(shards, number)
             prompts.append(Prompt(frames[:known], chunks[: known - 1]))
             told.append(np.nan_to_num(chunks[known - 1 :]).reshape(-1, len(scenes.dimensions)))
             groups.append(str(row["group"] or row["id"]))
         steps = list(np.stack(told, axis=1).astype(np.float32))
         held = np.where([dim.kind == "rate" for dim in scenes.dimensions], 0, steps[0]).astype(np.float32)
         return Recorded(scenes, prompts, held, steps, groups)
+
+    def _window(self, shards: ShardSet, number: int) -> tuple[dict[str, Any], NDArray[Any], Floats]:
+        """Return a row of an episode, and a window of it: frames (P + T, …) and chunks (P + T - 1, K).
+
+        The commands are known: those of the window, or for a policy's episodes those up to its first one.
+
+        Raises:
+            UsageError: there is hardly such a window.
+        """
+        rng = np.random.default_rng((self.settings.seed, 5, number))
+        length, every = self.prompt_frames + self.settings.frames, shards.manifest.frame_stride
+        needed = None if self.settings.recorded else self.prompt_frames
+        for draw in range(DRAWS):
+            row = self._long[(number + draw) % len(self._long)]
+            start = int(rng.integers(row["room"])) // every * every
+            given = {"shards": shards.folder, "episode": row["episode_index"], "start": start}
+            frames, chunks = read_prompt(self.world.model, self.scenes.name, given | {"frames": length})
+            assert chunks is not None
+            if np.isfinite(chunks[:needed]).all():
+                return row, frames, chunks
+        fault = f"has hardly a window of {length} frames whose commands are all known"
+        raise UsageError(shards.folder, fault, "give fewer --frames, or shards with more of the commands")
 
 
 def _prompt_tokens(world: World, prompts: Sequence[Prompt]) -> NDArray[Any]:

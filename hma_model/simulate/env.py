@@ -8,6 +8,7 @@
 S pixels a side, V views side by side, A action dims, T pictures of an episode, N environments.
 """
 
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
+import torch
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -27,6 +29,8 @@ from hma_model.generation.commands import Floats
 from hma_model.simulate.prompts import Prompt, read_prompt
 from hma_model.simulate.world import Picture, World, load_world
 
+# An OpenMP pool does not survive a fork, as in gymnasium's "async" vectors; one thread needs none.
+os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 PROMPTS = 32  # simulated prompts among which a reset without a prompt draws
 CONTROLS = ("frame", "chunk")
 

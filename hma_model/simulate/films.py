@@ -81,20 +81,27 @@ def lerobot_episode(robot: Drivable, frames: Sequence[Frame]) -> tuple[LeRobotEp
     """Return what was driven at the control rate, and the embodiment that describes it.
 
     A row holds a command and the frame before it, which stands for `stride` rows; after the last frame the
-    last command is held. A second camera, with `_true` at the end of its name, has the true pictures.
+    last command is held. For each camera another one, with `_true` at the end of its name, has the true
+    pictures.
     """
-    stride = robot.embodiment.stride
+    stride, views = robot.embodiment.stride, len(robot.cameras)
     following = [*frames[1:], frames[-1]]
     actions = np.concatenate([frame.commands for frame in following])
-    cameras = {"": [decode_image(frame.model, "a frame") for frame in frames]}
+    shown = {"": [decode_image(frame.model, "a frame") for frame in frames]}
     if all(frame.true is not None for frame in frames):
-        cameras["_true"] = [decode_image(frame.true or b"", "a frame") for frame in frames]
+        shown["_true"] = [decode_image(frame.true or b"", "a frame") for frame in frames]
+    cameras = {
+        name + end: [np.split(picture, views, axis=1)[view] for picture in pictures]
+        for end, pictures in shown.items()
+        for view, name in enumerate(robot.cameras)
+    }
     states = [frame.state for frame in frames if frame.state is not None]
-    size = cameras[""][0].shape[:2]
-    own = embodiment_of(robot.embodiment, DRIVEN, size, list(cameras), len(states) == len(frames))
+    stated = robot.embodiment.state is not None and len(states) == len(frames)
+    size = cameras[robot.cameras[0]][0].shape[:2]
+    own = embodiment_of(robot.embodiment, DRIVEN, size, list(cameras), stated)
     pictures = {
-        camera.key: np.stack(shown).repeat(stride, axis=0)
-        for camera, shown in zip(own.cameras, cameras.values(), strict=True)
+        camera.key: np.stack(views).repeat(stride, axis=0)
+        for camera, views in zip(own.cameras, cameras.values(), strict=True)
     }
     state = np.stack(states).repeat(stride, axis=0) if own.state else None
     return LeRobotEpisode(pictures, actions, state, "driven by hand in a world model"), own
@@ -104,7 +111,7 @@ def embodiment_of(
     robot: Embodiment,
     recording: str,
     size: tuple[int, ...],
-    cameras: Sequence[str] = ("",),
+    cameras: Sequence[str],
     with_state: bool = False,
 ) -> Embodiment:
     """Return the embodiment of a dataset that is saved of a model; LeRobot's rates are whole numbers.
@@ -113,11 +120,10 @@ def embodiment_of(
         robot: the robot.
         recording: how it was made, for its provenance.
         size: height and width of the pictures.
-        cameras: what is added to the name of the primary camera, for each camera.
+        cameras: their names.
         with_state: whether there are states.
     """
     values = robot.to_dict()
-    name = robot.primary_camera.name
     hz = max(1, round(robot.rate_hz))
     rate = "" if hz == robot.rate_hz else f"; the robot runs at {robot.rate_hz:g} Hz"
     kept = {key: values[key] for key in ("id", "description", "robot", "license") if key in values}
@@ -127,8 +133,7 @@ def embodiment_of(
         "stride": robot.stride,
         "action": {"space": robot.action.space, "components": _packed(values["action"], "action")},
         "cameras": [
-            {"name": name + end, "key": f"observation.images.{name}{end}", "size": list(size)}
-            for end in cameras
+            {"name": name, "key": f"observation.images.{name}", "size": list(size)} for name in cameras
         ],
         "source": {"format": "lerobot"},
         "provenance": {

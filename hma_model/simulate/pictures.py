@@ -3,6 +3,7 @@
 P pictures, H×W pixels, S pixels a side of the tokenizer's pictures, V views side by side.
 """
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import decode_image, resize
 from hma_data.episodes.sheets import first_of_grid
 from hma_data.errors import EpisodeError, HMAError, UsageError
+from hma_data.loading.views import Cameras
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
@@ -47,6 +49,23 @@ def picture_shape(config: HMAConfig) -> tuple[int, int, int]:
     """Return (S, V·S, 3) of a model's pictures."""
     size = TokenizerSpec.from_json(dict(config.tokenizer)).image_size
     return size, config.views * size, 3
+
+
+def seen_cameras(cameras: Cameras, stored: Sequence[str]) -> list[str]:
+    """Return the names of the V cameras that a model's picture shows.
+
+    Args:
+        cameras: those that it was trained on, see `hma_data.loading.views`.
+        stored: those that are there. Its first one stands for `first`, `drawn`, and names that are not there.
+    """
+    names = [cameras] if isinstance(cameras, str) else cameras
+    return [name if name in stored else stored[0] for name in names]
+
+
+def recorded_cameras(robot: "Embodiment") -> list[str]:
+    """Return the names of a robot's cameras, the primary one first."""
+    primary = robot.primary_camera.name
+    return [primary, *(camera.name for camera in robot.cameras if camera.name != primary)]
 
 
 def fitted(pictures: NDArray[Any], config: HMAConfig, robot: "Embodiment | None") -> Picture:

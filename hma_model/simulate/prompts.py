@@ -28,7 +28,7 @@ from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.evaluate import cameras_for
 from hma_model.generation.commands import card, described
-from hma_model.simulate.pictures import read_picture
+from hma_model.simulate.pictures import read_picture, recorded_cameras, seen_cameras
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -173,11 +173,8 @@ def _of_shards(model: "HMA", embodiment: str, folder: StrPath, part: Part) -> Pr
         raise HMAError(shards.folder, fault, f"{embodiment} takes {space.stride} of {space.action_dim}")
     rows = shards.episodes.to_pylist()
     chosen = rows[part.number([row["id"] for row in rows], shards.folder)]
-    cameras = cameras_for(model, shards)
-    names = [cameras] if isinstance(cameras, str) else cameras
-    names = [shards.manifest.cameras[0] if name not in shards.manifest.cameras else name for name in names]
     views = []
-    for name in names:
+    for name in seen_cameras(cameras_for(model, shards), shards.manifest.cameras):
         columns = EpisodeReader(shards, shards.columns([name])).episode(chosen, name)
         (stored,) = (columns[key] for key in columns if key in ("tokens", "latents"))
         views.append(shards.tokens(stored))
@@ -236,9 +233,6 @@ def _chunks(
 def _pictures(model: "HMA", robot: Embodiment, clip: Clip, at: NDArray[np.int64]) -> NDArray[np.uint8]:
     spec = TokenizerSpec.from_json(dict(model.config.tokenizer))
     cameras = card(model, robot.id).get("data", {}).get("cameras", "first")
-    names = [robot.primary_camera.name] if isinstance(cameras, str) else cameras
-    if isinstance(cameras, str) and cameras in [camera.name for camera in robot.cameras]:
-        names = [cameras]
     views = [
         prepared(
             clip.episode.streams[name],
@@ -247,6 +241,6 @@ def _pictures(model: "HMA", robot: Embodiment, clip: Clip, at: NDArray[np.int64]
             spec.image_size,
             spec.resize_filter,
         )
-        for name in names
+        for name in seen_cameras(cameras, recorded_cameras(robot))
     ]
     return np.concatenate(views, axis=2)

@@ -16,14 +16,23 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.episodes.images import resize
 from hma_data.errors import UsageError
 from hma_data.lab import FAMILY
 from hma_data.lab.simulator import SIZE, LabSimulator, simulated
+from hma_data.loading.views import FIRST, Cameras
 from hma_data.registry.components import Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
-from hma_model.simulate.pictures import Picture, fitted, sample_picture
+from hma_model.simulate.pictures import (
+    Picture,
+    fitted,
+    picture_shape,
+    recorded_cameras,
+    sample_picture,
+    seen_cameras,
+)
 
 if TYPE_CHECKING:
     from hma_data.loading.dataset import WindowDataset
@@ -90,11 +99,13 @@ class Drivable(Protocol):
     Attributes:
         key: tells it from others; letters, digits, `_`, `-`, `.` and `:`.
         dimensions: A of them.
+        cameras: the names of those that its pictures show, side by side.
     """
 
     key: str
     embodiment: Embodiment
     dimensions: tuple[Dimension, ...]
+    cameras: list[str]
 
     @property
     def source(self) -> str:
@@ -108,25 +119,28 @@ class Drivable(Protocol):
 
 
 class LabRobot:
-    """A robot of the laboratory, with its simulator."""
+    """A robot of the laboratory, with its simulator; its pictures have `size` pixels a side."""
 
     source = "simulator"
 
-    def __init__(self, embodiment: Embodiment, stats: Mapping[str, Any]) -> None:
-        self.key, self.embodiment = embodiment.id, embodiment
+    def __init__(self, embodiment: Embodiment, stats: Mapping[str, Any], size: int = SIZE) -> None:
+        self.key, self.embodiment, self.size = embodiment.id, embodiment, size
         self.dimensions = dimensions(embodiment, stats)
+        self.cameras = [embodiment.primary_camera.name]
 
     def scene(self, number: int) -> "LabScene":
-        return LabScene(self.embodiment, self.dimensions, number)
+        return LabScene(self.embodiment, self.dimensions, number, self.size)
 
 
 class LabScene:
     """A scene of a simulator, begun by the recorder's own driver."""
 
-    def __init__(self, embodiment: Embodiment, dims: tuple[Dimension, ...], number: int) -> None:
-        self.stride, self.width = embodiment.stride, embodiment.action_dim
+    def __init__(
+        self, embodiment: Embodiment, dims: tuple[Dimension, ...], number: int, size: int = SIZE
+    ) -> None:
+        self.stride, self.width, self.size = embodiment.stride, embodiment.action_dim, size
         self.simulator = LabSimulator(embodiment.id)
-        frames = [self.simulator.reset(seed=SEED, episode=number)]
+        frames = [self._fitted(self.simulator.reset(seed=SEED, episode=number))]
         chunks = []
         for _ in range(PROMPT - 1):
             chunk, frame = self.advance(None)
@@ -146,7 +160,10 @@ class LabScene:
             )
             self.simulator.advance(command)
             taken.append(command)
-        return np.concatenate(taken).astype(np.float32), self.simulator.picture()
+        return np.concatenate(taken).astype(np.float32), self._fitted(self.simulator.picture())
+
+    def _fitted(self, picture: Picture) -> Picture:
+        return picture if len(picture) == self.size else resize(picture[None], self.size)[0]
 
 
 SEED = 1_000_000  # of scenes; recordings for training have small seeds
@@ -167,6 +184,7 @@ class RecordedRobot:
         self.key = f"{self.embodiment.id}:recordings"
         self.dimensions = dimensions(self.embodiment, stats)
         self._shards, self._tokenizer, self._cameras = shards, tokenizer, cameras
+        self.cameras = seen_cameras(cameras, shards.manifest.cameras)
 
     @cached_property
     def _windows(self) -> "WindowDataset":
@@ -226,8 +244,15 @@ class PicturedRobot:
 
     source = "pictures"
 
-    def __init__(self, embodiment: Embodiment, stats: Mapping[str, Any], pictures: Picture) -> None:
+    def __init__(
+        self,
+        embodiment: Embodiment,
+        stats: Mapping[str, Any],
+        pictures: Picture,
+        cameras: Cameras = FIRST,
+    ) -> None:
         self.embodiment, self.key = embodiment, f"{embodiment.id}:pictures"
+        self.cameras = seen_cameras(cameras, recorded_cameras(embodiment))
         self.dimensions = dims = dimensions(embodiment, stats)
         means = stats["action"]["mean"]
         rest = [{"rate": 0.0, "switch": dim.low}.get(dim.kind, mean) for dim, mean in zip(dims, means)]
@@ -288,21 +313,21 @@ def drivable(
                 shards.folder, f"{checkpoint.name} does not know the robot {name}", f"known: {known}"
             )
         require_tokenizer(checkpoint.config, shards.spec, shards.folder)
-        cameras = checkpoint.card(name).get("data", {}).get("cameras") or "first"
+        cameras = checkpoint.card(name).get("data", {}).get("cameras") or FIRST
         robot = RecordedRobot(shards, tokenizer, checkpoint.stats(name), cameras)
         found[robot.key] = robot
     recorded = {robot.embodiment.id for robot in found.values()}
     for name in checkpoint.embodiments:
         embodiment, stats = checkpoint.embodiment(name), checkpoint.stats(name)
+        cameras = checkpoint.card(name).get("data", {}).get("cameras") or FIRST
         begun = list(pictures)
         if simulated(name):
-            found[name] = LabRobot(embodiment, stats)
+            found[name] = LabRobot(embodiment, stats, picture_shape(checkpoint.config)[0])
         elif not begun and name not in recorded and (sample := sample_picture(checkpoint, name)) is not None:
             begun = [sample]
         if begun:
-            pictured = PicturedRobot(
-                embodiment, stats, fitted(np.stack(begun), checkpoint.config, embodiment)
-            )
+            shown = fitted(np.stack(begun), checkpoint.config, embodiment)
+            pictured = PicturedRobot(embodiment, stats, shown, cameras)
             found[pictured.key] = pictured
     if not found:
         remedy = "give shards of it, hma play CHECKPOINT SHARDS, or a picture of it, --prompt PICTURE"

@@ -307,6 +307,10 @@ class Connection:
             ended = isinstance(message, messages.Resume)
             self.page.tell({"kind": "gone" if ended else "error", "text": str(fault)})
             return
+        except Exception as fault:  # a bug of ours; the engine has logged it
+            text = f"stopped with {type(fault).__name__}: {fault}; the terminal has more"
+            self.page.tell({"kind": "error", "text": text})
+            return
         if self.session and self.session.name != entered.name:
             left = self.session.name
             self.engine.call(lambda: self.engine.detach(left, self.page))

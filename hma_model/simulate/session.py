@@ -110,7 +110,11 @@ class Session:
         self._times: deque[float] = deque(maxlen=40)
         self._begin(number)
         self.row = world.open(robot.embodiment.id, *self._history())
-        self._set_start()
+        try:
+            self._set_start()
+        except Exception:
+            world.close(self.row)
+            raise
 
     # -- scene and model
 

@@ -106,6 +106,7 @@ def write_shards(
     made_by: dict[str, Any],
     origin: str = ORIGIN,
     refused: Sequence[Refused] = (),
+    camera: str | None = None,
 ) -> Manifest:
     """Write the shards of episodes; a frame without commands after it, the last one, is no row.
 
@@ -116,13 +117,15 @@ def write_shards(
         made_by: facts for the plan.
         origin: how the episodes came about, in words.
         refused: other episodes, which go to quarantine; the first shard states them.
+        camera: whose pictures they show; the primary one by default.
     """
     own = described_as(robot, origin)
     refs = [
         EpisodeRef(one.id, len(one.chunks) * own.stride, None, str(number), one.group)
         for number, one in enumerate(episodes)
     ]
-    planned = make_plan(refs, own, spec, Settings(frames="strided"), origin)
+    settings = Settings(frames="strided", cameras=() if camera is None else (camera,))
+    planned = make_plan(refs, own, spec, settings, origin)
     facts = {key: value for key, value in planned.facts.items() if key != "hash"}
     plan = Plan.of(planned.units, facts | {"made_by": made_by})
     layout = RowLayout.of_plan(plan.facts, own)
@@ -161,7 +164,7 @@ def require_new(folder: Path) -> None:
 def write_as_lerobot(folder: Path, shards: Path, tokenizer: "Tokenizer") -> None:
     """Write the episodes of synthetic shards as a LeRobotDataset, with its embodiment beside it."""
     made, size = ShardSet(shards), tokenizer.spec.image_size
-    own = embodiment_of(made.embodiment, ORIGIN, (size, size))
+    own = embodiment_of(made.embodiment, ORIGIN, (size, size), made.manifest.cameras)
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     write_lerobot(part, own, _decoded(made, own, tokenizer))

@@ -216,6 +216,27 @@ def test_recorded_pictures_are_those_of_the_windows_frames(tmp_path: Path) -> No
     assert np.argmin(errors, axis=1).tolist() == [0, 1, 2, 3] and np.diag(errors).max() < 12
 
 
+@pytest.mark.parametrize("cameras", ["wrist", "drawn"])
+def test_recorded_pictures_are_of_the_camera_that_the_window_takes(cameras: str, tmp_path: Path) -> None:
+    from hma_data.conversion.job import convert
+    from hma_data.conversion.plan import Settings
+    from hma_data.loading.dataset import WindowDataset
+    from hma_data.shards.reader import ShardSet
+    from tests.conftest import BlockTokenizer
+    from tests.data import cameras as three
+
+    settings = Settings(val_fraction=0, cameras=("all",))
+    recording = three.write_hdf5(tmp_path / "three.hdf5")
+    convert(three.arm(), recording, BlockTokenizer(), tmp_path / "set", settings=settings)
+    shards = ShardSet(tmp_path / "set")
+    windows = WindowDataset(shards, "train", 3, cameras=cameras)
+    batch = windows.batch(range(len(windows)))
+    assert batch.camera is not None
+    for row, camera in enumerate(batch.camera.tolist()):
+        seen = showcase.recorded_frames(shards, batch, row)
+        assert (seen[..., 0] == 17 * (1 + 4 * camera)).all()
+
+
 @pytest.mark.slow
 def test_the_state_of_a_laboratory_robot_is_read_beside_the_probes_error() -> None:
     from hma_data.tokenizers.base import get_tokenizer

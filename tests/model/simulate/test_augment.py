@@ -19,6 +19,9 @@ from hma_model.simulate import World
 from hma_model.simulate import augment as augment_module
 from hma_model.simulate.arenas import Scenes, TrueArena
 from hma_model.simulate.augment import Augmentation, augment
+from hma_model.simulate.synthetic import Made, write_shards
+from tests.conftest import BlockTokenizer
+from tests.data import cameras as three
 
 ROBOT, FRAMES, KNOWN = "rails_03", 4, 2
 
@@ -148,6 +151,72 @@ def test_first_frames_and_commands_come_from_shards(world: World, tmp_path: Path
         assert any(np.array_equal(one, columns["action"].ravel()) for one in rows)
     with pytest.raises(UsageError, match="has no episode of 2 \\+ 900 frames"):
         augment(tmp_path / "no", asked(frames=900), world=world, shards=tmp_path / "real")
+
+
+@pytest.fixture
+def real(world: World, tmp_path: Path) -> Path:
+    """One recorded episode, as shards of the world's tokenizer."""
+    recording = record(ROBOT, tmp_path, 1)
+    settings = Settings(val_fraction=0)
+    convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "real", settings=settings)
+    return tmp_path / "real"
+
+
+@pytest.mark.slow
+def test_episodes_of_the_same_beginning_differ(
+    world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    long_enough = augment_module._Maker._long_enough
+
+    def one_beginning(maker: Any, shards: ShardSet) -> list[dict[str, Any]]:
+        return [row | {"room": 1} for row in long_enough(maker, shards)]
+
+    monkeypatch.setattr(augment_module._Maker, "_long_enough", one_beginning)
+    augment(tmp_path / "out", asked(source="real"), world=world, shards=real)
+    made = [columns["tokens"].tobytes() for columns in episodes(tmp_path / "out")]
+    assert len(set(made)) == len(made) == 4
+
+
+def test_windows_with_unknown_commands_are_left_out(
+    world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, unknown = augment_module.read_prompt, [True]
+
+    def gaps(model: Any, name: str, prompt: Any) -> Any:
+        frames, chunks = read(model, name, prompt)
+        chunks = chunks.copy()
+        chunks[2, 0] = np.nan if all(unknown) or prompt["start"] % 2 else chunks[2, 0]
+        return frames, chunks
+
+    monkeypatch.setattr(augment_module, "read_prompt", gaps)
+    with pytest.raises(UsageError, match="hardly a window of 6 frames whose commands are all known"):
+        augment(tmp_path / "none", asked(source="real"), world=world, shards=real)
+    unknown.append(False)
+    augment(tmp_path / "out", asked(source="real"), world=world, shards=real)
+    assert verify(tmp_path / "out") == []
+    assert all(np.isfinite(columns["action"]).all() for columns in episodes(tmp_path / "out"))
+    augment(tmp_path / "still", asked(source="real", commands="still"), world=world, shards=real)
+
+
+@pytest.mark.slow
+def test_other_shards_of_the_same_name_are_not_the_same_job(world: World, real: Path, tmp_path: Path) -> None:
+    settings = asked(source="real", episodes=2)
+    augment(tmp_path / "out", settings, world=world, shards=real)
+    augment(tmp_path / "out", settings, world=world, shards=real)
+    recording = record(ROBOT, tmp_path / "again", 2)
+    convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "other" / "real")
+    with pytest.raises(OutputError, match="holds another shard set"):
+        augment(tmp_path / "out", settings, world=world, shards=tmp_path / "other" / "real")
+
+
+def test_the_camera_that_is_shown_is_the_one_that_is_named(tmp_path: Path) -> None:
+    arm, tokenizer = three.arm(), BlockTokenizer()
+    pictures = np.zeros((4, 64, 64, 3), np.uint8)
+    made = Made("one", tokenizer.encode(pictures), np.zeros((3, arm.chunk_dim), np.float32), {}, "a")
+    given: Any = {"made_by": {"synthetic": True}, "camera": "wrist"}
+    (tmp_path / "out").mkdir()
+    manifest = write_shards(tmp_path / "out", [made], tokenizer.spec, arm, **given)
+    assert manifest.cameras == ["wrist"] and verify(tmp_path / "out") == []
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """The world model as gymnasium environments: checked by gymnasium, and against the world itself."""
 
 import re
+import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -266,3 +267,18 @@ def test_bad_actions_are_refused_and_the_episode_goes_on(
 def test_bad_settings_are_refused(world: World, change: dict[str, Any], message: str) -> None:
     with pytest.raises(HMAError, match=message):
         WorldModelEnv(**{"embodiment": PUSH, "world": world, **change})
+
+
+@pytest.mark.slow
+def test_forked_environments_step_though_torch_has_threads() -> None:
+    program = """
+import gymnasium, torch, hma_model.simulate
+torch.set_num_threads(2)
+torch.ones(2000, 2000) @ torch.ones(2000, 2000)  # starts the pool, which no fork takes along
+env = gymnasium.make_vec("hma/WorldModel-v0", 2, "async", embodiment="rails_03")
+env.reset(seed=0)
+print(env.step(env.action_space.sample())[0].shape)
+env.close()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=280)
+    assert done.stdout.strip() == "(2, 128, 128, 3)", done.stderr

@@ -10,16 +10,18 @@ import pytest
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.episodes.align import to_clip
+from hma_data.episodes.images import resize
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.errors import UsageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
-from hma_model.simulate.films import film
+from hma_model.simulate.films import film, lerobot_episode
 from hma_model.simulate.scenes import PROMPT, LabRobot, RecordedRobot, drivable, pad
-from hma_model.simulate.session import Sampling, Session
+from hma_model.simulate.session import Frame, Sampling, Session, jpeg
 from tests.conftest import BlockTokenizer
+from tests.data import cameras as three
 from tests.model.robots import save
 from tests.model.simulate.worlds import TrueWorld, lab_robots
 
@@ -63,6 +65,31 @@ def test_a_scene_begins_with_a_prompt_and_a_command_that_leaves_the_robot_there(
     assert still and again and still[1] is not None and again[1] is not None
     moved = np.abs(still[1].astype(int) - again[1]).mean()
     assert moved < 0.1
+
+
+@pytest.mark.parametrize("size", [96, 256])
+def test_what_truly_happens_is_shown_in_the_size_of_the_models_pictures(size: int) -> None:
+    class Scaled(TrueWorld):
+        def picture(self, session: int) -> np.ndarray:
+            return resize(super().picture(session)[None], size)[0]
+
+    robots = drivable(Checkpoint.open(EMBEDDED), (), pytest.fail)
+    plain = robots["mover_04"]
+    robot = LabRobot(plain.embodiment, Checkpoint.open(EMBEDDED).stats("mover_04"), size)
+    scene = robot.scene(0)
+    found = scene.advance(None)
+    assert scene.prompt.frames.shape == (PROMPT, size, size, 3) and found[1].shape == (size, size, 3)
+    session = Session("s", robot, 0, Scaled(), Sampling(2, 0.0, "random"), 0.0)
+    assert session.start.psnr is not None
+
+
+def test_a_session_that_cannot_begin_leaves_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    (robot,) = lab_robots("mover_04").values()
+    world = TrueWorld()
+    monkeypatch.setattr(world, "picture", lambda row: np.zeros((3, 3, 3), np.uint8))
+    with pytest.raises(ValueError, match="broadcast"):
+        Session("s", robot, 0, world, Sampling(2, 0.0, "random"), 0.0)
+    assert not world.rows
 
 
 @pytest.fixture
@@ -121,6 +148,31 @@ def test_a_robot_without_simulator_begins_from_its_sample_or_from_pictures(tmp_p
     assert list(robots) == ["arm_a:pictures", "arm_b:pictures"]
     begun = robots["arm_b:pictures"].scene(1).prompt
     assert np.array_equal(begun.frames, pictures[:2]) and np.isnan(begun.chunks).all()
+
+
+def test_a_saved_dataset_names_the_cameras_that_the_model_shows(
+    block_tokenizer: BlockTokenizer, tmp_path: Path
+) -> None:
+    arm, settings = three.arm(), Settings(val_fraction=0, cameras=("all",))
+    convert(
+        arm, three.write_hdf5(tmp_path / "three.hdf5"), block_tokenizer, tmp_path / "set", settings=settings
+    )
+    shards, stats = ShardSet(tmp_path / "set"), {"action": {"mean": [0.0, 0.0], "std": [1.0, 1.0]}}
+
+    def saved(cameras: object) -> list[str]:
+        robot = RecordedRobot(shards, lambda: block_tokenizer, stats, cameras)
+        views = [np.full((16, 16, 3), 90 * view, np.uint8) for view in range(len(robot.cameras))]
+        picture, commands = jpeg(np.concatenate(views, axis=1)), np.zeros((arm.stride, 2), np.float32)
+        state = np.zeros(3, np.float32)  # of which the robot's YAML knows nothing
+        frames = [Frame(i, picture, None, commands, state, None) for i in range(3)]
+        episode, own = lerobot_episode(robot, frames)
+        assert episode.state is None and own.state is None
+        shown = [episode.pictures[camera.key] for camera in own.cameras]
+        assert all(np.abs(view - 90.0 * i).max() < 3 for i, view in enumerate(shown))
+        return [camera.name for camera in own.cameras]
+
+    assert saved("first") == saved("drawn") == ["top"]
+    assert saved("wrist") == ["wrist"] and saved(["side", "wrist"]) == ["side", "wrist"]
 
 
 @pytest.mark.slow
