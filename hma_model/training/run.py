@@ -334,7 +334,7 @@ class Run:
         """Write pictures of rollouts: after the last step always, after others if the time allows."""
         recipe, begun = self.recipe, time.monotonic()
         spare = recipe.pictures_share * self.seconds - sum(self._sheet_seconds) - self._sheet_seconds[-1]
-        if not recipe.pictures or (self.done < 1 and spare <= 0):
+        if not (recipe.pictures and model.config.predicts_video) or (self.done < 1 and spare <= 0):
             return
         facts = {"frames": recipe.frames, "count": recipe.pictures, "seed": recipe.seed}
         fault = write_sheets(model, self.held_out, self.out, self.step, cameras=recipe.cameras, **facts)

@@ -197,6 +197,13 @@ def test_pictures_before_the_last_take_their_share_of_time(data, painter, tmp_pa
     assert names == [f"step-{step:08d}-arm.png" for step in steps]
 
 
+@pytest.mark.parametrize("objective", ["policy", "inverse"])
+def test_a_model_that_predicts_no_frames_is_trained_without_pictures(data, painter, tmp_path, objective):
+    given = {"data": data[:1], "pictures": 1, "eval_every": 2, "objectives": {objective: 1.0}}
+    result = train(make_recipe({**TINY, **given}), out=tmp_path / "run", show=False)
+    assert result.checkpoint.is_dir() and not (tmp_path / "run/pictures").exists()
+
+
 def test_without_the_tokenizer_there_is_a_word_and_no_picture(data, tmp_path, capsys):
     train(make_recipe({**TINY, "data": data, "pictures": 1}), out=tmp_path / "run")
     assert "no pictures: " in capsys.readouterr().err and not (tmp_path / "run/pictures").exists()
