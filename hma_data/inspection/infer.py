@@ -7,6 +7,7 @@ The YAML holds what the recording states. What the recording cannot know is writ
 
 import math
 import re
+import statistics
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -38,6 +39,7 @@ from hma_data.storage.paths import StrPath
 
 LINE = 110
 HIGHEST_HZ = 100_000  # of a rate in a YAML
+TARGET_HZ, SHOWN = 2, 24  # frames a second of the paper; frames that a model should see of an episode
 MEASURED_TO = 5e-4  # relative error of a measured rate; the doubt from jittering stamps is added
 
 
@@ -200,7 +202,7 @@ class _Draft:
             "robot": found.robot or f"{TODO}: which robot is it?",
             "kind": "simulation" if facts.get("simulator") else f"{TODO}: real, simulation or human?",
             "frequency_hz": self._rate() or f"{TODO}: at how many Hz were actions recorded?",
-            "target_hz": 2,
+            "target_hz": self._target(),
             "action": {
                 "space": f"{TODO}: one of {', '.join(spaces[:-1])} or {spaces[-1]}?",
                 "components": [self._component(key) for key in self.action.keys],
@@ -235,6 +237,16 @@ class _Draft:
         whole = round(self.hz)
         tolerance = MEASURED_TO + (min(doubt, 0.02) if doubt == doubt else 0.0)
         return whole if whole and abs(self.hz / whole - 1) < tolerance else round(self.hz, 3) or None
+
+    def _target(self) -> float | int:
+        """Return the rate for the model: the paper's, or as much more as short episodes need."""
+        hz, lengths = self._rate(), self.found.lengths
+        if self.bag or not hz or not lengths:
+            return TARGET_HZ
+        length, slowest = statistics.median(lengths), max(1, math.floor(hz / TARGET_HZ + 0.5))
+        stride = max(1, min(slowest, int(length // SHOWN)))
+        rate = round(hz / stride, 3)
+        return TARGET_HZ if stride == slowest else int(rate) if rate == int(rate) else rate
 
     def _component(self, key: KeyInfo) -> dict[str, Any]:
         component = _named(key, key.names)
@@ -281,6 +293,9 @@ class _Draft:
 
     def _provenance(self) -> dict[str, str]:
         said = {"frequency_hz": self._rate_from() if self.hz else f"{TODO}: who says so?"}
+        if self._target() != TARGET_HZ:
+            length = f"{statistics.median(self.found.lengths):g} steps"
+            said["target_hz"] = f"so that a model sees {SHOWN} frames of an episode of {length}, if it has them"
         if self.action.question:
             said["action"] = f"{TODO}: {self.action.question}"
         if self.seen.question:

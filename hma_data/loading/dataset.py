@@ -436,7 +436,7 @@ def _check_windows(decoder: Decoder, frames: int) -> None:
             decoder.shards.folder,
             f"has no window of {frames} frames, {index.row_stride} rows apart, in {decoder.split} "
             f"({index.short_episodes} episodes, all shorter)",
-            "use fewer frames, or leave this embodiment out",
+            "raise target_hz in its YAML and run hma convert again, or use fewer frames",
         )
 
 

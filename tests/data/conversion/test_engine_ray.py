@@ -269,5 +269,5 @@ def test_without_ray_the_error_says_how_to_install_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingDependencyError, match="uv sync --extra ray"):
+    with pytest.raises(MissingDependencyError, match="uv sync --inexact --extra ray"):
         do(PLAIN, tmp_path)

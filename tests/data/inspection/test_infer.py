@@ -481,3 +481,23 @@ def test_grey_cameras_are_taken_with_a_question_where_there_is_no_colour() -> No
     found = Inspection("rlds", "d", 1, (grey, KeyInfo("action", "vector", (3,), "float32")))
     values = parse_yaml(from_inspection(found, "mine"), "d")
     assert "grey" in questions(values)["provenance.cameras"]
+
+
+@pytest.mark.parametrize(
+    ("hz", "lengths", "rate"),
+    [
+        (30, (300, 400, 500), 2),
+        (30, (90, 96, 120), 7.5),
+        (10, (12, 20, 20), 10),
+        (50, (1000,), 2),
+        (30, (), 2),
+    ],
+)
+def test_short_episodes_get_a_rate_at_which_a_model_sees_enough_of_them(
+    hz: float, lengths: tuple[int, ...], rate: float
+) -> None:
+    keys = KeyInfo("image", "camera", (64, 64, 3), "uint8"), KeyInfo("action", "vector", (3,), "float32")
+    found = Inspection("hdf5", "d", max(len(lengths), 1), keys, lengths=lengths, hz=hz)
+    values = parse_yaml(from_inspection(found, "mine"), "d")
+    assert values["target_hz"] == rate
+    assert ("target_hz" in values["provenance"]) == (rate != 2)

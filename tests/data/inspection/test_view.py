@@ -108,6 +108,6 @@ def test_what_cannot_be_shown_says_what_to_do(
     fails(hma("view", recording, "-e", arm, "--episode", 3), 2, "3 episodes")
     fails(hma("view", recording, "-e", arm, "--out", "seen.mp4"), 2, ".rrd")
     monkeypatch.setitem(__import__("sys").modules, "rerun", None)
-    fails(hma("view", recording, "-e", arm), 1, "uv sync --extra view")
+    fails(hma("view", recording, "-e", arm), 1, "uv sync --inexact --extra view")
     with pytest.raises(MissingDependencyError):
         view_recording(recording, arm)

@@ -41,7 +41,7 @@ def tokenizer(folder) -> Tokenizer:
 def test_without_diffusers_the_command_that_installs_it_is_named(tmp_path, monkeypatch):
     save_file({"a": torch.ones(1)}, tmp_path / NAME)
     monkeypatch.setitem(sys.modules, "diffusers", None)
-    with pytest.raises(MissingDependencyError, match="uv sync --extra svd"):
+    with pytest.raises(MissingDependencyError, match="uv sync --inexact --extra svd"):
         get_tokenizer("svd-vae", weights=str(tmp_path))
 
 

@@ -386,5 +386,5 @@ def test_models_in_each_others_place_or_damaged_are_refused(models: Path, tmp_pa
 
 def test_without_litert_the_error_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
-    with pytest.raises(MissingDependencyError, match="uv sync --extra hands"):
+    with pytest.raises(MissingDependencyError, match="uv sync --inexact --extra hands"):
         Network(b"", 192, (1,), "x")

@@ -97,7 +97,7 @@ def test_a_remote_dataset_of_array_records_is_refused(tmp_path):
 def test_without_the_package_the_error_says_how_to_install_it(tmp_path, monkeypatch):
     folder = dataset(tmp_path / "d")
     monkeypatch.setitem(sys.modules, "array_record.python.array_record_module", None)
-    with pytest.raises(MissingDependencyError, match="uv sync --extra arrayrecord") as caught:
+    with pytest.raises(MissingDependencyError, match="uv sync --inexact --extra arrayrecord") as caught:
         open_source("rlds").index(str(folder))
     assert "\n" not in str(caught.value)
 
