@@ -166,7 +166,7 @@ def test_trackio_and_wandb_get_the_recipe_the_figures_and_the_pictures(package, 
     [
         ("trackio", "trackio", "pip install trackio"),
         ("wandb", "wandb", "pip install wandb"),
-        ("tensorboard", "tensorboard.compat.proto.event_pb2", "uv sync --extra tensorboard"),
+        ("tensorboard", "tensorboard.compat.proto.event_pb2", "uv sync --inexact --extra tensorboard"),
     ],
 )
 def test_a_package_that_is_missing_is_said_with_how_to_install_it(
