@@ -211,7 +211,9 @@ class ModelArena:
         from hma_model.simulate.env import WorldModelVectorEnv
 
         scenes, prompts = true.scenes, true.prompts
-        self.prompts: Sequence[Prompt] = prompts
+        self.prompts: Sequence[Prompt] = [
+            Prompt(world.shown(prompt.frames), prompt.chunks) for prompt in prompts
+        ]
         self.scenes, self.held, self._told, self._probe, self._steps = scenes, true.held, true.told, probe, 0
         self._env = WorldModelVectorEnv(
             len(prompts), embodiment=scenes.name, world=world, horizon=None, autoreset_mode="Disabled"

@@ -191,6 +191,12 @@ class World:
         """Return the newest picture of a session; after `open`, the last of its prompt."""
         return decode(self.tokenizer, self._newest(session).unsqueeze(1))[0, 0]
 
+    def shown(self, frames: NDArray[Any]) -> Picture:
+        """Return the pictures (P, S, V·S, 3) of frames as a prompt takes them; pictures stay as they are."""
+        if frames.ndim == 4 and frames.dtype == np.uint8:
+            return frames
+        return decode(self.tokenizer, torch.from_numpy(np.asarray(frames)).unsqueeze(0))[0]
+
     def stored(self, session: int) -> NDArray[Any]:
         """Return the newest frame of a session as shards store it: tokens (h, w) or latents (c, h, w)."""
         frame = self._newest(session)[0].cpu().numpy()

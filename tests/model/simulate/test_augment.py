@@ -198,6 +198,24 @@ def test_windows_with_unknown_commands_are_left_out(
     augment(tmp_path / "still", asked(source="real", commands="still"), world=world, shards=real)
 
 
+def test_a_policy_of_pictures_acts_after_stored_frames(world: World, real: Path, tmp_path: Path) -> None:
+    seen = []
+
+    class Looks:
+        def begin(self, arena: Any) -> None:
+            seen.extend(prompt.frames for prompt in arena.prompts)
+
+        def act(self, arena: Any) -> Any:
+            return arena.held
+
+    maker = augment_module._Maker(world, asked(source="real", commands="still", episodes=2), ShardSet(real))
+    maker.policy = Looks()
+    maker._make(range(2), lambda done: None)
+    stored = maker._recorded(ShardSet(real), range(2)).prompts
+    for pictures, prompt in zip(seen, stored, strict=True):
+        assert pictures.dtype == np.uint8 and np.array_equal(pictures, world.tokenizer.decode(prompt.frames))
+
+
 @pytest.mark.slow
 def test_other_shards_of_the_same_name_are_not_the_same_job(world: World, real: Path, tmp_path: Path) -> None:
     settings = asked(source="real", episodes=2)
