@@ -1,9 +1,14 @@
-"""Measure how well two judgements agree: correlations and accuracies, with bootstrap intervals.
+"""Measure how well two judgements agree: correlations and accuracies, with intervals.
+
+Correlations have bootstrap intervals. Shares have those of Clopper and Pearson (1934), which stay honest for
+few episodes and for shares of 0 and 1: a bootstrap would call these certain.
 
 M policies, N episodes, R resamples. All intervals hold 95 %.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
+from math import lgamma
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +18,7 @@ Bools = NDArray[np.bool_]
 
 RESAMPLES = 2000
 MIN_POLICIES, MIN_EPISODES = 3, 8  # fewer say nothing about a correlation
+TAIL = 0.025  # chance beyond either end of an interval
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,7 @@ class Accuracy:
 
     Attributes:
         balanced: the mean of the shares of right ones among the true successes and among the failures.
-        low, high: its interval, by bootstrap within both.
+        low, high: its interval, from those of both shares.
         share: the share of right ones among all.
         count, successes: judgements, and true successes among them.
     """
@@ -59,11 +65,20 @@ class Accuracy:
         """Return whether the interval lies above 0.5, which is chance."""
         return self.low is not None and self.low > 0.5
 
+    @property
+    def too_few(self) -> str:
+        """Return "successes" or "failures" if they are so few that no judge can pass; else nothing."""
+        failures = self.count - self.successes
+        if _balanced((self.successes, failures), (self.successes, failures))[1] > 0.5:
+            return ""
+        return "successes" if self.successes <= failures else "failures"
+
     def __str__(self) -> str:
         counts = f"{self.count} episodes, {self.successes} success{'es' * (self.successes != 1)}"
         if self.balanced is None:
             return f"{self.share:.0%} right; all episodes end alike ({counts})"
-        return f"balanced {self.balanced:.0%} ({self.low:.0%} to {self.high:.0%}; {counts})"
+        few = f"; too few {self.too_few} to tell" if self.too_few else ""
+        return f"balanced {self.balanced:.0%} ({self.low:.0%} to {self.high:.0%}; {counts}{few})"
 
 
 def pearson(one: ArrayLike, other: ArrayLike) -> Floats:
@@ -132,20 +147,45 @@ def _too_little(one: Floats, other: Floats) -> str:
     return ""
 
 
-def accuracy(true: Bools, judged: Bools, seed: int = 0) -> Accuracy:
-    """Return how often judgements (N,) are right; `seed` is that of the resamples."""
-    right = [(judged == true)[true == label].astype(np.float64) for label in (True, False)]
-    counts = float((judged == true).mean()), true.size, int(true.sum())
-    if not all(map(len, right)):
+def accuracy(true: Bools, judged: Bools) -> Accuracy:
+    """Return how often judgements (N,) are right."""
+    right = judged == true
+    counts = float(right.mean()), true.size, int(true.sum())
+    each = int(true.sum()), int((~true).sum())
+    if not all(each):
         return Accuracy(None, None, None, *counts)
-    rng = np.random.default_rng(seed)
-    drawn = [part[rng.integers(len(part), size=(RESAMPLES, len(part)))].mean(axis=1) for part in right]
-    low, high = np.percentile((drawn[0] + drawn[1]) / 2, (2.5, 97.5))
-    return Accuracy(float(np.mean([part.mean() for part in right])), float(low), float(high), *counts)
+    return Accuracy(*_balanced((int(right[true].sum()), int(right[~true].sum())), each), *counts)
 
 
-def mean_interval(values: Floats, seed: int = 0) -> tuple[float, float]:
-    """Return the interval of the mean of values (N,)."""
-    chosen = np.random.default_rng(seed).integers(len(values), size=(RESAMPLES, len(values)))
-    low, high = np.percentile(values[chosen].mean(axis=1), (2.5, 97.5))
-    return float(low), float(high)
+def _balanced(right: tuple[int, int], each: tuple[int, int]) -> tuple[float, float, float]:
+    """Return the balanced accuracy and its interval from the right judgements of both outcomes.
+
+    The distances of two shares from the ends of their intervals add up in squares (Newcombe 1998). With the
+    ends of Clopper and Pearson, a judge that guesses, with whatever bias, passes in less than 2.5 % of cases.
+    An outcome that never came tells nothing.
+    """
+    shares = np.array([part / max(whole, 1) for part, whole in zip(right, each)])
+    ends = np.array([share_interval(part, whole) for part, whole in zip(right, each)])
+    below, above = np.sqrt(np.square(ends - shares[:, None]).sum(axis=0)) / 2
+    middle = float(shares.mean())
+    return middle, middle - float(below), middle + float(above)
+
+
+def share_interval(successes: int, count: int) -> tuple[float, float]:
+    """Return Clopper and Pearson's interval of a share: the shares under which the count is no surprise."""
+    return _lower_end(successes, count), 1 - _lower_end(count - successes, count)
+
+
+@lru_cache(maxsize=1024)
+def _lower_end(successes: int, count: int) -> float:
+    """Return the share under which so many successes, or more, have the chance TAIL; 0 for none."""
+    if not successes:
+        return 0.0
+    many = np.arange(successes, count + 1)
+    ways = np.array([lgamma(count + 1) - lgamma(one + 1) - lgamma(count - one + 1) for one in many])
+    low, high = 0.0, 1.0
+    for _ in range(50):  # halves the gap; far below what is printed
+        share = (low + high) / 2
+        chance = np.exp(ways + many * np.log(share) + (count - many) * np.log1p(-share)).sum()
+        low, high = (share, high) if chance < TAIL else (low, share)
+    return low

@@ -193,9 +193,12 @@ def train_judge(
         read[row] = _read_score(task, probe, shown[None])[0]
     half, success = examples // 2, true >= task.limit
     limit = best_limit(read[:half], success[:half], task.limit)
-    found = accuracy(success[half:], read[half:] >= limit, seed)
+    found = accuracy(success[half:], read[half:] >= limit)
     if not found.better_than_chance:
-        remedy = f"try another task or limit, such as --judge {task.name}={2 * abs(task.limit):g}"
+        # successes of `moved` get rarer with a higher limit, those of the others more frequent
+        rare = found.too_few
+        factor = 0.5 if rare and (task.name == "moved") == (rare == "successes") else 2
+        remedy = f"try another task or limit, such as --judge {task.name}={factor * abs(task.limit):g}"
         raise HMAError(f"judge of {robot}", f"is no better than chance: {found}", remedy)
     return StateJudge(robot, task, probe, limit, found)
 

@@ -9,15 +9,14 @@ from typing import Any
 
 from hma_data.conversion.publish import SMALL, publish
 from hma_data.errors import HubError, ShardError
-from hma_data.shards.manifest import EPISODES, MANIFEST, SHARD_NAME, Manifest, seal_problem
+from hma_data.shards.manifest import BESIDE, EPISODES, FINDER, MANIFEST, SHARD_NAME, Manifest, seal_problem
 from hma_data.storage.files import file_sha256, write_atomic
 from hma_data.storage.paths import REPOSITORY, StrPath, as_address, as_path
 from hma_data.storage.yaml_io import write_yaml
-from hma_model.checkpoint.folder import README
 from hma_model.checkpoint.model_card import licence, line, number
 from hma_model.hub.publish import Store, open_store
 
-_OURS = {*SMALL, MANIFEST, README, ".gitattributes"}
+_OURS = {*SMALL, MANIFEST, *BESIDE}
 _AGAIN = "pull again; if it stays so, have it pushed again"
 _DATASETS = "hf://datasets/"
 _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"),
@@ -134,6 +133,7 @@ def _refuse_others(store: Store, manifest: Manifest) -> dict[str, int]:
     """Return the published files; raise HubError if they are of another robot, tokenizer or kind."""
     files = store.files()
     strange = [name for name in files if not (name in _OURS or SHARD_NAME.fullmatch(name))]
+    strange = [name for name in strange if not name.endswith(f"/{FINDER}")]
     if strange:
         raise HubError(store.name, f"holds something else: {strange[0]}", "push to a place of its own")
     if MANIFEST not in files:

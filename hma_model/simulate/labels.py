@@ -5,14 +5,16 @@
 
 Film is a shard set, of any robot or of people, or a folder of video files. Its frames are taken at the rate
 of the robot's model; an episode that cannot be read goes to quarantine. Labelled episodes lie in a folder of
-the output until all are written, so the same call continues.
+the output until all are written, by the content of their film, so the same call continues.
 
 T frames, A action dims, K = stride · A.
 """
 
+import hashlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -23,16 +25,19 @@ from numpy.typing import NDArray
 
 from hma_data.conversion.output import locked
 from hma_data.errors import EpisodeError, HMAError, OutputError, UsageError
+from hma_data.loading.views import FIRST, Cameras, Views
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST, Manifest
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import Refused
 from hma_data.sources.common.video_file import VideoFile, frame_table
-from hma_data.storage.files import atomic_path, kept_arrays
+from hma_data.storage.files import atomic_path, file_sha256, kept_arrays
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.config import INVERSE, OBJECTIVES
-from hma_model.generation.commands import Commands, Floats, described
-from hma_model.simulate.pictures import fitted
+from hma_model.generation.commands import Commands, Floats, card, described
+from hma_model.simulate.pictures import fitted, recorded_cameras, seen_cameras
+from hma_model.simulate.prompts import seen_frames
 from hma_model.simulate.synthetic import Made, begun, digests, finished, write_shards
 from hma_model.simulate.world import World, load_world
 
@@ -94,6 +99,9 @@ class Film(Protocol):
     def heads(self) -> list[tuple[str, str, str]]:
         """Return id, group and instruction of each episode."""
 
+    def content(self, number: int) -> str:
+        """Return words that are others if the frames of an episode are others."""
+
     def read(self, number: int) -> NDArray[Any]:
         """Return the frames (T, …) of an episode as shards store them."""
 
@@ -148,12 +156,15 @@ def label_actions(
             "film": shown.name,
         }
         made_by |= {"error": error.to_json()} | digests(world, embodiment)
-        manifest = finished(folder, made_by)
+        keys = _keys(shown)
+        whole = made_by | {"film_sha256": hashlib.sha256("\n".join(keys).encode()).hexdigest()}
+        manifest = finished(folder, whole)
         if manifest is None:
-            work = begun(folder, WORK, made_by)
-            episodes, refused = _label(world, commands, shown, work, on_progress)
+            work = begun(folder, WORK, made_by)  # what is kept of other film does no harm there
+            episodes, refused = _label(world, commands, shown, keys, work, on_progress)
+            (camera,) = seen_cameras(_cameras(model, embodiment), recorded_cameras(robot))
             spec = world.tokenizer.spec
-            manifest = write_shards(folder, episodes, spec, robot, made_by, ORIGIN, refused)
+            manifest = write_shards(folder, episodes, spec, robot, whole, ORIGIN, refused, camera)
             shutil.rmtree(work)
     return Labelled(manifest, error)
 
@@ -192,7 +203,7 @@ def measure(
     Raises:
         HMAError: of no value of the command it is better than the mean.
     """
-    film = ShardFilm(world, shards, shards.row_stride)
+    film = ShardFilm(world, shards, shards.row_stride, commands.embodiment)
     rows = shards.episodes.to_pylist()
     split = "val" if any(row["split"] == "val" for row in rows) else "train"
     chosen = [number for number, row in enumerate(rows) if row["split"] == split][:CHECKED]
@@ -236,17 +247,24 @@ def _labelled(model: "HMA", embodiment: str, check: StrPath | None) -> ShardSet:
     return found[0]
 
 
+def _keys(film: Film) -> list[str]:
+    """Return what tells each episode of film, by its id and content, from any other."""
+    heads = enumerate(film.heads())
+    return [hashlib.sha256(f"{name}\n{film.content(i)}".encode()).hexdigest() for i, (name, *_) in heads]
+
+
 def _label(
     world: World,
     commands: Commands,
     film: Film,
+    keys: Sequence[str],
     work: Path,
     on_progress: Callable[[float, str, float], None],
 ) -> "tuple[_Kept, list[Refused]]":
     """Infer the commands of all episodes that are not in the folder yet."""
     heads, kept, refused = film.heads(), [], list[Refused]()
     for number, (name, group, instruction) in enumerate(heads):
-        path = work / f"episode-{number:06d}.npz"
+        path = work / f"{keys[number][:32]}.npz"
         found = kept_arrays(path)
         if found is None:
             on_progress(number, "labelling", len(heads))
@@ -315,7 +333,7 @@ def film_of(world: World, place: StrPath, embodiment: str, hz: float) -> Film:
             fault = f"has {rows_hz:g} frames a second; the model takes {hz:g}"
             remedy = "convert the film with --frames all, or at a multiple of the model's rate"
             raise UsageError(path, fault, remedy)
-        return ShardFilm(world, shards, step)
+        return ShardFilm(world, shards, step, embodiment)
     videos = (
         sorted(file for file in path.rglob("*") if file.suffix.lower() in VIDEOS) if path.is_dir() else []
     )
@@ -328,25 +346,52 @@ def film_of(world: World, place: StrPath, embodiment: str, hz: float) -> Film:
     return VideoFilm(world, path, videos, embodiment, hz)
 
 
-class ShardFilm:
-    """The episodes of a shard set: of its first camera, every `step`-th row."""
+def _cameras(model: "HMA", embodiment: str) -> Cameras:
+    """Return the cameras that a robot's stem was trained on."""
+    found: Cameras = card(model, embodiment).get("data", {}).get("cameras") or FIRST
+    return found
 
-    def __init__(self, world: World, shards: ShardSet, step: int) -> None:
+
+class ShardFilm:
+    """The episodes of a shard set: every `step`-th row, of the cameras that the model sees of a robot.
+
+    Film of another robot, which lacks them, is taken from its first camera.
+
+    Args:
+        world: of the model.
+        shards: the set.
+        step: rows from one frame to the next.
+        embodiment: the robot whose commands are inferred; by default that of the set.
+
+    Raises:
+        UsageError: the set is of the robot and lacks a camera that the model sees.
+    """
+
+    def __init__(self, world: World, shards: ShardSet, step: int, embodiment: str | None = None) -> None:
         self.name, self._shards, self._step = shards.folder.name, shards, step
         self._rows = shards.episodes.to_pylist()
-        self._camera = shards.manifest.cameras[0]
-        self._reader = EpisodeReader(shards, shards.columns([self._camera]))
+        cameras = _cameras(world.model, embodiment or shards.embodiment.id)
+        if embodiment in (None, shards.embodiment.id):
+            Views.of(shards, cameras)
+        self.cameras = seen_cameras(cameras, shards.manifest.cameras)
+        self._reader = EpisodeReader(shards, shards.columns(self.cameras))
 
     def heads(self) -> list[tuple[str, str, str]]:
         return [(row["id"], row["group"] or "", row["instruction"] or "") for row in self._rows]
+
+    def content(self, number: int) -> str:
+        return f"{self._manifest_sha256} {self.cameras} {self._step}"
+
+    @cached_property
+    def _manifest_sha256(self) -> str:
+        return hashlib.sha256((self._shards.folder / MANIFEST).read_bytes()).hexdigest()
 
     def read(self, number: int) -> NDArray[Any]:
         return self.labelled(number)[0]
 
     def labelled(self, number: int) -> tuple[NDArray[Any], Floats, NDArray[np.bool_]]:
         """Return the frames (T, …), the chunks (T, K) that follow them, and which are known (T,)."""
-        columns = self._reader.episode(self._rows[number], self._camera)
-        (stored,) = (self._shards.tokens(columns[key]) for key in columns if key in ("tokens", "latents"))
+        stored, columns = seen_frames(self._shards, self._reader, self._rows[number], self.cameras)
         at = np.arange(0, len(stored), self._step)
         actions = columns["action"]
         spans = at[:, None] + np.arange(self._step)
@@ -361,10 +406,17 @@ class VideoFilm:
 
     def __init__(self, world: World, folder: Path, files: list[Path], embodiment: str, hz: float) -> None:
         self.name, self._world, self._folder, self._files = folder.name, world, folder, files
-        self._robot, self._hz = described(world.model, embodiment), hz
+        self._hz, robot = hz, described(world.model, embodiment)
+        self._robot = None if robot is None else _seen_by(robot, _cameras(world.model, embodiment))
 
     def heads(self) -> list[tuple[str, str, str]]:
         return [(str(file.relative_to(self._folder).with_suffix("")), "", "") for file in self._files]
+
+    def content(self, number: int) -> str:
+        try:
+            return file_sha256(self._files[number])
+        except OSError as fault:  # it goes to quarantine when it is read
+            return str(fault)
 
     def read(self, number: int) -> NDArray[Any]:
         path = self._files[number]
@@ -378,3 +430,10 @@ class VideoFilm:
             made.append(self._world.tokenizer.encode(pictures))
         video.close()
         return np.concatenate(made)
+
+
+def _seen_by(robot: Embodiment, cameras: Cameras) -> Embodiment:
+    """Return a robot whose primary camera is the one that a model of one view sees."""
+    camera, *_ = seen_cameras(cameras, recorded_cameras(robot))
+    sync = robot.sync.model_copy(update={"primary": None})
+    return robot.model_copy(update={"cameras": (robot.camera(camera),), "sync": sync})

@@ -9,12 +9,13 @@ commands that it gave in the model are also played to the simulator. So the judg
 is compared with what truly comes of the same commands.
 
 With an output folder, what came of each policy lies in a folder of it until the page is written, so the same
-call continues.
+call continues. A policy that was changed in between is scored again.
 
 M policies, N episodes, T frames after the prompt, S pixels a side.
 """
 
 import hashlib
+import json
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
@@ -35,11 +36,12 @@ from hma_model.evaluation.agreement import (
     Estimate,
     accuracy,
     correlations,
-    mean_interval,
     pearson,
+    share_interval,
 )
 from hma_model.evaluation.judge import StateJudge, task_of, train_judge
 from hma_model.simulate.arenas import Arena, Floats, ModelArena, Picture, Scenes, TrueArena
+from hma_model.simulate.fingerprints import object_sha256, policy_facts, world_facts
 from hma_model.simulate.policies import Judged, Policy, begin, checked, read_policy
 from hma_model.simulate.synthetic import begun, digests
 from hma_model.simulate.world import World, load_world
@@ -120,10 +122,10 @@ class PolicyEvaluation:
             row: dict[str, Any] = {"policy": one.policy}
             for name in OUTCOMES:
                 outcomes: Outcomes = getattr(one, name)
-                rate = outcomes.success.astype(np.float64)
+                good, count = int(outcomes.success.sum()), len(outcomes.success)
                 row |= {
-                    f"{name}_success": float(rate.mean()),
-                    f"{name}_success_interval": mean_interval(rate, self.seed),
+                    f"{name}_success": good / count,
+                    f"{name}_success_interval": share_interval(good, count),
                     f"{name}_score": float(outcomes.scores.mean()),
                 }
             agree = (one.true.success == one.model.success).mean()
@@ -208,6 +210,7 @@ def evaluate_policies(
         sampling = f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}"
         scenes = Scenes.of(world, embodiment, episodes, seed)
         made = [(one, read_policy(one, scenes, world)) if isinstance(one, str) else one for one in policies]
+        keys = [""] * len(made) if folder is None else _keys(policies, world, embodiment, judge)
         for name, policy in made:  # what it returns is refused before minutes of work
             if not isinstance(policy, Judged):
                 _try(name, policy, TrueArena(scenes.take(range(1)), world.picture_shape[0]))
@@ -224,10 +227,10 @@ def evaluate_policies(
             facts |= {"judge": asdict(judge.task), "sampling": sampling, **digests(world, embodiment)}
             work = begun(folder, WORK, facts)
         scored: list[Scored] = []
-        for name, policy in made:
+        for (name, policy), key in zip(made, keys, strict=True):
             told = partial(_tell, tell, len(scored) * frames * episodes, name)
             score = partial(score_policy, name, policy, world, scenes, judge, frames, told)
-            scored.append(_once(name, work, score))
+            scored.append(_once(name, key, work, score))
         success, scores = _matrices(scored, "success"), _matrices(scored, "scores")
         return PolicyEvaluation(
             embodiment,
@@ -239,16 +242,31 @@ def evaluate_policies(
             tuple(scored),
             Correlation(**correlations(success[0], success[1], seed)),
             Correlation(**correlations(scores[0], scores[1], seed)),
-            accuracy(success[2].ravel() > 0, success[1].ravel() > 0, seed),
+            accuracy(success[2].ravel() > 0, success[1].ravel() > 0),
             _correlation(scores[1].ravel(), scores[2].ravel()),
         )
 
 
-def _once(name: str, work: Path | None, score: Callable[[], Scored]) -> Scored:
+def _keys(
+    policies: Sequence[str | tuple[str, Policy]], world: World, embodiment: str, judge: str | StateJudge
+) -> list[str]:
+    """Return the name under which each policy's results are kept: another one for all that changes them.
+
+    The rest is in the settings of the folder of work, with which a judge of words always comes out the same.
+    """
+    shared = [world_facts(world), None if isinstance(judge, str) else object_sha256(judge)]
+    own = [
+        (one, policy_facts(one, embodiment)) if isinstance(one, str) else (one[0], object_sha256(one[1]))
+        for one in policies
+    ]
+    return [hashlib.sha256(json.dumps([one, shared]).encode()).hexdigest()[:32] for one in own]
+
+
+def _once(name: str, key: str, work: Path | None, score: Callable[[], Scored]) -> Scored:
     """Return the results of a policy: those kept in a folder of work, else new ones, which are kept there."""
     if work is None:
         return score()
-    path = work / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
+    path = work / f"{key}.npz"
     found = _kept(name, path)
     if found is None:
         found = score()

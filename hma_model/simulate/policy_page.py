@@ -56,7 +56,10 @@ def sentences(found: PolicyEvaluation) -> list[str]:
         f"success rates over policies: Pearson {found.success.pearson}, ranks {found.success.spearman}",
         f"mean scores over policies: Pearson {found.score.pearson}, ranks {found.score.spearman}",
     ]
-    if not found.generated.better_than_chance:
+    if found.generated.too_few:
+        few = f"too few {found.generated.too_few} to tell whether the judge is better than chance"
+        said.append(f"on generated frames there are {few}: the model's success rates mean nothing")
+    elif not found.generated.better_than_chance:
         said.append(
             "on generated frames the judge is no better than chance: the model's success rates mean nothing"
         )

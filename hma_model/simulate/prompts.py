@@ -173,14 +173,30 @@ def _of_shards(model: "HMA", embodiment: str, folder: StrPath, part: Part) -> Pr
         raise HMAError(shards.folder, fault, f"{embodiment} takes {space.stride} of {space.action_dim}")
     rows = shards.episodes.to_pylist()
     chosen = rows[part.number([row["id"] for row in rows], shards.folder)]
+    names = seen_cameras(cameras_for(model, shards), shards.manifest.cameras)
+    frames, columns = seen_frames(shards, EpisodeReader(shards, shards.columns(names)), chosen, names)
+    at = part.rows(model, len(frames), shards.row_stride, part.start // shards.manifest.frame_stride)
+    chunks = _chunks(columns["action"], columns.get("action_known"), at, shards.row_stride)
+    return frames[at], chunks
+
+
+def seen_frames(
+    shards: ShardSet, reader: EpisodeReader, row: Mapping[str, Any], cameras: Sequence[str]
+) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:
+    """Return the frames (T, …) of an episode with the views of cameras stacked, and its columns.
+
+    Args:
+        shards: the set.
+        reader: of the cameras' columns of the set.
+        row: of episodes.parquet.
+        cameras: their names, see `seen_cameras`.
+    """
     views = []
-    for name in seen_cameras(cameras_for(model, shards), shards.manifest.cameras):
-        columns = EpisodeReader(shards, shards.columns([name])).episode(chosen, name)
+    for name in cameras:
+        columns = reader.episode(row, name)
         (stored,) = (columns[key] for key in columns if key in ("tokens", "latents"))
         views.append(shards.tokens(stored))
-    at = part.rows(model, len(views[0]), shards.row_stride, part.start // shards.manifest.frame_stride)
-    chunks = _chunks(columns["action"], columns.get("action_known"), at, shards.row_stride)
-    return np.concatenate([view[at] for view in views], axis=-2), chunks
+    return np.concatenate(views, axis=-2), columns
 
 
 def _of_lerobot(model: "HMA", embodiment: str, folder: StrPath, part: Part) -> Prompt:

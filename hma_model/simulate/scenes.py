@@ -7,6 +7,7 @@ knows it for a robot that begins from pictures.
 P frames of a prompt, H×W pixels, A action dims, K = stride * A values of a chunk.
 """
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -206,11 +207,19 @@ class RecordedRobot:
         from hma_model.evaluation.evaluate import decode
 
         windows = self._windows
-        batch = windows.batch([number * (1 + round(0.382 * len(windows))) % len(windows)])
+        batch = windows.batch([number * apart(len(windows)) % len(windows)])
         stored = batch.latents if batch.tokens is None else batch.tokens
         assert stored is not None
         frames = decode(self._tokenizer(), stored)[0]
         return RecordedScene(self.dimensions, frames, batch.actions[0].numpy().astype(np.float32))
+
+
+def apart(count: int) -> int:
+    """Return a step of about 0.382 of so many windows that comes to each of them once."""
+    step = 1 + round(0.382 * count)
+    while math.gcd(step, count) > 1:
+        step += 1
+    return step
 
 
 class RecordedScene:

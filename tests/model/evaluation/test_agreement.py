@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hma_model.evaluation.agreement import accuracy, correlations, mean_interval, pearson, ranks, spearman
+from hma_model.evaluation.agreement import accuracy, correlations, pearson, ranks, share_interval, spearman
 
 
 @pytest.fixture
@@ -23,10 +23,11 @@ def test_correlations_are_those_of_scipy(series: tuple[np.ndarray, np.ndarray]) 
     assert np.isnan(pearson([1, 1, 1], [1, 2, 3]))
 
 
-def test_an_interval_is_that_of_scipys_bootstrap() -> None:
-    values = np.random.default_rng(1).exponential(3.0, 40)
-    wanted = stats.bootstrap((values,), np.mean, method="percentile", n_resamples=5000, rng=2)
-    np.testing.assert_allclose(mean_interval(values), wanted.confidence_interval, atol=0.12)
+@pytest.mark.parametrize(("successes", "count"), [(0, 8), (1, 8), (17, 32), (32, 32), (11, 192)])
+def test_the_interval_of_a_share_is_scipys_exact_one(successes: int, count: int) -> None:
+    wanted = stats.binomtest(successes, count).proportion_ci(0.95, "exact")
+    np.testing.assert_allclose(share_interval(successes, count), wanted, atol=1e-9)
+    assert wanted.high - wanted.low > 0.05  # never certain
 
 
 def test_policies_and_episodes_are_drawn_jointly_for_both_judgements() -> None:
@@ -60,3 +61,24 @@ def test_accuracy_counts_successes_and_failures_alike() -> None:
     found = accuracy(true, judged)
     assert found.balanced == pytest.approx((0.8 + 29 / 30) / 2) and found.low < found.balanced < found.high
     assert not accuracy(np.ones(9, bool), np.ones(9, bool)).better_than_chance  # all alike: nothing is known
+
+
+@pytest.mark.parametrize("count", [48, 192])
+@pytest.mark.parametrize("says_success", [0.05, 0.15, 0.5])
+def test_a_judge_that_guesses_hardly_ever_passes(count: int, says_success: float) -> None:
+    """However few the successes; it need not be a fair coin."""
+    rng, draws = np.random.default_rng(0), 400
+    for successes in (*range(1, 13), 18, 24):
+        true = np.arange(count) < successes
+        passed = [accuracy(true, rng.random(count) < says_success).better_than_chance for _ in range(draws)]
+        assert np.mean(passed) <= 0.05, successes
+
+
+def test_successes_or_failures_too_few_for_any_judge_are_said() -> None:
+    true = np.arange(8) < 1
+    for outcome, word in ((true, "successes"), (~true, "failures")):
+        found = accuracy(outcome, outcome)  # without error
+        assert found.balanced == 1 and not found.better_than_chance
+        assert found.too_few == word and f"too few {word} to tell" in str(found)
+    plenty = np.arange(48) < 6
+    assert not accuracy(plenty, plenty).too_few and "too few" not in str(accuracy(plenty, ~plenty))

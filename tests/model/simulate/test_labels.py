@@ -1,6 +1,7 @@
 """Film gets commands: shards that verify and say that they are inferred, with their true error."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,15 +9,23 @@ import pytest
 import torch
 
 from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.episodes.sheets import write_mp4
 from hma_data.errors import HMAError, OutputError, UsageError
 from hma_data.lab import family, record
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
-from hma_data.tokenizers.base import get_tokenizer
-from hma_model.simulate import World, labels
+from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer
+from hma_model.checkpoint import io as checkpoint
+from hma_model.config import HMAConfig
+from hma_model.generation import commands
+from hma_model.network.model import HMA
+from hma_model.simulate import World, labels, read_prompt
 from hma_model.simulate.labels import ShardFilm, VideoFilm, infer, label_actions
+from tests.conftest import BlockTokenizer
+from tests.data import cameras
+from tests.model.robots import stats
 from tests.model.simulate.worlds import tiny_model
 
 ROBOT = "rails_03"
@@ -170,3 +179,143 @@ def test_film_that_cannot_be_read_goes_to_quarantine(
     said = (tmp_path / "out" / "quarantine.jsonl").read_text()
     assert "cut.mp4" in said and "none.mp4" in said
     assert [row["id"] for row in ShardSet(tmp_path / "out").episodes.to_pylist()] == ["long"]
+
+
+def grey(folder: Path, **levels: int) -> None:
+    """Write videos of eight grey pictures at 10 Hz, by name."""
+    folder.mkdir(exist_ok=True)
+    for name, level in levels.items():
+        write_mp4(folder / f"{name}.mp4", [np.full((128, 128, 3), level, np.uint8)] * 8, 10)
+
+
+def shown(world: World, out: Path) -> dict[str, int]:
+    """Return the level of each labelled episode, to the nearest ten."""
+    shards = ShardSet(out)
+    reader, found = EpisodeReader(shards, shards.columns()), {}
+    for row in shards.episodes.to_pylist():
+        tokens = reader.episode(row, shards.manifest.cameras[0])["tokens"]
+        found[row["id"]] = int(world.tokenizer.decode(shards.tokens(tokens)).mean().round(-1))
+    return found
+
+
+def test_film_that_has_grown_or_changed_is_never_taken_for_what_was_labelled(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
+    monkeypatch.setattr(labels, "measure", lambda *_: known)
+    monkeypatch.setattr(labels, "_labelled", lambda *_: None)
+    labelled = list[int]()
+
+    def infer_and_count(*given: Any) -> np.ndarray:
+        labelled.append(1)
+        return infer(*given)
+
+    def stop(done: float, words: str, total: float) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    def run(**given: Any) -> int:
+        before = len(labelled)
+        label_actions(tmp_path / "film", tmp_path / "out", ROBOT, checkpoint="", world=world, **given)
+        return len(labelled) - before
+
+    monkeypatch.setattr(labels, "infer", infer_and_count)
+    grey(tmp_path / "film", b=60, c=200, d=160)
+    with pytest.raises(KeyboardInterrupt):
+        run(on_progress=stop)
+    grey(tmp_path / "film", a=120, c=20)  # one is added, and a labelled one is another
+    assert run() == 3  # b was labelled before
+    assert shown(world, tmp_path / "out") == {"a": 120, "b": 60, "c": 20, "d": 160}
+    assert run() == 0
+    grey(tmp_path / "film", e=90)
+    with pytest.raises(OutputError, match="out: holds another shard set — choose another folder"):
+        run()
+
+
+class BlockLatents(BlockTokenizer):
+    """The mean colours of 8×8 blocks as latents."""
+
+    spec = TokenizerSpec("latents", 1, "continuous", 64, (8, 8), channels=3, dtype="float16")
+
+    def encode(self, frames: np.ndarray) -> np.ndarray:
+        blocks = frames.reshape(-1, 8, 8, 8, 8, 3).astype(np.float32).mean(axis=(2, 4)) / 17
+        return blocks.transpose(0, 3, 1, 2).astype(np.float16)
+
+
+@pytest.fixture(scope="module", params=[BlockTokenizer, BlockLatents])
+def three(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> ShardSet:
+    folder = tmp_path_factory.mktemp("three")
+    recording = cameras.write_hdf5(folder / "three.hdf5")
+    convert(cameras.arm(), recording, request.param(), folder / "set", settings=Settings(cameras=("all",)))
+    return ShardSet(folder / "set")
+
+
+def trained_on(views: Any, shards: ShardSet, folder: Path, objective: str = "forward") -> Any:
+    """Return a world of a saved model whose robot was trained on these cameras."""
+    spec, count = shards.spec, 1 if isinstance(views, str) else len(views)
+    sizes = {"factored": spec.factored} if spec.kind == "discrete" else {"channels": 3}
+    config = HMAConfig(
+        kind=spec.kind, layers=1, width=16, heads=2, grid=(8, 8), views=count, tokenizer=spec.to_json(),
+        objectives={objective: 1.0}, **sizes,
+    )  # fmt: skip
+    model, robot = HMA(config), shards.embodiment
+    model.add_embodiment(robot, checkpoint.action_stats(stats(2), robot.id))
+    described = {"stats": {robot.id: stats(2)}, "cards": {robot.id: {"data": {"cameras": views}}}}
+    checkpoint.save(model, folder, embodiment_yaml={robot.id: robot.to_yaml()}, **described)
+    return SimpleNamespace(model=HMA.from_pretrained(folder), tokenizer=None)
+
+
+@pytest.mark.parametrize(
+    ("views", "seen"),
+    [
+        ("first", ["top"]),
+        ("drawn", ["top"]),
+        ("wrist", ["wrist"]),
+        (["wrist"], ["wrist"]),
+        (["side", "top"], ["side", "top"]),
+    ],
+)
+def test_film_shows_the_cameras_that_the_model_was_trained_on(
+    three: ShardSet, views: Any, seen: list[str], tmp_path: Path
+) -> None:
+    world = trained_on(views, three, tmp_path / "model")
+    film = ShardFilm(world, three, three.row_stride)
+    stored = film.read(1)
+    red = stored[:, 0] % 16 if three.spec.kind == "continuous" else stored % 16
+    for view, name in enumerate(seen):
+        assert (red[:, 8 * view : 8 * view + 8] == 1 + 4 * list(cameras.SIZES).index(name)).all()
+    place = {"shards": three.folder, "episode": 1, "frames": len(stored) - 1}
+    frames, chunks = read_prompt(world.model, three.embodiment.id, place)
+    np.testing.assert_array_equal(frames, stored[:-1])
+    np.testing.assert_array_equal(chunks, film.labelled(1)[1][: len(frames) - 1])
+
+
+@pytest.mark.parametrize("three", [BlockTokenizer], indirect=True)
+def test_labelled_shards_name_the_camera_that_their_pictures_are_of(
+    three: ShardSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(labels, "described", commands.described)
+    known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
+    monkeypatch.setattr(labels, "measure", lambda *_: known)
+    world: Any = World(trained_on("wrist", three, tmp_path / "model", "inverse").model, BlockTokenizer())
+    given: Any = {"checkpoint": "", "check": three.folder, "world": world}
+    label_actions(three.folder, tmp_path / "out", three.embodiment.id, **given)
+    made = ShardSet(tmp_path / "out")
+    assert made.manifest.cameras == ["wrist"] and verify(tmp_path / "out") == []
+    tokens = EpisodeReader(made, made.columns()).episode(made.episodes.to_pylist()[0], "wrist")["tokens"]
+    assert (tokens % 16 == 5).all()
+
+
+def test_film_of_the_robot_without_the_models_camera_is_refused(three: ShardSet, tmp_path: Path) -> None:
+    world = trained_on("nose", three, tmp_path / "model")
+    with pytest.raises(UsageError, match="three_hdf5 has the cameras top, wrist, side in .* not nose"):
+        ShardFilm(world, three, three.row_stride)
+    assert ShardFilm(world, three, three.row_stride, "another").cameras == ["top"]
+
+
+def test_videos_are_cut_as_the_camera_that_the_model_was_trained_on() -> None:
+    values = cameras.arm().to_dict()
+    values["cameras"][1] |= {"resize": "stretch"}
+    values["sync"] = {"primary": "top"}
+    robot = labels._seen_by(type(cameras.arm()).from_values(values, "arm"), "wrist")
+    assert robot.primary_camera.name == "wrist" and robot.primary_camera.resize == "stretch"

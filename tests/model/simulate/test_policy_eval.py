@@ -1,7 +1,9 @@
 """Policies scored twice: in a world without error both agree; faults of policies are one clear line."""
 
+import hashlib
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from hma_model.network.model import HMA
 from hma_model.simulate import World, policy_eval
 from hma_model.simulate.arenas import Scenes, TrueArena
 from hma_model.simulate.policies import begin, checked, read_policy
-from hma_model.simulate.policy_eval import PolicyEvaluation, Scored, evaluate_policies, score_policy
+from hma_model.simulate.policy_eval import WORK, PolicyEvaluation, Scored, evaluate_policies, score_policy
 from hma_model.simulate.policy_page import html, sentences, write_report
 from tests.model.simulate.worlds import TrueWorld
 
@@ -51,6 +53,9 @@ class KnownPlaces:
     def areas(self, pictures: np.ndarray) -> np.ndarray:
         return np.ones((*pictures.shape[:-3], 4))
 
+    def __reduce__(self) -> Any:
+        return KnownPlaces, ()  # what it has seen so far makes no other judge of it
+
 
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> StateJudge:
@@ -64,7 +69,7 @@ class FlawlessWorld(TrueWorld):
     def __init__(self, world: World) -> None:
         super().__init__()
         self.model, self.tokenizer, self.picture_shape = world.model, world.tokenizer, world.picture_shape
-        self.commands = world.commands
+        self.commands, self.shown = world.commands, world.shown
 
 
 def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJudge) -> None:
@@ -94,7 +99,6 @@ def test_a_model_is_scored_and_the_report_written(world: World, judge: StateJudg
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_an_interrupted_evaluation_continues_after_its_last_finished_policy(
     world: World, judge: StateJudge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,6 +123,43 @@ def test_an_interrupted_evaluation_continues_after_its_last_finished_policy(
     assert html(found) == html(whole) and found.to_json() == whole.to_json()
     write_report(found, out)
     assert sorted(path.name for path in out.iterdir()) == ["report.html", "results.json"]
+
+
+def test_shares_have_exact_intervals_and_too_few_successes_are_said(world: World, judge: StateJudge) -> None:
+    found = evaluate_policies(ROBOT, ["still"], world=world, judge=judge, episodes=8, frames=4)
+    (row,) = found.rows()
+    assert row["true_success"] == 0 and row["true_success_interval"] == pytest.approx((0, 0.369), abs=1e-3)
+    assert "there are too few successes to tell whether the judge is better" in sentences(found)[-1]
+
+
+@pytest.mark.slow
+def test_a_policy_that_was_edited_is_scored_again(
+    world: World, judge: StateJudge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = list[str]()
+
+    def score(name: str, *given: Any) -> Scored:
+        begun.append(name)
+        return score_policy(name, *given)
+
+    def written(value: int) -> list[str]:
+        sys.modules.pop("mine", None)
+        (tmp_path / "mine.py").write_text(f"act = lambda picture: [{value}, 0]\n")
+        before = len(begun)
+        given: Any = {"world": world, "judge": judge, "episodes": 2, "frames": 4, "out": tmp_path / "out"}
+        evaluate_policies(ROBOT, ["mine:act", "still"], **given)
+        return begun[before:]
+
+    monkeypatch.setattr(policy_eval, "score_policy", score)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    old = hashlib.sha256(b"still").hexdigest()[:16]
+    assert written(1) == ["mine:act", "still"]
+    (kept, _) = (tmp_path / "out" / WORK).glob("*.npz")
+    kept.rename(kept.with_name(f"{old}.npz"))  # as older releases named it
+    assert len(written(1)) == 1
+    assert written(2) == ["mine:act"] and written(1) == []
+    sys.modules.pop("mine")
 
 
 def test_both_arenas_begin_with_the_same_frames_and_numbers_follow_the_seed(world: World) -> None:

@@ -18,7 +18,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.simulate.films import film, lerobot_episode
-from hma_model.simulate.scenes import PROMPT, LabRobot, RecordedRobot, drivable, pad
+from hma_model.simulate.scenes import PROMPT, LabRobot, RecordedRobot, apart, drivable, pad
 from hma_model.simulate.session import Frame, Sampling, Session, jpeg
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
@@ -119,6 +119,12 @@ def test_a_recordings_truth_is_known_for_its_own_commands(
     assert other.advance(np.zeros(6, np.float32)) is not None
     followed = other.advance(None)
     assert followed is not None and followed[1] is None  # it was left
+
+
+def test_new_scenes_come_to_every_window_once_before_any_comes_again() -> None:
+    for count in range(1, 201):
+        assert {number * apart(count) % count for number in range(count)} == {*range(count)}
+        assert count < 16 or 0.35 < apart(count) / count < 0.65  # neighbours in number lie apart
 
 
 def test_a_robot_without_simulator_and_shards_of_another_model_are_refused(
