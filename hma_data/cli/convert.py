@@ -193,7 +193,7 @@ def convert(
             raise UsageError("--shard-index", "cannot be combined with --overwrite or --engine ray")
     elif shard_index is not None or shard_count is not None:
         raise UsageError("hma convert", "--shard-index and --shard-count belong together", "give both")
-    sound = _plan(job, json) if dry_run else _convert(job, json, extend, overwrite, share)
+    sound = _plan(job, json, share) if dry_run else _convert(job, json, extend, overwrite, share)
     raise typer.Exit(0 if sound else 1)
 
 
@@ -240,17 +240,18 @@ def _kept(job: _Job, overwrite: bool) -> str:
     return f"{human_count(shards, 'finished shard')} in {job.out} kept; {again}"
 
 
-def _plan(job: _Job, json: bool) -> bool:
+def _plan(job: _Job, json: bool, share: "Share | None") -> bool:
     robot = _ready(job)
     from hma_data.conversion.job import plan_conversion
-    from hma_data.conversion.plan import estimate
+    from hma_data.conversion.plan import estimate, idle_workers
     from hma_data.shards.manifest import cameras_line
     from hma_data.storage.remote import place
     from hma_data.tokenizers.base import get_tokenizer
 
     opened = get_tokenizer(job.tokenizer, weights=job.weights, device=job.device)
     plan, uri = plan_conversion(robot, job.source, opened, job.settings)
-    cost = estimate(plan, uri, robot, opened, job.workers)
+    tasks = share.count if share else 1
+    cost = estimate(plan, uri, robot, opened, job.workers, tasks)
     units = [{"shard": unit.name, "episodes": len(unit), "frames": unit.frames} for unit in plan.units]
     if json:
         print_json(
@@ -281,10 +282,13 @@ def _plan(job: _Job, json: bool) -> bool:
     if cost.seconds is None:
         print(f"time unknown, no episode could be read: {cost.fault}")
     else:
+        each = f" in each of {tasks} tasks" if tasks > 1 else ""
         print(
-            f"about {human_seconds(cost.seconds)} with --workers {job.workers}: one worker converts "
+            f"about {human_seconds(cost.seconds)} with --workers {job.workers}{each}: one worker converts "
             f"{cost.frames_per_second:,.0f} frames/s, measured on one episode"
         )
+    if idle := idle_workers(plan, len(units[share.index :: tasks] if share else units), job.workers, tasks):
+        print(idle)
     return True
 
 
@@ -312,10 +316,13 @@ def _ready(job: _Job) -> Any:
 @contextmanager
 def _shown(job: _Job) -> "Iterator[Callable[[Progress], None]]":
     with progress(f"convert {Path(job.embodiment).stem}") as update:
-        told = 0
+        told, idle = 0, ""
 
         def show(state: "Progress") -> None:
-            nonlocal told
+            nonlocal told, idle
+            if state.idle and not idle:
+                idle = state.idle
+                typer.echo(idle, err=True)
             for reason in state.retries[told:]:
                 typer.echo(f"again: a worker {reason}", err=True)
             told = len(state.retries)
@@ -331,7 +338,8 @@ def _report_share(done: "Shared", share: "Share", json: bool) -> None:
     if json:
         facts = {"shards_made": done.made_shards, "shards_kept": done.kept_shards}
         facts |= {"shards_missing": done.missing}
-        print_json({"out": str(done.out), **facts, "seconds": done.seconds})
+        told = {"changed": done.changed, "warning": done.warning}
+        print_json({"out": str(done.out), **facts, **told, "seconds": done.seconds})
         return
     said = "all shards are there, the manifest is written"
     if done.missing:
@@ -341,6 +349,15 @@ def _report_share(done: "Shared", share: "Share", json: bool) -> None:
         f"{done.out}: share {share.name} made {human_count(done.made_shards, 'shard')} "
         f"({done.kept_shards} were there already), {human_seconds(done.seconds)}; {said}"
     )
+    _print_changes(done)
+
+
+def _print_changes(done: "Shared | Summary") -> None:
+    """Print what of the YAML is new in a finished set, and the fault of its rate, a line each."""
+    if done.changed:
+        print(done.changed)
+    if done.warning:
+        typer.echo(f"warning: {done.warning}", err=True)
 
 
 def _print_left_out(count: int) -> None:
@@ -367,6 +384,8 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
                 "pictures": summary.pictures,
                 "flags": summary.flags,
                 "left_out": summary.left_out,
+                "changed": summary.changed,
+                "warning": summary.warning,
                 "reasons": summary.reasons,
                 "too_many_quarantined": summary.too_many,
             }
@@ -380,6 +399,7 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
         if summary.flags:
             counts = [f"{count:,} {flag_words(name)}" for name, count in summary.flags.items()]
             print(f"flags: {', '.join(counts)}")
+        _print_changes(summary)
     for reason, count in sorted(summary.reasons.items(), key=lambda item: -item[1])[:SHOWN]:
         typer.echo(f"quarantine: {count:,} × {reason}", err=True)
     if summary.too_many:

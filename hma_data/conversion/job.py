@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hma_data.conversion.engines import LIMITS, RESOURCES, Limits, Resources, Retry
+from hma_data.conversion.engines.local import end_worker_that_starts_workers
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.extend import content_of, extended
 from hma_data.conversion.output import (
@@ -32,15 +33,17 @@ from hma_data.conversion.output import (
     refuse_other,
     remove_notes,
 )
-from hma_data.conversion.plan import Plan, Settings, ShardUnit, make_plan
+from hma_data.conversion.plan import Plan, Settings, ShardUnit, idle_workers, make_plan
 from hma_data.conversion.publish import HubOutput
 from hma_data.conversion.worker import Job, MakeWork, Seen, Tick
+from hma_data.episodes.align import OFF_RATE
 from hma_data.errors import OutputError, RegistryError, SourceError, StorageAwayError, UsageError
+from hma_data.inspection.shard_rate import rate_finding
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, finish, shard_sizes
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import RowLayout, flag_totals, to_numpy
-from hma_data.sources.base import EpisodeRef, of_another_format, open_source
+from hma_data.sources.base import EpisodeRef, of_another_format, open_source, require_utf8
 from hma_data.sources.common.choice import chosen_ids, ids_for_robot
 from hma_data.storage.files import remove_parts
 from hma_data.storage.paths import StrPath, as_text
@@ -51,7 +54,11 @@ from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
 @dataclass
 class Progress:
-    """The progress of a conversion, as the console shows it."""
+    """The progress of a conversion, as the console shows it.
+
+    Attributes:
+        idle: a line for the user where workers have no shard to make, see `idle_workers`; else empty.
+    """
 
     episodes: int = 0
     frames: int = 0
@@ -62,6 +69,7 @@ class Progress:
     total_frames: int = 0
     retries: list[str] = field(default_factory=list)
     pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
+    idle: str = ""
     started: float = field(default_factory=time.monotonic)
 
 
@@ -76,6 +84,8 @@ class Summary:
         pictures: camera -> (height, width) of its recorded pictures; empty if no shard was made.
         left_out: number of the recording's episodes that `only` and `exclude` leave out.
         too_many: True where more than `max_quarantine` was refused; the command ends with exit code 1.
+        changed: what the YAML says now that a finished set did not say yet; empty if nothing.
+        warning: the fault of a rate that the recordings do not have; empty if there is none.
     """
 
     out: Path
@@ -88,6 +98,8 @@ class Summary:
     too_many: bool
     pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
     left_out: int = 0
+    changed: str = ""
+    warning: str = ""
 
 
 @dataclass(frozen=True)
@@ -96,6 +108,7 @@ class Shared:
 
     Attributes:
         missing: number of shards that other shares have still to make.
+        changed, warning: see `Summary`; empty for a share that does not finish the set.
     """
 
     out: Path
@@ -103,6 +116,8 @@ class Shared:
     made_shards: int
     missing: int
     seconds: float
+    changed: str = ""
+    warning: str = ""
 
 
 def plan_conversion(
@@ -114,6 +129,7 @@ def plan_conversion(
         raise UsageError("--source", "is empty", "name a recording, or leave it out to take the YAML's")
     if not uri:
         raise RegistryError(f"embodiment {embodiment.id}", "names no source.uri", "give --source URI")
+    require_utf8(uri)
     if embodiment.frequency_hz == "unknown":
         _ = embodiment.rate_hz  # raises, and says what to do
     form = embodiment.source.format
@@ -157,7 +173,8 @@ def convert(
         embodiment: the robot.
         source: str or path of the recording, or its URI; None takes the one in the embodiment's YAML.
         tokenizer: name, see `get_tokenizer`; or one that is open already, for work in this process.
-        workers: processes, which may crash or hang without ending the job; 0 works in this one.
+        workers: processes, which may crash or hang without ending the job; 0 works in this one. Each imports
+            the script that calls this, so the call must stand under `if __name__ == "__main__":`.
         out: str or path of the folder, or its URI.
         engine: what runs the workers: this machine, or a Ray cluster.
         weights, device: of the tokenizer; the weights as str or path.
@@ -171,8 +188,10 @@ def convert(
     Raises:
         OutputError: `out` holds something else, or another job is writing it.
         SourceError: the recording cannot be read, or not one of its episodes can be used.
-        HMAError: the embodiment or the tokenizer cannot be used.
+        HMAError: the embodiment or the tokenizer cannot be used; or a script converts with workers outside of
+            `if __name__ == "__main__":`.
     """
+    end_worker_that_starts_workers(workers)
     begun, out = time.monotonic(), place(out)
     hub = HubOutput.of(out)
     folder = hub.staging if hub else out
@@ -204,13 +223,14 @@ def convert(
             worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
             told = "; ".join(f"{count} × {reason}" for reason, count in worst)
             raise SourceError(conversion.uri, f"gave no usable episode, so nothing was written: {told}")
+        warning = _rate_warning(folder, out) if OFF_RATE in flags else ""
         if hub:
             hub.upload()
     episodes = sum(split["episodes"] for split in manifest.splits.values())
     too_many = manifest.quarantined > max_quarantine * (episodes + manifest.quarantined)
     seconds = time.monotonic() - begun
-    shown, left_out = conversion.pictures, conversion.left_out
-    return Summary(out, manifest, done, made, seconds, reasons, flags, too_many, shown, left_out)
+    more = conversion.pictures, conversion.left_out, conversion.changed, warning
+    return Summary(out, manifest, done, made, seconds, reasons, flags, too_many, *more)
 
 
 def convert_share(
@@ -232,6 +252,7 @@ def convert_share(
 
     The bytes are those that `convert` alone would write. The arguments are those of `convert`.
     """
+    end_worker_that_starts_workers(workers)
     begun, out = time.monotonic(), place(out)
     conversion = _Conversion(
         embodiment, source, tokenizer, out, settings or Settings(), workers, weights, device, limits
@@ -239,13 +260,15 @@ def convert_share(
     with locked(out, share):
         plan, base = conversion.plan(extend)
         done, made = conversion.make(plan, base, share, on_progress)
-    missing = len({unit.name for unit in plan.units} - shard_sizes(out).keys())
+    missing, warning = len({unit.name for unit in plan.units} - shard_sizes(out).keys()), ""
     if not missing:
         with suppress(OutputError), locked(out):  # others are still writing: the last of them finishes
             missing = len(plan.units) - len(finished_shards(out, plan, base, shared=False))
             if not missing:
-                conversion.finish(plan, base, True)
-    return Shared(out, done, made, missing, time.monotonic() - begun)
+                # A journal shows that some share has made shards since the manifest was written.
+                conversion.finish(plan, base, bool(made or known_hashes(out)))
+                warning = _rate_warning(out, out)
+    return Shared(out, done, made, missing, time.monotonic() - begun, conversion.changed, warning)
 
 
 @dataclass
@@ -273,6 +296,7 @@ class _Conversion:
             self.workers = 0  # no other process sees them
         self._whole, self.uri = plan_conversion(self.embodiment, self.source, self._opened, self.settings)
         self.pictures: dict[str, tuple[int, int]] = {}
+        self.changed = ""
 
     @property
     def left_out(self) -> int:
@@ -283,8 +307,13 @@ class _Conversion:
         """Return the plan, and the manifest it extends or None.
 
         A set that was extended before can be continued without `extend`.
+
+        Raises:
+            OutputError: the rows of a strided set are of another stride, or `extended` refuses the set.
         """
         base = base_manifest(self.out)
+        if base is not None:
+            self._check_stride(base)
         if base is None or not (extend or "extends" in base.plan):
             return self._whole, None
         source = open_source(self.embodiment.source.format)
@@ -297,6 +326,19 @@ class _Conversion:
             fault = f"lacks {plan.episodes:,} episodes that the recording has now"
             raise OutputError(self.out, fault, "--extend adds them")
         return plan, base
+
+    def _check_stride(self, base: Manifest) -> None:
+        """Refuse another stride for a strided set; its rows hold the action chunks of one stride."""
+        if self.settings.frames != "strided" or base.plan.get("frames") != "strided":
+            return
+        stride, same = base.frame_stride, base.plan.get("embodiment_hash") == self.embodiment.digest
+        if not same or stride == self.embodiment.stride:
+            return  # what else differs is told where the plans are compared
+        fault = (
+            f"has rows of stride {stride} (--frames strided), the YAML gives stride {self.embodiment.stride}"
+        )
+        remedy = f"set stride: {stride} in the YAML, choose another --out, or --overwrite to start anew"
+        raise OutputError(self.out, fault, remedy)
 
     def make(
         self, plan: Plan, base: Manifest | None, share: Share | None, on_progress: Callable[[Progress], None]
@@ -315,6 +357,9 @@ class _Conversion:
             total_frames=_encoded(mine, layout),
             pictures=self.pictures,
         )
+        if todo or (plan.units and not mine):  # a share may have no shard at all
+            tasks = share.count if share else 1
+            progress.idle = idle_workers(plan, len(todo), self.workers, tasks, bool(there))
         on_progress(progress)
         if todo:
             with Journal(self.out, share) as journal:
@@ -344,16 +389,24 @@ class _Conversion:
         return run_local(todo, make_work, self.workers, on_event, self.limits)
 
     def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Manifest:
-        """Return the manifest; write it and the other files derived from footers, unless nothing changed."""
+        """Return the manifest; write it and the other files derived from footers, unless nothing changed.
+
+        Args:
+            changed: True where shards may have been made. A finished set is written anew too where the YAML
+                has changed: its shards stay, and readers take target_hz and stride from the manifest.
+        """
         out = self.out
         remove_parts(out)  # of workers that died
-        if not changed and (out / MANIFEST).is_file():
-            manifest = Manifest.load(out)
-            if not damaged_files(out, manifest):
-                remove_notes(out)
-                return manifest
+        before = Manifest.load(out) if (out / MANIFEST).is_file() else None
         kept = base.shards if base else ()
-        names = [*(shard.path for shard in kept), *(unit.name for unit in plan.units)]
+        if before is not None:
+            self.changed = _change(before.embodiment, self.embodiment)
+            if not changed and not damaged_files(out, before):
+                if not self.changed and before.plan["hash"] == plan.facts["hash"]:
+                    remove_notes(out)
+                    return before
+                kept = before.shards  # their hashes are known
+        names = list(dict.fromkeys([*(shard.path for shard in kept), *(unit.name for unit in plan.units)]))
         manifest = finish(
             out,
             names,
@@ -371,6 +424,26 @@ def _encoded(units: Sequence[ShardUnit], layout: RowLayout) -> int:
     """Return the number of frames to encode: of every camera, and with --frames strided only the grid's."""
     rows = sum(int((to_numpy(unit.refs.column("frames")) // layout.frame_stride).sum()) for unit in units)
     return rows * len(layout.cameras)
+
+
+def _change(before: Embodiment, now: Embodiment) -> str:
+    """Return what of the YAML has changed, in words; empty if it is the same."""
+    old, new = before.to_dict(), now.to_dict()
+    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+    if not keys:
+        return ""
+    with suppress(RegistryError):  # nobody states the rate
+        if before.stride != now.stride:
+            said = f"stride {before.stride} → {now.stride}: the model now sees {now.effective_hz:g} Hz"
+            others = [key for key in keys if key not in ("target_hz", "stride", "provenance")]
+            return said + (f"; also new from the YAML: {', '.join(others)}" if others else "")
+    return f"new from the YAML: {', '.join(keys)}"
+
+
+def _rate_warning(folder: Path, out: Path) -> str:
+    """Return the fault and the remedy where episodes have another rate than the YAML states; else empty."""
+    finding = rate_finding(ShardSet(folder))
+    return f"{out}: {finding}" if finding else ""
 
 
 def _reasons(out: Path) -> dict[str, int]:

@@ -18,6 +18,7 @@ from hma_data.conversion.extend import hashes, ways
 from hma_data.conversion.plan import Plan, differences
 from hma_data.errors import HMAError, OutputError, StorageAwayError
 from hma_data.shards.manifest import (
+    BESIDE,
     EMBODIMENT,
     EPISODES,
     MANIFEST,
@@ -106,23 +107,30 @@ def _lock(path: Path, kind: int) -> Iterator[None]:
 
 
 def clear(out: Path) -> None:
-    """Empty a folder that holds a shard set.
+    """Delete the shard set of a folder; keep what lies beside it.
+
+    The next `hma hub push-data` writes README.md anew, but it may also be the user's own.
 
     Raises:
-        OutputError: it holds something else.
+        OutputError: the folder holds something else.
     """
     _refuse_foreign(out)
     if isinstance(out, RemotePath):
-        out.delete_tree()
+        for name in out.listing().keys() - BESIDE:
+            (out / name).unlink(missing_ok=True)
         return
     for item in out.iterdir():
-        if not item.name.startswith(LOCK):
+        if item.name not in BESIDE and not item.name.startswith(LOCK):
             shutil.rmtree(item) if item.is_dir() else item.unlink()
 
 
 def _refuse_foreign(out: Path) -> None:
-    names = {item.name for item in out.iterdir()} - OURS
+    names = {item.name for item in out.iterdir()} - OURS - BESIDE
     foreign = sorted(name for name in names if not (name.endswith(PART) or name.startswith(WORKING)))
+    if foreign and (out / MANIFEST).is_file():
+        what, them = ("a file that is", "it") if len(foreign) == 1 else ("files that are", "them")
+        fault = f"holds {what} not of the set: {', '.join(foreign[:3])}"
+        raise OutputError(out, fault, f"move {them} out")
     if foreign:
         fault = f"is not a shard set: it holds {', '.join(foreign[:3])}"
         raise OutputError(out, fault, "choose an empty or new --out")

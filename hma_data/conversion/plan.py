@@ -9,6 +9,7 @@ stream that is not stored still limits the time at which every stream runs.
 """
 
 import hashlib
+import heapq
 import json
 import math
 import time
@@ -23,6 +24,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from hma_data.console import human_count
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepare
@@ -36,6 +38,7 @@ from hma_data.storage.records import BATCH, Records, schema_of, values_of
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 
 FRAMES, TRIED = 64, 5  # of an estimate: pictures tokenized, episodes tried
+SHARDS_A_WORKER = 4  # so that the last shards of a job do not leave most workers waiting
 SMALLEST_SHARD, LARGEST_SHARD, SHARDS_WANTED = 4_096, 170_000, 32  # frames; 170,000 are about 100 MB
 
 
@@ -363,7 +366,7 @@ class Estimate:
     Attributes:
         bytes: of all shards.
         frames_per_second: of one worker, decoding included; None when no episode could be read.
-        seconds: in all, with the requested number of workers; None when no episode could be read.
+        seconds: until the last worker ends; None when no episode could be read.
         fault: why no episode could be read.
         pictures: camera -> [height, width] of its recorded pictures.
     """
@@ -376,9 +379,14 @@ class Estimate:
 
 
 def estimate(
-    plan: Plan, uri: StrPath, embodiment: Embodiment, tokenizer: Tokenizer, workers: int
+    plan: Plan, uri: StrPath, embodiment: Embodiment, tokenizer: Tokenizer, workers: int, tasks: int = 1
 ) -> Estimate:
-    """Estimate a conversion: tokenize some frames of the first readable episode, and scale up."""
+    """Estimate a conversion: tokenize some frames of the first readable episode, and scale up.
+
+    Args:
+        workers: of each task.
+        tasks: jobs that share the shards, see `output.Share`; all run at the same time.
+    """
     layout = RowLayout.of_plan(plan.facts, embodiment)
     rows = plan.frames // layout.frame_stride
     size = int(rows * bytes_a_row(layout))
@@ -394,10 +402,47 @@ def estimate(
                 tokenizer.encode(prepare(raw, embodiment.camera(name), spec.image_size, spec.resize_filter))
                 pictures[name] = (raw.shape[1], raw.shape[2])
             rate = len(kept) / (time.monotonic() - begun)
-            return Estimate(size, rate, rows / rate / max(workers, 1), pictures=pictures)
+            slowest = longest_work([unit.frames for unit in plan.units], workers, tasks)
+            return Estimate(size, rate, slowest / layout.frame_stride / rate, pictures=pictures)
         except HMAError as refused:
             fault = str(refused)
     return Estimate(size, None, None, fault)
+
+
+def longest_work(frames: Sequence[int], workers: int, tasks: int = 1) -> int:
+    """Return the frames of the worker that has most, where each takes the next shard when it is free.
+
+    Args:
+        frames: of every shard, in the order of the plan.
+        workers, tasks: see `estimate`.
+    """
+    longest = 0
+    for task in range(min(tasks, len(frames))):
+        mine = frames[task::tasks]
+        busy = [0] * max(1, min(workers, len(mine)))
+        for shard in mine:
+            heapq.heapreplace(busy, busy[0] + shard)
+        longest = max(longest, *busy)
+    return longest
+
+
+def idle_workers(plan: Plan, todo: int, workers: int, tasks: int = 1, begun: bool = False) -> str:
+    """Return a line for the user where workers have no shard to make; empty where every worker has one.
+
+    Args:
+        todo: number of shards that this task has to make.
+        workers, tasks: see `estimate`.
+        begun: whether shards of the plan are there: then their size can no longer be chosen.
+    """
+    if todo >= workers:
+        return ""
+    shards = human_count(todo, "shard") + (" left" if begun else "") + (" of this task" if tasks > 1 else "")
+    line = f"{shards}: {todo} of {workers} workers {'has' if todo == 1 else 'have'} work"
+    shortest = min((int(to_numpy(unit.refs.column("frames")).min()) for unit in plan.units), default=0)
+    size = max(plan.frames // (tasks * workers * SHARDS_A_WORKER), shortest, 1)
+    if begun or not any(unit.frames > size for unit in plan.units if len(unit) > 1):
+        return line  # a shard holds whole episodes
+    return f"{line}; --shard-frames {size}{' in every task' if tasks > 1 else ''} gives more"
 
 
 def bytes_a_row(layout: RowLayout) -> float:

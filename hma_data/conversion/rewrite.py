@@ -324,7 +324,7 @@ def _check_out(out: StrPath, folders: Sequence[StrPath]) -> None:
 
 def _stateless(shards: ShardSet) -> Embodiment:
     values = {key: value for key, value in shards.embodiment.to_dict().items() if key != "state"}
-    return Embodiment.from_values(values, f"embodiment {shards.embodiment.id}")
+    return Embodiment.from_values(values, f"embodiment {shards.embodiment.id}", stored=True)
 
 
 def _check_alike(first: ShardSet, other: ShardSet) -> None:

@@ -26,6 +26,7 @@ from hma_data.conversion.extend import Content, kept_frames
 from hma_data.conversion.output import Made
 from hma_data.conversion.plan import ShardUnit, camera_fault, read_clip
 from hma_data.cpu import usable_cores
+from hma_data.episodes.align import rate_flags
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import PictureCheck, picture_flags, prepared
 from hma_data.errors import (
@@ -172,7 +173,7 @@ class _Episode:
         read: whether all its pictures are in the queue, or encoded.
         waiting: frames that are in the queue.
         tokens: camera -> tokens of the frames that are encoded.
-        flags: of its pictures, see `picture_flags`.
+        flags: of its grid and its pictures, see `rate_flags` and `picture_flags`.
     """
 
     index: int
@@ -232,7 +233,7 @@ def _episode(
     clip = read_clip(source, job.source, ref.id, job.embodiment, layout.cameras)
     kept = kept_frames(clip, layout)
     content = Content(clip, kept)
-    episode = _Episode(index, ref, clip, content)
+    episode = _Episode(index, ref, clip, content, flags=rate_flags(clip, job.embodiment))
     yield episode
     for name in layout.cameras:
         camera, stream = job.embodiment.camera(name), clip.episode.streams[name]

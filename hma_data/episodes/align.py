@@ -20,10 +20,12 @@ from hma_data.episodes.episode import Clip, Episode, Floats, Known, Signal
 from hma_data.episodes.rotations import between
 from hma_data.errors import AlignmentError, EpisodeError
 from hma_data.registry.components import Component, Sync
-from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.embodiment import ONE_INDEX, Embodiment
 
 Moved = tuple[NDArray[np.int64], Floats]
 Timed = tuple[str, Floats, str, float]  # name, times, method and tolerance in seconds of a stream
+RATE_TOLERANCE = 0.1  # share of the stated rate by which the measured one may differ
+OFF_RATE = "off_rate_frames"  # the flag of an episode whose grid has another rate
 ROUNDING_S = 1e-7  # the error of periods added up over hours; far below any sensor's interval
 
 
@@ -293,3 +295,29 @@ def _check_skew(episode_id: str, skew: dict[str, Floats], limit_ms: float, sync:
             off, time = values[worst], grid[worst] - grid[0]
             fault = f"{name} is {off:.1f} ms off at {time:.3f} s; sync.max_skew_ms is {sync.max_skew_ms:g}"
             raise AlignmentError(episode_id, fault, "raise max_skew_ms, or leave the episode in quarantine")
+
+
+# -- the rate of a grid
+
+
+def measured_hz(steps: Floats) -> float | None:
+    """Return the rate of a grid in Hz from its steps (N,) in seconds: that of the median one, if above 0."""
+    period = float(np.median(steps)) if len(steps) else 0.0
+    return 1 / period if period > 0 else None
+
+
+def is_off_rate(hz: float, embodiment: Embodiment) -> bool:
+    """Check whether the measured rate of a grid differs from the one that the embodiment states, if any."""
+    stated = embodiment.sync.rate_hz or embodiment.frequency_hz
+    return isinstance(stated, float) and abs(hz / stated - 1) > RATE_TOLERANCE
+
+
+def rate_flags(clip: Clip, embodiment: Embodiment) -> dict[str, int]:
+    """Return OFF_RATE -> number of frames where a clip's grid is off the embodiment's rate; else nothing."""
+    hz = measured_hz(np.diff(clip.timestamps))
+    return {OFF_RATE: len(clip)} if hz and is_off_rate(hz, embodiment) else {}
+
+
+def rate_remedy(embodiment: Embodiment) -> str:
+    """Return what to correct in the YAML where `is_off_rate`."""
+    return "correct frequency_hz" + ("" if embodiment.source.format in ONE_INDEX else ", or sync.rate_hz")

@@ -21,6 +21,8 @@ MAX_PIXELS = 64_000_000  # a picture that claims more is a decompression bomb or
 FINE, COARSE = (16, 16), (8, 8)  # blocks
 BLANK = 8  # levels from the darkest to the brightest coarse block: 3 % of full scale
 STILL = 4  # levels by which a fine block changes
+BT601, OTHER_MATRICES = 5, (1, 7, 9)  # FFmpeg's AVCOL_SPC: BT.709, SMPTE 240M and BT.2020 differ from BT.601
+LIMITED, FULL = 1, 2  # FFmpeg's AVCOL_RANGE: luma of 16 to 235, or of 0 to 255
 
 
 def opencv() -> Any:
@@ -59,6 +61,43 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
     if picture is None:
         raise EpisodeError(where, f"a picture of {len(buffer)} bytes cannot be decoded{fault}")
     return picture
+
+
+class FrameToRGB:
+    """A converter of PyAV's video frames to RGB, by the matrix and range that they state; one serves many.
+
+    A frame that states none is BT.601 in the range of its pixel format, as FFmpeg has it.
+    """
+
+    def __init__(self) -> None:
+        from av.video.reformatter import VideoReformatter
+
+        # Two, because FFmpeg keeps the matrix of the frame before, and a video may change what it states.
+        self._usual, self._stated = VideoReformatter(), VideoReformatter()
+
+    def __call__(self, frame: Any) -> Any:
+        """Return the frame as one of PyAV in rgb24."""
+        full = frame.color_range == FULL
+        if not (full or frame.colorspace in OTHER_MATRICES) or _has_usual_colours(frame, full):
+            return self._usual.reformat(frame, format="rgb24")
+        matrix = int(frame.colorspace) if frame.colorspace in OTHER_MATRICES else BT601
+        return self._stated.reformat(
+            frame,
+            format="rgb24",
+            src_colorspace=matrix,
+            # RGB has no matrix, but PyAV applies that of the frame only where the two differ.
+            dst_colorspace=BT601 if matrix != BT601 else OTHER_MATRICES[0],
+            src_color_range=FULL if full else LIMITED,
+            dst_color_range=FULL,
+        )
+
+
+def _has_usual_colours(frame: Any, full: bool) -> bool:
+    """Check whether FFmpeg converts a frame the same with and without what it states: RGB, grey, "yuvj"."""
+    kind = frame.format
+    if kind.is_rgb or len(kind.components) < 3:
+        return True
+    return full and kind.name.startswith("yuvj") and frame.colorspace not in OTHER_MATRICES
 
 
 def prepare(

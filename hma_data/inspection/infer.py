@@ -34,7 +34,7 @@ from hma_data.inspection.infer_choices import (
 from hma_data.registry.catalog import entries
 from hma_data.registry.components import Space
 from hma_data.registry.embodiment import ID_PATTERN, TODO, Embodiment, find
-from hma_data.sources.base import Inspection, KeyInfo, detect, open_source
+from hma_data.sources.base import Inspection, KeyInfo, detect, open_source, require_utf8
 from hma_data.storage.paths import StrPath
 
 LINE = 110
@@ -85,12 +85,14 @@ def infer(uri: StrPath, embodiment_id: str) -> str:
 
     Raises:
         UsageError: `embodiment_id` is not an id.
-        SourceError: the recording cannot be read, or has no camera or nothing that could be an action.
+        SourceError: the recording cannot be read, has a name that is not UTF-8, or has no camera or nothing
+            that could be an action.
     """
     if not ID_PATTERN.fullmatch(embodiment_id) or ".." in embodiment_id:
         raise UsageError(
             "--id", f"{embodiment_id!r} is not an id", "use a-z 0-9 _ - . and begin with a letter or digit"
         )
+    require_utf8(uri)
     return from_inspection(open_source(detect(uri)).inspect(uri), embodiment_id)
 
 
@@ -295,7 +297,9 @@ class _Draft:
         said = {"frequency_hz": self._rate_from() if self.hz else f"{TODO}: who says so?"}
         if self._target() != TARGET_HZ:
             length = f"{statistics.median(self.found.lengths):g} steps"
-            said["target_hz"] = f"so that a model sees {SHOWN} frames of an episode of {length}, if it has them"
+            said["target_hz"] = (
+                f"so that a model sees {SHOWN} frames of an episode of {length}, if it has them"
+            )
         if self.action.question:
             said["action"] = f"{TODO}: {self.action.question}"
         if self.seen.question:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.align import hold, matched, to_clip
+from hma_data.episodes.align import hold, is_off_rate, matched, measured_hz, rate_remedy, to_clip
 from hma_data.episodes.episode import Clip, Floats
 from hma_data.episodes.images import describe_resize
 from hma_data.episodes.offset import Offset, measure
@@ -122,7 +122,7 @@ def _fit(
         height, width = sizes[camera.name]
         said = describe_resize(camera, height, width, SQUARE)
         facts[f"camera {camera.name}"] = said.removeprefix(f"{camera.name}: ")
-    hz = _median_hz(np.diff(clip.timestamps))
+    hz = measured_hz(np.diff(clip.timestamps))
     facts["rate on the grid"] = f"{hz:.3g} Hz" if hz else "unknown"
     for stream, skew in clip.skew_ms.items():
         p50, p95, most = np.percentile(skew, [50, 95, 100])
@@ -130,9 +130,10 @@ def _fit(
     for key, (offset, finding) in judged([clip], robot).items():
         facts[f"commands {key}"] = offset.measured
         found += [finding] if finding else []
-    if hz and isinstance(robot.frequency_hz, float) and abs(hz / robot.rate_hz - 1) > 0.1:
+    if hz and is_off_rate(hz, robot):
         said = f"{robot.id} says {robot.rate_hz:g} Hz, the recording's grid ticks at {hz:.3g} Hz"
-        found.append(Finding("rate", "error", said, numbers={"hz": hz, "stated_hz": robot.rate_hz}))
+        numbers = {"hz": hz, "stated_hz": robot.rate_hz}
+        found.append(Finding("rate", "error", said, numbers=numbers))
     constant = _constant(clip.actions.std(axis=0), robot)
     return facts | ({"constant in it": "action " + ", ".join(constant)} if constant else {})
 
@@ -144,11 +145,6 @@ def _alike(robot: Embodiment, inspection: Inspection) -> str:
     missing = [key for key in wanted if key not in known and not key.startswith("/")]
     near = [alike for key in missing for alike in get_close_matches(key, known, n=2)]
     return f" (recorded keys like it: {', '.join(near)})" if near else ""
-
-
-def _median_hz(steps: NDArray[np.float64]) -> float | None:
-    period = float(np.median(steps)) if len(steps) else 0.0
-    return 1 / period if period > 0 else None
 
 
 def _constant(deviations: NDArray[Any], robot: Embodiment) -> list[str]:
@@ -329,10 +325,10 @@ def _episodes(
 
 def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
     steps = np.concatenate([np.diff(clip.timestamps) for clip in clips])
-    hz = _median_hz(steps)
-    if hz and abs(robot.rate_hz / hz - 1) > 0.1:
+    hz = measured_hz(steps)
+    if hz and is_off_rate(hz, robot):
         said = f"the grid ticks at {hz:.3g} Hz, the YAML says {robot.rate_hz:g}"
-        yield Finding("rate", "error", said, "correct frequency_hz, or sync.rate_hz")
+        yield Finding("rate", "error", said, rate_remedy(robot))
     if hz and (steps > 3 / hz).any():
         yield Finding(
             "gaps",
@@ -381,6 +377,7 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
 
 def _shard_set(folder: Path) -> Iterator[Finding]:
     from hma_data.inspection.shard_pictures import shard_picture_findings
+    from hma_data.inspection.shard_rate import rate_finding
     from hma_data.shards.reader import ShardSet
     from hma_data.shards.verify import verify
     from hma_data.shards.windows import WindowIndex
@@ -407,4 +404,6 @@ def _shard_set(folder: Path) -> Iterator[Finding]:
     deviations = np.asarray(manifest.stats["action"]["std"], np.float64)
     if constant := _constant(deviations, manifest.embodiment):
         yield Finding("constant", "warn", f"never change: {', '.join(constant)}")
+    if off_rate := rate_finding(shards):
+        yield off_rate
     yield from shard_picture_findings(ShardSet(folder))

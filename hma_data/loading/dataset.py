@@ -52,7 +52,8 @@ def open_sets(data: Sequence[StrPath | ShardSet], cameras: Cameras = FIRST) -> d
         name = shards.embodiment.id
         if name in sets:
             fault = f"has embodiment {name}, and so has {sets[name].folder}"
-            raise ShardError(shards.folder, fault, "give each embodiment once")
+            remedy = "give each embodiment once; hma shards merge makes one set of several"
+            raise ShardError(shards.folder, fault, remedy)
         Views.of(shards, cameras)
         sets[name] = shards
     if not sets:

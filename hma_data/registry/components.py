@@ -157,7 +157,7 @@ class Camera(SpecModel):
         None, description="applied before rotate; vertical: rows are stored from bottom to top"
     )
     crop: tuple[Start, Start, Positive, Positive] | None = Field(
-        None, description="[x, y, width, height] in source pixels"
+        None, description="[x, y, width, height] in pixels, after flip and rotate"
     )
     stamp: Literal["header", "receive"] | None = Field(None, description="as `sync.stamp`, for this alone")
     levels: tuple[Number, Number] | None = Field(
@@ -178,7 +178,7 @@ class Sync(SpecModel):
         None, description="the camera whose frames are the grid; the first by default"
     )
     rate_hz: Number | None = Field(
-        None, gt=0, le=100_000, description="a fixed grid instead of a camera's frames"
+        None, gt=0, le=100_000, description="a fixed grid instead of a camera's frames; for bags and videos"
     )
     images: Method = Field("nearest", description="which picture a time gets")
     actions: Method = Field("hold", description="which command a time gets")

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 ID_PATTERN = re.compile(r"[a-z0-9][a-z0-9_.-]{0,99}")
 TODO = "TODO"
+ONE_INDEX = ("rlds", "hdf5", "lerobot")  # formats in which frame i, action i and state i belong together
 # The fields that decide the content of shards. target_hz and stride act later, when windows are drawn.
 _DECIDES: Any = {
     "id": True,
@@ -124,6 +125,13 @@ class Embodiment(SpecModel):
         sync = info.data.get("sync")
         if sync and sync.action_shift and value.format == "rosbag":
             raise ValueError("a bag has times instead of steps, which sync.action_shift counts")
+        stored = info.context and info.context["stored"]
+        if sync and sync.rate_hz and value.format in ONE_INDEX and not stored:
+            raise ValueError(
+                f"frames of format {value.format} are not resampled to sync.rate_hz, which is for bags and "
+                "videos of hands; remove it: frequency_hz states the recording's rate, target_hz what the "
+                "model sees"
+            )
         return value
 
     # -- derived facts
@@ -145,7 +153,9 @@ class Embodiment(SpecModel):
         if isinstance(self.frequency_hz, float):
             return self.frequency_hz
         stated = self.provenance.get("frequency_hz", "nobody states it")
-        fault = f"is unknown ({stated})" if self.frequency_hz else "is null, and so is sync.rate_hz"
+        fault = "is null" if self.source.format in ONE_INDEX else "is null, and so is sync.rate_hz"
+        if self.frequency_hz:
+            fault = f"is unknown ({stated})"
         raise RegistryError(
             f"embodiment {self.id}: frequency_hz",
             fault,
@@ -241,8 +251,8 @@ class Embodiment(SpecModel):
 
         Args:
             path: str or path of the YAML.
-            stored: the YAML lies in shards or a checkpoint; keys of `source.layout` that older releases
-                ignored are ignored.
+            stored: the YAML lies in shards or a checkpoint; keys of `source.layout`, and a `sync.rate_hz`,
+                that older releases ignored are no error.
 
         Raises:
             RegistryError: the file has problems; the error lists them all, each with YAML path, value and

@@ -22,8 +22,10 @@ from numpy.typing import NDArray
 from hma_data.cpu import usable_cores
 from hma_data.errors import HMAError
 from hma_data.shards.manifest import (
+    BESIDE,
     EMBODIMENT,
     EPISODES,
+    FINDER,
     MANIFEST,
     QUARANTINE,
     SPLITS,
@@ -45,7 +47,6 @@ from hma_data.storage.remote import parquet_file, parquet_input, place
 
 REMAKE = "delete it and run the same hma convert again"
 KNOWN = {"action": "action_known", "state": "state_known"}  # bool columns of sets whose values can be missing
-BESIDE = {"README.md", ".gitattributes"}  # files that a hub adds
 OnProgress = Callable[[int, int], None]
 
 
@@ -332,6 +333,8 @@ def _foreign(folder: Path, manifest: Manifest) -> Iterator[str]:
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if name in known or name.startswith(WORKING) or (path.is_dir() and name in SPLITS):
+            continue
+        if path.name == FINDER:
             continue
         if path.name.endswith(PART):
             yield f"{path}: is left of a job that runs or was killed — run the same hma convert again"

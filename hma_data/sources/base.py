@@ -299,6 +299,16 @@ def require_there(uri: StrPath) -> None:
         local_path(uri)
 
 
+def require_utf8(uri: StrPath) -> None:
+    """Raise SourceError if a recording's path is not UTF-8 text: YAML files and shards could not state it."""
+    text = as_text(uri)
+    try:
+        text.encode()
+    except UnicodeEncodeError as fault:
+        shown = text.encode(errors="backslashreplace").decode()
+        raise SourceError(shown, "its name is not UTF-8 text", "rename it") from fault
+
+
 def _of_toolkit() -> Recognitions:
     return {name: import_module(package).RECOGNITION for name, package in FORMATS.items()}
 

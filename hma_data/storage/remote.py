@@ -265,11 +265,6 @@ class RemotePath(PosixPath):
         if self.scheme not in WHOLE_PUTS:
             attempt(self, "made", lambda: self.files.makedirs(self.key, exist_ok=True))
 
-    def delete_tree(self) -> None:
-        """Delete every file below."""
-        for name in self.listing():
-            (self / name).unlink(missing_ok=True)
-
 
 # -- writing
 

@@ -7,6 +7,7 @@ when its parent ends, for whatever reason.
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +23,7 @@ from hma_data.errors import HMAError
 CRASHES = {"SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGSYS"}  # signals of a process's own faults
 TICK_S = 0.5
 START_FAILURES = 10  # limit of processes in a row that end before they are ready
+UNGUARDED = 86  # exit code of a worker that would start workers while it imports the script of its parent
 
 
 def run(
@@ -40,6 +42,7 @@ def run(
     Raises:
         HMAError: a unit failed for a reason that is not its data, or its worker died too often.
     """
+    end_worker_that_starts_workers(workers)
     if workers < 1:
         work = make_work(1)
         for number, unit in enumerate(units):
@@ -56,6 +59,16 @@ def run(
             raise ledger.failures[0]
     finally:
         pool.close()
+
+
+def end_worker_that_starts_workers(workers: int) -> None:
+    """End this process if it is a worker that still imports its parent's script, and that asks for workers.
+
+    A spawned process imports the script that started it. Where the script converts outside of
+    `if __name__ == "__main__":`, each worker would convert again. The exit code tells the parent.
+    """
+    if workers and getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise SystemExit(UNGUARDED)  # not an error, whose traceback every worker would print
 
 
 def _report(on_event: OnEvent, number: int, event: Any) -> None:
@@ -184,12 +197,18 @@ class Pool:
     def _bury(self, process: WorkerProcess, hung: bool = False) -> None:
         self.processes.remove(process)
         cause, how = process.end()
+        if process.process.exitcode == UNGUARDED:
+            script = getattr(sys.modules["__main__"], "__file__", None) or "this script"
+            fault = "starts workers when it is imported, and each worker imports it"
+            raise HMAError(script, fault, 'put the call under `if __name__ == "__main__":`')
         if hung:
             cause, how = "hung", f"made no progress for {self._units.limits.quiet_s:g} s"
         if not process.ready:
             self._start_failures += 1
             if self._start_failures >= START_FAILURES:
                 remedy = "try fewer --workers; the machine may be short of memory"
+                if "exit code" in how:
+                    remedy = "the messages above say why"
                 raise HMAError("a worker", f"cannot start; the last one {how}", remedy)
         if process.unit is not None:
             self._units.lost(process.unit, cause, process.step, how)

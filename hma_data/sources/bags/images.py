@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Floats
-from hma_data.episodes.images import MAX_PIXELS, Images, decode_image, opencv
+from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images, decode_image, opencv
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel
@@ -258,6 +258,7 @@ class VideoDecoder:
             raise EpisodeError(where, f"video in {codec!r} cannot be read", f"these can: {', '.join(CODECS)}")
         self._codec, self._keyframes, self._fetch, self._where = codec, keyframes, fetch, where
         self._context: Any = None
+        self._to_rgb = FrameToRGB()
         self._next = 0  # the message that the decoder takes next
         self._taken = -1  # the last picture returned
         self._ready: dict[int, Any] = {}  # pictures decoded but not returned yet; None for a damaged one
@@ -288,7 +289,7 @@ class VideoDecoder:
             if frame is None:
                 fault = f"frame {index} of the video is damaged, or depends on one that is damaged or lost"
                 raise EpisodeError(self._where, fault)
-            found[index] = frame.to_ndarray(format="rgb24")
+            found[index] = self._to_rgb(frame).to_ndarray()
         return found
 
     def _must_begin(self, index: int) -> bool:

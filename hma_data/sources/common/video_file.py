@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Floats
-from hma_data.episodes.images import MAX_PIXELS, Images
+from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images
 from hma_data.errors import EpisodeError
 from hma_data.storage.kinds import unreadable
 
@@ -140,7 +140,7 @@ class VideoFile:
         self._entry = -1  # index of the keyframe of the last seek
         self._counts, self._seeks = False, True  # whether frames are counted; whether seeking is used
         self._spoilt = False  # whether the last frame, or a frame it may depend on, is damaged
-        self._reformatter: Any = None
+        self._converter: Any = None
 
     def __len__(self) -> int:
         return len(self.table)
@@ -247,8 +247,6 @@ class VideoFile:
             self._next = self._entry = int(self.table.keys[index])
 
     def _reopen(self) -> None:
-        from av.video.reformatter import VideoReformatter
-
         # A parent's decoder is dropped without closing it: after a fork, both share the file's position.
         self._container, self._process = _open(str(self.path)), os.getpid()
         stream = _video_stream(self._container, str(self.path))
@@ -256,7 +254,7 @@ class VideoFile:
         stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
         self._decoder, self._next, self._entry = self._container.decode(stream), 0, -1
         self._spoilt = False
-        self._reformatter = VideoReformatter()  # one for all frames: making one costs a third of the time
+        self._converter = FrameToRGB()  # one for all frames: making one costs a third of the time
 
     def _index_of(self, frame: Any) -> int:
         """Return the frame's index; -1 for a frame that comes before the first shown."""
@@ -271,7 +269,7 @@ class VideoFile:
 
     def _to_rgb(self, frame: Any) -> Images:
         """Return a frame's picture (H, W, 3)."""
-        rgb = self._reformatter.reformat(frame, format="rgb24")
+        rgb = self._converter(frame)
         plane = rgb.planes[0]  # its bytes are copied once, into the array that `frames` returns
         lines = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: rgb.height, : rgb.width * 3]
         quarters = round(frame.rotation / 90) % 4  # phones state here that they were held upright

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.images import Filter, prepare, resize
+from hma_data.episodes.images import Filter, FrameToRGB, prepare, resize
 from hma_data.errors import EpisodeError, RecipeError, SourceError, TokenizerError
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import TokenizerSpec
@@ -130,9 +130,10 @@ def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
             count = sum(1 for _ in container.decode(video=0))
         wanted = set(_evenly(count, frames))
         with av.open(str(path)) as container:
+            to_rgb = FrameToRGB()
             for index, frame in enumerate(container.decode(video=0)):
                 if index in wanted:
-                    yield frame.to_ndarray(format="rgb24")
+                    yield to_rgb(frame).to_ndarray()
     except (av.FFmpegError, IndexError) as fault:  # a container without video has no stream 0
         raise TokenizerError(path, f"cannot be decoded as a video: {fault}") from fault
 

@@ -1,6 +1,7 @@
 """Episodes chosen by id, by glob and by a file of ids: in the command and the YAML."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -142,3 +143,20 @@ def test_inspect_and_doctor_take_the_episodes_that_the_yaml_chooses(
     arm_yaml.write_text(ARM_YAML.replace("format: hdf5", "format: hdf5, only: [demo_5]"))
     report = json.loads(hma("inspect", toy_recording, "-e", arm_yaml, "--json").stdout)
     assert report["embodiment"]["first episode"].startswith("demo_5:")
+
+
+def test_a_recording_whose_name_is_not_utf8_is_refused_before_the_work(
+    tmp_path: Path, arm_yaml: Path, toy_recording: Path
+) -> None:
+    """Neither a YAML nor a shard can state such a name."""
+    odd = tmp_path / os.fsdecode(b"r\xe9c.hdf5")
+    try:
+        toy_recording.rename(odd)
+    except OSError:
+        pytest.skip("this file system takes UTF-8 names only")
+    words = [r"r\udce9c.hdf5: its name is not UTF-8 text — rename it"]
+    fails(hma("registry", "infer", odd, "--id", "mine", "--out", tmp_path / "mine.yaml"), 1, *words)
+    assert not (tmp_path / "mine.yaml").exists()
+    start = ("convert", "-e", arm_yaml, "--tokenizer", "fsq-8")
+    fails(hma(*start, "--source", odd, "--out", tmp_path / "out"), 1, *words)
+    assert not (tmp_path / "out").exists()

@@ -12,13 +12,14 @@ import pytest
 from hma_data.conversion.extend import Content, content_of
 from hma_data.conversion.job import Summary, convert
 from hma_data.conversion.plan import Settings
-from hma_data.conversion.rewrite import restat
+from hma_data.conversion.rewrite import merge, restat
 from hma_data.errors import OutputError
 from hma_data.inspection.inspect import examine
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import EPISODES, Manifest
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
+from hma_model.hub.datasets import push_data
 from tests.conftest import BlockTokenizer, write_toy
 from tests.data.sources.lerobot.test_lerobot import embodiment as lerobot_robot
 from tests.data.sources.rlds.test_rlds import embodiment as rlds_robot
@@ -237,3 +238,61 @@ def test_records_in_another_order_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="recorded anew, first 'train/000000'"):
         run(rlds_robot(), folder, out, extend=True)
     assert json.loads((out / "manifest.json").read_text())["totals"]["episodes"] == 3
+
+
+# -- files beside the set
+
+
+def test_files_of_a_hub_and_of_macos_may_lie_beside_a_set(tmp_path: Path, toy_arm: Embodiment) -> None:
+    recording, out = tmp_path / "toy.hdf5", tmp_path / "out"
+    write_toy(recording, [20, 21])
+
+    def make(**options) -> Summary:
+        return convert(toy_arm, recording, BlockTokenizer(), out, **options)
+
+    make()
+    beside = {"README.md": "my notes", ".gitattributes": "*.parquet filter=lfs", ".DS_Store": "finder"}
+    for name, text in beside.items():
+        (out / name).write_text(text)
+    (out / "train/.DS_Store").write_text("finder")
+    assert make().made_shards == 0
+    assert verify(out) == []
+    write_toy(recording, [20, 21, 22])
+    assert make(extend=True).made_shards == 1
+    assert verify(out) == []
+    merge([out], tmp_path / "merged")
+    assert push_data(out, tmp_path / "pushed")
+    (tmp_path / "pushed/.DS_Store").write_text("finder")
+    (tmp_path / "pushed/val/.DS_Store").write_text("finder")
+    assert push_data(out, tmp_path / "pushed")
+    make(overwrite=True)
+    assert {name: (out / name).read_text() for name in beside} == beside
+    assert Manifest.load(out).splits["train"]["episodes"] + Manifest.load(out).splits["val"]["episodes"] == 3
+    assert verify(out) == []
+
+
+def test_a_published_set_is_a_set_to_extend(tmp_path: Path, toy_arm: Embodiment) -> None:
+    write_toy(tmp_path / "toy.hdf5", [20, 21])
+    convert(toy_arm, tmp_path / "toy.hdf5", BlockTokenizer(), tmp_path / "out")
+    push_data(tmp_path / "out", tmp_path / "pushed")
+    assert (tmp_path / "pushed/README.md").is_file()
+    write_toy(tmp_path / "toy.hdf5", [20, 21, 22])
+    convert(toy_arm, tmp_path / "toy.hdf5", BlockTokenizer(), tmp_path / "pushed", extend=True)
+    assert verify(tmp_path / "pushed") == []
+
+
+@pytest.mark.parametrize("options", [{}, {"extend": True}, {"overwrite": True}])
+def test_a_foreign_file_in_a_set_is_named_and_kept(
+    options: dict[str, bool], tmp_path: Path, toy_arm: Embodiment
+) -> None:
+    recording, out = tmp_path / "toy.hdf5", tmp_path / "out"
+    write_toy(recording, [20, 21])
+    convert(toy_arm, recording, BlockTokenizer(), out)
+    (out / "thesis.tex").write_text("years of work")
+    with pytest.raises(OutputError, match=r"holds a file that is not of the set: thesis\.tex — move it out"):
+        convert(toy_arm, recording, BlockTokenizer(), out, **options)
+    (out / "notes.txt").write_text("more")
+    with pytest.raises(OutputError, match=r"holds files that are not of the set: notes\.txt, thesis\.tex — "):
+        convert(toy_arm, recording, BlockTokenizer(), out, **options)
+    assert (out / "thesis.tex").read_text() == "years of work"
+    assert (out / "manifest.json").is_file()

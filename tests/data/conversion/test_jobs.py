@@ -25,6 +25,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.verify import verify
 from hma_data.sources.hdf5.source import Hdf5Source
+from tests.command import hma
 from tests.conftest import BlockTokenizer, write_toy
 
 SMALL = Settings(val_fraction=0.2, shard_frames=60)
@@ -86,6 +87,68 @@ def test_shares_run_side_by_side_and_one_of_them_finishes(
     for thread in threads:
         thread.join()
     assert contents(tmp_path / "out") == whole
+
+
+def test_workers_without_a_shard_are_told_before_the_work_and_by_a_dry_run(
+    toy_arm: Embodiment, tmp_path: Path
+) -> None:
+    (tmp_path / "toy_arm.yaml").write_text(toy_arm.to_yaml())
+    write_toy(tmp_path / "toy.hdf5", [20] * 8)
+    words = ["convert", "-e", tmp_path / "toy_arm.yaml", "--source", tmp_path / "toy.hdf5"]
+    words += ["--tokenizer", "fsq-8", "--out", tmp_path / "out", "--workers", "3"]
+    line = "2 shards: 2 of 3 workers have work; --shard-frames 20 gives more"
+    planned = hma(*words, "--dry-run")
+    assert planned.stdout.splitlines()[-1] == line
+    shared = [*words, "--shard-index", "2", "--shard-count", "4"]
+    empty = "0 shards of this task: 0 of 3 workers have work; --shard-frames 20 in every task gives more"
+    planned = hma(*shared, "--dry-run")
+    assert planned.stdout.splitlines()[-1] == empty
+    assert "with --workers 3 in each of 4 tasks" in planned.stdout
+    assert empty in hma(*shared).stderr.splitlines()
+    assert line in hma(*words).stderr.splitlines()
+    assert "workers" not in hma(*words).stderr  # all shards are there
+    (tmp_path / "out/val/shard-00000.parquet").unlink()
+    assert "1 shard left: 1 of 3 workers has work" in hma(*words).stderr.splitlines()
+
+
+UNGUARDED = """
+from hma_data.conversion.job import convert
+from hma_data.registry.embodiment import Embodiment
+from hma_data.storage.paths import as_path
+print("imported", flush=True)
+robot = Embodiment.from_yaml(as_path("toy_arm.yaml").read_text())
+"""
+CALL = 'print(convert(robot, "toy.hdf5", "fsq-8", "out", workers=2).made_shards)\n'
+
+
+def test_a_script_that_every_worker_would_run_is_told_to_guard_its_call(
+    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "toy_arm.yaml").write_text(toy_arm.to_yaml())
+
+    def run_script(name: str, text: str) -> subprocess.CompletedProcess[str]:
+        (tmp_path / name).write_text(text)
+        return subprocess.run(
+            [sys.executable, name],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            timeout=200,
+        )
+
+    done = run_script("bare.py", UNGUARDED + CALL)
+    assert done.returncode == 1
+    assert done.stderr.count("Traceback") == 1, done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert "bare.py: starts workers when it is imported" in last
+    assert last.endswith('put the call under `if __name__ == "__main__":`')
+    assert done.stdout.count("imported") <= 3  # this process and its two workers: none was started again
+    assert not (tmp_path / "out").exists()
+    done = run_script("guarded.py", UNGUARDED + 'if __name__ == "__main__":\n    ' + CALL)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[0] == "imported"
+    assert "2" in done.stdout.splitlines()
 
 
 def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(

@@ -1,10 +1,19 @@
 """Plans depend on the recording and the settings, and on nothing else."""
 
+import re
+
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hma_data.conversion.plan import Settings, choose_splits, make_plan, shard_size
+from hma_data.conversion.plan import (
+    Settings,
+    choose_splits,
+    idle_workers,
+    longest_work,
+    make_plan,
+    shard_size,
+)
 from hma_data.errors import RegistryError, SourceError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import EpisodeRef
@@ -19,6 +28,7 @@ def plan(episodes: list[EpisodeRef], arm: Embodiment, settings: Settings | None 
     return make_plan(episodes, arm, BlockTokenizer.spec, settings or Settings(), "toy")
 
 
+@settings(deadline=None)  # the first call imports
 @given(st.lists(st.integers(0, 3000), min_size=1, max_size=40), st.integers(1, 5000))
 def test_every_episode_is_in_one_shard_and_one_split(frames: list[int], size: int) -> None:
     arm = Embodiment.from_yaml(
@@ -82,3 +92,50 @@ def test_episodes_cut_from_one_recording_share_a_split() -> None:
     splits = choose_splits(cut, 0.3, seed=0)
     assert all(len(set(splits[start : start + 5])) == 1 for start in range(0, 100, 5))
     assert set(splits) == {"train", "val"}
+
+
+# -- workers without a shard
+
+
+@pytest.mark.parametrize(
+    ("frames", "workers", "tasks", "longest"),
+    [
+        ([100, 100], 1, 1, 200),
+        ([100, 100], 64, 1, 100),  # more workers than shards are no faster
+        ([190, 10], 2, 1, 190),
+        ([50, 50, 50], 2, 1, 100),
+        ([50] * 8, 2, 4, 50),
+        ([50] * 8, 4, 64, 50),
+        ([50] * 8, 0, 1, 400),  # 0 works in this process
+        ([], 4, 1, 0),
+    ],
+)
+def test_a_job_takes_as_long_as_its_busiest_worker(
+    frames: list[int], workers: int, tasks: int, longest: int
+) -> None:
+    assert longest_work(frames, workers, tasks) == longest
+
+
+@pytest.mark.parametrize(("workers", "tasks"), [(64, 1), (4, 16), (10, 1), (3, 64)])
+def test_workers_without_a_shard_are_told_with_the_size_that_gives_them_one(
+    workers: int, tasks: int, toy_arm: Embodiment
+) -> None:
+    episodes = refs(*[50] * 400)
+    few = plan(episodes, toy_arm)
+    todo = len(few.units[::tasks])
+    line = idle_workers(few, todo, workers, tasks)
+    assert line.startswith(f"{todo} shards" if todo > 1 else "1 shard")
+    assert f": {todo} of {workers} workers ha" in line
+    assert ("in every task" in line) == (tasks > 1)
+    size = re.search(r"--shard-frames (\d+)( in every task)? gives more$", line)
+    assert size
+    many = plan(episodes, toy_arm, Settings(shard_frames=int(size[1])))
+    assert idle_workers(many, len(many.units[tasks - 1 :: tasks]), workers, tasks) == ""
+
+
+def test_a_size_is_only_named_where_it_helps(toy_arm: Embodiment) -> None:
+    alone = plan(refs(500, 500), toy_arm, Settings(shard_frames=100))  # a shard holds whole episodes
+    assert idle_workers(alone, 2, 8) == "2 shards: 2 of 8 workers have work"
+    few = plan(refs(*[50] * 100), toy_arm)
+    assert idle_workers(few, 1, 8, begun=True) == "1 shard left: 1 of 8 workers has work"
+    assert idle_workers(few, 2, 2) == idle_workers(few, 2, 0) == ""

@@ -140,7 +140,7 @@ def test_no_window_at_all_is_refused_with_what_to_do(sets: list[Path]) -> None:
 
 
 def test_one_embodiment_twice_is_refused(sets: list[Path]) -> None:
-    with pytest.raises(ShardError, match="each embodiment once"):
+    with pytest.raises(ShardError, match="each embodiment once; hma shards merge makes one set of several"):
         MixtureDataset([sets[0], sets[0]], 4, FRAMES)
 
 

@@ -288,6 +288,20 @@ def test_shards_and_checkpoints_of_older_releases_may_have_layout_keys_that_were
     assert Embodiment.from_values(values, "arm.yaml", stored=True).source.layout == {"axes": "THWC"}
 
 
+@pytest.mark.parametrize("name", ["rlds", "hdf5", "lerobot"])
+def test_a_fixed_grid_is_refused_where_frames_are_not_resampled(name: str) -> None:
+    values = changed("source.format", name) | {"sync": {"rate_hz": 2}}
+    with pytest.raises(RegistryError, match=r"sync\.rate_hz.*remove it: frequency_hz states.*target_hz what"):
+        Embodiment.from_values(values, "arm.yaml")
+    assert Embodiment.from_values(values, "arm.yaml", stored=True).sync.rate_hz == 2, "shards may state it"
+
+
+@pytest.mark.parametrize("name", ["rosbag", "hands"])
+def test_bags_and_videos_of_hands_may_have_a_fixed_grid(name: str) -> None:
+    values = changed("source.format", name) | {"sync": {"rate_hz": 2}}
+    assert Embodiment.from_values(values, "arm.yaml").rate_hz == 2
+
+
 def test_the_page_on_adding_a_robot_lists_every_layout_key() -> None:
     page = (Path(__file__).parents[3] / "docs" / "adding-a-robot.md").read_text()
     table = page[page.index("| format | key of `layout` |") :].split("\n\n")[0]

@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import math
+import re
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,8 @@ import pytest
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
-from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.components import Camera
+from hma_data.registry.embodiment import _DECIDES, Embodiment
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import Footer, arrow_schema
 from hma_data.shards.stats import Stats
@@ -277,3 +279,11 @@ def test_row_groups_of_large_frames_hold_fewer_of_them(tmp_path: Path) -> None:
     assert groups == [80, 10, 85, 15]
     stored = file.read_row_group(3, ["latents"]).column(0).combine_chunks().flatten().to_numpy()
     np.testing.assert_array_equal(stored.reshape(15, -1)[:, 0], np.arange(85, 100))
+
+
+def test_the_page_names_the_keys_that_the_hash_of_an_embodiment_is_of() -> None:
+    page = (Path(__file__).parents[3] / "docs/format.md").read_text()
+    (row,) = (line for line in page.splitlines() if line.startswith("| `embodiment`, `embodiment_hash` |"))
+    named = set(re.findall(r"`(\w+)`", row)) - {"embodiment", "embodiment_hash", "size"}
+    assert named == {*_DECIDES, *_DECIDES["source"]}
+    assert _DECIDES["cameras"]["__all__"] == set(Camera.model_fields) - {"size"}

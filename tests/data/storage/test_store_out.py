@@ -140,6 +140,15 @@ def test_overwrite_starts_anew_and_foreign_files_are_never_touched(
     assert remote(out.with_name("other")) == {"notes.txt": b"mine"}
 
 
+def test_an_edited_stride_reaches_a_finished_set_of_a_store(toy_arm, toy_recording, out, tmp_path) -> None:
+    run(toy_arm, toy_recording, out)
+    other = Embodiment.from_values(toy_arm.to_dict() | {"target_hz": 1}, "other")
+    summary = run(other, toy_recording, out)
+    assert summary.changed == "stride 2 → 10: the model now sees 1 Hz" and not summary.made_shards
+    run(other, toy_recording, tmp_path / "whole")
+    assert remote(out) == local(tmp_path / "whole")
+
+
 def test_a_manifest_is_restored_in_place(toy_arm, toy_recording, out, whole) -> None:
     run(toy_arm, toy_recording, out)
     (out / "manifest.json").unlink()
@@ -315,3 +324,14 @@ def test_a_part_of_a_running_process_is_left(out: RemotePath) -> None:
         (folder / f".shard-00000.parquet.{pid}.part").touch()
     remove_parts(out)
     assert [path.name for path in folder.iterdir()] == [f".shard-00000.parquet.{os.getpid()}.part"]
+
+
+def test_a_card_beside_a_set_of_a_store_stays(toy_arm, toy_recording, out, whole) -> None:
+    run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
+    put_bytes(b"my notes", out / "README.md")
+    run(toy_arm, toy_recording, out, overwrite=True)
+    assert remote(out) == whole | {"README.md": b"my notes"}
+    assert verify(out) == []
+    put_bytes(b"mine", out / "notes.txt")
+    with pytest.raises(OutputError, match=r"holds a file that is not of the set: notes\.txt — move it out"):
+        run(toy_arm, toy_recording, out)

@@ -1,0 +1,43 @@
+"""Find the episodes of a shard set whose grid has another rate than its embodiment states.
+
+A conversion flags them; see `hma_data.episodes.align.rate_flags`. Sets of older releases have no such flag.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pyarrow.compute as pc
+
+from hma_data.episodes.align import OFF_RATE, measured_hz, rate_remedy
+from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.sources.common.checks import Finding
+
+TRIED = 20  # flagged episodes of which the first with more than one row is measured
+
+
+def rate_finding(shards: ShardSet) -> Finding | None:
+    """Return a finding with the stated and a measured rate; None where no episode is flagged.
+
+    It is an error where more than half of the episodes are flagged, because the stride is then wrong.
+    """
+    episodes = shards.episodes
+    flagged = episodes.filter(pc.match_substring(episodes["flags"], f"{OFF_RATE}="))
+    if not len(flagged):
+        return None
+    robot, count, total = shards.embodiment, len(flagged), len(episodes)
+    which, hz = next(_measured(shards, flagged[:TRIED].to_pylist()), ("", None))
+    said = f"{count:,} of {total:,} episodes have another rate than the stated {robot.rate_hz:g} Hz"
+    said += f", such as {which} with {hz:.3g} Hz" if hz else ""
+    remedy = f"{rate_remedy(robot)}, and convert again with --overwrite"
+    numbers = {"episodes": count, "hz": hz, "stated_hz": robot.rate_hz}
+    return Finding("rate", "error" if count > total / 2 else "warn", said, remedy, numbers=numbers)
+
+
+def _measured(shards: ShardSet, rows: list[dict[str, Any]]) -> Iterator[tuple[str, float]]:
+    """Yield the id and the rate in Hz of each episode that has more than one row."""
+    reader = EpisodeReader(shards, ["timestamp"])
+    for row in rows:
+        times = reader.rows(row["shard"], row["row_start"], row["length"])["timestamp"]
+        if hz := measured_hz(np.diff(times)):
+            yield row["id"], hz * shards.manifest.frame_stride

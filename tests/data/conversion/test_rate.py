@@ -1,0 +1,131 @@
+"""Recordings of another rate than the YAML states: flagged, and told by hma convert and hma doctor."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
+from hma_data.episodes.align import rate_flags, to_clip
+from hma_data.inspection.inspect import examine
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.verify import verify
+from tests.command import hma
+from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.data import bag_files
+from tests.data.conversion.test_convert import contents
+from tests.data.episodes.test_align import STEADY, embodiment, episode
+
+TIMED_YAML = ARM_YAML.replace("{format: hdf5}", "{format: hdf5, layout: {timestamps: t}}")
+WHOLE = Settings(val_fraction=0.2, shard_frames=60)
+
+
+def timed(folder: Path, rates: list[float]) -> Path:
+    """An HDF5 file with an episode of 30 frames for each rate in Hz."""
+    path = folder / "toy.hdf5"
+    write_toy(path, [30] * len(rates))
+    with h5py.File(path, "a") as file:
+        for i, hz in enumerate(rates):
+            file[f"data/demo_{i}/t"] = 5 + np.arange(30) / hz
+    return path
+
+
+def made(path: Path, out: Path, settings: Settings = WHOLE, yaml: str = TIMED_YAML):
+    return convert(Embodiment.from_yaml(yaml), path, BlockTokenizer(), out, settings=settings)
+
+
+def rate_findings(out: Path) -> list:
+    return [one for one in examine(out) if one.check == "rate"]
+
+
+@pytest.mark.parametrize(("hz", "flags"), [(10, {}), (9.3, {}), (10.9, {}), (5, {"off_rate_frames": 60})])
+def test_only_a_rate_that_is_more_than_a_tenth_off_is_flagged(hz: float, flags: dict, tmp_path: Path) -> None:
+    summary = made(timed(tmp_path, [hz, hz]), tmp_path / "out")
+    assert summary.flags == flags and bool(summary.warning) == bool(flags)
+    assert len(rate_findings(tmp_path / "out")) == len(flags)
+
+
+def test_a_pause_is_not_another_rate(tmp_path: Path) -> None:
+    path = timed(tmp_path, [10, 10])
+    with h5py.File(path, "a") as file:
+        file["data/demo_0/t"][15:] += 20
+    assert made(path, tmp_path / "out").flags == {}
+
+
+@pytest.mark.parametrize("frames", ["all", "strided"])
+def test_the_warning_has_both_rates_and_what_to_do(frames, tmp_path: Path) -> None:
+    settings = replace(WHOLE, frames=frames)
+    summary = made(timed(tmp_path, [10, 5, 5, 5]), tmp_path / "out", settings)
+    said = "3 of 4 episodes have another rate than the stated 10 Hz, such as demo_1 with 5 Hz"
+    remedy = "correct frequency_hz, and convert again with --overwrite"
+    assert summary.warning == f"{tmp_path / 'out'}: {said} — {remedy}"
+    (finding,) = rate_findings(tmp_path / "out")
+    assert (finding.severity, finding.message, finding.remedy) == ("error", said, remedy)
+    assert finding.numbers == {"episodes": 3, "hz": pytest.approx(5), "stated_hz": 10}
+    assert verify(tmp_path / "out") == []
+
+
+def test_a_few_such_episodes_are_a_warning_of_doctor(tmp_path: Path) -> None:
+    made(timed(tmp_path, [10, 10, 10, 20]), tmp_path / "out")
+    assert [one.severity for one in rate_findings(tmp_path / "out")] == ["warn"]
+
+
+def test_hma_convert_prints_one_line_and_again_when_it_keeps_all_shards(tmp_path: Path) -> None:
+    path, out = timed(tmp_path, [5, 5, 5]), tmp_path / "out"
+    (tmp_path / "toy_arm.yaml").write_text(TIMED_YAML)
+    args = ["convert", "-e", tmp_path / "toy_arm.yaml", "--source", path, "--out", out]
+    args += ["--tokenizer", "fsq-8", "--workers", "0"]
+    for _ in range(2):
+        done = hma(*args)
+        lines = [line for line in done.stderr.splitlines() if line.startswith("warning: ")]
+        assert done.returncode == 0 and len(lines) == 1, done.stderr
+        assert "3 of 3 episodes have another rate than the stated 10 Hz, such as demo_0 with 5 Hz" in lines[0]
+    told = json.loads(hma(*args, "--json").stdout)
+    assert "such as demo_0 with 5 Hz" in told["warning"] and told["flags"] == {"off_rate_frames": 90}
+
+
+def test_the_same_bytes_come_out_however_the_job_is_run(tmp_path: Path) -> None:
+    path = timed(tmp_path, [5, 10, 5, 20])
+    made(path, tmp_path / "whole")
+    made(path, tmp_path / "out")
+    next((tmp_path / "out" / "train").iterdir()).unlink()
+    (tmp_path / "out" / "manifest.json").unlink()
+    again = made(path, tmp_path / "out")
+    assert again.kept_shards and again.made_shards == 1
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+def test_a_bag_is_measured_by_its_primary_camera(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    bag_files.write_mcap(tmp_path / "run" / "run.mcap", bag_files.make_recording(20), bag_files.as_cdr())
+    values = bag_files.arm().to_dict()
+    slow = Embodiment.from_values(values | {"frequency_hz": 20}, "slow")
+    settings = Settings(val_fraction=0)
+    summary = convert(slow, tmp_path / "run", BlockTokenizer(), tmp_path / "out", settings=settings)
+    assert summary.warning.endswith(
+        "correct frequency_hz, or sync.rate_hz, and convert again with --overwrite"
+    )
+    assert "10 Hz" in summary.warning and "stated 20 Hz" in summary.warning
+    sync = values.get("sync", {}) | {"rate_hz": 20}
+    resampled = Embodiment.from_values(values | {"frequency_hz": 20, "sync": sync}, "resampled")
+    other = convert(resampled, tmp_path / "run", BlockTokenizer(), tmp_path / "other", settings=settings)
+    assert other.flags == {} and other.warning == ""
+
+
+def test_a_rate_that_nobody_states_is_not_compared() -> None:
+    run = episode(STEADY, STEADY, STEADY, STEADY, STEADY)
+    robot = embodiment()
+    unstated = Embodiment.from_values(robot.to_dict() | {"frequency_hz": None, "stride": 2}, "unstated")
+    assert rate_flags(to_clip(run, unstated), unstated) == {}
+
+
+def test_sets_without_the_flag_have_no_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hma_data.conversion.worker.rate_flags", lambda clip, robot: {})
+    made(timed(tmp_path, [5, 5]), tmp_path / "out")
+    assert ShardSet(tmp_path / "out").episodes["flags"].to_pylist() == ["", ""]
+    assert rate_findings(tmp_path / "out") == []
