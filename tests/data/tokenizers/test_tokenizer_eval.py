@@ -243,8 +243,8 @@ def test_the_catalogue_says_what_the_embedded_tokenizers_are(name):
     assert entry.state() == "ready"
 
 
-def test_embedded_weights_take_at_most_fourteen_megabytes():
-    assert sum(path.stat().st_size for path in EMBEDDED.iterdir()) <= 14_000_000
+def test_embedded_weights_take_at_most_fifteen_megabytes():
+    assert sum(path.stat().st_size for path in EMBEDDED.iterdir()) <= 15_000_000
 
 
 def _entry(weights, **values) -> Entry:
