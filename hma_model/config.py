@@ -169,7 +169,7 @@ class HMAConfig:
     latent_noise: float = 0.0
     told_noise: bool = False  # tell the model each frame's corruption; 0 for what it is shown after training
     # Tell the model at every frame what its place held in the first frame: of the prompt, or in training in a
-    # frame drawn from the episode up to the window. A memory of looks, however long the rollout.
+    # frame drawn from the episode up to the window.
     told_first: bool = False
     # The share of samples whose longer history stays unmasked, with later frames corrupted more.
     history_probability: float = 0.2
