@@ -433,11 +433,13 @@ class MixtureDataset(IterableDataset[Batch]):
 def _check_windows(decoder: Decoder, frames: int) -> None:
     index = decoder.index
     if not index.count:
+        short = index.short_episodes
+        remedy = "raise target_hz in its YAML and run hma convert again, or use fewer frames"
         raise ShardError(
             decoder.shards.folder,
             f"has no window of {frames} frames, {index.row_stride} rows apart, in {decoder.split} "
-            f"({index.short_episodes} episodes, all shorter)",
-            "raise target_hz in its YAML and run hma convert again, or use fewer frames",
+            f"({short} episodes{', all shorter' if short else ''})",
+            remedy if short else "leave this embodiment out",
         )
 
 
