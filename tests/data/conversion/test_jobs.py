@@ -89,6 +89,7 @@ def test_shares_run_side_by_side_and_one_of_them_finishes(
     assert contents(tmp_path / "out") == whole
 
 
+@pytest.mark.slow
 def test_workers_without_a_shard_are_told_before_the_work_and_by_a_dry_run(
     toy_arm: Embodiment, tmp_path: Path
 ) -> None:
@@ -121,6 +122,7 @@ robot = Embodiment.from_yaml(as_path("toy_arm.yaml").read_text())
 CALL = 'print(convert(robot, "toy.hdf5", "fsq-8", "out", workers=2).made_shards)\n'
 
 
+@pytest.mark.slow
 def test_a_script_that_every_worker_would_run_is_told_to_guard_its_call(
     toy_arm: Embodiment, toy_recording: Path, tmp_path: Path
 ) -> None:
