@@ -67,7 +67,7 @@ def quiet() -> Iterator[list[str]]:
 
 @dataclass(frozen=True)
 class MakeWork:
-    """Each time a step is reached a file is made, so that other processes know."""
+    """Each time a step is reached a file with the process's number is made, so that other processes know."""
 
     notes: Path
 
@@ -88,7 +88,7 @@ class MakeWork:
 
     def _reached(self, unit: Unit) -> int:
         before = len(list(self.notes.glob(f"{unit.name}-*")))
-        (self.notes / f"{unit.name}-{before}").touch()
+        (self.notes / f"{unit.name}-{before}").write_text(str(os.getpid()))
         return before
 
 
