@@ -106,7 +106,8 @@ def _join(ray: Any) -> None:
 # -- in an actor
 
 
-End = tuple[str, Any]  # "done" with a result, "failed" with the error that ends the job, or "short of memory"
+# "done" with a result, "failed" with the error that ends the job, "short of memory", "closed" if never opened
+End = tuple[str, Any]
 
 
 class Worker:
@@ -117,6 +118,7 @@ class Worker:
         self._events: list[tuple[int, Any]] = []
         self._given: list[tuple[int, Any]] = []  # by the last look; the driver has them once it looks again
         self._urgent = False
+        self._work: Any = None
 
     def open(self, make_work: Callable[[int], Work], workers: int) -> End:
         """Load the tokenizer."""
@@ -126,6 +128,8 @@ class Worker:
 
     def do(self, number: int, unit: Any, attempt: Attempt) -> tuple[End, list[tuple[int, Any]]]:
         """Make a unit; return how it ended, and its events that no look has returned."""
+        if self._work is None:  # the one that was opened is lost, and Ray gave its task to this one
+            return ("closed", None), []
         end = _outcome(self._work, unit, partial(self._report, number, attempt), attempt)
         with self._news:
             events, self._events = self._events, []
@@ -250,11 +254,14 @@ class _Actors:
         except self._ray.exceptions.RayError as fault:
             self._lost(slot, "was lost: " + _first_line(fault))
             return
-        slot.task, slot.unit = None, None
         if number is not None:
             end, events = end
-            self._pass_on(slot, events)
         kind, value = end
+        if kind == "closed":
+            self._lost(slot, "was lost between two units")
+            return
+        slot.task, slot.unit = None, None
+        self._pass_on(slot, events)
         if kind == "failed":
             raise value
         if number is None:

@@ -82,6 +82,21 @@ def test_an_actor_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None:
 
 
 @on_a_cluster
+def test_an_actor_that_is_killed_between_two_units_costs_nothing(cluster, tmp_path: Path) -> None:
+    from hma_data.conversion.engines.ray import run
+
+    units = [Unit(f"u{i}", ("a",), "a", times=0) for i in range(3)]  # each notes its process
+    results = run(units, MakeWork(tmp_path), 1, lambda number, event: None, LIMITS)
+    first = next(results)
+    lost = int((tmp_path / "u0-0").read_text())
+    os.kill(lost, signal.SIGKILL)
+    while not {pid for pid in actors_of(os.getpid()) if pid != lost}:  # until Ray has started it again
+        time.sleep(0.1)
+    time.sleep(1)
+    assert dict([first, *results]) == {unit.name: ["a"] for unit in units}
+
+
+@on_a_cluster
 def test_workers_that_cannot_be_made_are_one_error(
     cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

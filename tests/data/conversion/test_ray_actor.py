@@ -64,6 +64,10 @@ def test_a_units_events_and_result_are_told_in_order(tmp_path: Path) -> None:
         assert said == [f"{unit.name} a", f"{unit.name} b"] and {n for n, _ in events} == {number}
 
 
+def test_an_actor_that_was_never_opened_says_so() -> None:
+    assert Worker().do(0, PLAIN[0], FIRST) == (("closed", None), [])
+
+
 def test_looks_and_the_end_give_every_event_once() -> None:
     worker, heard = opened(Chatty()), []
     with ThreadPoolExecutor(1) as other:
