@@ -159,6 +159,7 @@ def test_pictures_show_the_state_they_are_recorded_with(fast: h5py.File) -> None
 # -- pusht_slow
 
 
+@pytest.mark.slow
 def test_any_mcap_reader_decodes_the_bags_by_their_own_schemas(slow: list[Path]) -> None:
     topics = bag(slow[0])
     with slow[0].open("rb") as file:
@@ -171,6 +172,7 @@ def test_any_mcap_reader_decodes_the_bags_by_their_own_schemas(slow: list[Path])
     assert len(decoded) == sum(map(len, topics.values()))
 
 
+@pytest.mark.slow
 def test_topics_tick_at_their_own_rates_with_jitter(slow: list[Path]) -> None:
     topics = bag(slow[1])
     for topic, hz in (("/camera/image/compressed", 12.5), ("/command", 5.0), ("/joint_states", 20.0)):
@@ -181,6 +183,7 @@ def test_topics_tick_at_their_own_rates_with_jitter(slow: list[Path]) -> None:
         assert all(stamp < received for stamp, received, _ in topics[topic])
 
 
+@pytest.mark.slow
 def test_camera_shows_the_joint_states(slow: list[Path]) -> None:
     topics = bag(slow[1])
     stamps = np.array([stamp for stamp, _, _ in topics["/joint_states"]], dtype=np.float64)
@@ -195,6 +198,7 @@ def test_camera_shows_the_joint_states(slow: list[Path]) -> None:
     assert len(errors) > 50 and np.median(errors) < 6
 
 
+@pytest.mark.slow
 def test_pusher_moves_as_commanded(slow: list[Path]) -> None:
     topics = bag(slow[1])
     stamps = np.array([stamp for stamp, _, _ in topics["/joint_states"]], dtype=np.float64)
@@ -264,9 +268,8 @@ def test_episodes_end_well_and_badly(fast: h5py.File, slow: list[Path]) -> None:
 # -- recorders
 
 
-@pytest.mark.parametrize(
-    "robot", [r if r == "pusht_fast" else pytest.param(r, marks=pytest.mark.slow) for r in RECORDERS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", RECORDERS)
 def test_same_seed_gives_same_bytes(tmp_path: Path, robot: str) -> None:
     first, again, other = (record(robot, tmp_path / n, 2, s) for n, s in (("a", 1), ("b", 1), ("c", 2)))
     assert hashes(first) == hashes(again) != hashes(other)

@@ -56,6 +56,7 @@ def test_lerobot_reads_the_rows_and_pictures_that_we_read(recorded: Path, theirs
         assert episode.instruction == item["task"] == TASK
 
 
+@pytest.mark.slow
 def test_lerobot_finds_the_robot_and_its_names_in_the_metadata(theirs: Any) -> None:
     robot = find("planar_arm_lerobot")
     assert theirs.meta.info.codebase_version == "v3.0"

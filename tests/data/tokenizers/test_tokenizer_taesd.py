@@ -133,6 +133,7 @@ def test_the_network_is_the_one_written_out(tmp_path, pooled):
     assert latents.shape == (2, 4, 4, 6)
 
 
+@pytest.mark.slow
 def test_it_is_diffusers_autoencoder_tiny(tmp_path):
     import diffusers
 

@@ -67,6 +67,7 @@ def test_training_makes_weights_that_tokenize(tmp_path):
     assert psnr_db(scenes(4, 128), tokenizer.decode(tokenizer.encode(scenes(4, 128)))).mean() > 14
 
 
+@pytest.mark.slow
 def test_training_learns(tmp_path):
     out = tmp_path / "w.safetensors"
     lines: list[str] = []
@@ -98,6 +99,7 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_read(tmp_path)
         train(tmp_path / "gone.yaml", tmp_path / "w", device="abacus")
 
 
+@pytest.mark.slow
 def test_a_stopped_training_goes_on_as_if_it_had_not_been(tmp_path):
     recipe = write_recipe(tmp_path, fall=[[4, 1], [6, 0]])
     train(recipe, tmp_path / "whole", report=lambda _: None)

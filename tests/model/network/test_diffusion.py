@@ -102,6 +102,7 @@ def test_variance_outputs_are_there_but_not_read() -> None:
     assert head.output.out_features == 8 and noise.shape == (3, 4)
 
 
+@pytest.mark.slow
 @TARGETS
 def test_the_head_learns_what_its_condition_says(target: str) -> None:
     torch.manual_seed(0)

@@ -66,6 +66,7 @@ assert os.environ["ONEDNN_PRIMITIVE_CACHE_CAPACITY"] == sys.argv[1]
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [None, "7"])
 def test_few_products_are_kept_unless_the_user_says_otherwise(given, monkeypatch):
     monkeypatch.delenv("ONEDNN_PRIMITIVE_CACHE_CAPACITY", raising=False)

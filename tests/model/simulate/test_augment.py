@@ -177,6 +177,7 @@ def test_episodes_of_the_same_beginning_differ(
     assert len(set(made)) == len(made) == 4
 
 
+@pytest.mark.slow
 def test_windows_with_unknown_commands_are_left_out(
     world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -198,6 +199,7 @@ def test_windows_with_unknown_commands_are_left_out(
     augment(tmp_path / "still", asked(source="real", commands="still"), world=world, shards=real)
 
 
+@pytest.mark.slow
 def test_a_policy_of_pictures_acts_after_stored_frames(world: World, real: Path, tmp_path: Path) -> None:
     seen = []
 

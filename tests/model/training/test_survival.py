@@ -64,6 +64,7 @@ def test_a_run_killed_again_and_again_goes_on_bit_for_bit(recipe, tmp_path):
     assert sorted(p.name for p in (again.out / "checkpoints").iterdir()) == ["step-00000057", "step-00000060"]
 
 
+@pytest.mark.slow
 def test_the_command_saves_on_sigterm_and_says_how_to_go_on(recipe, tmp_path):
     path, said = tmp_path / "recipe.yaml", tmp_path / "said.txt"
     path.write_text(json.dumps(recipe(steps=100_000, checkpoint_every=0, eval_every=0).values()))

@@ -284,6 +284,7 @@ def train_to_its_kill(recipe, out: Path) -> None:
     train(recipe, out=out, show=False, on_progress=kill)
 
 
+@pytest.mark.slow
 def test_a_run_killed_at_once_goes_on_bit_for_bit(recipe, tmp_path):
     work = partial(train_to_its_kill, recipe(), tmp_path / "cut")
     run(work, tmp_path / "said.txt", code=-signal.SIGKILL)
