@@ -8,6 +8,7 @@ H×W pixels, A action dims, K = stride * A values of a chunk.
 import math
 from collections import deque
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -110,11 +111,10 @@ class Session:
         self._times: deque[float] = deque(maxlen=40)
         self._begin(number)
         self.row = world.open(robot.embodiment.id, *self._history())
-        try:
+        with ExitStack() as undo:
+            undo.callback(world.close, self.row)
             self._set_start()
-        except Exception:
-            world.close(self.row)
-            raise
+            undo.pop_all()
 
     # -- scene and model
 
