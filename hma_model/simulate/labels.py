@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from hma_data.conversion.output import locked
 from hma_data.errors import EpisodeError, HMAError, OutputError, UsageError
-from hma_data.loading.views import FIRST, Cameras, Views
+from hma_data.loading.views import Cameras, Views
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST, Manifest
 from hma_data.shards.reader import EpisodeReader, ShardSet
@@ -36,7 +36,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.config import INVERSE, OBJECTIVES
 from hma_model.generation.commands import Commands, Floats, card, described
-from hma_model.simulate.pictures import fitted, recorded_cameras, seen_cameras
+from hma_model.simulate.pictures import fitted, recorded_cameras, seen_cameras, trained_cameras
 from hma_model.simulate.prompts import seen_frames
 from hma_model.simulate.synthetic import Made, begun, digests, finished, write_shards
 from hma_model.simulate.world import World, load_world
@@ -162,7 +162,7 @@ def label_actions(
         if manifest is None:
             work = begun(folder, WORK, made_by)  # what is kept of other film does no harm there
             episodes, refused = _label(world, commands, shown, keys, work, on_progress)
-            (camera,) = seen_cameras(_cameras(model, embodiment), recorded_cameras(robot))
+            (camera,) = seen_cameras(trained_cameras(card(model, embodiment)), recorded_cameras(robot))
             spec = world.tokenizer.spec
             manifest = write_shards(folder, episodes, spec, robot, whole, ORIGIN, refused, camera)
             shutil.rmtree(work)
@@ -346,12 +346,6 @@ def film_of(world: World, place: StrPath, embodiment: str, hz: float) -> Film:
     return VideoFilm(world, path, videos, embodiment, hz)
 
 
-def _cameras(model: "HMA", embodiment: str) -> Cameras:
-    """Return the cameras that a robot's stem was trained on."""
-    found: Cameras = card(model, embodiment).get("data", {}).get("cameras") or FIRST
-    return found
-
-
 class ShardFilm:
     """The episodes of a shard set: every `step`-th row, of the cameras that the model sees of a robot.
 
@@ -370,7 +364,7 @@ class ShardFilm:
     def __init__(self, world: World, shards: ShardSet, step: int, embodiment: str | None = None) -> None:
         self.name, self._shards, self._step = shards.folder.name, shards, step
         self._rows = shards.episodes.to_pylist()
-        cameras = _cameras(world.model, embodiment or shards.embodiment.id)
+        cameras = trained_cameras(card(world.model, embodiment or shards.embodiment.id))
         if embodiment in (None, shards.embodiment.id):
             Views.of(shards, cameras)
         self.cameras = seen_cameras(cameras, shards.manifest.cameras)
@@ -407,7 +401,9 @@ class VideoFilm:
     def __init__(self, world: World, folder: Path, files: list[Path], embodiment: str, hz: float) -> None:
         self.name, self._world, self._folder, self._files = folder.name, world, folder, files
         self._hz, robot = hz, described(world.model, embodiment)
-        self._robot = None if robot is None else _seen_by(robot, _cameras(world.model, embodiment))
+        self._robot = (
+            None if robot is None else _seen_by(robot, trained_cameras(card(world.model, embodiment)))
+        )
 
     def heads(self) -> list[tuple[str, str, str]]:
         return [(str(file.relative_to(self._folder).with_suffix("")), "", "") for file in self._files]

@@ -3,7 +3,7 @@
 P pictures, H×W pixels, S pixels a side of the tokenizer's pictures, V views side by side.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import decode_image, resize
 from hma_data.episodes.sheets import first_of_grid
 from hma_data.errors import EpisodeError, HMAError, UsageError
-from hma_data.loading.views import Cameras
+from hma_data.loading.views import FIRST, Cameras
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
@@ -49,6 +49,12 @@ def picture_shape(config: HMAConfig) -> tuple[int, int, int]:
     """Return (S, V·S, 3) of a model's pictures."""
     size = TokenizerSpec.from_json(dict(config.tokenizer)).image_size
     return size, config.views * size, 3
+
+
+def trained_cameras(card: Mapping[str, Any]) -> Cameras:
+    """Return the cameras that a robot's stem was trained on, by its card."""
+    found: Cameras = card.get("data", {}).get("cameras") or FIRST
+    return found
 
 
 def seen_cameras(cameras: Cameras, stored: Sequence[str]) -> list[str]:

@@ -28,7 +28,7 @@ from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.evaluate import cameras_for
 from hma_model.generation.commands import card, described
-from hma_model.simulate.pictures import read_picture, recorded_cameras, seen_cameras
+from hma_model.simulate.pictures import read_picture, recorded_cameras, seen_cameras, trained_cameras
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -248,7 +248,7 @@ def _chunks(
 
 def _pictures(model: "HMA", robot: Embodiment, clip: Clip, at: NDArray[np.int64]) -> NDArray[np.uint8]:
     spec = TokenizerSpec.from_json(dict(model.config.tokenizer))
-    cameras = card(model, robot.id).get("data", {}).get("cameras", "first")
+    cameras = trained_cameras(card(model, robot.id))
     views = [
         prepared(
             clip.episode.streams[name],

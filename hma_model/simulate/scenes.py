@@ -33,6 +33,7 @@ from hma_model.simulate.pictures import (
     recorded_cameras,
     sample_picture,
     seen_cameras,
+    trained_cameras,
 )
 
 if TYPE_CHECKING:
@@ -322,13 +323,13 @@ def drivable(
                 shards.folder, f"{checkpoint.name} does not know the robot {name}", f"known: {known}"
             )
         require_tokenizer(checkpoint.config, shards.spec, shards.folder)
-        cameras = checkpoint.card(name).get("data", {}).get("cameras") or FIRST
+        cameras = trained_cameras(checkpoint.card(name))
         robot = RecordedRobot(shards, tokenizer, checkpoint.stats(name), cameras)
         found[robot.key] = robot
     recorded = {robot.embodiment.id for robot in found.values()}
     for name in checkpoint.embodiments:
         embodiment, stats = checkpoint.embodiment(name), checkpoint.stats(name)
-        cameras = checkpoint.card(name).get("data", {}).get("cameras") or FIRST
+        cameras = trained_cameras(checkpoint.card(name))
         begun = list(pictures)
         if simulated(name):
             found[name] = LabRobot(embodiment, stats, picture_shape(checkpoint.config)[0])
