@@ -8,7 +8,7 @@ W, so a run may continue with another number of ranks.
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from hma_data.errors import RecipeError, UsageError
+from hma_data.errors import RecipeError, ShardError, UsageError
 from hma_data.loading.dataset import Batch, MixtureDataset
 from hma_data.loading.mixture import Mixture
 from hma_data.shards.reader import ShardSet
@@ -79,7 +79,7 @@ class TrainData:
             return MixtureDataset(
                 list(sets.values()),
                 size,
-                recipe.frames,
+                recipe.drawn_frames,
                 **given,
                 samples=recipe.steps * recipe.windows_per_step if recipe.mixture.max_epochs else None,
                 short=recipe.short,
@@ -94,6 +94,12 @@ class TrainData:
             remedy = fault.remedy or f"the data has {', '.join(sets)}"
             where = fault.where.replace("mixture ", "mixture.")
             raise RecipeError(f"recipe: {where}", fault.fault, remedy) from fault
+        except ShardError as fault:
+            if not recipe.self_rollout:
+                raise
+            needed = f"asks for {recipe.frames} + {recipe.self_rollout_frames} frames; {fault}"
+            remedy = "lower it, or set short=pad, so that windows of short episodes begin at fewer frames"
+            raise RecipeError("recipe: self_rollout_frames", needed, remedy) from fault
 
     @property
     def mixture(self) -> Mixture:

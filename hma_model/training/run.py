@@ -44,7 +44,7 @@ from hma_model.training.resume import (
     write_state,
 )
 from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment, require_memory
-from hma_model.training.scheduled_sampling import forwarded, share_at
+from hma_model.training.scheduled_sampling import forwarded, rolled, share_at
 
 
 class Run:
@@ -54,9 +54,10 @@ class Run:
         if not recipe.data:
             raise RecipeError("recipe: data", "names no shards", "add data=[FOLDER, …]")
         self.out, self.device, self.world = out, device, world or World()
-        if recipe.self_forward and recipe.parallel == "fsdp" and self.world.size > 1:
-            fault = "does not work with parallel=fsdp on several ranks"
-            raise RecipeError("recipe: self_forward", fault, "use parallel=ddp")
+        for name in ("self_forward", "self_rollout"):
+            if getattr(recipe, name) and recipe.parallel == "fsdp" and self.world.size > 1:
+                fault = "does not work with parallel=fsdp on several ranks"
+                raise RecipeError(f"recipe: {name}", fault, "use parallel=ddp")
         if recipe.optimizer == "muon" and recipe.parallel == "fsdp" and self.world.size > 1:
             fault = "muon does not work with parallel=fsdp on several ranks"
             raise RecipeError("recipe: optimizer", fault, "use parallel=ddp")
@@ -246,9 +247,11 @@ class Run:
         generator = torch.Generator().manual_seed(seed_for(recipe.seed, "masks", self.step, number))
         with self.parallel_model.passing(last):
             with self._autocast():
-                if share := share_at(self.step, recipe):
-                    own = seed_for(recipe.seed, "self_forward", self.step, number)
-                    draws = torch.Generator().manual_seed(own)
+                if recipe.self_rollout:
+                    share = share_at(self.step, recipe, recipe.self_rollout)
+                    batch = rolled(self.model, batch, share, recipe.frames, self._draws("rollout", number))
+                if share := share_at(self.step, recipe, recipe.self_forward):
+                    draws = self._draws("self_forward", number)
                     batch = forwarded(self.model, batch, share, recipe.self_forward_frames, draws)
                 output = self.parallel_model(batch, generator=generator)
             if not output.loss.requires_grad:
@@ -256,6 +259,9 @@ class Run:
                 raise RecipeError("recipe: freeze", fault, "use freeze=nothing, or another objective")
             (output.loss / len(self.train_data.own)).backward()
         return output
+
+    def _draws(self, name: str, number: int) -> torch.Generator:
+        return torch.Generator().manual_seed(seed_for(self.recipe.seed, name, self.step, number))
 
     def _autocast(self) -> AbstractContextManager[Any]:
         if self.recipe.precision == "fp32":

@@ -1,14 +1,19 @@
 """Replace past frames by the model's own predictions in training, so that long rollouts drift less.
 
-In some windows of a batch, a few past frames are replaced by the model's predictions, one after the other.
-Each is predicted from the true frames before it and those already replaced. The target of the loss stays the
-true frame. The share of such windows may rise over the run, because predictions of an untrained model teach
-nothing. (The paper corrupts the past at random instead; see `corrupt_max` and `history_probability`.)
+`forwarded`: in some windows of a batch, a few past frames are replaced by the model's predictions, one after
+the other. Each is predicted from the true frames before it and those already replaced.
 
-B batch, T frames, h,w token grid, c,H,W latents, D frames replaced.
+`rolled`: some windows begin with a rollout, drawn as in generation and with its cache, of up to as many frames
+as the batch is longer than a window, so that a window's whole past may be far from the truth.
+
+The target of the loss stays the true frame. The share of such windows may rise over the run, because
+predictions of an untrained model teach nothing. (The paper corrupts the past at random instead; see
+`corrupt_max` and `history_probability`.)
+
+B batch, T frames of a window, L of a longer batch, h,w token grid, c,H,W latents, D frames replaced.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,6 +21,7 @@ from torch import Tensor
 
 from hma_data.loading.dataset import Batch
 from hma_model.config import OBJECTIVES
+from hma_model.generation.rollout import generate
 from hma_model.network.head import uniform
 from hma_model.network.stem import from_digits, split_tokens, unpatchify
 
@@ -33,12 +39,74 @@ class Forwarded(Batch):
     context: Tensor | None = None  # (B, T, h, w) tokens or (B, T, c, H, W) latents that the model sees
 
 
-def share_at(step: int, recipe: "Recipe") -> float:
-    """Return the share of windows with predicted past frames in step `step`, counted from 0."""
-    if step < recipe.self_forward_from or not recipe.self_forward:
+def share_at(step: int, recipe: "Recipe", share: float) -> float:
+    """Return how much of `share` windows have predicted past frames in step `step`, counted from 0."""
+    if step < recipe.self_forward_from:
         return 0.0
     along = (step + 1 - recipe.self_forward_from) / max(recipe.self_forward_over, 1)
-    return recipe.self_forward * min(along, 1.0)
+    return share * min(along, 1.0)
+
+
+def rolled(
+    model: "HMA", batch: Batch, share: float, frames: int, generator: torch.Generator | None = None
+) -> Batch:
+    """Cut windows out of a longer batch; in some of them, the past is the model's rollout.
+
+    Where a window begins is drawn, and so is the number of true frames, 2 to T, that all rollouts begin with.
+    A rollout goes from these, the first of the longer batch, to the frame before the window's last.
+
+    Args:
+        model: the model in training; its mode is restored afterwards.
+        batch: L frames on the model's device; padded ones (`frame_mask`) are left out where possible.
+        share: the probability that a window's past is a rollout.
+        frames: T, at most L.
+    """
+    size, length = batch.action_mask.shape
+    where = "cpu" if generator is None else generator.device
+    draws = uniform((3, size), generator, where).to(batch.actions.device)
+    inside = torch.full((size,), length) if batch.frame_mask is None else batch.frame_mask.sum(1).cpu()
+    room = (inside - frames).clamp(min=0).to(draws.device)
+    begin = (draws[1] * (room + 1)).long().minimum(room)
+    windows = _cut(batch, begin, frames)
+    chosen = draws[0] < share
+    prompt = 2 + int(float(draws[2, 0]) * (frames - 1))
+    count = int(begin[chosen].max()) + frames - 1 - prompt if bool(chosen.any()) else 0
+    if count < 1:
+        return windows
+    true = batch.tokens if batch.tokens is not None else batch.latents
+    assert true is not None
+    names = [name for name, taken in zip(batch.embodiment, chosen.tolist()) if taken]
+    actions, known = (batch.actions[chosen], batch.action_mask[chosen]) if _acts(model) else (None, None)
+    training = model.training
+    model.eval()
+    made = generate(model, true[chosen, :prompt], actions, names, count, known, generator=generator)
+    model.train(training)
+    seen = true.clone()
+    seen[chosen, prompt : prompt + count] = made.to(seen.dtype)
+    context = _from(seen, begin, frames)
+    shown = windows.tokens if windows.tokens is not None else windows.latents
+    assert shown is not None
+    context[:, -1] = shown[:, -1]
+    given = {f.name: getattr(windows, f.name) for f in fields(Batch)}
+    return Forwarded(**given, context=context)
+
+
+def _cut(batch: Batch, begin: Tensor, frames: int) -> Batch:
+    """Return the windows of a batch that begin at frame `begin` (B,)."""
+    names = ("actions", "action_mask", "tokens", "latents", "frame_mask")
+    values = {name: getattr(batch, name) for name in names}
+    return replace(batch, **{n: _from(v, begin, frames) for n, v in values.items() if v is not None})
+
+
+def _from(values: Tensor, begin: Tensor, frames: int) -> Tensor:
+    """Return values (B, L, …) from `begin` (B,) on, as (B, T, …)."""
+    rows = torch.arange(len(begin), device=values.device).unsqueeze(1)
+    return values[rows, begin.unsqueeze(1) + torch.arange(frames, device=values.device)]
+
+
+def _acts(model: "HMA") -> bool:
+    """Check whether some objective of the model sees actions."""
+    return any(weight and OBJECTIVES[name].sees_actions for name, weight in model.config.objectives.items())
 
 
 @torch.no_grad()
@@ -74,7 +142,7 @@ def forwarded(
         at = first[chosen] + offset
         context[rows, at] = _predicted(model, context, at, own, generator)
     model.train(training)
-    seen = true.clone()
+    seen = (batch.context if isinstance(batch, Forwarded) and batch.context is not None else true).clone()
     seen[chosen] = context
     given = {f.name: getattr(batch, f.name) for f in fields(Batch)}
     return Forwarded(**given, context=seen)
@@ -85,9 +153,8 @@ def _predicted(
 ) -> Tensor:
     """Predict frame `at` (n,) of each window, wholly masked, from the frames before it."""
     config, rows = model.config, torch.arange(len(at), device=at.device)
-    names, actions, known = batch.embodiment, None, None
-    if any(weight and OBJECTIVES[name].sees_actions for name, weight in config.objectives.items()):
-        actions, known = batch.actions, batch.action_mask
+    names = batch.embodiment
+    actions, known = (batch.actions, batch.action_mask) if _acts(model) else (None, None)
     if config.kind == "discrete":
         hidden = context.clone()
         hidden[rows, at] = config.vocab_size
