@@ -27,6 +27,7 @@ from hma_data.inspection.infer_choices import (
     instruction,
     is_gripper,
     likely,
+    next_poses,
     shown,
     states,
     vectors,
@@ -182,6 +183,11 @@ class _Draft:
             self.seen = replace(self.seen, keys=running or self.seen.keys)
             self.action = infer_topics.actions(numbers)
             self.states = infer_topics.states(numbers, self.action.keys)
+        elif found.format == "rh20t":
+            self.action, self.states = (
+                next_poses([key for key in found.keys if key.kind == "vector"]),
+                states(numbers, ()),
+            )
         else:
             action = actions(numbers)
             self.action = action if action.keys else likely(numbers)
@@ -207,7 +213,7 @@ class _Draft:
             "target_hz": self._target(),
             "action": {
                 "space": f"{TODO}: one of {', '.join(spaces[:-1])} or {spaces[-1]}?",
-                "components": [self._component(key) for key in self.action.keys],
+                "components": [self._component(key) for key in self._commands()],
             },
         }
         if self.states:
@@ -215,7 +221,7 @@ class _Draft:
         values["cameras"] = self._cameras()
         if self.bag:
             values["sync"] = self._sync(values["cameras"][0]["name"])
-        elif self.action.measured:
+        elif self.action.measured and found.format != "rh20t":
             values["sync"] = {"action_shift": 1}
         source = {"format": found.format, "uri": found.uri, "episodes": max(found.episodes, 1)}
         said = self._instruction()
@@ -234,7 +240,7 @@ class _Draft:
             return None
         camera = self.seen.keys[0]
         doubt = 0.0  # relative error of the median interval of jittering stamps
-        if self.bag and camera.jitter_ms and camera.count:
+        if self.found.format in ("rosbag", "rh20t") and camera.jitter_ms and camera.count:
             doubt = 2.5 * camera.jitter_ms * self.hz / 1e3 / math.sqrt(camera.count)
         whole = round(self.hz)
         tolerance = MEASURED_TO + (min(doubt, 0.02) if doubt == doubt else 0.0)
@@ -249,6 +255,13 @@ class _Draft:
         stride = max(1, min(slowest, int(length // SHOWN)))
         rate = round(hz / stride, 3)
         return TARGET_HZ if stride == slowest else int(rate) if rate == int(rate) else rate
+
+    def _commands(self) -> list[KeyInfo]:
+        """Return the keys of the action as the YAML names them: of RH20T, those of the next sample."""
+        keys = list(self.action.keys)
+        if self.found.format == "rh20t" and self.action.measured:
+            return [replace(key, key=f"{key.key}/next") for key in keys]
+        return keys
 
     def _component(self, key: KeyInfo) -> dict[str, Any]:
         component = _named(key, key.names)

@@ -349,6 +349,15 @@ def likely(found: list[KeyInfo]) -> Choice:
     return Choice(chosen, asked + (f", or which of {others} is it?" if others else "?"), measured=bool(own))
 
 
+def next_poses(found: list[KeyInfo]) -> Choice:
+    """Choose RH20T's pose and width of the next sample, which stand for a command; else what may be one."""
+    chosen = tuple(key for key in found if key.key in ("tcp_base/tcp", "gripper/gripper_info"))
+    if not chosen:
+        return likely(found)
+    asked = f"may {shown(key.key for key in chosen)} of the next sample stand for the command?"
+    return Choice(chosen, asked, measured=True)
+
+
 def instruction(keys: Iterable[KeyInfo]) -> str | None:
     """Return the key of the language instruction; None where there is none."""
     ranked = []

@@ -14,6 +14,7 @@ FORMATS = {  # name -> package: RECOGNITION in it, open() in its module `source`
     "rosbag": "hma_data.sources.bags",
     "hdf5": "hma_data.sources.hdf5",
     "lerobot": "hma_data.sources.lerobot",
+    "rh20t": "hma_data.sources.rh20t",
     "hands": "hma_data.sources.hands",
 }
 MORE = f"an installed package may add formats by entry points of {SOURCE_GROUP}"

@@ -197,7 +197,7 @@ class Sync(SpecModel):
         0,
         ge=-100,
         le=100,
-        description="in steps: the command of frame t is recorded at t + action_shift; not for bags",
+        description="in steps: the command of frame t is recorded at t + action_shift; not for bags, RH20T",
     )
     stamp: Literal["header", "receive"] = Field("header", description="which of a message's times counts")
 
@@ -372,6 +372,7 @@ LAYOUTS: dict[str, type[SourceLayout]] = {
     "rosbag": SourceLayout,
     "hdf5": Hdf5Layout,
     "lerobot": LeRobotLayout,
+    "rh20t": SourceLayout,
     "hands": HandsLayout,
 }
 

@@ -125,6 +125,8 @@ class Embodiment(SpecModel):
         sync = info.data.get("sync")
         if sync and sync.action_shift and value.format == "rosbag":
             raise ValueError("a bag has times instead of steps, which sync.action_shift counts")
+        if sync and sync.action_shift and value.format == "rh20t":
+            raise ValueError("RH20T has no steps, which sync.action_shift counts: end keys in /next instead")
         stored = info.context and info.context["stored"]
         if sync and sync.rate_hz and value.format in ONE_INDEX and not stored:
             raise ValueError(

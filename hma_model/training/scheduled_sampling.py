@@ -3,8 +3,8 @@
 `forwarded`: in some windows of a batch, a few past frames are replaced by the model's predictions, one after
 the other. Each is predicted from the true frames before it and those already replaced.
 
-`rolled`: some windows begin with a rollout, drawn as in generation and with its cache, of up to as many frames
-as the batch is longer than a window, so that a window's whole past may be far from the truth.
+`rolled`: some windows begin with a rollout, drawn as in generation and with its cache. Windows are cut out of
+longer batches for it, so that the whole past of a window may be the model's own, and far from the truth.
 
 The target of the loss stays the true frame. The share of such windows may rise over the run, because
 predictions of an untrained model teach nothing. (The paper corrupts the past at random instead; see
@@ -14,7 +14,7 @@ B batch, T frames of a window, L of a longer batch, h,w token grid, c,H,W latent
 """
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -93,9 +93,12 @@ def rolled(
 
 def _cut(batch: Batch, begin: Tensor, frames: int) -> Batch:
     """Return the windows of a batch that begin at frame `begin` (B,)."""
-    names = ("actions", "action_mask", "tokens", "latents", "frame_mask")
-    values = {name: getattr(batch, name) for name in names}
-    return replace(batch, **{n: _from(v, begin, frames) for n, v in values.items() if v is not None})
+    cut: dict[str, Any] = {
+        name: _from(value, begin, frames)
+        for name in ("actions", "action_mask", "tokens", "latents", "frame_mask")
+        if (value := getattr(batch, name)) is not None
+    }
+    return replace(batch, **cut)
 
 
 def _from(values: Tensor, begin: Tensor, frames: int) -> Tensor:

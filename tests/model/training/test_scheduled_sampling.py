@@ -246,7 +246,7 @@ LONG = FRAMES + 7
 
 
 def long_batch(size: int = 8, continuous: bool = False) -> Batch:
-    """Frame t of row b is b + t · 100 in every token, and so are its actions, so that windows show their place."""
+    """Frame t of row b is b + t · 100 in every token and action, so that windows show their place."""
     place = torch.arange(size).view(-1, 1) + 100 * torch.arange(LONG)
     names = ["arm", "hand"] * (size // 2)
     shape = (size, LONG, 2, 4, 4) if continuous else (size, LONG, 2, 3)
@@ -257,7 +257,7 @@ def long_batch(size: int = 8, continuous: bool = False) -> Batch:
 
 
 def begins(given: Batch) -> list[int]:
-    """Return the frame of the longer batch that each window begins with; checks that all of it is cut alike."""
+    """Return the frame of the longer batch that each window begins with; all of it must be cut alike."""
     stored = given.tokens if given.tokens is not None else given.latents
     places = stored.flatten(2)[:, :, 0].long()
     first = places[:, :1] // 100
@@ -275,8 +275,10 @@ def marked(made: list, prompts: list):
         made.append(count)
         prompts.append(prompt.shape[1])
         times = prompt.shape[1] + torch.arange(count)
-        return (-1 - times).view(1, count, *[1] * (prompt.dim() - 2)).expand(
-            len(prompt), count, *prompt.shape[2:]
+        return (
+            (-1 - times)
+            .view(1, count, *[1] * (prompt.dim() - 2))
+            .expand(len(prompt), count, *prompt.shape[2:])
         )
 
     return generate

@@ -1,0 +1,203 @@
+"""RH20T's scenes: every number and frame at its own time, and each defect named."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import yaml
+
+from hma_data.conversion.job import convert
+from hma_data.episodes.align import to_clip
+from hma_data.errors import EpisodeError, RegistryError, SourceError
+from hma_data.inspection.infer import infer
+from hma_data.registry.embodiment import find
+from hma_data.shards.reader import ShardSet
+from hma_data.sources.base import detect, open_source
+from tests.data.rh20t_files import CAMERAS, LATE_MS, pose, robot, stamps, tables, write_scene
+
+SCENE = "task_0001_user_0001_scene_0001_cfg_0001"
+
+
+@pytest.fixture
+def recording(tmp_path):
+    folder = tmp_path / "RH20T_cfg1"
+    folder.mkdir()
+    write_scene(folder)
+    return folder
+
+
+def read(folder, name=SCENE, embodiment=None):
+    return open_source("rh20t").read(folder, name, embodiment or robot())
+
+
+def test_numbers_and_frames_lie_at_their_times(recording):
+    episode = read(recording)
+    assert not episode.rate_stamped and episode.success is True and episode.metadata["rating"] == 5
+    for camera, name in enumerate(("c0", "c1")):
+        assert np.array_equal(episode.streams[name].timestamps, np.array(stamps(camera, 12)) / 1e3)
+    tcp, width = episode.actions
+    assert np.array_equal(tcp.timestamps, np.array(stamps(0, 12))[:-1] / 1e3)
+    assert np.array_equal(tcp.values, np.stack([pose(0, i + 1) for i in range(11)]).astype(np.float32))
+    assert width.values[:, 0].tolist() == [100 - i for i in range(1, 12)]
+    clip = to_clip(episode, robot())
+    assert len(clip) == 12 and clip.skew_ms["c1"].max() == pytest.approx(LATE_MS, abs=1)
+    assert np.array_equal(clip.states[:, 7:], np.arange(14) + np.arange(12)[:, None])
+    # the last frame has no next sample: the last command stays in force
+    assert clip.actions[:, 0].tolist() == [*range(1, 12), 11]
+
+
+def test_the_task_is_found_in_a_folder_above(recording):
+    assert read(recording).instruction == ""
+    told = {"task_0001": {"task_description_english": "press it", "task_description_chinese": "按"}}
+    (recording.parent / "task_description.json").write_text(json.dumps(told))
+    assert read(recording).instruction == "press it"
+    source = {"format": "rh20t", "instruction": "task_description_chinese"}
+    assert read(recording, embodiment=robot(source=source)).instruction == "按"
+
+
+@pytest.mark.parametrize(("rating", "success"), [(0, False), (1, False), (2, True), (9, True)])
+def test_a_rating_tells_success(rating, success, tmp_path):
+    write_scene(tmp_path, rating=rating)
+    assert read(tmp_path).success is success
+
+
+def test_scenes_are_found_in_nested_folders_and_films_of_people_are_not(recording):
+    write_scene(recording, 2)
+    shutil.copytree(recording / SCENE, recording / f"{SCENE}_human")
+    other = recording.parent / "RH20T_cfg2"
+    shutil.copytree(recording, other)
+    source = open_source("rh20t")
+    second = SCENE.replace("0001", "0002", 1)
+    assert source.episode_ids(recording) == [SCENE, second]
+    assert source.episode_ids(recording.parent) == [
+        f"RH20T_cfg{n}/{scene}" for n in (1, 2) for scene in (SCENE, second)
+    ]
+    assert open_source("rh20t").episode_ids(recording / SCENE) == [SCENE]
+    assert {detect(path) for path in (recording, recording.parent, recording / SCENE)} == {"rh20t"}
+    shutil.rmtree(recording / SCENE)
+    shutil.rmtree(recording / second)
+    with pytest.raises(SourceError, match="films of people"):
+        open_source("rh20t").index(recording)
+
+
+def test_a_film_with_fewer_frames_than_times_is_counted_and_one_with_more_refused(tmp_path):
+    write_scene(tmp_path, films=10)
+    episode = read(tmp_path)
+    assert len(episode.streams["c0"].timestamps) == 10 and episode.metadata["flags"] == {"frames_missing": 4}
+    assert len(to_clip(episode, robot())) == 10
+    write_scene(tmp_path, 2, films=13)
+    with pytest.raises(EpisodeError, match="has 13 frames, .* only 12 times"):
+        read(tmp_path, SCENE.replace("0001", "0002", 1))
+
+
+def changed(change):
+    content = tables(12)
+    change(content)
+    return content
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t: t.pop("joint"), r"has no transformed/joint\.npy — transformed has gripper, tcp_base"),
+        (lambda t: t["tcp_base"].pop(CAMERAS[0]), "no samples of camera 750612070851 — it has 043322070878"),
+        (lambda t: t["tcp_base"][CAMERAS[0]][3].pop("tcp"), "no 'tcp' — it has timestamp, robot_ft"),
+        (lambda t: t["tcp_base"][CAMERAS[0]][3].update(tcp=np.zeros(6)), "changes its number of values"),
+        (lambda t: t["tcp_base"][CAMERAS[0]][3].update(tcp=[[1], [2]]), "holds list values, not numbers"),
+        (lambda t: t["tcp_base"][CAMERAS[0]][3].update(timestamp="x"), "no timestamps in whole milliseconds"),
+        (lambda t: t["tcp_base"].update({CAMERAS[0]: []}), "no timestamps in whole milliseconds"),
+        (lambda t: t["joint"][CAMERAS[0]].update(dict.fromkeys(stamps(0, 12), np.zeros(9000))), "more than"),
+    ],
+)  # fmt: skip
+def test_a_defect_of_a_table_is_named(change, said, tmp_path):
+    write_scene(tmp_path, content=changed(change))
+    with pytest.raises(EpisodeError, match=said):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda s: (s / f"cam_{CAMERAS[1]}/color.mp4").unlink(), r"has no cam_043322070878/color\.mp4"),
+        (lambda s: (s / f"cam_{CAMERAS[1]}/timestamps.npy").unlink(), "there is no such file"),
+        (lambda s: np.save(s / f"cam_{CAMERAS[0]}/timestamps.npy", {"depth": [1]}), "color holds NoneType"),
+        (lambda s: (s / "metadata.json").write_text("{"), "cannot be read as JSON"),
+    ],
+)  # fmt: skip
+def test_a_missing_or_damaged_file_is_named(spoil, said, recording):
+    spoil(recording / SCENE)
+    with pytest.raises(EpisodeError, match=said):
+        read(recording)
+
+
+def test_links_out_of_a_scene_are_refused(recording, tmp_path):
+    film = recording / SCENE / f"cam_{CAMERAS[0]}" / "color.mp4"
+    shutil.move(film, tmp_path / "elsewhere.mp4")
+    film.symlink_to(tmp_path / "elsewhere.mp4")
+    with pytest.raises(EpisodeError, match="outside its folder"):
+        read(recording)
+
+
+def test_every_file_that_is_used_changes_the_fingerprint(recording):
+    def told():
+        return open_source("rh20t").index(recording, robot())[0].fingerprint
+
+    seen = {told()}
+    for place in ("transformed/joint.npy", f"cam_{CAMERAS[0]}/timestamps.npy", "metadata.json"):
+        path = recording / SCENE / place
+        path.write_bytes(path.read_bytes() + b" ")
+        seen.add(told())
+    assert len(seen) == 4 and told() == told()
+    (recording / SCENE / "audio").mkdir()
+    assert told() in seen
+
+
+def test_a_bad_scene_goes_to_quarantine_and_the_others_become_shards(recording, tmp_path):
+    write_scene(recording, 2)
+    (recording / SCENE / "transformed/tcp_base.npy").write_bytes(b"spoilt")
+    convert(robot(), recording, "fsq-8", tmp_path / "out", max_quarantine=1)
+    shards = ShardSet(tmp_path / "out")
+    assert shards.manifest.quarantined == 1
+    assert sum(split["episodes"] for split in shards.manifest.splits.values()) == 1
+
+
+def test_inspection_measures_the_cameras_and_lists_the_tables(recording):
+    found = open_source("rh20t").inspect(recording)
+    keys = {key.key: key for key in found.keys}
+    assert set(keys) == {
+        *(f"cam_{serial}" for serial in CAMERAS), "tcp_base/tcp", "tcp_base/robot_ft",
+        "gripper/gripper_command", "gripper/gripper_info", "joint",
+    }  # fmt: skip
+    assert found.hz == pytest.approx(10, abs=0.15) and found.frames == 12
+    assert keys["tcp_base/tcp"].shape == (7,) and keys[f"cam_{CAMERAS[0]}"].codec == "h264"
+    assert keys[f"cam_{CAMERAS[0]}"].skew_ms is not None
+    (recording / SCENE / "transformed/joint.npy").write_bytes(b"")
+    assert any("joint" in str(finding) for finding in open_source("rh20t").inspect(recording).findings)
+
+
+def test_an_inferred_robot_takes_the_next_pose_as_its_command(recording):
+    values = yaml.safe_load(infer(recording, "mine"))
+    keys = [part["key"] for part in values["action"]["components"]]
+    assert sorted(keys) == ["gripper/gripper_info/next", "tcp_base/tcp/next"]
+    assert "action_shift" not in values.get("sync", {}) and values["frequency_hz"] == 10
+
+
+def test_a_shift_in_steps_is_refused():
+    with pytest.raises(RegistryError, match="end keys in /next"):
+        robot(sync={"action_shift": 1})
+
+
+@pytest.mark.parametrize("number", range(1, 8))
+def test_the_registry_reads_scenes_of_its_cameras(number, tmp_path):
+    own = find(f"rh20t_cfg{number}")
+    scene = write_scene(tmp_path)
+    serials = [camera.key.removeprefix("cam_") for camera in own.cameras]
+    first = shutil.move(scene / f"cam_{CAMERAS[0]}", tmp_path / "camera")
+    for serial in serials:
+        shutil.copytree(first, scene / f"cam_{serial}", dirs_exist_ok=True)
+    content = {name: dict.fromkeys(serials, table[CAMERAS[0]]) for name, table in tables(12).items()}
+    for name, table in content.items():
+        np.save(scene / "transformed" / f"{name}.npy", table)
+    clip = to_clip(read(tmp_path, embodiment=own), own)
+    assert clip.actions.shape == (12, 8) and clip.states.shape == (12, 8) and len(clip.frame_indices) == 6
