@@ -122,6 +122,7 @@ assert not heavy, heavy
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_the_whole_data_road_on_a_toy_recording(arm: Path, tmp_path: Path) -> None:
     out = tmp_path / "shards"
     source = str(tmp_path / "toy.hdf5")
@@ -220,6 +221,7 @@ def test_a_truncated_hdf5(arm: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.slow
 def test_an_action_of_the_wrong_width(arm: Path, tmp_path: Path) -> None:
     arm.write_text(ARM_YAML.replace("dims: 3, names: [a, b, c]", "dims: 5"))
     source, out = str(tmp_path / "toy.hdf5"), tmp_path / "o"
@@ -258,6 +260,7 @@ def slow(source: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str
     )
 
 
+@pytest.mark.slow
 def test_a_truncated_mcap(bags: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     whole = next(iter(sorted(bags.glob("*.mcap")))).read_bytes()

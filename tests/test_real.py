@@ -34,7 +34,7 @@ source: {format: rosbag}
     ("robot", "recording", "limit"),
     [
         ("bridge_data_v2", "rlds/bridge_dataset", 3),
-        ("robosuite_lift", "hdf5/lift_rendered.hdf5", 2),
+        pytest.param("robosuite_lift", "hdf5/lift_rendered.hdf5", 2, marks=pytest.mark.slow),
         pytest.param("g1_inspire", "lerobot/g1_v21", 3, marks=pytest.mark.slow),
     ],
 )

@@ -75,6 +75,7 @@ def test_shards_are_not_hashed_again(toy_recording, tmp_path, monkeypatch) -> No
     assert run(robot(1), toy_recording, tmp_path / "out").changed
 
 
+@pytest.mark.slow
 def test_hma_convert_prints_the_new_stride_in_one_line(toy_recording, tmp_path) -> None:
     args = ["convert", "-e", tmp_path / "toy_arm.yaml", "--source", toy_recording, "--out", tmp_path / "out"]
     args += ["--tokenizer", "fsq-8", "--workers", "0"]

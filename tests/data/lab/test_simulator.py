@@ -27,7 +27,9 @@ def recorded(robot: Embodiment, folder: Path) -> tuple[Clip, NDArray[np.uint8]]:
     return clip, prepare(clip.frames_at(camera.name, np.arange(len(clip))), camera, SIZE)
 
 
-@pytest.mark.parametrize("robot", ["pusht_fast", "pendulum", "planar_arm", "arm2_12"])
+@pytest.mark.parametrize(
+    "robot", [pytest.param("pusht_fast", marks=pytest.mark.slow), "pendulum", "planar_arm", "arm2_12"]
+)
 def test_recorded_commands_give_the_recorded_pictures_and_states(robot: str, tmp_path: Path) -> None:
     simulator = LabSimulator(robot)
     clip, pictures = recorded(simulator.embodiment, tmp_path)
@@ -41,6 +43,7 @@ def test_recorded_commands_give_the_recorded_pictures_and_states(robot: str, tmp
     np.testing.assert_allclose(np.stack(states), clip.states, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_pusht_slow_follows_its_recording_up_to_the_jitter(tmp_path: Path) -> None:
     simulator = LabSimulator("pusht_slow")
     clip, pictures = recorded(simulator.embodiment, tmp_path)

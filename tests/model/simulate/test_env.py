@@ -103,7 +103,9 @@ def test_a_judge_sees_the_episode_and_ends_it(world: World, window: tuple[Any, A
     assert shapes == [((2, 128, 128, 3), (1, 4, 2)), ((3, 128, 128, 3), (2, 4, 2))] * 2
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize(
+    "mode", [AutoresetMode.NEXT_STEP, pytest.param(AutoresetMode.SAME_STEP, marks=pytest.mark.slow)]
+)
 def test_a_vector_steps_as_gymnasium_steps_environments_one_by_one(
     model: HMA, window: tuple[Any, Any], mode: AutoresetMode
 ) -> None:

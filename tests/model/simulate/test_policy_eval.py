@@ -86,6 +86,7 @@ def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJu
     assert found.success.pearson.value is None and "4 of the 8 episodes" in sentences(found)[3]
 
 
+@pytest.mark.slow
 def test_a_model_is_scored_and_the_report_written(world: World, judge: StateJudge, tmp_path: Path) -> None:
     again, found = (
         evaluate_policies(ROBOT, ["random", "still"], world=world, judge=judge, episodes=4, frames=4, seed=3)

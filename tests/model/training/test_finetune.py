@@ -195,6 +195,7 @@ def test_heads_learn_on_a_frozen_trunk_when_actions_are_the_objective(base, leg,
     assert not torch.equal(a[name], b[name])
 
 
+@pytest.mark.slow
 def test_the_command_takes_shards_overrides_and_json(base, leg, tmp_path):
     foot = make_shards(tmp_path / "foot", "foot", dims=1, seed=5)
     words = ["finetune", "--from", str(base.out), "--data", str(leg), str(foot), "--freeze-trunk"]
