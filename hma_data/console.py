@@ -4,6 +4,7 @@ The data and the model verbs share this module. rich is imported when something 
 """
 
 import json
+import os
 import shutil
 import sys
 import textwrap
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-from hma_data.errors import Interrupted
+from hma_data.errors import HMAError, Interrupted
 
 
 class Update(Protocol):
@@ -21,6 +22,23 @@ class Update(Protocol):
     def __call__(self, done: float, extra: str = "", total: float | None = None) -> None:
         """Show the amount done so far, a few words beside the bar, and the total once it is known."""
         ...
+
+
+def run_script(main: Callable[[], None]) -> None:
+    """Run a script; an error of the toolkit becomes one line on stderr and an exit code, as of `hma`.
+
+    With HMA_DEBUG in the environment, errors show where they happened.
+    """
+    try:
+        main()
+    except HMAError as fault:
+        if os.environ.get("HMA_DEBUG"):
+            raise
+        print(f"error: {' '.join(str(fault).split())}", file=sys.stderr)
+        raise SystemExit(fault.exit_code) from None
+    except KeyboardInterrupt:
+        print("error: interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def print_json(values: Any) -> None:

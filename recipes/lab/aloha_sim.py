@@ -20,6 +20,7 @@ follow lines, and inverse kinematics give the joints.
 
 import numpy as np
 
+from hma_data.console import run_script
 from hma_data.lab import recorder
 
 SIZE, SHADOWS = 128, 1024  # pixels: the side of the pictures, and of the map of shadows
@@ -123,4 +124,4 @@ def _turn(axis, angle):
 
 
 if __name__ == "__main__":
-    recorder.main(Aloha, __doc__)
+    run_script(lambda: recorder.main(Aloha, __doc__))

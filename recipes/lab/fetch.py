@@ -22,6 +22,7 @@ The physics, the look and the success are the environment's; the camera is neare
 
 import numpy as np
 
+from hma_data.console import run_script
 from hma_data.lab import recorder
 
 SIZE = 128  # pixels: the side of the pictures
@@ -84,4 +85,4 @@ class Fetch:
 
 
 if __name__ == "__main__":
-    recorder.main(Fetch, __doc__)
+    run_script(lambda: recorder.main(Fetch, __doc__))

@@ -27,6 +27,7 @@ import logging
 
 import numpy as np
 
+from hma_data.console import run_script
 from hma_data.lab import recorder
 
 SIZE = 128  # pixels: the side of the pictures
@@ -123,4 +124,4 @@ def _yaw(quat):
 
 
 if __name__ == "__main__":
-    recorder.main(Panda, __doc__)
+    run_script(lambda: recorder.main(Panda, __doc__))

@@ -18,6 +18,7 @@ import numpy as np
 from stable_worldmodel import World
 from stable_worldmodel.policy import PlanConfig, RandomPolicy, WorldModelPolicy
 
+from hma_data.console import run_script
 from hma_data.lab import truth
 from hma_model.simulate.arenas import Scenes
 from hma_model.simulate.planning import ELITES, SOLVERS, Cost, solver_of
@@ -112,4 +113,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

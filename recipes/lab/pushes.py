@@ -19,6 +19,7 @@ import argparse
 from functools import partial
 from pathlib import Path
 
+from hma_data.console import run_script
 from hma_data.lab import pusht
 from hma_data.storage.files import part_of
 
@@ -49,4 +50,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

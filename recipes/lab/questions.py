@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from what_pays import append, read
 
+from hma_data.console import run_script
 from hma_data.lab.family import TRUNK
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
@@ -321,4 +322,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

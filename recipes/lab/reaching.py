@@ -40,6 +40,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hma_data.console import run_script
 from hma_data.lab import family, record, whole
 from hma_data.lab.writers import LeRobotEpisode, write_lerobot
 
@@ -88,4 +89,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -26,6 +26,7 @@ import warnings
 
 import numpy as np
 
+from hma_data.console import run_script
 from hma_data.lab import recorder
 
 SIZE, SHADOWS = 128, 1024  # pixels: the side of the pictures, and of the map of shadows
@@ -91,4 +92,4 @@ class Sawyer:
 
 
 if __name__ == "__main__":
-    recorder.main(Sawyer, __doc__)
+    run_script(lambda: recorder.main(Sawyer, __doc__))

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from hma_data import lab
+from hma_data.console import run_script
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import merge
@@ -147,4 +148,4 @@ def table(known: list[dict[str, str]]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

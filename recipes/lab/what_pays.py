@@ -19,6 +19,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from hma_data.console import run_script
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import get_tokenizer
 
@@ -166,4 +167,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hma_data.console import run_script
 from hma_data.episodes.images import resize
 from hma_data.episodes.sheets import grid
 from hma_data.tokenizers.base import get_tokenizer
@@ -44,4 +45,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -17,6 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.console import run_script
+
 Picture = NDArray[np.uint8]
 EACH = 8  # mosaics of a further look
 LAB = ("pendulum", "planar_arm", "pusht_fast", "pusht_slow")  # beside the family's robots
@@ -157,4 +159,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

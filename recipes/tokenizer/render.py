@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.console import run_script
+
 SIZE = 256
 # name -> tasks; a scene is a task after random actions
 SCENES: dict[str, list[str]] = {
@@ -159,4 +161,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

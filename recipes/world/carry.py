@@ -8,6 +8,7 @@ The weights stay as they are. Only do this where most tokens stay the same; then
 import argparse
 from pathlib import Path
 
+from hma_data.console import run_script
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint import io
 from hma_model.checkpoint.folder import Checkpoint
@@ -30,4 +31,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import torch
 
+from hma_data.console import run_script
 from hma_data.shards.reader import ShardSet
 from hma_model.checkpoint import io
 from hma_model.checkpoint.folder import Checkpoint
@@ -55,4 +56,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from hma_data import lab
+from hma_data.console import run_script
 from hma_data.conversion.engines import Attempt, Report, Work
 from hma_data.conversion.engines.local import run
 from hma_data.conversion.job import convert
@@ -88,4 +89,4 @@ def _ignore(number: int, event: Any) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -3,7 +3,7 @@
 import pytest
 
 from hma_data import console
-from hma_data.errors import Interrupted
+from hma_data.errors import Interrupted, SourceError, UsageError
 
 
 def test_progress_tells_elapsed_from_remaining_time(
@@ -45,3 +45,25 @@ def test_a_ctrl_c_becomes_an_error_with_the_words() -> None:
         console.interruptible(lambda: "3 shards kept"),
     ):
         raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("fault", "said", "code"),
+    [
+        (UsageError("x", "is wrong", "give y"), "error: x: is wrong — give y\n", 2),
+        (SourceError("x", "is not\nthere"), "error: x: is not there\n", 1),
+        (KeyboardInterrupt(), "error: interrupted\n", 130),
+    ],
+)
+def test_a_script_tells_an_error_in_one_line(fault, said, code, capsys, monkeypatch):
+    def main():
+        raise fault
+
+    monkeypatch.delenv("HMA_DEBUG", raising=False)
+    with pytest.raises(SystemExit) as ended:
+        console.run_script(main)
+    assert ended.value.code == code and capsys.readouterr().err == said
+    if not isinstance(fault, KeyboardInterrupt):
+        monkeypatch.setenv("HMA_DEBUG", "1")
+        with pytest.raises(type(fault)):
+            console.run_script(main)
