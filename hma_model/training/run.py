@@ -58,6 +58,9 @@ class Run:
             if getattr(recipe, name) and recipe.parallel == "fsdp" and self.world.size > 1:
                 fault = "does not work with parallel=fsdp on several ranks"
                 raise RecipeError(f"recipe: {name}", fault, "use parallel=ddp")
+        if recipe.self_rollout and not any(OBJECTIVES[name].predicts_video for name in recipe.objectives):
+            fault = f"needs frames to roll out, which {', '.join(recipe.objectives)} does not predict"
+            raise RecipeError("recipe: self_rollout", fault, "add one such as forward, or set it to 0")
         if recipe.optimizer == "muon" and recipe.parallel == "fsdp" and self.world.size > 1:
             fault = "muon does not work with parallel=fsdp on several ranks"
             raise RecipeError("recipe: optimizer", fault, "use parallel=ddp")

@@ -151,6 +151,12 @@ def test_sharded_ranks_are_refused(past, tmp_path):
         Run(recipe, tmp_path, torch.device("cpu"), World(0, 2))
 
 
+def test_rollouts_without_predicted_frames_are_refused(tmp_path):
+    recipe = make_recipe({**TINY, "data": ["x"], "self_rollout": 0.5, "objectives": {"policy": 1}})
+    with pytest.raises(RecipeError, match="self_rollout: needs frames .* policy does not predict"):
+        Run(recipe, tmp_path, torch.device("cpu"))
+
+
 def test_no_loss_is_due_on_padded_frames(model):
     true = batch(2)
     padded = replace(true, frame_mask=torch.tensor([[True] * 3 + [False] * 3, [True] * 6]))
