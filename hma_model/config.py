@@ -245,6 +245,11 @@ class HMAConfig:
         return any(OBJECTIVES[name].predicts_video for name, weight in self.objectives.items() if weight)
 
     @property
+    def sees_actions(self) -> bool:
+        """Return whether an objective of the training sees actions."""
+        return any(OBJECTIVES[name].sees_actions for name, weight in self.objectives.items() if weight)
+
+    @property
     def vocab_size(self) -> int:
         """Return the number of ids of a stored token; this number is also the id that means masked."""
         return math.prod(self.factored)

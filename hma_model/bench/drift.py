@@ -94,9 +94,11 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     from hma_data.tokenizers.network import single_threads
     from hma_model.checkpoint.folder import require_tokenizer
     from hma_model.network.model import HMA
+    from hma_model.training.runtime import choose_device
 
-    model = HMA.from_pretrained(settings["checkpoint"], embodiments=robots).eval()
-    tokenizer = get_tokenizer(str(model.config.tokenizer["name"]))
+    device = str(choose_device(settings["device"]))
+    model = HMA.from_pretrained(settings["checkpoint"], embodiments=robots, device=device).eval()
+    tokenizer = get_tokenizer(str(model.config.tokenizer["name"]), device=device)
     require_tokenizer(model.config, tokenizer.spec, settings["checkpoint"])
     work = partial(measure, model, tokenizer, samplings=samplings, settings=settings)
     with single_threads(len(robots)) as pool:
@@ -302,6 +304,7 @@ BENCH = Bench(
         "rollouts": 8,  # of each robot
         "sampling": "unmask_steps=2",
         "prompt": 0,  # true frames; 0: the model's window
+        "device": "auto",
         "seed": 1818,
         "sheet": "",  # a PNG to write
     },

@@ -27,12 +27,14 @@ from hma_model.cli.options import (
     Checkpoint,
     Compile,
     Data,
+    Device,
     Precision,
     SampleSteps,
     Split,
     Temperature,
     UnmaskSteps,
     camera_names,
+    device_name,
     require_checkpoint,
 )
 from hma_model.cli.play import play
@@ -186,6 +188,7 @@ def generate(
     temperature: Temperature = None,
     precision: Precision = "float32",
     compile: Compile = False,
+    device: Device = "auto",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollout.")] = 0,
     cameras: Cameras = None,
 ) -> None:
@@ -195,7 +198,7 @@ def generate(
     """
     if out.suffix not in (".mp4", ".webp", ".gif"):
         raise UsageError("--out", f"{out} is none of .mp4, .webp and .gif")
-    opened = _opened(checkpoint, data)
+    opened = _opened(checkpoint, data, device)
     from hma_model.evaluation.rollout_video import rollout_video, write_video
     from hma_model.generation.commands import Commands
 
@@ -213,7 +216,7 @@ def generate(
     print(f"wrote {out}: {about}")
 
 
-def _opened(checkpoint: str, data: Path) -> tuple[Any, Any, Any]:
+def _opened(checkpoint: str, data: Path, device: str) -> tuple[Any, Any, Any]:
     """Return the model with the shard set's embodiment, its tokenizer, and the shard set."""
     from hma_data.shards.reader import ShardSet
 
@@ -222,8 +225,9 @@ def _opened(checkpoint: str, data: Path) -> tuple[Any, Any, Any]:
     from hma_data.shards.preview import tokenizer_of
     from hma_model.network.model import HMA
 
-    model = HMA.from_pretrained(checkpoint, embodiments=[shards.embodiment.id])
-    return model.eval(), tokenizer_of(shards), shards
+    there = device_name(device)
+    model = HMA.from_pretrained(checkpoint, embodiments=[shards.embodiment.id], device=there)
+    return model.eval(), tokenizer_of(shards, device=there), shards
 
 
 app.command("policy-eval", rich_help_panel=MODELS)(policy_eval)

@@ -14,11 +14,13 @@ from hma_model.cli.options import (
     Cameras,
     Checkpoint,
     Compile,
+    Device,
     Precision,
     SampleSteps,
     Split,
     UnmaskSteps,
     camera_names,
+    device_name,
     require_checkpoint,
 )
 
@@ -60,6 +62,7 @@ def evaluate(
     sample_steps: SampleSteps = None,
     precision: Precision = "float32",
     compile: Compile = False,
+    device: Device = "auto",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollouts.")] = 0,
     cameras: Cameras = None,
     paper: Annotated[
@@ -107,7 +110,8 @@ def evaluate(
             split, windows, frames, prompt, seed=seed, cameras=camera_names(cameras), paper=paper,
             state=episodes if state else 0, sampling=sampling,
         )  # fmt: skip
-        parts = evaluate_all(checkpoints, data, settings, open_networks(lpips, fid, fvd or []), out)
+        networks = open_networks(lpips, fid, fvd or [])
+        parts = evaluate_all(checkpoints, data, settings, networks, out, device_name(device))
         if out is not None:
             from hma_model.evaluation.report import write_results
 

@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from hma_data.errors import HMAError, UsageError
+
 Checkpoint = Annotated[
     str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
 ]
@@ -32,12 +34,27 @@ Compile = Annotated[
     bool,
     typer.Option("--compile", help="Compile the trunk for rollouts; pays on a GPU, after a minute or more."),
 ]
+Device = Annotated[
+    str,
+    typer.Option("--device", help="Of model and tokenizer: auto (a GPU if there is one), cpu, cuda or mps."),
+]
 Cameras = Annotated[
     str | None,
     typer.Option(
         "--cameras", metavar="NAME[,NAME…]", help="Cameras to show the model; default: those of its training."
     ),
 ]
+
+
+def device_name(device: str) -> str:
+    """Return the device of the option, as torch names it; refuse one that is not here."""
+    from hma_model.training.runtime import choose_device
+
+    try:
+        return str(choose_device(device))
+    except (HMAError, RuntimeError) as fault:
+        said = fault.fault if isinstance(fault, HMAError) else f"{device!r} is no device"
+        raise UsageError("--device", said, "use auto or cpu") from fault
 
 
 def camera_names(cameras: str | None) -> str | list[str] | None:

@@ -13,7 +13,7 @@ from urllib.parse import quote
 import typer
 
 from hma_data.errors import UsageError
-from hma_model.cli.options import Compile, Precision, require_checkpoint
+from hma_model.cli.options import Compile, Device, Precision, device_name, require_checkpoint
 
 
 def play(
@@ -38,9 +38,7 @@ def play(
     token: Annotated[
         str | None, typer.Option("--token", help="What the address must carry; made up with --host.")
     ] = None,
-    device: Annotated[
-        str, typer.Option("--device", help="Of the model and its tokenizer, such as cpu, cuda or mps.")
-    ] = "cpu",
+    device: Device = "auto",
     precision: Precision = "float32",
     compile: Compile = False,
     browser: Annotated[
@@ -62,7 +60,7 @@ def play(
     # what is wrong with it, the data or the pictures is said before torch is imported
     sets, pictures = list(map(ShardSet, data or ())), list(map(read_picture, prompt or ()))
     require_checkpoint(checkpoint)
-    opened = Checkpoint.open(located(checkpoint)[0])
+    opened, device = Checkpoint.open(located(checkpoint)[0]), device_name(device)
 
     @cache
     def tokenizer() -> Any:

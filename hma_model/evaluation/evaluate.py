@@ -27,8 +27,8 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import OBJECTIVES
-from hma_model.evaluation.commands import gaussian, shuffled, shuffled_actions
-from hma_model.evaluation.intervals import interval, rounded, summary
+from hma_model.evaluation.commands import gaussian, shuffled, shuffled_actions, without_commands
+from hma_model.evaluation.intervals import ends_of, interval, rounded, summary
 from hma_model.evaluation.losses import (
     Means,
     digit_frequencies,
@@ -71,6 +71,7 @@ __all__ = [
 DRAWS = 5  # of other windows' actions, and of Gaussian ones
 FOLLOWS_DB = 0.5  # gain of the last frame's PSNR from which a model is said to follow its actions
 HEARS = 1.2  # and times the loss with shuffled ones from which it is said to hear them
+NO_ACTIONS = "no objective of its training sees actions, so it is given none: all rollouts are without"
 PAPER_BATCH = 4  # the paper's perplexity is a mean over batches of so many windows
 Floats = NDArray[np.float64]
 
@@ -193,6 +194,9 @@ def measure(
         fault = f"has no window of {length} frames in {split}"
         raise UsageError(shards.folder, fault, "give another --split or fewer --frames")
     batches = list(windows(shards, split, length, settings.windows, settings.batch_size, cameras))
+    if not model.config.sees_actions:  # it knows only how frames without commands go on
+        batches = [without_commands(batch) for batch in batches]
+    episodes = _episodes(batches)
     table, by_window = _losses(model, shards, batches, cameras, draws, seed)
     roll = partial(rollout, model, tokenizer, **settings.sampling)
     rolled = Rolled(first, Judge(networks or Networks()))
@@ -203,7 +207,7 @@ def measure(
     gain = by_window["true.psnr_last"] - by_window["shuffled.psnr_last"]
     by_window["psnr_action_gain_last"] = gain
     frechet, missing = rolled.judge.figures(length - first)
-    figures = {name: joined[name].figures(seed) | frechet.get(name, {}) for name in ROLLOUTS}
+    figures = {name: joined[name].figures(seed, episodes) | frechet.get(name, {}) for name in ROLLOUTS}
     extra: dict[str, Any] = {}
     if settings.paper:
         extra["paper"] = _paper(roll, batches, shards, by_window, draws, seed, on_frames)
@@ -213,6 +217,7 @@ def measure(
         "embodiment": shards.embodiment.id,
         "split": split,
         "windows": len(gain),
+        "episodes": len(np.unique(episodes)),
         "frames": length,
         "prompt": first,
         "draws": draws,
@@ -220,17 +225,25 @@ def measure(
         "cameras": cameras if isinstance(cameras, str) else ", ".join(cameras),
         **table,
         **figures,
-        **summary("psnr_action_gain_last", gain, seed, digits=6),
+        **summary("psnr_action_gain_last", gain, seed, digits=6, episodes=episodes),
         **extra,
         "missing": missing,
         "notes": _notes(model, joined, table, rolled.still, len(gain)),
         "seconds_a_frame": round(1 / shards.embodiment.effective_hz, 6),
     }
+    by_window["episode"] = episodes.astype(np.float64)
     return Measured(found, by_window, batches, rolled.predicted)
+
+
+def _episodes(batches: list[Batch]) -> NDArray[np.int64]:
+    """Return the episode (N,) of each window."""
+    return np.concatenate([np.arange(len(b)) if b.episode is None else b.episode.numpy() for b in batches])
 
 
 def verdict(found: Mapping[str, Any]) -> str:
     """Return a sentence about the result of `evaluate`: whether the model follows its actions."""
+    if NO_ACTIONS in found.get("notes", ()):
+        return "was trained without actions"
     gain = found["psnr_action_gain_last"]
     if gain is None:
         return "cannot be judged: its predictions are not finite"
@@ -250,36 +263,38 @@ def _losses(
     """Return the losses, and by the name of each the values (N,) of the windows."""
     if model.config.kind == "continuous":
         loss = np.array(validation_losses(model, batches)[0].samples)
-        return summary("loss", loss, digits=6), {"loss": loss}
+        return summary("loss", loss, digits=6, episodes=_episodes(batches)), {"loss": loss}
     forced = [teacher_forced(model, batch.to(model.device)) for batch in batches]
     nats, hits = (torch.cat(part).double().cpu().numpy() for part in zip(*forced, strict=True))
-    other = (shuffled(batch, draw=draw) for draw in range(draws) for batch in batches)
+    other = (shuffled(batch, seed=seed, draw=draw) for draw in range(draws) for batch in batches)
     drawn = [torch.Generator().manual_seed(seed * 1_000_003 + number) for number in range(len(batches))]
     masked = [masked_scores(model, batch.to(model.device), g) for batch, g in zip(batches, drawn)]
     masked_nats, masked_hits = (torch.cat(part).double().cpu().numpy() for part in zip(*masked, strict=True))
     by_window = {"loss": nats.mean(axis=1), "accuracy": hits.mean(axis=1)}
     by_window |= {"masked_loss": masked_nats, "masked_accuracy": masked_hits}
-    table: dict[str, Any] = summary("loss", by_window["loss"], seed, digits=6) | {
+    episodes = _episodes(batches)
+    table: dict[str, Any] = summary("loss", by_window["loss"], seed, digits=6, episodes=episodes) | {
         "shuffled_loss": masked_val_loss(model, other),
         "baseline_loss": unconditional_baseline(
             [shards], batches, cameras, model.config.factored, model.config.merge
         ).mean(),
     }
-    table |= _perplexity("perplexity", by_window["loss"], seed)
-    table |= summary("accuracy", by_window["accuracy"], seed, digits=6)
-    table |= _perplexity("masked_perplexity", masked_nats, seed)
-    table |= summary("masked_accuracy", masked_hits[np.isfinite(masked_hits)], seed, digits=6)
+    table |= _perplexity("perplexity", by_window["loss"], seed, episodes)
+    table |= summary("accuracy", by_window["accuracy"], seed, digits=6, episodes=episodes)
+    table |= _perplexity("masked_perplexity", masked_nats, seed, episodes)
+    finite = np.isfinite(masked_hits)
+    table |= summary("masked_accuracy", masked_hits[finite], seed, digits=6, episodes=episodes[finite])
     table |= {"loss_by_frame": rounded(nats.mean(axis=0)), "accuracy_by_frame": rounded(hits.mean(axis=0))}
     return table, by_window
 
 
-def _perplexity(name: str, nats: Floats, seed: int) -> dict[str, Any]:
+def _perplexity(name: str, nats: Floats, seed: int, episodes: NDArray[np.int64]) -> dict[str, Any]:
     """Return exp of the mean of losses (N,), with its interval."""
-    nats = nats[np.isfinite(nats)]
+    nats, episodes = nats[np.isfinite(nats)], episodes[np.isfinite(nats)]
     if not len(nats):
         return {name: None, f"{name}_95": None}
-    ends = [perplexity(float(end)) for end in interval(nats, seed)]
-    return {name: perplexity(float(nats.mean())), f"{name}_95": [round(end, 4) for end in ends]}
+    ends = np.array([perplexity(float(end)) for end in interval(nats, seed, episodes)])
+    return {name: perplexity(float(nats.mean())), f"{name}_95": ends_of(ends)}
 
 
 def _paper(
@@ -304,8 +319,9 @@ def _paper(
         scores["gaussian"].append(Scores.mean([Scores.of(last(other, truth=true.truth)) for other in drawn]))
     true_db, gaussian_db = (Scores.join(scores[name]).psnr[:, 0] for name in ("true", "gaussian"))
     by_window["paper.delta_psnr"] = true_db - gaussian_db
-    found = summary("psnr_last", true_db, seed) | summary("gaussian_psnr_last", gaussian_db, seed)
-    found |= summary("delta_psnr", true_db - gaussian_db, seed) | {"draws": draws}
+    mean = partial(summary, seed=seed, episodes=_episodes(batches))
+    found = mean("psnr_last", true_db) | mean("gaussian_psnr_last", gaussian_db)
+    found |= mean("delta_psnr", true_db - gaussian_db) | {"draws": draws}
     if "accuracy" in by_window:  # exp of each batch's mean, then the mean: above the exp of the mean
         nats = by_window["loss"]
         parts = np.array_split(nats, range(PAPER_BATCH, len(nats), PAPER_BATCH))
@@ -317,7 +333,7 @@ def _notes(
     model: "HMA", joined: "Mapping[str, Scores]", table: Mapping[str, Any], still: int, count: int
 ) -> list[str]:
     """Return what must be known to read the figures."""
-    notes, config = [], model.config
+    notes, config = [] if model.config.sees_actions else [NO_ACTIONS], model.config
     if wrong := sum(int((~part.finite).sum()) for part in joined.values()):
         total = sum(part.finite.size for part in joined.values())
         notes.append(f"{wrong} of {total} predicted frames are NaN or infinite: the checkpoint has diverged")

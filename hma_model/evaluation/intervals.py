@@ -1,7 +1,9 @@
 """Give means their uncertainty: 95 % intervals by bootstrap, over windows and over datasets.
 
-A mean over windows is resampled 1,000 times from the windows (Efron 1979); the interval holds the middle 95 %
-of the means. Windows of one episode resemble each other, so the intervals are a little narrow.
+A mean over windows is resampled 1,000 times (Efron 1979); the interval holds the middle 95 % of the means.
+Windows of one episode overlap and resemble each other, so whole episodes are drawn where they are known
+(Davison and Hinkley 1997, 3.8). With fewer than about ten episodes the intervals are still too narrow; of a
+single one there is none.
 
 N windows, R resamples.
 """
@@ -14,14 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Episodes = Sequence[int] | NDArray[Any] | None  # (N,) which windows belong together; None: none do
 RESAMPLES, LEVELS = 1000, (2.5, 97.5)
 
 
-def resampled_means(values: NDArray[Any], seed: int = 0) -> Floats:
-    """Return means (R, …) of resamples of values (N, …)."""
+def resampled_means(values: NDArray[Any], seed: int = 0, episodes: Episodes = None) -> Floats:
+    """Return means (R, …) of resamples of values (N, …); NaN where there is but one to draw from."""
     flat = values.reshape(len(values), -1).astype(np.float64)
-    means: Floats = (_shares(len(values), seed) @ flat).reshape(RESAMPLES, *values.shape[1:])
-    return means
+    if episodes is None:
+        count, shares = len(values), _shares(len(values), seed)
+    else:
+        names, own = np.unique(np.asarray(episodes), return_inverse=True)
+        count = len(names)
+        shares = _shares(count, seed)[:, own]
+        shares /= shares.sum(axis=1, keepdims=True)
+    means: Floats = (shares @ flat).reshape(RESAMPLES, *values.shape[1:])
+    return means if count > 1 else np.full_like(means, np.nan)
 
 
 @lru_cache(maxsize=8)
@@ -32,9 +42,9 @@ def _shares(count: int, seed: int) -> Floats:
     return np.bincount(cells.ravel(), minlength=RESAMPLES * count).reshape(RESAMPLES, count) / count
 
 
-def interval(values: NDArray[Any], seed: int = 0) -> Floats:
-    """Return the ends (2, …) of the 95 % interval of the mean of values (N, …)."""
-    return np.percentile(resampled_means(values, seed), LEVELS, axis=0)
+def interval(values: NDArray[Any], seed: int = 0, episodes: Episodes = None) -> Floats:
+    """Return the ends (2, …) of the 95 % interval of the mean of values (N, …); NaN of a single one."""
+    return np.percentile(resampled_means(values, seed, episodes), LEVELS, axis=0)
 
 
 def rounded(values: Any, digits: int = 4) -> Any:
@@ -44,18 +54,37 @@ def rounded(values: Any, digits: int = 4) -> Any:
     return round(float(values), digits) if np.isfinite(values) else None
 
 
-def summary(name: str, values: NDArray[Any], seed: int = 0, digits: int = 4) -> dict[str, Any]:
-    """Return the mean of values (N,) as `name`, its interval as `name_95`; None if a value is not finite."""
+def summary(
+    name: str, values: NDArray[Any], seed: int = 0, digits: int = 4, episodes: Episodes = None
+) -> dict[str, Any]:
+    """Return the mean of values (N,) as `name`, and its interval as `name_95`.
+
+    Both are None if a value is not finite; the interval also of one window or episode.
+    """
     mean = rounded(values.mean(), digits) if np.isfinite(values).all() else None
-    return {name: mean, f"{name}_95": None if mean is None else rounded(interval(values, seed), digits)}
+    ends = None if mean is None else ends_of(interval(values, seed, episodes), digits)
+    return {name: mean, f"{name}_95": ends}
 
 
-def over_datasets(sets: Sequence[NDArray[Any]], seed: int = 0) -> tuple[float, list[float]]:
+def ends_of(ends: Floats, digits: int = 4) -> list[float] | None:
+    """Return the ends (2,) of an interval as plain values; None where there is none."""
+    return rounded(ends, digits) if np.isfinite(ends).all() else None
+
+
+def over_datasets(
+    sets: Sequence[NDArray[Any]], seed: int = 0, episodes: Sequence[Episodes] | None = None
+) -> tuple[float, list[float] | None]:
     """Return the mean over datasets of their means of values (N,), and its interval.
 
-    Each dataset counts once; windows are resampled within theirs. Values that are not finite are left out.
+    Each dataset counts once; its windows, or episodes, are resampled within it. Values that are not finite
+    are left out. There is no interval where a dataset has but one.
     """
-    sets = [values[np.isfinite(values)] for values in sets]
-    means = [resampled_means(values, seed + number) for number, values in enumerate(sets)]
+    kept = [np.isfinite(values) for values in sets]
+    own = [
+        None if one is None else np.asarray(one)[k] for one, k in zip(episodes or [None] * len(sets), kept)
+    ]
+    sets = [values[k] for values, k in zip(sets, kept)]
+    means = [resampled_means(v, seed + n, e) for n, (v, e) in enumerate(zip(sets, own))]
     low, high = np.percentile(np.mean(means, axis=0), LEVELS)
-    return float(np.mean([values.mean() for values in sets])), [float(low), float(high)]
+    ends = [float(low), float(high)] if np.isfinite(low) else None
+    return float(np.mean([values.mean() for values in sets])), ends

@@ -89,14 +89,14 @@ def rollout(
     given, chunks = stored[:, :first].to(model.device), batch.actions
     chunks = chunks[:, : first + count].to(model.device)
     generator = torch.Generator().manual_seed(seed)
-    known: Tensor | None = batch.action_mask[:, : first + count].to(model.device)
-    passive = model.config.absent_action != "embedding" and not batch.action_mask[:, : first + count].any()
+    known = batch.action_mask[:, : first + count].to(model.device) & model.config.sees_actions
+    passive = model.config.absent_action != "embedding" and not known.any()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", OutsideRangeWarning)  # nobody chose these commands
         predicted = model.generate(
             given, None if passive else chunks, batch.embodiment, count, generator=generator,
             known=None if passive else known, **sampling,
-        )  # fmt: skip
+        ).cpu()  # fmt: skip
     if truth is None:
         truth = decode(tokenizer, stored[:, : first + count])
     finite = np.ones(predicted.shape[:2], np.bool_)

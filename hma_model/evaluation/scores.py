@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hma_data.loading.dataset import Batch
 from hma_model.evaluation.commands import shuffled, without_commands
-from hma_model.evaluation.intervals import interval, rounded, summary
+from hma_model.evaluation.intervals import Episodes, interval, rounded, summary
 from hma_model.evaluation.metrics import psnr, ssim
 from hma_model.evaluation.perceptual import Judge
 from hma_model.evaluation.rollouts import Pictures
@@ -62,14 +62,14 @@ class Scores:
         psnrs, ssims = rule([part.psnr for part in parts]), rule([part.ssim for part in parts])
         return cls(psnrs, ssims, far, of_finite([part.finite for part in parts]))
 
-    def figures(self, seed: int) -> dict[str, Any]:
-        """Return the means over windows, with their intervals."""
-        found = summary("psnr", self.psnr.mean(axis=1), seed, digits=6)
-        found |= summary("psnr_last", self.psnr[:, -1], seed, digits=6)
-        found |= _by_frame("psnr", self.psnr, seed) | summary("ssim", self.ssim.mean(axis=1), seed, digits=6)
-        found |= _by_frame("ssim", self.ssim, seed)
+    def figures(self, seed: int, episodes: Episodes = None) -> dict[str, Any]:
+        """Return the means over windows, with their intervals; `episodes` are the windows' own."""
+        mean, frames = partial(summary, seed=seed, episodes=episodes), partial(_by_frame, seed, episodes)
+        found = mean("psnr", self.psnr.mean(axis=1), digits=6)
+        found |= mean("psnr_last", self.psnr[:, -1], digits=6) | frames("psnr", self.psnr)
+        found |= mean("ssim", self.ssim.mean(axis=1), digits=6) | frames("ssim", self.ssim)
         if self.lpips is not None:
-            found |= summary("lpips", self.lpips.mean(axis=1), seed) | _by_frame("lpips", self.lpips, seed)
+            found |= mean("lpips", self.lpips.mean(axis=1)) | frames("lpips", self.lpips)
         return found
 
     def by_window(self, rollout: str) -> dict[str, Floats]:
@@ -84,11 +84,11 @@ class Scores:
         return {f"{rollout}.{name}": values for name, values in found.items()}
 
 
-def _by_frame(name: str, values: Floats, seed: int) -> dict[str, Any]:
+def _by_frame(seed: int, episodes: Episodes, name: str, values: Floats) -> dict[str, Any]:
     """Return the means of values (N, P) over windows and their intervals: P pairs."""
     return {
         f"{name}_by_frame": rounded(values.mean(axis=0), 3 if name == "psnr" else 4),
-        f"{name}_by_frame_95": rounded(interval(values, seed).T),
+        f"{name}_by_frame_95": rounded(interval(values, seed, episodes).T),
     }
 
 

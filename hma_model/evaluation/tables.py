@@ -77,9 +77,10 @@ def means(parts: Sequence[Part]) -> list[dict[str, Any]]:
             if not key:
                 row[path] = sum(figures) / len(figures)
                 continue
-            mean, ends = over_datasets([part.by_window[key] for part in own])
+            episodes = [part.by_window.get("episode") for part in own]
+            mean, ends = over_datasets([part.by_window[key] for part in own], episodes=episodes)
             row[path] = math.exp(mean) if exponential else mean
-            row[f"{path}_95"] = [math.exp(end) for end in ends] if exponential else ends
+            row[f"{path}_95"] = [math.exp(end) for end in ends] if exponential and ends else ends
         rows.append(row)
     return rows
 

@@ -80,6 +80,8 @@ def train(
         raise UsageError("out", f"is {folder!r}, no folder of this machine", "train here, then hma hub push")
     device = choose_device(recipe.device)
     cuda = [device] if device.type == "cuda" else []
+    if cuda:
+        torch.cuda.set_device(device)  # FSDP takes the current one
     with join(device) as world, run_errors(Path(folder)), ExitStack() as stack, torch.random.fork_rng(cuda):
         world.once(lambda: stack.enter_context(own_folder(Path(folder))))
         run = Run(recipe, Path(folder), device, world)

@@ -262,7 +262,11 @@ def load_recipe(name_or_path: StrPath, overrides: Sequence[str] = ()) -> Recipe:
         UsageError: an override is not key=value.
     """
     path = find_recipe(name_or_path)
-    values = merge(_extended(path, []), parse_overrides(overrides))
+    values = _extended(path, [])
+    own = values.get("objectives", Recipe.model_fields["objectives"].default)
+    if any(one.startswith("objectives.") for one in overrides):
+        values = {**values, "objectives": own}
+    values = parse_overrides(overrides, values)
     return make_recipe(values, f"{path}" + (" with overrides" if overrides else ""))
 
 
@@ -314,13 +318,15 @@ def recipe_for(source: StrPath) -> str:
     return "finetune_tiny" if as_text(source) == EMBEDDED_NAME else "finetune"
 
 
-def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
-    """Parse overrides such as `["model.layers=4", "lr=1e-3"]` to nested values.
+def parse_overrides(overrides: Sequence[str], base: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Parse overrides such as `["model.layers=4", "lr=1e-3"]` to nested values, one after the other.
+
+    `objectives={policy: 1}` replaces the objectives of `base`, `objectives.policy=1` adds one.
 
     Raises:
         UsageError: an override is not key=value.
     """
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = dict(base or {})
     for override in overrides:
         key, equals, text = override.partition("=")
         parts = key.strip().split(".")
@@ -329,7 +335,10 @@ def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
         nested: Any = parse_yaml(text, f"override {override!r}", UsageError)
         for part in reversed(parts):
             nested = {part: nested}
-        values = merge(values, nested)
+        if parts[0] == "objectives" and len(parts) > 1:
+            values["objectives"] = merge(values.get("objectives", {}), nested["objectives"])
+        else:
+            values = merge(values, nested)
     return values
 
 

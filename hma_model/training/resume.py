@@ -33,6 +33,7 @@ from hma_data.loading.views import view_count
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import file_sha256, finite, read_json, to_json
+from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint import weights as stored
 from hma_model.checkpoint.folder import (
@@ -153,6 +154,10 @@ class Start:
                 fault = f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}"
                 remedy = "leave it out: the network is the checkpoint's"
                 raise RecipeError(f"recipe: model.{key}", fault, remedy)
+        spec = TokenizerSpec.from_json(dict(config.tokenizer)) if recipe.digits and config.tokenizer else None
+        if spec and config.factored and recipe.factored(spec) != tuple(config.factored):
+            fault = f"gives digits of {recipe.factored(spec)}, the checkpoint has {tuple(config.factored)}"
+            raise RecipeError("recipe: digits", fault, "leave it out: the network is the checkpoint's")
         if (views := view_count(recipe.cameras)) != config.views:
             fault = f"are {views} in a frame, the checkpoint that the run starts from has {config.views}"
             raise RecipeError("recipe: cameras", fault, "name as many, or train from scratch")

@@ -58,6 +58,11 @@ class Run:
             if getattr(recipe, name) and recipe.parallel == "fsdp" and self.world.size > 1:
                 fault = "does not work with parallel=fsdp on several ranks"
                 raise RecipeError(f"recipe: {name}", fault, "use parallel=ddp")
+        seeing = {OBJECTIVES[name].sees_actions for name, weight in recipe.objectives.items() if weight}
+        skips = recipe.model.get("absent_action") == "skip" and len(seeing) > 1
+        if skips and recipe.parallel == "fsdp" and self.world.size > 1:
+            fault = "skip does not work with parallel=fsdp where only some objectives see actions"
+            raise RecipeError("recipe: model.absent_action", fault, "use parallel=ddp")
         if recipe.self_rollout and not any(OBJECTIVES[name].predicts_video for name in recipe.objectives):
             fault = f"needs frames to roll out, which {', '.join(recipe.objectives)} does not predict"
             raise RecipeError("recipe: self_rollout", fault, "add one such as forward, or set it to 0")

@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from hma_data.loading.dataset import Batch
-from hma_model.config import OBJECTIVES
 from hma_model.generation.rollout import generate
 from hma_model.network.head import uniform
 from hma_model.network.stem import from_digits, split_tokens, unpatchify
@@ -76,7 +75,9 @@ def rolled(
     true = batch.tokens if batch.tokens is not None else batch.latents
     assert true is not None
     names = [name for name, taken in zip(batch.embodiment, chosen.tolist()) if taken]
-    actions, known = (batch.actions[chosen], batch.action_mask[chosen]) if _acts(model) else (None, None)
+    actions, known = (
+        (batch.actions[chosen], batch.action_mask[chosen]) if model.config.sees_actions else (None, None)
+    )
     training = model.training
     model.eval()
     made = generate(model, true[chosen, :prompt], actions, names, count, known, generator=generator)
@@ -105,11 +106,6 @@ def _from(values: Tensor, begin: Tensor, frames: int) -> Tensor:
     """Return values (B, L, …) from `begin` (B,) on, as (B, T, …)."""
     rows = torch.arange(len(begin), device=values.device).unsqueeze(1)
     return values[rows, begin.unsqueeze(1) + torch.arange(frames, device=values.device)]
-
-
-def _acts(model: "HMA") -> bool:
-    """Check whether some objective of the model sees actions."""
-    return any(weight and OBJECTIVES[name].sees_actions for name, weight in model.config.objectives.items())
 
 
 @torch.no_grad()
@@ -157,7 +153,7 @@ def _predicted(
     """Predict frame `at` (n,) of each window, wholly masked, from the frames before it."""
     config, rows = model.config, torch.arange(len(at), device=at.device)
     names = batch.embodiment
-    actions, known = (batch.actions, batch.action_mask) if _acts(model) else (None, None)
+    actions, known = (batch.actions, batch.action_mask) if model.config.sees_actions else (None, None)
     if config.kind == "discrete":
         hidden = context.clone()
         hidden[rows, at] = config.vocab_size

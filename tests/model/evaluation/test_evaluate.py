@@ -328,8 +328,41 @@ def test_the_verdict_says_whether_the_model_follows_its_actions() -> None:
 # -- intervals, other commands, words
 
 
-def test_intervals_are_the_middle_of_resampled_means(data, model):
+def test_a_single_episode_has_no_interval(data, model):
     found = evaluate(model, Blocks(), data, count=5, prompt=1)
+    assert found["episodes"] == 1 and found["windows"] == 5
+    assert found["true"]["psnr_95"] is None and found["loss_95"] is None and found["perplexity_95"] is None
+    assert found["true"]["psnr_by_frame_95"][0] == [None, None]
+
+
+def test_episodes_are_resampled_whole():
+    rng = np.random.default_rng(0)
+    level = np.repeat(rng.normal(0, 1, 20), 10)  # windows of an episode are nearly equal
+    values, episodes = level + rng.normal(0, 0.01, 200), np.repeat(np.arange(20), 10)
+    apart, whole = interval(values), interval(values, 0, episodes)
+    assert (whole[1] - whole[0]) / (apart[1] - apart[0]) == pytest.approx(np.sqrt(10), rel=0.15)
+    assert np.allclose(whole, interval(level[::10]), atol=0.01)
+    uneven = np.concatenate([np.zeros(30), np.ones(10)])  # a mean of windows, not of episodes
+    ends = interval(uneven, 0, np.repeat([0, 1], [30, 10]))
+    assert tuple(ends) == (0, 1)
+    mean, ends = over_datasets([values, values], episodes=[episodes, np.zeros(200)])
+    assert mean == pytest.approx(values.mean()) and ends is None
+
+
+def test_a_model_that_was_trained_without_actions_is_given_none(data, model):
+    blind = make_model({"arm": 2}, config=model.config.replace(objectives={"passive": 1})).eval()
+    blind.load_state_dict(model.state_dict())
+    found, seeing = (evaluate(one, Blocks(), data, count=5, prompt=1) for one in (blind, model))
+    assert verdict(found) == "was trained without actions"
+    assert found["loss"] == pytest.approx(found["shuffled_loss"], abs=1e-5) != seeing["loss"]
+        found["loss"] == pytest.approx(found["shuffled_loss"], abs=1e-5) and found["loss"] != seeing["loss"]
+    )
+    assert found["true"] == found["none"] == seeing["none"] and found["psnr_action_gain_last"] == 0
+
+
+def test_intervals_are_the_middle_of_resampled_means(tmp_path, model):
+    data = make_shards(tmp_path / "arm", "arm", held_out=3)
+    found = evaluate(model, Blocks(), data, count=15, prompt=1)
     for part in (found, *(found[name] for name in ("true", "shuffled", "none", "copy"))):
         for key in [key for key in part if f"{key}_95" in part and not key.endswith("by_frame")]:
             low, high = part[f"{key}_95"]

@@ -40,7 +40,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (suite, showcase):
-        monkeypatch.setattr(module, "tokenizer_of", lambda shards: Blocks())
+        monkeypatch.setattr(module, "tokenizer_of", lambda shards, **_: Blocks())
     suite._tokenizer.cache_clear()
 
 

@@ -211,6 +211,12 @@ def test_the_difference_names_keys_with_both_values():
 
 
 def test_overrides_of_one_mapping_gather():
+    assert parse_overrides(["objectives.full=0.5", "objectives.policy=0.5"]) == {
+        "objectives": {"full": 0.5, "policy": 0.5}
+    }
+    assert load_recipe("discrete_tiny", ["objectives.full=0.3"]).objectives == {"forward": 1, "full": 0.3}
+    assert load_recipe("discrete_tiny", ["objectives={full: 0.3}"]).objectives == {"full": 0.3}
+    assert load_recipe("policy", ["objectives.full=0.3"]).objectives == {"policy": 1, "full": 0.3}
     assert parse_overrides(["model.layers=2", "model.width=64"]) == {"model": {"layers": 2, "width": 64}}
 
 
