@@ -315,9 +315,7 @@ def chosen_cameras(embodiment: Embodiment, cameras: Sequence[str]) -> list[str]:
 def read_clip(
     source: Source, uri: str, episode_id: str, embodiment: Embodiment, cameras: Sequence[str]
 ) -> Clip:
-    """Return an episode with the cameras that are stored.
-
-    A fault of a camera that is not stored does not refuse the episode: it is then read without those.
+    """Return an episode with the cameras that are stored; the others neither refuse nor shorten it.
 
     Raises:
         EpisodeError: the episode cannot be used. If it could be without one of several cameras, the error
@@ -334,14 +332,11 @@ def read_clip(
         except (EpisodeError, SourceError):
             return False
 
-    every = [camera.name for camera in embodiment.cameras]
     try:
-        return read(every)
+        return read(cameras)
     except StorageAwayError:
         raise
     except (EpisodeError, SourceError) as fault:
-        if len(cameras) < len(every) and is_readable(cameras):
-            return read(cameras)
         for name in cameras if len(cameras) > 1 else ():
             if is_readable([other for other in cameras if other != name]):
                 raise camera_fault(episode_id, name, cameras, fault) from fault

@@ -336,12 +336,12 @@ def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
             f"frames pause for up to {steps.max():.3g} s",
             "split or trim the episodes at the pauses",
         )
-    needed = (WINDOW - 1) * robot.stride + 1
+    needed = WINDOW * robot.stride  # the chunk of the last frame too
     lengths = sorted(len(clip) for clip in clips)
     short = sum(length < needed for length in lengths)
     if short:
         said = f"{short} of {len(clips)} episodes are shorter than a window, {needed} frames"
-        fits = max((lengths[len(lengths) // 10] - 1) // (WINDOW - 1), 1)  # nine of ten episodes hold a window
+        fits = max(lengths[len(lengths) // 10] // WINDOW, 1)  # nine of ten episodes hold a window
         remedy = f"set a higher target_hz, such as {robot.rate_hz / fits:.3g}, or fewer frames a window"
         yield Finding("length", "warn", said, remedy)
     for stream in dict.fromkeys(name for clip in clips for name in clip.skew_ms):

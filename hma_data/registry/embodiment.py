@@ -213,7 +213,7 @@ class Embodiment(SpecModel):
     def with_cameras(self, names: Sequence[str]) -> Self:
         """Return a copy with these cameras alone, and with the one whose frames are the grid."""
         needed = {*names, self.sync.primary}
-        if self.source.format == "rosbag":
+        if self.source.format not in ONE_INDEX:
             needed.add(self.primary_camera.name)
         kept = tuple(camera for camera in self.cameras if camera.name in needed)
         return self if kept == self.cameras else self.model_copy(update={"cameras": kept})

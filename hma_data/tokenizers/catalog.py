@@ -5,6 +5,7 @@ To add a tokenizer, add a row to `CATALOG`, or have an installed package add an 
 imports neither torch nor a built-in tokenizer's module.
 """
 
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
@@ -13,6 +14,7 @@ from typing import Any, Literal
 
 from hma_data.errors import PluginError, TokenizerError, install_command
 from hma_data.plugins import TOKENIZER_GROUP, Plugin, installed
+from hma_data.storage.files import file_sha256
 
 EMBEDDED = Path(__file__).parent / "weights"
 
@@ -65,6 +67,15 @@ class Entry:
     def size(self) -> int:
         """Return the size of the weights in bytes; 0 if there are none or the user names them."""
         return (EMBEDDED / self.file).stat().st_size if self.weights == "embedded" else self.bytes or 0
+
+    def tokens_digest(self) -> str:
+        """Return the digest by which specs name its embedded weights; empty where none are embedded."""
+        if self.weights != "embedded":
+            return ""
+        path = EMBEDDED / self.file
+        with path.open("rb") as file:  # a safetensors file begins with the size of its header
+            header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+        return header.get("__metadata__", {}).get("tokens_sha256") or file_sha256(path)
 
     def state(self) -> str:
         """Return "ready" or what it still needs: an install, a path, or a download on first use."""
@@ -167,6 +178,17 @@ _ROWS = (
 )  # fmt: skip
 
 CATALOG: dict[str, Entry] = {entry.name: entry for entry in _ROWS}
+
+
+def other_weights(spec: Mapping[str, Any]) -> str:
+    """Return the digest of a tokenizer's weights if they are not those that come along under its name.
+
+    Args:
+        spec: values of a TokenizerSpec, as in a checkpoint's config.json.
+    """
+    entry, stated = CATALOG.get(str(spec.get("name"))), str(spec.get("weights_sha256") or "")
+    own = entry.tokens_digest() if entry else ""
+    return stated if own and stated and stated != own else ""
 
 
 def find_entry(name: str) -> Entry:

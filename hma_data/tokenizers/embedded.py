@@ -18,7 +18,6 @@ B pictures, S side, h·w grid, C latent channels. Pixels inside the networks are
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, Any
 
 import torch
@@ -28,7 +27,7 @@ from torch.nn import functional
 
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
-from hma_data.tokenizers.checkpoints import fill, read_weights
+from hma_data.tokenizers.checkpoints import fill, find_weights, read_weights
 from hma_data.tokenizers.network import NetworkTokenizer, open_device
 
 VERSION = 1
@@ -318,7 +317,7 @@ Autoencoder = FsqAutoencoder | VaeAutoencoder
 def load(name: str, *, weights: str | None, device: str, image_size: int) -> NetworkTokenizer:
     """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors."""
     place = open_device(name, device)
-    path = Path(weights).expanduser() if weights else EMBEDDED / CATALOG[name].file
+    path = find_weights(name, weights) if weights else EMBEDDED / CATALOG[name].file
     kind: Any = FsqAutoencoder if name.startswith("fsq") else VaeAutoencoder
     config, tensors, sha256 = read_weights(path, kind.format, kind.shape)
     with torch.device("meta"):

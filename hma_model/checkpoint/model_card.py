@@ -10,6 +10,7 @@ from typing import Any
 
 from hma_data.storage.paths import REPOSITORY
 from hma_data.storage.yaml_io import write_yaml
+from hma_data.tokenizers.catalog import other_weights
 
 _TAGS = ("robotics", "world-model", "video-prediction", "hma")
 _DATASET = re.compile(rf"hf://datasets/({REPOSITORY.pattern})")
@@ -67,6 +68,8 @@ def _about(config: Mapping[str, Any]) -> str:
     model, tokenizer = config["model"], config["tokenizer"]
     grid = "×".join(str(side) for side in model.get("grid", ()))
     views = f" of {line(model['views'])} cameras" if model.get("views", 1) != 1 else ""
+    other = other_weights(tokenizer)
+    weights = f", with weights of its own (SHA-256 `{line(other)}`), which are needed too" if other else ""
     return (
         "An action-conditioned video model of robots (Heterogeneous Masked Autoregression): one trunk, "
         "and a stem and head for each embodiment, which are published and pulled one at a time.\n\n"
@@ -74,7 +77,7 @@ def _about(config: Mapping[str, Any]) -> str:
         f"width {line(model.get('width'))}, {line(model.get('heads'))} heads, "
         f"window of {line(model.get('frames'))} frames{views}\n"
         f"- tokenizer: {line(tokenizer.get('name'))}, {grid} tokens of a "
-        f"{line(tokenizer.get('image_size'))}-pixel picture\n"
+        f"{line(tokenizer.get('image_size'))}-pixel picture{weights}\n"
         f"- trunk SHA-256: `{line(config.get('trunk_sha256'))}`"
     )
 
@@ -120,7 +123,7 @@ import torch
 from hma_data import get_tokenizer
 from hma_model import HMA
 
-tokenizer = get_tokenizer("{tokenizer}")
+tokenizer = get_tokenizer("{tokenizer}"{weights})
 model = HMA.from_pretrained("{name}", embodiments=["{example}"]).eval()
 
 pictures = np.zeros((2, {side}, {side}, 3), np.uint8)  # two frames of your camera, RGB
@@ -138,6 +141,7 @@ def _usage(name: str, config: Mapping[str, Any], cards: Mapping[str, Any]) -> st
     discrete = model.get("kind") == "discrete"
     code = _CODE.strip().format(
         name=name, example=example, tokenizer=line(tokenizer.get("name")),
+        weights=', weights="WEIGHTS"' if other_weights(tokenizer) else "",
         side=line(tokenizer.get("image_size")), chunk=line(cards.get(example, {}).get("chunk_dim")) or "K",
         dtype="int64" if discrete else "float32",
         views="" if views == 1 else f".repeat({line(views)}, axis=-2)  # one picture a camera, stacked",
@@ -168,13 +172,17 @@ def _pairs(values: Any) -> str:
 
 
 def licence(stated: Iterable[Any]) -> dict[str, str]:
-    """Return the licence fields of the front matter; empty if the embodiments state no licence."""
-    names = sorted({line(value) for value in stated} - {"", "unknown"})
+    """Return the licence fields of the front matter; empty if the embodiments state no licence.
+
+    One licence stands for all only if each of them states it.
+    """
+    told = {line(value) for value in stated}
+    names = sorted(told - {"", "unknown"})
     if not names:
         return {}
-    if len(names) == 1 and names[0].lower() in LICENCES:
+    if len(told) == 1 and names[0].lower() in LICENCES:
         return {"license": names[0].lower()}
-    shown = re.sub(r"[^a-z0-9.+-]+", "-", names[0].lower()).strip("-")[:60] if len(names) == 1 else "several"
+    shown = re.sub(r"[^a-z0-9.+-]+", "-", names[0].lower()).strip("-")[:60] if len(told) == 1 else "several"
     return {"license": "other", "license_name": shown or "stated-below"}
 
 

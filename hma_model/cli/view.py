@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hma_data.errors import UsageError
+from hma_model.checkpoint.folder import EMBEDDED_NAME
 from hma_model.cli.play import has_display
 
 if TYPE_CHECKING:
@@ -60,6 +61,14 @@ def _made(
     from hma_data.storage.kinds import kind_of
 
     kind = kind_of(Path(place).expanduser())
+    if place == EMBEDDED_NAME and not Path(place).exists():
+        kind = "a checkpoint"
+    if not kind and not Path(place).expanduser().exists() and "://" not in place:
+        raise UsageError(place, "does not exist", "name a recording (with -e), a shard set or a run")
+    of = {"DATA": (bool(data), "a checkpoint"), "--tokenizer": (bool(tokenizer), "a recording")}
+    for option, (given, only) in of.items():
+        if given and kind in ("a checkpoint", "a shard set", "a recording") and kind != only:
+            raise UsageError(option, f"is for {only}, and {place} is {kind}", "leave it out")
     if embodiment is None and kind == "a checkpoint":
         from hma_model.training.view import view_run
 

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 
 START, ROBOTS = EMBEDDED_NAME, HELD_OUT  # the trunk, and robots that it has not seen
 RECIPES = {FINETUNED: "demo", SCRATCH: "demo_scratch"}
-RESULTS = "results.json"
-OURS = {"recordings", "shards", "run", "scratch", "hub", "pulled", "report.html", TIMINGS, RESULTS}
+RESULTS, SETTINGS = "results.json", "settings.json"
+OURS = {"recordings", "shards", "run", "scratch", "hub", "pulled", "report.html", TIMINGS, RESULTS, SETTINGS}
 WINDOWS = 24  # held-out windows of each robot; the figures are means over them
 LONGEST = 10  # frames of a window of the film
 FILM: "Sampling" = {"unmask_steps": 8, "order": "confidence"}  # slower than the figures, and limbs stay whole
@@ -70,6 +70,7 @@ def demo(out: StrPath, *, episodes: int = 32, steps: int | None = None, seed: in
         raise OutputError(out, "is not a folder", "choose another --out")
     if foreign := sorted({item.name for item in out.glob("*")} - OURS):
         raise OutputError(out, f"holds {', '.join(foreign[:3])}", "choose an empty or new --out")
+    _require_same(out, {"episodes": episodes, "steps": steps, "seed": seed})
     made = Demo(out, Checkpoint.open(START))
     with made.stage(1, "record and convert"):
         record_and_convert(made, episodes, seed)
@@ -89,6 +90,16 @@ def demo(out: StrPath, *, episodes: int = 32, steps: int | None = None, seed: in
     results = {"seconds": sum(made.seconds.values()), "embodiments": figures}
     write_atomic(out / RESULTS, json.dumps(results, indent=1))
     return write_report(made)
+
+
+def _require_same(out: Path, settings: dict[str, Any]) -> None:
+    """Keep the settings in the folder; raise OutputError if it was begun with others."""
+    path = out / SETTINGS
+    kept = json.loads(path.read_bytes()) if path.is_file() else settings
+    if other := [f"--{name} {kept[name]}" for name, value in settings.items() if kept.get(name) != value]:
+        raise OutputError(out, f"was begun with {', '.join(other)}", "give the same, or choose a new --out")
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, json.dumps(settings))
 
 
 def _worker(out: Path, tokenizer: str, episodes: int, seed: int, workers: int) -> Work:

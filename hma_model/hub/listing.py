@@ -149,7 +149,7 @@ def _row(name: str, card: Mapping[str, Any], size: int | None, problems: list[st
 
 def _tokenizer_problems(tokenizer: Any) -> list[str]:
     """Return the problems that prevent decoding the model's predictions here."""
-    from hma_data.tokenizers.catalog import find_entry
+    from hma_data.tokenizers.catalog import find_entry, other_weights
 
     name = _of(tokenizer, "name")
     try:
@@ -158,6 +158,8 @@ def _tokenizer_problems(tokenizer: Any) -> list[str]:
         return [str(fault)]
     except TokenizerError:
         return [f"tokenizer {str(name)[:60]!r} is not one of this release: pictures need it"]
+    if isinstance(tokenizer, Mapping) and (digest := other_weights(tokenizer)):
+        return [f"tokenizer {name} has weights of its own ({digest[:12]}…): pictures need them"]
     missing = entry.missing()
     return [f"tokenizer {name} needs {', '.join(missing)}: {entry.extra}"] if missing else []
 

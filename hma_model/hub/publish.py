@@ -268,11 +268,11 @@ def _require_yaml(source: Checkpoint, name: str) -> None:
         raise CheckpointError(path, f"is not the file that {CARD} names", remedy)
 
 
-def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content]:
+def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content | None]:
     from hma_data.shards.manifest import MANIFEST  # imports pyarrow
 
     files = store.files()
-    present: dict[str, Content] = {}
+    present: dict[str, Content | None] = {}
     if CONFIG in files:
         _require_trunk(source, _config(store, files), store.name)
     else:
@@ -283,13 +283,16 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
         present[TRUNK] = inside(source.folder, TRUNK)
     for name in ids:
         home = source.folder / "embodiments" / name
-        shown = (part for part in SHOWN if (home / part).is_file())
+        shown = [part for part in SHOWN if (home / part).is_file()]
         present.update({f"embodiments/{name}/{part}": source.path(name, part) for part in (*shown, *PARTS)})
+        stale = (f"embodiments/{name}/{part}" for part in SHOWN if part not in shown)
+        present.update({path: None for path in stale if path in files})  # it shows what earlier weights did
     others = [name for name in embodiment_ids(files) if name not in ids]
     store.warm([f"embodiments/{name}/{CARD}" for name in others])
     cards = {name: _readable_card(store, name) for name in others}
     cards.update({name: source.card(name) for name in ids})
-    samples = {path.removeprefix("embodiments/") for path in (*files, *present) if path.endswith(SHOWN)}
+    there = [path for path in {*files, *present} if path not in present or present[path] is not None]
+    samples = {path.removeprefix("embodiments/") for path in there if path.endswith(SHOWN)}
     config = checkpoints.config_json(source.config, source.trunk_sha256)
     present[README] = render(config, cards, repo=store.repo, samples=samples)
     return present

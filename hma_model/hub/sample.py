@@ -12,7 +12,7 @@ from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RemotePath
 from hma_model.checkpoint import io as checkpoints
-from hma_model.checkpoint.folder import FILM, SAMPLE, Checkpoint, require_tokenizer
+from hma_model.checkpoint.folder import EMBEDDED, FILM, SAMPLE, Checkpoint, require_tokenizer
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,6 +41,9 @@ def add_samples(checkpoint: StrPath, data: Iterable[StrPath]) -> list[Path]:
     from hma_data.shards.reader import ShardSet
 
     source, made = Checkpoint.open(checkpoint), []
+    if source.folder == EMBEDDED:
+        remedy = "copy the folder and name the copy, or finetune it"
+        raise CheckpointError(source.folder, "comes along with the package, which stays as it is", remedy)
     for folder in data:
         shards = ShardSet(folder)
         name = shards.embodiment.id

@@ -12,6 +12,7 @@ import pytest
 from hma_data.conversion.job import convert
 from hma_data.errors import HMAError
 from hma_data.inspection.inspect import examine
+from hma_data.loading.dataset import WindowDataset
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.preview import preview
 from hma_data.storage.kinds import LFS
@@ -140,6 +141,18 @@ def test_shards_without_a_window_are_an_error(tmp_path: Path, toy_arm: Embodimen
     first = examine(str(tmp_path / "shards"))[0]
     assert (first.check, first.severity) == ("windows", "error")
     assert "12 frames need 24 rows, the longest episode has 1" in first.message
+
+
+@pytest.mark.parametrize(("length", "short"), [(23, True), (24, False)])
+def test_doctor_counts_the_rows_of_a_window_as_the_loader_does(
+    length: int, short: bool, tmp_path: Path, toy_arm: Embodiment
+) -> None:
+    write_toy(tmp_path / "toy.hdf5", [length] * 3)
+    (tmp_path / "arm.yaml").write_text(toy_arm.to_yaml())
+    found = [one for one in examine(tmp_path / "toy.hdf5", tmp_path / "arm.yaml") if one.check == "length"]
+    assert bool(found) is short and (not short or "a window, 24 frames" in found[0].message)
+    convert(toy_arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / "shards")
+    assert bool(len(WindowDataset(tmp_path / "shards", "train", 12))) is not short
 
 
 def test_faults_that_differ_in_numbers_alone_are_one_group_that_counts_all(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from hma_data.conversion.job import convert
+from hma_data.conversion.plan import read_clip
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, RegistryError, SourceError
 from hma_data.inspection.infer import infer
@@ -15,6 +16,7 @@ from hma_data.registry.embodiment import find
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import detect, open_source
 from tests.data.rh20t_files import CAMERAS, LATE_MS, pose, robot, stamps, tables, write_scene
+from tests.data.videos import encode
 
 SCENE = "task_0001_user_0001_scene_0001_cfg_0001"
 
@@ -201,3 +203,14 @@ def test_the_registry_reads_scenes_of_its_cameras(number, tmp_path):
         np.save(scene / "transformed" / f"{name}.npy", table)
     clip = to_clip(read(tmp_path, embodiment=own), own)
     assert clip.actions.shape == (12, 8) and clip.states.shape == (12, 8) and len(clip.frame_indices) == 6
+
+
+def test_a_camera_that_is_not_stored_shortens_no_episode(recording):
+    place = recording / SCENE / f"cam_{CAMERAS[1]}"
+    np.save(place / "timestamps.npy", {"color": stamps(1, 12)[:4]})
+    encode(place / "color.mp4", range(4))
+    source = open_source("rh20t")
+    assert len(read_clip(source, str(recording), SCENE, robot(), ["c0"])) == 12
+    assert len(read_clip(source, str(recording), SCENE, robot(), ["c0", "c1"])) < 6
+    other = read_clip(source, str(recording), SCENE, robot(), ["c1"])  # on the frames of the primary one
+    assert set(other.frame_indices) == {"c0", "c1"} and len(other) < 6

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -54,6 +55,20 @@ def test_a_folder_that_holds_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(OutputError, match=r"thesis\.tex"):
         demos.demo(tmp_path)
+
+
+def test_other_settings_than_the_folder_was_begun_with_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def begun(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demos, "record_and_convert", begun)
+    for episodes, steps, seed, said in ((8, 2, 0, ""), (16, 2, 0, "--episodes 8"), (8, 2, 5, "--seed 0")):
+        with pytest.raises(OutputError if said else KeyboardInterrupt, match=said):
+            demos.demo(tmp_path / "demo", episodes=episodes, steps=steps, seed=seed)
+    with pytest.raises(KeyboardInterrupt):
+        demos.demo(tmp_path / "demo", episodes=8, steps=2)
 
 
 @pytest.mark.parametrize(

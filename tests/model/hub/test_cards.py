@@ -10,6 +10,7 @@ from huggingface_hub import DatasetCard, ModelCard
 
 from hma_data.errors import HubError
 from hma_data.tokenizers.base import get_tokenizer
+from hma_model.checkpoint.model_card import licence
 from hma_model.config import HMAConfig
 from hma_model.hub import publish as hub
 from hma_model.hub.datasets import push_data
@@ -83,3 +84,17 @@ def test_a_token_is_in_no_file_log_or_error(
     files += list(server.model(REPO).files.values())
     assert files and not any(TOKEN.encode() in content for content in files)
     assert caplog.records and not any(TOKEN in record.getMessage() for record in caplog.records)
+
+
+@pytest.mark.parametrize(
+    ("stated", "found"),
+    [
+        (["Apache-2.0", "apache-2.0 "], {"license": "other", "license_name": "several"}),
+        (["MIT", "MIT"], {"license": "mit"}),
+        (["MIT", "unknown"], {"license": "other", "license_name": "several"}),
+        (["MIT", None], {"license": "other", "license_name": "several"}),
+        (["unknown", None], {}),
+    ],
+)
+def test_one_licence_stands_for_all_only_if_each_states_it(stated: list[Any], found: dict[str, str]) -> None:
+    assert licence(stated) == found

@@ -1,6 +1,7 @@
 """What `hma hub list` says of a folder or repository, and the picture that goes into the card."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ from safetensors.torch import save_file
 from typer.testing import CliRunner
 
 from hma_data.errors import CheckpointError, HubError, UsageError
+from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint.io import Checkpoint
 from hma_model.cli import app, main
+from hma_model.config import HMAConfig
 from hma_model.hub import publish as hub
 from hma_model.hub.listing import survey
 from hma_model.hub.sample import add_samples
@@ -159,6 +162,38 @@ def test_the_picture_is_pushed_with_its_embodiment_and_shown_in_the_card(folder,
     assert "(embodiments/arm/sample.gif)" in page and "(embodiments/hand/sample." not in page
     home = hub.pull(tmp_path / "hub", ["arm"], tmp_path / "out") / "embodiments/arm"
     assert (home / "sample.png").is_file() and (home / "sample.gif").is_file()
+
+
+def test_new_weights_take_the_film_of_older_ones_from_the_hub(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Flat())
+    bare = shutil.copytree(folder, tmp_path / "bare")
+    add_samples(folder, [make_shards(tmp_path / "shards", "arm")])
+    hub.push(folder, tmp_path / "hub")
+    hub.push(bare, tmp_path / "hub", ["hand"])
+    assert (tmp_path / "hub/embodiments/arm/sample.gif").is_file()  # of a robot that is not pushed
+    hub.push(bare, tmp_path / "hub", ["arm"])
+    assert not list((tmp_path / "hub/embodiments/arm").glob("sample.*"))
+    assert "sample." not in (tmp_path / "hub/README.md").read_text()
+
+
+def test_samples_are_not_written_into_the_package(tmp_path):
+    with pytest.raises(CheckpointError, match="comes along with the package"):
+        add_samples("embedded", [make_shards(tmp_path / "shards", "arm")])
+
+
+def test_weights_of_ones_own_are_named_where_a_model_is_listed(tmp_path):
+    spec = get_tokenizer("fsq-lab").spec.to_json()
+    config = HMAConfig(
+        layers=1, width=16, heads=2, frames=4, grid=(16, 16), factored=(8,) * 5, tokenizer=spec
+    )
+    save(tmp_path / "usual", {"arm": 2}, model=make_model({"arm": 2}, config=config))
+    own = config.replace(tokenizer={**spec, "weights_sha256": "0293" * 16})
+    save(tmp_path / "own", {"arm": 2}, model=make_model({"arm": 2}, config=own))
+    assert [one["problems"] for one in survey(tmp_path / "usual")] == [[]]
+    assert "weights of its own (029302930293…)" in survey(tmp_path / "own")[0]["problems"][0]
+    usual, other = ((tmp_path / name / "README.md").read_text() for name in ("usual", "own"))
+    assert 'get_tokenizer("fsq-lab", weights="WEIGHTS")' in other and "0293" * 16 in other
+    assert 'get_tokenizer("fsq-lab")' in usual
 
 
 def test_the_command_makes_the_picture_on_pushing(folder, tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ import pytest
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.reader import ShardSet
+from hma_model.cli import main
 from hma_model.training import view as module
 from tests.data.inspection.test_view import pictures, read, seconds
 from tests.model.evaluation.test_evaluate import Blocks
@@ -64,3 +65,18 @@ def test_a_run_without_its_shards_is_shown_by_its_log(run: Path, tmp_path: Path)
 def test_a_window_that_is_not_there_is_refused(run: Path) -> None:
     with pytest.raises(UsageError, match="held-out windows"):
         module.view_run(run, 999)
+
+
+def test_the_command_refuses_what_does_not_belong_to_the_place(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "x.rrd")]
+    for words, said in (
+        ([str(tmp_path / "arm"), "--tokenizer", "fsq-8"], "--tokenizer: is for a recording"),
+        ([str(tmp_path / "arm"), str(tmp_path / "arm")], "DATA: is for a checkpoint"),
+        ([str(run), "--tokenizer", "fsq-8"], "--tokenizer: is for a recording"),
+        ([str(tmp_path / "nothere")], "does not exist"),
+    ):
+        assert main(["view", *words, *out]) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "x.rrd").exists()
