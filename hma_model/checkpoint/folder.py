@@ -4,7 +4,7 @@
     trunk.safetensors            tensors that all embodiments share
     embodiments/<id>/            stem.safetensors, head.safetensors, embodiment.yaml, stats.json, card.json
     README.md                    the model card, made from the card.json files
-    training/                    optimizer, sampler and rng state; never published
+    training/                    optimizer and the sampler's place; never published
 
 Every card and every stem holds the SHA-256 of the trunk, and the digests of the tokenizer and of the
 statistics that the stem was trained on. Parts that do not belong together are therefore refused.

@@ -1,8 +1,9 @@
-"""Draw the batches of a training step, the same for every number of ranks.
+"""Draw the batches of a training step, the same for every number of ranks that divides its passes.
 
 A step consists of a number of passes, each over its own batch. Rank r of W makes the passes r, r + W and so
-on. Pass p draws from the mixture as if it were rank p and every pass were a rank. Its data do not depend on
-W, so a run may continue with another number of ranks.
+on. Pass p draws from the mixture as if it were rank p and every pass were a rank. There are `accumulate`
+passes where W divides that; the data do not depend on W then, and a run may continue with another such W.
+Otherwise there are W passes.
 """
 
 from collections.abc import Iterator, Mapping

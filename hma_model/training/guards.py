@@ -25,29 +25,41 @@ SETTLED = 20  # steps before a norm can be a spike
 
 
 class StepMetrics:
-    """Sums of losses by embodiment, kept on their device, so that a step needs only one transfer."""
+    """Sums of losses, kept on their device, so that a step needs only one transfer.
 
-    def __init__(self, names: list[str], device: torch.device) -> None:
-        self._names = sorted(names)
+    Objectives have losses of different kinds, nats or squared errors; those by embodiment are of one alone.
+
+    Args:
+        names: ids of the embodiments.
+        device: of the model.
+        main: the objective whose losses are told by embodiment.
+    """
+
+    def __init__(self, names: list[str], device: torch.device, main: str) -> None:
+        self._names, self._main = sorted(names), main
         self._loss = torch.zeros(1, device=device)
         self._sums = torch.zeros(2, len(names), device=device)
-        self._objectives = torch.zeros(len(OBJECTIVES), device=device)
+        self._objectives = torch.zeros(2, len(OBJECTIVES), device=device)
 
     def add(self, embodiment: list[str], output: "Output") -> None:
         """Add the loss of a pass, the loss of each sample, and the objective."""
         index = torch.tensor([self._names.index(name) for name in embodiment], device=self._sums.device)
         losses = output.per_sample.to(self._sums)
         self._loss += output.loss.detach().to(self._loss)
-        self._sums.index_add_(1, index, torch.stack([losses, torch.ones_like(losses)]))
-        self._objectives[list(OBJECTIVES).index(output.objective)] += 1
+        if output.objective == self._main:
+            self._sums.index_add_(1, index, torch.stack([losses, torch.ones_like(losses)]))
+        own = list(OBJECTIVES).index(output.objective)
+        self._objectives[:, own] += torch.stack([output.loss.detach().to(losses), torch.ones_like(losses[0])])
 
-    def whole(self, world: World, passes: int) -> tuple[float, dict[str, float], list[str]]:
-        """Return the mean loss over all ranks, the mean by embodiment, and the objectives of the step."""
-        flat = world.sum(torch.cat([self._loss, self._sums.flatten(), self._objectives])).tolist()
-        count = len(self._names)
-        sums, counts, objectives = flat[1 : 1 + count], flat[1 + count : 1 + 2 * count], flat[1 + 2 * count :]
-        by_name = {name: s / n for name, s, n in zip(self._names, sums, counts) if n}
-        return flat[0] / passes, by_name, sorted(n for n, used in zip(OBJECTIVES, objectives) if used)
+    def whole(self, world: World, passes: int) -> tuple[float, dict[str, float], dict[str, float]]:
+        """Return the mean loss over all ranks, the main objective's by embodiment, and each objective's."""
+        flat = world.sum(torch.cat([self._loss, self._sums.flatten(), self._objectives.flatten()]))
+        parts = flat[1:].split([*[len(self._names)] * 2, *[len(OBJECTIVES)] * 2])
+        by_name, by_objective = (
+            {name: s / n for name, s, n in zip(names, sums.tolist(), counts.tolist()) if n}
+            for names, sums, counts in ((self._names, *parts[:2]), (OBJECTIVES, *parts[2:]))
+        )
+        return float(flat[0]) / passes, by_name, dict(sorted(by_objective.items()))
 
 
 def peak_memory_mib(device: torch.device) -> float:

@@ -57,12 +57,14 @@ def write_report(out: StrPath) -> None:
 
 
 def _headline(page: Page, recipe: dict[str, Any], steps: Lines, evaluations: Lines) -> None:
-    recent = steps[-RECENT:]
+    recent, main = steps[-RECENT:], max(recipe["objectives"], key=recipe["objectives"].get)
+    own = [s.get("loss_by_objective", {main: s["loss"]}).get(main) for s in recent]
+    losses = [loss for loss in own if loss is not None]
     pace = sum(s["windows"] for s in recent) / max(sum(s["step_seconds"] for s in recent), 1e-9)
     last = evaluations[-1] if evaluations else {}
     tiles = [
         (f"{steps[-1]['step']:,} of {recipe['steps']:,}", "steps"),
-        (f"{_mean([s['loss'] for s in recent]):.3f}", f"training loss, last {len(recent)} steps"),
+        (_short(_mean(losses)) if losses else "", f"training loss, {main}, last {len(recent)} steps"),
         (_short(last.get("loss")), "held-out loss"),
         (_short(last.get("baseline")), "held-out loss of the token frequencies"),
         (f"{pace:.1f}", "windows a second"),

@@ -207,7 +207,7 @@ class Run:
         recipe, begun, cpu_begun = self.recipe, time.monotonic(), time.process_time()
         lr = optim.set_lr(self.optimizer, optim.lr_scale(self.step, recipe, self.done))
         self.optimizer.zero_grad(set_to_none=True)
-        metrics, seen, waited = guards.StepMetrics(list(self.sets), self.device), [], 0.0
+        metrics, seen, waited = guards.StepMetrics(list(self.sets), self.device, self.objective.name), [], 0.0
         batches = self.train_data.step()
         for _ in self.train_data.own:
             asked = time.monotonic()
@@ -218,7 +218,7 @@ class Run:
             seen.append((batch, output.per_sample))
         self.parallel_model.average()
         norm = self.parallel_model.clip(recipe.clip)
-        loss, by_embodiment, objectives = metrics.whole(self.world, self.train_data.passes)
+        loss, by_embodiment, by_objective = metrics.whole(self.world, self.train_data.passes)
         self.step += 1
         fault = self.spike_detector.fault(loss, norm)
         if fault:
@@ -238,7 +238,8 @@ class Run:
             "done": round(self.done, 6),
             "loss": loss,
             "loss_by_embodiment": by_embodiment,
-            "objectives": objectives,
+            "objectives": list(by_objective),
+            "loss_by_objective": by_objective,
             "lr": lr,
             "grad_norm": norm,
             "windows": recipe.windows_per_step,

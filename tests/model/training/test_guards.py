@@ -3,15 +3,19 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from hma_data.errors import RecipeError, TrainingError
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_model.checkpoint.folder import training_checkpoints
+from hma_model.training.guards import StepMetrics
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
+from hma_model.training.parallel import World
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import errors
 from tests.model.runs import TINY, same
@@ -109,3 +113,15 @@ def test_two_ranks_stop_with_one_error_that_names_the_window(tmp_path):
     said = errors(spread(hurt, tmp_path / "run", codes=(1, 1)))
     assert len(said) == 1, said
     assert f"windows: arm episode {EPISODE} (e{EPISODE}) frames" in said[0] and "; arm" not in said[0]
+
+
+def test_losses_of_several_objectives_are_kept_apart():
+    metrics = StepMetrics(["arm", "hand"], torch.device("cpu"), "forward")
+    for name, objective, losses in (
+        ("arm", "forward", [3.0, 5.0]), ("hand", "policy", [0.5, 0.5]), ("arm", "policy", [0.25, 0.25]),
+    ):  # fmt: skip
+        values = torch.tensor(losses)
+        metrics.add([name] * 2, SimpleNamespace(per_sample=values, loss=values.mean(), objective=objective))
+    loss, by_embodiment, by_objective = metrics.whole(World(), 3)
+    assert loss == pytest.approx((4 + 0.5 + 0.25) / 3)
+    assert by_embodiment == {"arm": 4} and by_objective == {"forward": 4, "policy": 0.375}
