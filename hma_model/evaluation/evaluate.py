@@ -72,6 +72,7 @@ DRAWS = 5  # of other windows' actions, and of Gaussian ones
 FOLLOWS_DB = 0.5  # gain of the last frame's PSNR from which a model is said to follow its actions
 HEARS = 1.2  # and times the loss with shuffled ones from which it is said to hear them
 NO_ACTIONS = "no objective of its training sees actions, so it is given none: all rollouts are without"
+UNMOVED = "the figures say nothing about the actions"
 PAPER_BATCH = 4  # the paper's perplexity is a mean over batches of so many windows
 Floats = NDArray[np.float64]
 
@@ -244,6 +245,8 @@ def verdict(found: Mapping[str, Any]) -> str:
     """Return a sentence about the result of `evaluate`: whether the model follows its actions."""
     if NO_ACTIONS in found.get("notes", ()):
         return "was trained without actions"
+    if any(UNMOVED in note for note in found.get("notes", ())):
+        return "cannot be judged: most of the true pictures never change"
     gain = found["psnr_action_gain_last"]
     if gain is None:
         return "cannot be judged: its predictions are not finite"
@@ -342,7 +345,7 @@ def _notes(
     if 2 * still > count:
         notes.append(
             f"the true pictures of {still} of {count} windows never change: a copy of the prompt is perfect "
-            "there, and the figures say nothing about the actions"
+            f"there, and {UNMOVED}"
         )
     blind = any(not OBJECTIVES[name].sees_actions for name, often in config.objectives.items() if often)
     if not config.drop_commands and not blind:

@@ -61,11 +61,18 @@ def windows(
     batch_size: int = 8,
     cameras: Cameras = FIRST,
 ) -> Iterator[Batch]:
-    """Yield up to `count` windows of a split in batches; they are evenly spaced and always the same."""
+    """Yield up to `count` windows of a split in batches; they are evenly spaced and always the same.
+
+    A batch has a single window only if there is but one: windows take the actions of others in their batch.
+    """
     dataset = WindowDataset(data, split, frames, cameras=cameras)
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(np.int64))
-    for start in range(0, len(chosen) if len(dataset) else 0, batch_size):
-        yield dataset.batch(chosen[start : start + batch_size])
+    if not len(dataset):
+        return
+    whole, rest = divmod(len(chosen), batch_size)
+    alone = rest == 1 and whole and batch_size > 1
+    parts = np.array_split(chosen, whole + 1 if alone else range(batch_size, len(chosen), batch_size))
+    yield from map(dataset.batch, parts)
 
 
 @torch.no_grad()

@@ -463,3 +463,13 @@ def test_pictures_that_never_change_are_said_in_words(model, data):
 def test_a_metric_without_weights_is_a_row_of_words(model, data):
     missing = evaluate(model, Blocks(), data, count=2)["missing"]
     assert all(f"--{name} FILE" in missing[name] for name in ("lpips", "fid", "fvd"))
+
+
+@pytest.mark.parametrize(
+    ("count", "sizes"), [(4, [4]), (5, [3, 2]), (6, [4, 2]), (8, [4, 4]), (9, [3, 3, 3]), (1, [1])]
+)
+def test_no_window_is_alone_in_its_batch(data, count, sizes):
+    found = list(windows(data, "val", 4, count, batch_size=4))
+    assert [len(batch) for batch in found] == sizes
+    frames = [int(frame) for batch in found for frame in batch.frame]
+    assert frames == sorted(set(frames)) and len(frames) == count

@@ -32,8 +32,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     for name, seed in (("one", 0), ("other", 1)):
         save(folder / name, {"arm": 2, "hand": 3}, seed)
-    make_shards(folder / "arm", "arm")
-    make_shards(folder / "hand", "hand", dims=3, seed=4)
+    make_shards(folder / "arm", "arm", held_out=2)
+    make_shards(folder / "hand", "hand", dims=3, seed=4, held_out=2)
     return folder
 
 
