@@ -138,7 +138,7 @@ def _print_one(part: "Part") -> None:
     plain = [
         [FIGURES.get(key, key), value, _ends(found.get(f"{key}_95"))]
         for key, value in found.items()
-        if not isinstance(value, dict | list) and key not in HIDDEN
+        if not isinstance(value, dict | list) and key not in HIDDEN and not key.endswith("_95")
     ]
     print_table(["figure", "value", "95 %"], plain)
     columns = {"psnr": "PSNR dB", "psnr_last": "last frame dB", "ssim": "SSIM"}
