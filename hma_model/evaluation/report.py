@@ -56,7 +56,7 @@ def page(parts: Sequence[Part], command: str) -> str:
     )
     made = Page(f"Evaluation of {', '.join(labels)}", lead)
     _headline(made, parts)
-    made.section("Figures", "Below a figure: the 95 % interval of its mean over windows, by bootstrap.")
+    made.section("Figures", "Below a figure: the 95 % interval of its mean, by bootstrap of whole episodes.")
     names, lines = rows(parts)
     made.table(names, [[_below(cell) for cell in line] for line in lines])
     made.definitions([(name, WORDS[name]) for name in names if name in WORDS])
