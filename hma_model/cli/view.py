@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hma_data.errors import UsageError
-from hma_model.checkpoint.folder import EMBEDDED_NAME
 from hma_model.cli.play import has_display
 
 if TYPE_CHECKING:
@@ -59,6 +58,7 @@ def _made(
     """Return the view of what lies at a place."""
     from hma_data.inspection.view import view_recording, view_shards
     from hma_data.storage.kinds import kind_of
+    from hma_model.checkpoint.folder import EMBEDDED_NAME
 
     kind = kind_of(Path(place).expanduser())
     if place == EMBEDDED_NAME and not Path(place).exists():

@@ -141,7 +141,7 @@ def markdown(parts: Sequence[Part], command: str) -> str:
     names, lines = rows(parts)
     text = ["# Evaluation", "", f"`{command}`", "", _line(names), _line(["---"] * len(names))]
     text += [_line(["–" if cell is None else cell for cell in line]) for line in lines]
-    text += ["", "In brackets: 95 % intervals of the means, by bootstrap of whole episodes (1,000 resamples).", ""]
+    text += ["", "In brackets: 95 % intervals, by bootstrap of whole episodes (1,000 resamples).", ""]
     text += [f"- {name}: {WORDS[name]}" for name in names if name in WORDS]
     if said := absences(parts):
         text += ["", "Not measured, or to be known:", ""]

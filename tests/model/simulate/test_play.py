@@ -73,7 +73,10 @@ def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, served: list[An
     assert list(served[0][2]) == ["rover:recordings"]
 
 
-def test_the_device_and_precision_reach_the_world(tmp_path: Path, served: list[Any], picture: str) -> None:
+def test_the_device_and_precision_reach_the_world(
+    tmp_path: Path, served: list[Any], picture: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hma_model.cli.play.device_name", lambda device: device)
     save(tmp_path / "model", {"arm": 2})
     words = ["play", str(tmp_path / "model"), "--prompt", picture, "--no-browser"]
     assert main([*words, "--precision", "bf16", "--device", "cuda", "--compile"]) == 0
