@@ -76,7 +76,7 @@ def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, served: list[An
 def test_the_device_and_precision_reach_the_world(
     tmp_path: Path, served: list[Any], picture: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hma_model.cli.play.device_name", lambda device: device)
+    monkeypatch.setattr("hma_model.training.runtime.choose_device", lambda name: name)
     save(tmp_path / "model", {"arm": 2})
     words = ["play", str(tmp_path / "model"), "--prompt", picture, "--no-browser"]
     assert main([*words, "--precision", "bf16", "--device", "cuda", "--compile"]) == 0
