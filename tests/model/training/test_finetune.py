@@ -155,6 +155,9 @@ def test_another_tokenizer_is_refused_with_both_names(base, tmp_path):
 def test_another_network_is_refused(base, leg, tmp_path):
     with pytest.raises(RecipeError, match=r"model\.width.*is 32, .* has 16"):
         tune(base.out, leg, tmp_path / "run", "model.width=32")
+    with pytest.raises(RecipeError, match=r"digits: gives digits of \(64,\), the checkpoint has \(8, 8\)"):
+        tune(base.out, leg, tmp_path / "run", "digits=64")
+    assert tune(base.out, leg, tmp_path / "same", "digits=8").step == 4
 
 
 def test_how_it_is_trained_may_differ(base, leg, tmp_path):

@@ -151,6 +151,14 @@ def test_sharded_ranks_are_refused(past, tmp_path):
         Run(recipe, tmp_path, torch.device("cpu"), World(0, 2))
 
 
+def test_passes_that_skip_actions_are_refused_where_they_would_disagree(tmp_path):
+    objectives = {"forward": 0.5, "passive": 0.5}
+    recipe = {**TINY, "data": ["x"], "objectives": objectives, "parallel": "fsdp"}
+    recipe["model"] = {**TINY["model"], "absent_action": "skip"}
+    with pytest.raises(RecipeError, match="absent_action: skip does not work with parallel=fsdp"):
+        Run(make_recipe(recipe), tmp_path, torch.device("cpu"), World(0, 2))
+
+
 def test_rollouts_without_predicted_frames_are_refused(tmp_path):
     recipe = make_recipe({**TINY, "data": ["x"], "self_rollout": 0.5, "objectives": {"policy": 1}})
     with pytest.raises(RecipeError, match="self_rollout: needs frames .* policy does not predict"):
