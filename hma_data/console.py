@@ -34,11 +34,15 @@ def run_script(main: Callable[[], None]) -> None:
     except HMAError as fault:
         if os.environ.get("HMA_DEBUG"):
             raise
-        print(f"error: {' '.join(str(fault).split())}", file=sys.stderr)
-        raise SystemExit(fault.exit_code) from None
+        raise SystemExit(fail(str(fault), fault.exit_code)) from None
     except KeyboardInterrupt:
-        print("error: interrupted", file=sys.stderr)
-        raise SystemExit(130) from None
+        raise SystemExit(fail("interrupted", 130)) from None
+
+
+def fail(text: str, code: int) -> int:
+    """Print an error as one line to standard error; return the exit code."""
+    print(f"error: {' '.join(text.split())}", file=sys.stderr)
+    return code
 
 
 def print_json(values: Any) -> None:

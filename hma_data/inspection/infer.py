@@ -34,7 +34,7 @@ from hma_data.inspection.infer_choices import (
 )
 from hma_data.registry.catalog import entries
 from hma_data.registry.components import Space
-from hma_data.registry.embodiment import ID_PATTERN, TODO, Embodiment, find
+from hma_data.registry.embodiment import ID_PATTERN, ONE_INDEX, TODO, Embodiment, find
 from hma_data.sources.base import Inspection, KeyInfo, detect, open_source, require_utf8
 from hma_data.storage.paths import StrPath
 
@@ -169,6 +169,7 @@ class _Draft:
     def __init__(self, found: Inspection) -> None:
         self.found = found
         self.bag = found.format == "rosbag"
+        self.timed = found.format not in ONE_INDEX  # each key has its own times
         self.seen = cameras(found.keys)
         if not self.seen.keys:
             raise _lacks(found, "has no colour camera", [key for key in found.keys if key.kind == "camera"])
@@ -221,7 +222,7 @@ class _Draft:
         values["cameras"] = self._cameras()
         if self.bag:
             values["sync"] = self._sync(values["cameras"][0]["name"])
-        elif self.action.measured and found.format != "rh20t":
+        elif self.action.measured and not self.timed:
             values["sync"] = {"action_shift": 1}
         source = {"format": found.format, "uri": found.uri, "episodes": max(found.episodes, 1)}
         said = self._instruction()
@@ -240,7 +241,7 @@ class _Draft:
             return None
         camera = self.seen.keys[0]
         doubt = 0.0  # relative error of the median interval of jittering stamps
-        if self.found.format in ("rosbag", "rh20t") and camera.jitter_ms and camera.count:
+        if self.timed and camera.jitter_ms and camera.count:
             doubt = 2.5 * camera.jitter_ms * self.hz / 1e3 / math.sqrt(camera.count)
         whole = round(self.hz)
         tolerance = MEASURED_TO + (min(doubt, 0.02) if doubt == doubt else 0.0)

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 ID_PATTERN = re.compile(r"[a-z0-9][a-z0-9_.-]{0,99}")
 TODO = "TODO"
+WITHOUT_STEPS = {"rosbag": "a bag has times", "rh20t": "RH20T has times (keys may end in /next)"}
 ONE_INDEX = ("rlds", "hdf5", "lerobot")  # formats in which frame i, action i and state i belong together
 # The fields that decide the content of shards. target_hz and stride act later, when windows are drawn.
 _DECIDES: Any = {
@@ -123,10 +124,9 @@ class Embodiment(SpecModel):
     @classmethod
     def _source_fits(cls, value: SourceSpec, info: ValidationInfo) -> SourceSpec:
         sync = info.data.get("sync")
-        if sync and sync.action_shift and value.format == "rosbag":
-            raise ValueError("a bag has times instead of steps, which sync.action_shift counts")
-        if sync and sync.action_shift and value.format == "rh20t":
-            raise ValueError("RH20T has no steps, which sync.action_shift counts: end keys in /next instead")
+        if sync and sync.action_shift and value.format in WITHOUT_STEPS:
+            said = WITHOUT_STEPS[value.format]
+            raise ValueError(f"{said} instead of steps, which sync.action_shift counts")
         stored = info.context and info.context["stored"]
         if sync and sync.rate_hz and value.format in ONE_INDEX and not stored:
             raise ValueError(

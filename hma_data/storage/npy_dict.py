@@ -29,7 +29,7 @@ _FAULTS = (ValueError, LookupError, TypeError, OverflowError, MemoryError, Synta
 
 
 class _Name(str):
-    """One of the names that a pickle may call, as `module name`."""
+    """What a pickle may name: a key of `_CALLS`, or ndarray, which is only an argument."""
 
 
 class _Array:
@@ -144,8 +144,8 @@ class _Reader:
     def call(self) -> None:
         given = self.pop()
         called = self.pop()
-        if not isinstance(called, _Name) or not isinstance(given, tuple):
-            raise ValueError("it calls something that is no name")
+        if not isinstance(called, _Name) or called not in _CALLS or not isinstance(given, tuple):
+            raise ValueError("it calls something that makes no plain value")
         self.push(_CALLS[called](*given))
 
     def build(self) -> None:

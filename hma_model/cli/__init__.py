@@ -16,7 +16,7 @@ from typer.core import TyperGroup
 from hma_data import __version__
 from hma_data.bench import BENCHES
 from hma_data.cli import mount
-from hma_data.console import interruptible
+from hma_data.console import fail, interruptible
 from hma_data.cpu import bound_spinning, take_ordinary_priority
 from hma_data.errors import HMAError, UsageError
 from hma_model.cli import train as cli_train
@@ -110,16 +110,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     except HMAError as fault:
         if debug:
             raise
-        return _fail(str(fault), fault.exit_code)
+        return fail(str(fault), fault.exit_code)
     except _Wrong as fault:
         context = getattr(fault, "ctx", None)
         if not fault.format_message().strip() or type(fault).__name__ == "NoArgsIsHelpError":
             return 2  # the help has been shown
         hint = f" — see {context.command_path} --help" if context else ""
         said = fault.format_message().replace("Value error, ", "").replace("Input should be", "must be")
-        return _fail(said + hint, 2)
+        return fail(said + hint, 2)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted", 130)
+        return fail("interrupted", 130)
     except BrokenPipeError:
         sys.stderr.close()
         return 1
@@ -127,13 +127,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if debug:
             raise
         text = f"{type(fault).__name__}: {fault}".splitlines()[0]
-        return _fail(f"{text} — this should have been a clearer error; --debug shows where it happened", 1)
+        return fail(f"{text} — this should have been a clearer error; --debug shows where it happened", 1)
     return code if isinstance(code, int) else 0
-
-
-def _fail(text: str, code: int) -> int:
-    print(f"error: {' '.join(text.split())}", file=sys.stderr)
-    return code
 
 
 @app.command()

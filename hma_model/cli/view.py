@@ -65,10 +65,10 @@ def _made(
         kind = "a checkpoint"
     if not kind and not Path(place).expanduser().exists() and "://" not in place:
         raise UsageError(place, "does not exist", "name a recording (with -e), a shard set or a run")
-    of = {"DATA": (bool(data), "a checkpoint"), "--tokenizer": (bool(tokenizer), "a recording")}
-    for option, (given, only) in of.items():
-        if given and kind in ("a checkpoint", "a shard set", "a recording") and kind != only:
-            raise UsageError(option, f"is for {only}, and {place} is {kind}", "leave it out")
+    if data and kind in ("a shard set", "a recording"):
+        raise UsageError("DATA", f"is for a checkpoint, and {place} is {kind}", "leave it out")
+    if tokenizer and kind in ("a shard set", "a checkpoint"):
+        raise UsageError("--tokenizer", f"is for a recording, and {place} is {kind}", "leave it out")
     if embodiment is None and kind == "a checkpoint":
         from hma_model.training.view import view_run
 

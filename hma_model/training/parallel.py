@@ -28,13 +28,33 @@ from torch import Tensor, nn
 from torch.distributed.tensor import DTensor, distribute_tensor
 
 from hma_data.errors import HMAError, RecipeError, TrainingError
+from hma_model.config import OBJECTIVES, HMAConfig
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
+    from hma_model.training.recipe import Recipe
 
 PATIENCE = timedelta(hours=2)  # rank 0 evaluates and writes while the others wait
 ANSWER = timedelta(seconds=30)  # the time limit for an answer of torchrun's store
 PREFIX, ERROR, REPORTS = "errors", "error", "reports"  # of the keys in the store
+
+
+def require_shardable(recipe: "Recipe", config: HMAConfig) -> None:
+    """Raise if several ranks cannot train a network so with `parallel=fsdp`.
+
+    Raises:
+        RecipeError: an option needs the whole network on every rank.
+    """
+    remedy = "use parallel=ddp"
+    wrong = [name for name in ("self_forward", "self_rollout") if getattr(recipe, name)]
+    if wrong or recipe.optimizer == "muon":
+        name, said = (wrong[0], "") if wrong else ("optimizer", "muon ")
+        fault = f"{said}does not work with parallel=fsdp on several ranks"
+        raise RecipeError(f"recipe: {name}", fault, remedy)
+    seeing = {OBJECTIVES[name].sees_actions for name, weight in recipe.objectives.items() if weight}
+    if config.absent_action == "skip" and len(seeing) > 1:
+        fault = "skip does not work with parallel=fsdp where only some objectives see actions"
+        raise RecipeError("recipe: model.absent_action", fault, remedy)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from hma_model.evaluation.rollout_video import newest_sheets, write_sheets
 from hma_model.network.model import HMA
 from hma_model.training import alike, guards, optim
 from hma_model.training.data import TrainData
-from hma_model.training.parallel import ParallelModel, World, gathered
+from hma_model.training.parallel import ParallelModel, World, gathered, require_shardable
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import (
     OtherVersionError,
@@ -54,21 +54,9 @@ class Run:
         if not recipe.data:
             raise RecipeError("recipe: data", "names no shards", "add data=[FOLDER, …]")
         self.out, self.device, self.world = out, device, world or World()
-        for name in ("self_forward", "self_rollout"):
-            if getattr(recipe, name) and recipe.parallel == "fsdp" and self.world.size > 1:
-                fault = "does not work with parallel=fsdp on several ranks"
-                raise RecipeError(f"recipe: {name}", fault, "use parallel=ddp")
-        seeing = {OBJECTIVES[name].sees_actions for name, weight in recipe.objectives.items() if weight}
-        skips = recipe.model.get("absent_action") == "skip" and len(seeing) > 1
-        if skips and recipe.parallel == "fsdp" and self.world.size > 1:
-            fault = "skip does not work with parallel=fsdp where only some objectives see actions"
-            raise RecipeError("recipe: model.absent_action", fault, "use parallel=ddp")
         if recipe.self_rollout and not any(OBJECTIVES[name].predicts_video for name in recipe.objectives):
             fault = f"needs frames to roll out, which {', '.join(recipe.objectives)} does not predict"
             raise RecipeError("recipe: self_rollout", fault, "add one such as forward, or set it to 0")
-        if recipe.optimizer == "muon" and recipe.parallel == "fsdp" and self.world.size > 1:
-            fault = "muon does not work with parallel=fsdp on several ranks"
-            raise RecipeError("recipe: optimizer", fault, "use parallel=ddp")
         try:
             self.sets = open_sets(recipe.data, recipe.cameras)
         except UsageError as wrong:
@@ -83,6 +71,8 @@ class Run:
         if self.start and "frames" not in recipe.model_fields_set:
             recipe = recipe.model_copy(update={"frames": self.start.checkpoint.config.frames})
         self.recipe = recipe
+        if recipe.parallel == "fsdp" and self.world.size > 1:
+            require_shardable(recipe, self._config())
         often = max(recipe.objectives, key=lambda name: recipe.objectives[name])
         self.objective = OBJECTIVES[often]  # whose loss the evaluations compute
         self.train_data = TrainData(recipe, self.sets, self.world, self._config().told_first)

@@ -4,12 +4,13 @@ import re
 
 from hma_data.sources.base import Recognition
 
+SCENE = re.compile(r"task_\d+_user_\d+_scene_\d+_cfg_\d+")  # the name of a folder
+
 
 def _is_named_so(uri: str) -> bool:
     """Check for the names of its folders: their calibration alone may have more files than are looked at."""
     last = uri.rstrip("/").rsplit("/", 1)[-1]
-    scene = r"task_\d+_user_\d+_scene_\d+_cfg_\d+"
-    return "://" not in uri and bool(re.fullmatch(rf"RH20T_cfg\d+|{scene}", last))
+    return "://" not in uri and bool(SCENE.fullmatch(last) or re.fullmatch(r"RH20T_cfg\d+", last))
 
 
 RECOGNITION = Recognition(

@@ -11,7 +11,6 @@ T samples, A values of a sample.
 """
 
 import os
-import re
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +20,14 @@ from numpy.typing import NDArray
 from hma_data.episodes.episode import Floats
 from hma_data.errors import EpisodeError
 from hma_data.sources.base import leaves, local_path, nothing_there
-from hma_data.storage.files import parse_json
-from hma_data.storage.kinds import unreadable
+from hma_data.sources.rh20t import SCENE
+from hma_data.storage.files import read_json
 from hma_data.storage.npy_dict import read_dict
 
-NAME = re.compile(r"task_\d+_user_\d+_scene_\d+_cfg_\d+")
 NEXT = "next"  # the ending of a key: the value of the next sample
 CAMERA, TABLES, FILM, STAMPS = "cam_", "transformed", "color.mp4", "timestamps.npy"
 TASKS = "task_description.json"
 DEPTH = 4  # folders below a uri in which scenes are looked for
-MAX_JSON = 16 << 20
 MAX_WIDTH = 4096  # values of a sample
 
 
@@ -41,12 +38,12 @@ def scenes(uri: str) -> dict[str, Path]:
         SourceError: there are none.
     """
     root = local_path(uri)
-    if NAME.fullmatch(root.name):
+    if SCENE.fullmatch(root.name):
         return {root.name: root}
     found, people = [], 0
     for folder, inside, _ in os.walk(root):
         here = Path(folder)
-        own = sorted(name for name in inside if NAME.fullmatch(name))
+        own = sorted(name for name in inside if SCENE.fullmatch(name))
         people += sum(name.endswith("_human") for name in inside)
         found += [here / name for name in own]
         deep = len(here.relative_to(root).parts) >= DEPTH
@@ -144,13 +141,14 @@ class Scene:
         Raises:
             EpisodeError: it is damaged.
         """
-        return _json(self.folder / "metadata.json")
+        path = self.folder / "metadata.json"
+        return read_json(path, EpisodeError) if path.exists() else {}
 
     def task(self, field: str) -> str:
         """Return the task in words, from task_description.json in a folder above; empty without it."""
         for folder in list(self.folder.parents)[:DEPTH]:
             if (folder / TASKS).is_file():
-                told = _json(folder / TASKS).get("_".join(self.folder.name.split("_")[:2]))
+                told = read_json(folder / TASKS, EpisodeError).get("_".join(self.folder.name.split("_")[:2]))
                 said = told.get(field) if isinstance(told, dict) else None
                 return said if isinstance(said, str) else ""
         return ""
@@ -207,17 +205,3 @@ def _numbers(value: Any, path: Path, key: str, lists: bool = False) -> NDArray[A
     if found.size > MAX_WIDTH and not lists:
         raise EpisodeError(path, f"{key} has {found.size:,} values a sample, more than {MAX_WIDTH:,}")
     return found
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        if path.stat().st_size > MAX_JSON:
-            raise ValueError(f"it has more than {MAX_JSON:,} bytes")
-        values = parse_json(path.read_bytes())
-    except FileNotFoundError:
-        return {}
-    except OSError as fault:
-        raise EpisodeError(path, *unreadable(path, str(fault), "")) from fault
-    except (ValueError, RecursionError) as fault:
-        raise EpisodeError(path, f"cannot be read as JSON: {fault}", "copy it again") from fault
-    return values if isinstance(values, dict) else {}

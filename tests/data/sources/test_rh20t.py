@@ -124,7 +124,7 @@ def test_a_defect_of_a_table_is_named(change, said, tmp_path):
         (lambda s: (s / f"cam_{CAMERAS[1]}/color.mp4").unlink(), r"has no cam_043322070878/color\.mp4"),
         (lambda s: (s / f"cam_{CAMERAS[1]}/timestamps.npy").unlink(), "there is no such file"),
         (lambda s: np.save(s / f"cam_{CAMERAS[0]}/timestamps.npy", {"depth": [1]}), "color holds NoneType"),
-        (lambda s: (s / "metadata.json").write_text("{"), "cannot be read as JSON"),
+        (lambda s: (s / "metadata.json").write_text("{"), "is not valid JSON"),
     ],
 )  # fmt: skip
 def test_a_missing_or_damaged_file_is_named(spoil, said, recording):
@@ -186,7 +186,7 @@ def test_an_inferred_robot_takes_the_next_pose_as_its_command(recording):
 
 
 def test_a_shift_in_steps_is_refused():
-    with pytest.raises(RegistryError, match="end keys in /next"):
+    with pytest.raises(RegistryError, match="keys may end in /next"):
         robot(sync={"action_shift": 1})
 
 

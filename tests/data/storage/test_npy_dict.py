@@ -65,6 +65,16 @@ def test_shared_values_and_fortran_order_are_read(tmp_path):
         assert equal(read_dict(write(tmp_path / "x.npy", value, protocol)), value)
 
 
+class Called:
+    def __reduce__(self):
+        return (np.ndarray, ((2,),))
+
+
+def test_an_array_without_content_is_refused(tmp_path):
+    with pytest.raises(EpisodeError, match="calls something that makes no plain value"):
+        read_dict(write(tmp_path / "x.npy", {"a": Called()}, 4))
+
+
 class Evil:
     def __reduce__(self):
         return (os.system, (f"touch {self.path}",))

@@ -146,14 +146,16 @@ def test_a_run_with_a_past_of_its_own_goes_on_bit_for_bit(past, tmp_path):
 
 @pytest.mark.parametrize("past", ["self_forward", "self_rollout"])
 def test_sharded_ranks_are_refused(past, tmp_path):
-    recipe = make_recipe({**TINY, "data": ["x"], past: 0.5, "parallel": "fsdp"})
+    data = [str(make_shards(tmp_path / "arm", "arm"))]
+    recipe = make_recipe({**TINY, "data": data, past: 0.5, "parallel": "fsdp"})
     with pytest.raises(RecipeError, match="use parallel=ddp"):
         Run(recipe, tmp_path, torch.device("cpu"), World(0, 2))
 
 
 def test_passes_that_skip_actions_are_refused_where_they_would_disagree(tmp_path):
+    data = [str(make_shards(tmp_path / "arm", "arm"))]
     objectives = {"forward": 0.5, "passive": 0.5}
-    recipe = {**TINY, "data": ["x"], "objectives": objectives, "parallel": "fsdp"}
+    recipe = {**TINY, "data": data, "objectives": objectives, "parallel": "fsdp"}
     recipe["model"] = {**TINY["model"], "absent_action": "skip"}
     with pytest.raises(RecipeError, match="absent_action: skip does not work with parallel=fsdp"):
         Run(make_recipe(recipe), tmp_path, torch.device("cpu"), World(0, 2))
