@@ -52,6 +52,7 @@ def save(
     training: Callable[[Path], None] | None = None,
     base: Checkpoint | None = None,
     samples: Mapping[str, bytes] | None = None,
+    half: bool = False,
 ) -> Checkpoint:
     """Write a model and all its embodiments; replace an existing checkpoint of that name in one step.
 
@@ -65,9 +66,11 @@ def save(
         base: a checkpoint with the same trunk. Its trunk, its configuration and the files of its other
             embodiments are taken over unchanged.
         samples: id -> a PNG shown in the model card.
+        half: store weights in float16, half the bytes; statistics stay float32, and all is once loaded.
 
     Raises:
-        CheckpointError: parts do not agree, the folder holds something else, or it cannot be written.
+        CheckpointError: parts do not agree, the folder holds something else, it cannot be written, or a
+            weight is too large for float16.
     """
     from safetensors import SafetensorError
 
@@ -78,7 +81,7 @@ def save(
             if base:
                 trunk = _take_over(base, new, set(embodiment_yaml))
             else:
-                write_tensors(new / TRUNK, model.trunk_state(), {"format": "pt"})
+                write_tensors(new / TRUNK, model.trunk_state(), {"format": "pt"}, half)
                 trunk = file_sha256(new / TRUNK)
                 (new / CONFIG).write_bytes(to_json(config_json(model.config, trunk)))
             for name in sorted(embodiment_yaml):
@@ -88,7 +91,7 @@ def save(
                 (home / STATS).write_bytes(to_json(stats[name]))
                 if samples and name in samples:
                     (home / SAMPLE).write_bytes(samples[name])
-                _write_embodiment(model, home, trunk, cards.get(name, {}))
+                _write_embodiment(model, home, trunk, cards.get(name, {}), half)
             if training:
                 (new / TRAINING).mkdir()
                 training(new / TRAINING)
@@ -100,7 +103,11 @@ def save(
 
 
 def save_like(
-    model: "HMA", folder: StrPath, like: Checkpoint, cards: Mapping[str, dict[str, Any]] | None = None
+    model: "HMA",
+    folder: StrPath,
+    like: Checkpoint,
+    cards: Mapping[str, dict[str, Any]] | None = None,
+    half: bool = False,
 ) -> Checkpoint:
     """Write a model with the YAML, statistics and cards of a checkpoint of the same embodiments.
 
@@ -109,6 +116,7 @@ def save_like(
         folder: as of `save`.
         like: the checkpoint.
         cards: other cards than its own.
+        half: as of `save`.
 
     Raises:
         CheckpointError: as `save`.
@@ -120,6 +128,7 @@ def save_like(
         embodiment_yaml={name: like.embodiment(name).to_yaml() for name in robots},
         stats={name: like.stats(name) for name in robots},
         cards=cards or {name: like.card(name) for name in robots},
+        half=half,
     )
 
 
@@ -227,12 +236,12 @@ def _take_over(base: Checkpoint, new: Path, besides: set[str]) -> str:
     return base.trunk_sha256
 
 
-def _write_embodiment(model: "HMA", home: Path, trunk: str, given: dict[str, Any]) -> None:
+def _write_embodiment(model: "HMA", home: Path, trunk: str, given: dict[str, Any], half: bool) -> None:
     tokenizer, stats = digest(model.config.tokenizer), file_sha256(home / STATS)
     links = {"trunk_sha256": trunk, "tokenizer": tokenizer, "stats_sha256": stats}
     metadata = {"format": "pt", "format_version": str(FORMAT_VERSION), "embodiment": home.name, **links}
-    write_tensors(home / STEM, model.stem_state(home.name), metadata)
-    write_tensors(home / HEAD, model.head_state(home.name), metadata)
+    write_tensors(home / STEM, model.stem_state(home.name), metadata, half)
+    write_tensors(home / HEAD, model.head_state(home.name), metadata, half)
     robot = Embodiment.load(home / YAML, stored=True)
     unstated = robot.frequency_hz == "unknown" and not robot.sync.rate_hz
     facts = {

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from hma_model.config import ActionSpace, HMAConfig
 
 State = dict[str, "Tensor"]
+STATISTICS = "normalizer."  # the beginning of their names in a stem
 MOST = 1_000_000  # upper limit of every count in a configuration
 _COUNTS = ("layers", "width", "heads", "frames", "channels", "patch", "action_tokens", "history_frames",
            "diffusion_depth", "diffusion_width", "diffusion_train_steps", "diffusion_sample_steps",
@@ -45,11 +46,26 @@ def read_tensors(path: Path) -> State:
         raise CheckpointError(path, *reason) from fault
 
 
-def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: dict[str, str]) -> None:
-    """Write a safetensors file; the same tensors give the same bytes, whatever device they are on."""
+def write_tensors(
+    path: Path, tensors: Mapping[str, "Tensor"], metadata: dict[str, str], half: bool = False
+) -> None:
+    """Write a safetensors file; the same tensors give the same bytes, whatever device they are on.
+
+    Args:
+        half: weights become float16, statistics do not.
+
+    Raises:
+        CheckpointError: a weight is too large for float16.
+    """
     from safetensors.torch import save_file
 
     plain = {name: tensors[name].detach().cpu().contiguous().clone() for name in sorted(tensors)}
+    for name, tensor in plain.items():
+        if half and tensor.is_floating_point() and not name.startswith(STATISTICS):
+            plain[name] = tensor.half()
+            if tensor.isfinite().all() and not plain[name].isfinite().all():
+                fault = f"{name} holds {float(tensor.abs().max()):.3g}, which float16 has no number for"
+                raise CheckpointError(path, fault, "store it in float32")
     save_file(plain, path, metadata)
     with path.open("r+b") as file:  # safetensors writes the metadata in a different order each time
         length = int.from_bytes(file.read(8), "little")
@@ -102,7 +118,7 @@ def _require_values(where: object, state: Mapping[str, "Tensor"]) -> None:
     for name, tensor in state.items():
         kind = str(tensor.dtype).removeprefix("torch.")
         if kind not in ("float16", "bfloat16", "float32", "float64"):
-            if not name.startswith("normalizer."):
+            if not name.startswith(STATISTICS):
                 raise CheckpointError(where, f"holds {name[:80]} as {kind}, not floating point", _REMEDY)
         elif not bool(tensor.isfinite().all()):
             raise CheckpointError(where, f"holds values in {name[:80]} that are not finite", _REMEDY)

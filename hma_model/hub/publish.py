@@ -19,6 +19,7 @@ from hma_data.storage.files import cache_folder, file_sha256, json_object
 from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
 from hma_data.storage.remote import RemotePath
 from hma_model.checkpoint import io as checkpoints
+from hma_model.checkpoint import weights
 from hma_model.checkpoint.folder import (
     CARD,
     CONFIG,
@@ -243,8 +244,19 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
             stats[name] = {"action": action}
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "model"
-        checkpoints.save(model, made, embodiment_yaml=yaml, stats=stats, cards=cards)
-        return push(made, target, embodiments)
+        same = known if known and _has_trunk(model, known) else None
+        checkpoints.save(model, made, embodiment_yaml=yaml, stats=stats, cards=cards, base=same)
+        return push(made, target, list(model.embodiments) if embodiments is None else embodiments)
+
+
+def _has_trunk(model: "HMA", stored: Checkpoint) -> bool:
+    """Check whether a model still has a checkpoint's trunk, which may be stored in float16."""
+    if model.config != stored.config:
+        return False
+    own, theirs = model.trunk_state(), weights.trunk(stored)
+    return own.keys() == theirs.keys() and all(
+        bool((own[name].cpu() == theirs[name].to(own[name].dtype)).all()) for name in own
+    )
 
 
 def _require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
