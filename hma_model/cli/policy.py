@@ -7,7 +7,7 @@ import typer
 
 from hma_data.console import human_count, interruptible, print_json, progress
 from hma_model.cli.hub import Json
-from hma_model.cli.options import Temperature, UnmaskSteps
+from hma_model.cli.options import Device, Temperature, UnmaskSteps, device_name
 
 
 def policy_eval(
@@ -31,6 +31,7 @@ def policy_eval(
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
+    device: Device = "auto",
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the page and the figures.")] = None,
     json: Json = False,
 ) -> None:
@@ -43,13 +44,15 @@ def policy_eval(
     from hma_model.simulate.policy_eval import evaluate_policies
     from hma_model.simulate.policy_page import show, write_report
 
+    there = device_name(device)
     words = "nothing is kept; with --out, finished policies are"
     if out:
         words = f"finished policies are kept in {out}; run the same command again to continue"
     with interruptible(lambda: words), progress("policies", len(policies) * episodes * frames) as update:
         found = evaluate_policies(
             embodiment, policies, checkpoint=checkpoint, episodes=episodes, frames=frames, judge=judge,
-            seed=seed, out=out, unmask_steps=unmask_steps, temperature=temperature, on_progress=update,
+            seed=seed, out=out, unmask_steps=unmask_steps, temperature=temperature, device=there,
+            on_progress=update,
         )  # fmt: skip
     page = write_report(found, out) if out else None
     if json:
@@ -90,6 +93,7 @@ def augment(
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
+    device: Device = "auto",
     json: Json = False,
 ) -> None:
     """Make synthetic episodes with the world model, as shards and as a LeRobotDataset.
@@ -99,13 +103,21 @@ def augment(
     from hma_model.simulate.augment import Augmentation
     from hma_model.simulate.augment import augment as run
 
-    name = source.resolve().name if source else ""
+    there, name = device_name(device), source.resolve().name if source else ""
     settings = Augmentation(
         embodiment, name, episodes, frames, commands, keep, judge, seed, unmask_steps, temperature
     )
     words = f"finished batches are kept in {out}; run the same command again to continue"
     with interruptible(lambda: words), progress("episodes", episodes * frames) as update:
-        made = run(out, settings, checkpoint=checkpoint, shards=source, lerobot=lerobot, on_progress=update)
+        made = run(
+            out,
+            settings,
+            checkpoint=checkpoint,
+            shards=source,
+            lerobot=lerobot,
+            device=there,
+            on_progress=update,
+        )
     kept = sum(split["episodes"] for split in made.splits.values())
     if json:
         print_json({"out": str(out), "made": episodes, "kept": kept, "plan": made.plan})
@@ -128,6 +140,7 @@ def label_actions(
             "--check", help="Labelled shards for the error; else those that the training run held out."
         ),
     ] = None,
+    device: Device = "auto",
     json: Json = False,
 ) -> None:
     """Infer the commands of film that has none, as shards that say so, with the error on labelled film.
@@ -137,9 +150,12 @@ def label_actions(
     from hma_data.shards.manifest import QUARANTINE
     from hma_model.simulate.labels import label_actions as run
 
+    there = device_name(device)
     words = f"finished episodes are kept in {out}; run the same command again to continue"
     with interruptible(lambda: words), progress("film", unit="episodes") as update:
-        made = run(film, out, embodiment, checkpoint=checkpoint, check=check, on_progress=update)
+        made = run(
+            film, out, embodiment, checkpoint=checkpoint, check=check, device=there, on_progress=update
+        )
     error, splits = made.error, made.manifest.splits.values()
     if json:
         print_json({"out": str(out), "splits": made.manifest.splits, "plan": made.manifest.plan})

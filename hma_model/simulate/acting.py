@@ -142,8 +142,9 @@ class Acting:
         return made
 
 
-def read_acting(words: str, scenes: Scenes) -> Acting:
+def read_acting(words: str, scenes: Scenes, device: str = "cpu") -> Acting:
     """Return the policy of `CHECKPOINT` or `CHECKPOINT,memory=1,horizon=2,temperature=0.5,unmask_steps=2`."""
     checkpoint, options = split_options("hma", words, OPTIONS)
     horizon, memory = options.pop("horizon", 1), options.pop("memory", None)
-    return Acting(load_world(checkpoint, **options), scenes, horizon, f"policy hma:{checkpoint}", memory)
+    world = load_world(checkpoint, device=device, **options)
+    return Acting(world, scenes, horizon, f"policy hma:{checkpoint}", memory)

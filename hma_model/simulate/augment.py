@@ -31,7 +31,7 @@ from hma_model.evaluation.judge import StateJudge, task_of, train_judge
 from hma_model.evaluation.probe import Probe, train_probe
 from hma_model.simulate.arenas import Arena, Floats, ModelArena, Scenes, TrueArena
 from hma_model.simulate.pictures import seen_cameras
-from hma_model.simulate.policies import Policy, read_policy
+from hma_model.simulate.policies import Judged, Policy, read_policy
 from hma_model.simulate.policy_eval import run
 from hma_model.simulate.prompts import default_frames, read_prompt
 from hma_model.simulate.scenes import Prompt
@@ -152,6 +152,7 @@ def augment(
     shards: StrPath | None = None,
     lerobot: StrPath | None = None,
     world: World | None = None,
+    device: str = "cpu",
     on_progress: Callable[[float, str], None] = lambda done, words: None,
 ) -> Manifest:
     """Make synthetic episodes, and write those that are kept as a shard set.
@@ -163,6 +164,7 @@ def augment(
         shards: shard set whose episodes give first frames and commands; by default the simulator does.
         lerobot: folder for the same episodes as a LeRobotDataset v3.0.
         world: a world instead of a checkpoint.
+        device: of the world made from the checkpoint, and of policies that are networks.
         on_progress: called with the frames done, and what is done.
 
     Raises:
@@ -173,7 +175,7 @@ def augment(
     if lerobot is not None:
         require_new(as_path(lerobot))
     drawn: dict[str, Any] = {"unmask_steps": settings.unmask_steps, "temperature": settings.temperature}
-    world = world or load_world(checkpoint, **drawn)
+    world = world or load_world(checkpoint, device=device, **drawn)
     if world.model.config.kind != "discrete" or world.model.config.views > 1:
         raise HMAError("augment", "takes models of discrete tokens and one view", "choose another checkpoint")
     made_by = (
@@ -217,7 +219,11 @@ class _Maker:
         _, given, number = commands.partition("=")
         std = self.world.model.embodiments[self.robot.id].std
         if not self.settings.recorded:
-            return read_policy(commands, self.scenes)
+            policy = read_policy(commands, self.scenes, self.world)
+            if isinstance(policy, Judged) and not self.settings.judge:
+                fault = f"{commands!r} plans for what a judge calls success"
+                raise UsageError("--commands", fault, "add --judge moved, or another task")
+            return policy
         try:
             share = float(number) if given else 0.0
         except ValueError:
@@ -277,6 +283,8 @@ class _Maker:
             self.judge = train_judge(
                 name, self.world.tokenizer, stride, frames, task, seed=settings.seed, probe=self.probe
             )
+            if isinstance(self.policy, Judged):
+                self.policy.judged(self.judge)
 
     def _make(self, numbers: range, tell: Callable[[float], None]) -> Batch:
         begun = self._simulated(numbers) if self.shards is None else self._recorded(self.shards, numbers)

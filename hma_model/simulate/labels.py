@@ -114,6 +114,7 @@ def label_actions(
     checkpoint: StrPath,
     check: StrPath | None = None,
     world: World | None = None,
+    device: str = "cpu",
     on_progress: Callable[[float, str, float], None] = lambda done, words, total: None,
 ) -> Labelled:
     """Infer the commands of film, and write a shard set of the robot.
@@ -126,13 +127,14 @@ def label_actions(
         check: labelled shards to measure the error on, their val split if they have one; by default those
             that the checkpoint's training run held out.
         world: a world instead of a checkpoint.
+        device: of the world made from the checkpoint.
         on_progress: called with the episodes done, what is done, and the episodes in all.
 
     Raises:
         HMAError: the model does not infer commands, film or output do not fit, or on labelled film the
             inferred commands are no better than their mean.
     """
-    folder, world = as_path(out), world or load_world(checkpoint)
+    folder, world = as_path(out), world or load_world(checkpoint, device=device)
     model = world.model
     trained = [OBJECTIVES[name].readout for name, weight in model.config.objectives.items() if weight]
     if INVERSE not in trained:

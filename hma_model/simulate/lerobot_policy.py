@@ -27,7 +27,7 @@ class LeRobotPolicy:
         HMAError: it cannot be loaded, or it takes inputs that a world model does not give.
     """
 
-    def __init__(self, source: str, scenes: Scenes) -> None:
+    def __init__(self, source: str, scenes: Scenes, device: str = "cpu") -> None:
         self.name = f"policy lerobot:{source}"
         with imported("lerobot"):
             from lerobot.configs.policies import PreTrainedConfig
@@ -35,11 +35,14 @@ class LeRobotPolicy:
         try:
             with redirect_stdout(sys.stderr):  # it prints what it loads
                 config = PreTrainedConfig.from_pretrained(source)
-                config.device, config.pretrained_path = "cpu", source
+                config.device, config.pretrained_path = device, source
                 self._policy: Any = get_policy_class(config.type).from_pretrained(source, config=config)
-                on_cpu = {"device_processor": {"device": "cpu"}}
+                there = {"device_processor": {"device": device}}
                 self._before, self._after = make_pre_post_processors(
-                    config, source, preprocessor_overrides=on_cpu, postprocessor_overrides=on_cpu
+                    config,
+                    source,
+                    preprocessor_overrides=there,
+                    postprocessor_overrides={"device_processor": {"device": "cpu"}},
                 )
         except Exception as fault:
             said = f"cannot be loaded: {type(fault).__name__}: {fault}"

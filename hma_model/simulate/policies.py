@@ -54,20 +54,21 @@ def read_policy(words: str, scenes: Scenes, world: "World | None" = None) -> Pol
     Args:
         words: as `hma policy-eval` takes them.
         scenes: in which it is to act.
-        world: for policies that plan.
+        world: for policies that plan; networks act on its device.
 
     Raises:
         HMAError: there is no such policy, or it does not fit the robot.
     """
+    device = "cpu" if world is None else str(world.model.device)
     kind, _, rest = words.partition(":")
     if kind == "lerobot" and rest:
         from hma_model.simulate.lerobot_policy import LeRobotPolicy
 
-        return LeRobotPolicy(rest, scenes)
+        return LeRobotPolicy(rest, scenes, device)
     if kind == "hma" and rest:
         from hma_model.simulate.acting import read_acting
 
-        return read_acting(rest, scenes)
+        return read_acting(rest, scenes, device)
     if kind == "plan" and rest:
         from hma_model.simulate.planning import read_planning
 

@@ -177,6 +177,7 @@ def evaluate_policies(
     world: World | None = None,
     unmask_steps: int = 2,
     temperature: float | None = None,
+    device: str = "cpu",
     on_progress: Progress | None = None,
 ) -> PolicyEvaluation:
     """Score policies in the simulator of a laboratory robot and inside a world model.
@@ -192,6 +193,7 @@ def evaluate_policies(
         out: folder that keeps finished policies until `write_report` has written there; None keeps nothing.
         world: a world instead of a checkpoint.
         unmask_steps, temperature: of the world, as of `World`.
+        device: of the world made from the checkpoint, and of policies that are networks.
         on_progress: called with the frames done, and what is done.
 
     Raises:
@@ -206,7 +208,9 @@ def evaluate_policies(
     folder = None if out is None else as_path(out)
     with locked(folder) if folder else nullcontext():
         tell = on_progress or (lambda done, words: None)
-        world = world or load_world(checkpoint, unmask_steps=unmask_steps, temperature=temperature)
+        world = world or load_world(
+            checkpoint, device=device, unmask_steps=unmask_steps, temperature=temperature
+        )
         sampling = f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}"
         scenes = Scenes.of(world, embodiment, episodes, seed)
         made = [(one, read_policy(one, scenes, world)) if isinstance(one, str) else one for one in policies]

@@ -19,6 +19,7 @@ from hma_model.simulate import World
 from hma_model.simulate import augment as augment_module
 from hma_model.simulate.arenas import Scenes, TrueArena
 from hma_model.simulate.augment import Augmentation, augment
+from hma_model.simulate.policies import Still
 from hma_model.simulate.synthetic import Made, write_shards
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
@@ -263,3 +264,27 @@ def test_a_robot_without_simulator_needs_shards(tmp_path: Path) -> None:
     world.model, world._commands = make_model({"arm": 2}), {}
     with pytest.raises(HMAError, match="arm: has no true simulator"):
         augment(tmp_path / "out", Augmentation("arm"), world=world)
+
+
+def test_a_policy_that_plans_gets_the_judge(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Planning(Still):
+        def judged(self, judge: Any) -> None:
+            self.judge = judge
+
+    class Judge:
+        def score(self, pictures: np.ndarray) -> np.ndarray:
+            return pictures[:, 0, 0, 0, 0]
+
+        def success(self, scores: np.ndarray) -> np.ndarray:
+            return np.ones(len(scores), np.bool_)
+
+    policy, judge = Planning(), Judge()
+    monkeypatch.setattr(augment_module, "read_policy", lambda *given: policy)
+    monkeypatch.setattr(augment_module, "train_probe", lambda *given: None)
+    monkeypatch.setattr(augment_module, "train_judge", lambda *given, **named: judge)
+    with pytest.raises(UsageError, match="'plan:cem' plans for what a judge calls success . add --judge"):
+        augment(tmp_path / "out", asked(commands="plan:cem"), world=world)
+    augment(tmp_path / "out", asked(commands="plan:cem", judge="moved", episodes=2), world=world)
+    assert policy.judge is judge and verify(tmp_path / "out") == []
