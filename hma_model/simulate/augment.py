@@ -176,8 +176,8 @@ def augment(
         require_new(as_path(lerobot))
     drawn: dict[str, Any] = {"unmask_steps": settings.unmask_steps, "temperature": settings.temperature}
     world = world or load_world(checkpoint, device=device, **drawn)
-    if world.model.config.kind != "discrete" or world.model.config.views > 1:
-        raise HMAError("augment", "takes models of discrete tokens and one view", "choose another checkpoint")
+    if world.model.config.kind != "discrete":
+        raise HMAError("augment", "takes models of discrete tokens", "choose another checkpoint")
     made_by = (
         {"by": "hma augment", "synthetic": True} | asdict(settings) | digests(world, settings.embodiment)
     )
@@ -190,7 +190,7 @@ def augment(
             maker = _Maker(world, settings, begins)
             batches = maker.run(begun(folder, WORK, made_by), on_progress)
             chosen, spec = _chosen(batches, settings), world.tokenizer.spec
-            found = write_shards(folder, chosen, spec, maker.robot, made_by, camera=maker.camera)
+            found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
             shutil.rmtree(folder / WORK)
     if lerobot is not None:
         write_as_lerobot(as_path(lerobot), folder, world.tokenizer)
@@ -211,9 +211,9 @@ class _Maker:
         self.probe: Probe | None = None
         self._long = [] if shards is None else self._long_enough(shards)
         if shards is None:
-            self.camera = self.robot.primary_camera.name
+            self.cameras = [self.robot.primary_camera.name]
         else:
-            (self.camera,) = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
+            self.cameras = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
 
     def _policy(self, commands: str) -> Policy:
         _, given, number = commands.partition("=")

@@ -140,8 +140,6 @@ def label_actions(
     if INVERSE not in trained:
         fault = f"was not trained to infer commands, but for {', '.join(model.config.objectives)}"
         raise HMAError(checkpoint, fault, "train one with objectives={inverse: 1.0}")
-    if model.config.views > 1:
-        raise HMAError(checkpoint, "sees several views", "choose a model of one view")
     if folder.exists() and not folder.is_dir():
         raise OutputError(folder, "is a file", "name a folder")
     commands = world.commands(embodiment)
@@ -164,9 +162,9 @@ def label_actions(
         if manifest is None:
             work = begun(folder, WORK, made_by)  # what is kept of other film does no harm there
             episodes, refused = _label(world, commands, shown, keys, work, on_progress)
-            (camera,) = seen_cameras(trained_cameras(card(model, embodiment)), recorded_cameras(robot))
+            cameras = seen_cameras(trained_cameras(card(model, embodiment)), recorded_cameras(robot))
             spec = world.tokenizer.spec
-            manifest = write_shards(folder, episodes, spec, robot, whole, ORIGIN, refused, camera)
+            manifest = write_shards(folder, episodes, spec, robot, whole, ORIGIN, refused, cameras)
             shutil.rmtree(work)
     return Labelled(manifest, error)
 
@@ -345,6 +343,9 @@ def film_of(world: World, place: StrPath, embodiment: str, hz: float) -> Film:
             "is no shard set and no folder with video files",
             f"give a folder of {', '.join(VIDEOS)}, or a shard set",
         )
+    if world.model.config.views > 1:
+        fault = f"has films of one camera, and the model sees {world.model.config.views} at once"
+        raise UsageError(path, fault, "convert the recordings with --cameras, and give the shards")
     return VideoFilm(world, path, videos, embodiment, hz)
 
 
@@ -360,14 +361,14 @@ class ShardFilm:
         embodiment: the robot whose commands are inferred; by default that of the set.
 
     Raises:
-        UsageError: the set is of the robot and lacks a camera that the model sees.
+        UsageError: the set lacks a camera that the model sees, and is of the robot or the model sees several.
     """
 
     def __init__(self, world: World, shards: ShardSet, step: int, embodiment: str | None = None) -> None:
         self.name, self._shards, self._step = shards.folder.name, shards, step
         self._rows = shards.episodes.to_pylist()
         cameras = trained_cameras(card(world.model, embodiment or shards.embodiment.id))
-        if embodiment in (None, shards.embodiment.id):
+        if embodiment in (None, shards.embodiment.id) or not isinstance(cameras, str):
             Views.of(shards, cameras)
         self.cameras = seen_cameras(cameras, shards.manifest.cameras)
         self._reader = EpisodeReader(shards, shards.columns(self.cameras))

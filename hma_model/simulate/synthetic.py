@@ -3,7 +3,7 @@
 The plan of the shards, which is in the manifest and in the footer of every shard, says `synthetic: true` or
 `inferred_actions: true`, and by which checkpoint and with which settings they were made.
 
-T frames, K = stride * action dim.
+T frames, V views stacked along the height, K = stride * action dim.
 """
 
 import json
@@ -28,6 +28,7 @@ from hma_data.sources.base import EpisodeRef
 from hma_data.storage.files import atomic_path, file_sha256
 from hma_model.checkpoint.folder import STEM, Checkpoint
 from hma_model.simulate.films import embodiment_of
+from hma_model.simulate.prompts import seen_frames
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
@@ -43,7 +44,7 @@ class Made:
 
     Attributes:
         id: of the episode.
-        stored: (T, …) frames as shards store them.
+        stored: (T, V·h, w) or (T, c, V·h, w) frames as the model has them.
         chunks: (T - 1, K) raw commands between them.
         counts: its flags.
         group: id of the real episode that it begins with, or of the recording that it is from.
@@ -106,7 +107,7 @@ def write_shards(
     made_by: dict[str, Any],
     origin: str = ORIGIN,
     refused: Sequence[Refused] = (),
-    camera: str | None = None,
+    cameras: Sequence[str] = (),
 ) -> Manifest:
     """Write the shards of episodes; a frame without commands after it, the last one, is no row.
 
@@ -117,14 +118,14 @@ def write_shards(
         made_by: facts for the plan.
         origin: how the episodes came about, in words.
         refused: other episodes, which go to quarantine; the first shard states them.
-        camera: whose pictures they show; the primary one by default.
+        cameras: V names, whose pictures they show from the top; the primary one by default.
     """
     own = described_as(robot, origin)
     refs = [
         EpisodeRef(one.id, len(one.chunks) * own.stride, None, str(number), one.group)
         for number, one in enumerate(episodes)
     ]
-    settings = Settings(frames="strided", cameras=() if camera is None else (camera,))
+    settings = Settings(frames="strided", cameras=tuple(cameras))
     planned = make_plan(refs, own, spec, settings, origin)
     facts = {key: value for key, value in planned.facts.items() if key != "hash"}
     plan = Plan.of(planned.units, facts | {"made_by": made_by})
@@ -144,7 +145,9 @@ def write_shards(
                         flags_text(0, one.counts), one.group,
                     )
                 )  # fmt: skip
-                writer.add(EpisodeRows(index, times, one.stored[:length], one.chunks, None))
+                views = np.split(one.stored[:length], len(layout.cameras), axis=-2)
+                further = dict(zip(list(layout.token_columns.values())[1:], views[1:], strict=True))
+                writer.add(EpisodeRows(index, times, views[0], one.chunks, None, further))
                 stats["action"].merge(layout.stats({"action": one.chunks}, slice(None))["action"])
             writer.close(Footer(plan.facts, unit.name, unit.split, tuple(rows), left, stats))
         left = ()
@@ -176,9 +179,14 @@ def write_as_lerobot(folder: Path, shards: Path, tokenizer: "Tokenizer") -> None
 
 def _decoded(made: ShardSet, own: Embodiment, tokenizer: "Tokenizer") -> Iterator[LeRobotEpisode]:
     """Yield episodes at the control rate; a frame stands for `stride` rows."""
-    reader, (camera,) = EpisodeReader(made, made.columns()), own.cameras
+    names = made.manifest.cameras
+    reader = EpisodeReader(made, made.columns(names))
     for row in made.episodes.to_pylist():
-        columns = reader.episode(row, made.manifest.cameras[0])
-        pictures = tokenizer.decode(made.tokens(columns["tokens"])).repeat(own.stride, axis=0)
+        stored, columns = seen_frames(made, reader, row, names)
+        views = np.split(stored, len(names), axis=-2)
+        pictures = {
+            camera.key: tokenizer.decode(view).repeat(own.stride, axis=0)
+            for camera, view in zip(own.cameras, views, strict=True)
+        }
         actions = columns["action"].reshape(-1, own.action_dim)
-        yield LeRobotEpisode({camera.key: pictures}, actions, None, f"{ORIGIN}: {row['id']}")
+        yield LeRobotEpisode(pictures, actions, None, f"{ORIGIN}: {row['id']}")

@@ -12,9 +12,11 @@ from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import merge
 from hma_data.errors import HMAError, OutputError, ShardError, UsageError
 from hma_data.lab import family, record
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
+from hma_data.sources.base import open_source
 from hma_model.simulate import World
 from hma_model.simulate import augment as augment_module
 from hma_model.simulate.arenas import Scenes, TrueArena
@@ -23,6 +25,7 @@ from hma_model.simulate.policies import Still
 from hma_model.simulate.synthetic import Made, write_shards
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
+from tests.model.simulate.worlds import trained_on
 
 ROBOT, FRAMES, KNOWN = "rails_03", 4, 2
 
@@ -230,11 +233,34 @@ def test_other_shards_of_the_same_name_are_not_the_same_job(world: World, real: 
         augment(tmp_path / "out", settings, world=world, shards=tmp_path / "other" / "real")
 
 
+def test_episodes_of_several_cameras_hold_each_in_its_place(tmp_path: Path) -> None:
+    recording, tokenizer = three.write_hdf5(tmp_path / "three.hdf5"), BlockTokenizer()
+    taken = Settings(cameras=("all",))
+    convert(three.arm(), recording, tokenizer, tmp_path / "real", settings=taken)
+    real = ShardSet(tmp_path / "real")
+    world = World(trained_on(["side", "top"], real, tmp_path / "model", frames=4).model, tokenizer)
+    settings = Augmentation(real.embodiment.id, "real", episodes=2, frames=2, keep=1.0)
+    given: Any = {"world": world, "shards": real.folder, "lerobot": tmp_path / "dataset"}
+    augment(tmp_path / "out", settings, **given)
+    made = ShardSet(tmp_path / "out")
+    assert made.manifest.cameras == ["side", "top"] and verify(made.folder) == []
+    reader = EpisodeReader(made, made.columns(made.manifest.cameras))
+    for row in made.episodes.to_pylist():
+        for name, red in (("side", 9), ("top", 1)):
+            first = reader.episode(row, name)["tokens"][0]
+            assert (first % 16 == red).all()
+    robot = Embodiment.load(tmp_path / "dataset" / "embodiment.yaml")
+    source, place = open_source("lerobot"), tmp_path / "dataset"
+    episode = source.read(place, source.episode_ids(place)[0], robot)
+    for name, red in (("side", 9), ("top", 1)):
+        assert abs(float(episode.streams[name].frames([0])[..., 0].mean()) - 17 * red) < 6
+
+
 def test_the_camera_that_is_shown_is_the_one_that_is_named(tmp_path: Path) -> None:
     arm, tokenizer = three.arm(), BlockTokenizer()
     pictures = np.zeros((4, 64, 64, 3), np.uint8)
     made = Made("one", tokenizer.encode(pictures), np.zeros((3, arm.chunk_dim), np.float32), {}, "a")
-    given: Any = {"made_by": {"synthetic": True}, "camera": "wrist"}
+    given: Any = {"made_by": {"synthetic": True}, "cameras": ["wrist"]}
     (tmp_path / "out").mkdir()
     manifest = write_shards(tmp_path / "out", [made], tokenizer.spec, arm, **given)
     assert manifest.cameras == ["wrist"] and verify(tmp_path / "out") == []

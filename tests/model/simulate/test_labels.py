@@ -1,7 +1,6 @@
 """Film gets commands: shards that verify and say that they are inferred, with their true error."""
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,16 +16,12 @@ from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer
-from hma_model.checkpoint import io as checkpoint
-from hma_model.config import HMAConfig
 from hma_model.generation import commands
-from hma_model.network.model import HMA
 from hma_model.simulate import World, labels, read_prompt
 from hma_model.simulate.labels import ShardFilm, VideoFilm, infer, label_actions
 from tests.conftest import BlockTokenizer
 from tests.data import cameras
-from tests.model.robots import stats
-from tests.model.simulate.worlds import tiny_model
+from tests.model.simulate.worlds import tiny_model, trained_on
 
 ROBOT = "rails_03"
 
@@ -250,21 +245,6 @@ def three(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return ShardSet(folder / "set")
 
 
-def trained_on(views: Any, shards: ShardSet, folder: Path, objective: str = "forward") -> Any:
-    """Return a world of a saved model whose robot was trained on these cameras."""
-    spec, count = shards.spec, 1 if isinstance(views, str) else len(views)
-    sizes = {"factored": spec.factored} if spec.kind == "discrete" else {"channels": 3}
-    config = HMAConfig(
-        kind=spec.kind, layers=1, width=16, heads=2, grid=(8, 8), views=count, tokenizer=spec.to_json(),
-        objectives={objective: 1.0}, **sizes,
-    )  # fmt: skip
-    model, robot = HMA(config), shards.embodiment
-    model.add_embodiment(robot, checkpoint.action_stats(stats(2), robot.id))
-    described = {"stats": {robot.id: stats(2)}, "cards": {robot.id: {"data": {"cameras": views}}}}
-    checkpoint.save(model, folder, embodiment_yaml={robot.id: robot.to_yaml()}, **described)
-    return SimpleNamespace(model=HMA.from_pretrained(folder), tokenizer=None)
-
-
 @pytest.mark.parametrize(
     ("views", "seen"),
     [
@@ -290,20 +270,32 @@ def test_film_shows_the_cameras_that_the_model_was_trained_on(
     np.testing.assert_array_equal(chunks, film.labelled(1)[1][: len(frames) - 1])
 
 
+@pytest.mark.parametrize("views", ["wrist", ["side", "top"]])
 @pytest.mark.parametrize("three", [BlockTokenizer], indirect=True)
-def test_labelled_shards_name_the_camera_that_their_pictures_are_of(
-    three: ShardSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_labelled_shards_name_the_cameras_that_their_pictures_are_of(
+    three: ShardSet, views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(labels, "described", commands.described)
     known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
     monkeypatch.setattr(labels, "measure", lambda *_: known)
-    world: Any = World(trained_on("wrist", three, tmp_path / "model", "inverse").model, BlockTokenizer())
+    world: Any = World(trained_on(views, three, tmp_path / "model", "inverse").model, BlockTokenizer())
     given: Any = {"checkpoint": "", "check": three.folder, "world": world}
     label_actions(three.folder, tmp_path / "out", three.embodiment.id, **given)
     made = ShardSet(tmp_path / "out")
-    assert made.manifest.cameras == ["wrist"] and verify(tmp_path / "out") == []
-    tokens = EpisodeReader(made, made.columns()).episode(made.episodes.to_pylist()[0], "wrist")["tokens"]
-    assert (tokens % 16 == 5).all()
+    names = [views] if isinstance(views, str) else views
+    assert made.manifest.cameras == names and verify(tmp_path / "out") == []
+    reader, row = EpisodeReader(made, made.columns(names)), made.episodes.to_pylist()[0]
+    for name in names:
+        (tokens,) = (value for key, value in reader.episode(row, name).items() if key == "tokens")
+        assert (tokens % 16 == 1 + 4 * list(cameras.SIZES).index(name)).all()
+
+
+def test_films_of_one_camera_are_refused_by_a_model_of_several(three: ShardSet, tmp_path: Path) -> None:
+    world = trained_on(["side", "top"], three, tmp_path / "model")
+    (tmp_path / "film").mkdir()
+    (tmp_path / "film" / "a.mp4").touch()
+    with pytest.raises(UsageError, match="has films of one camera, and the model sees 2 at once"):
+        labels.film_of(world, tmp_path / "film", three.embodiment.id, 5.0)
 
 
 def test_film_of_the_robot_without_the_models_camera_is_refused(three: ShardSet, tmp_path: Path) -> None:

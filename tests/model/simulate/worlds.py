@@ -1,6 +1,8 @@
 """A world that knows the truth, and a viewer that keeps what it is shown."""
 
 from collections.abc import Mapping
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,12 +11,15 @@ from numpy.typing import NDArray
 
 from hma_data.lab import family
 from hma_data.lab.simulator import LabSimulator
+from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import get_tokenizer
+from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint, action_stats
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.network.model import HMA
 from hma_model.simulate.scenes import PROMPT, SEED, Drivable, LabRobot
 from hma_model.simulate.session import Frame
+from tests.model.robots import stats
 
 
 class TrueWorld:
@@ -120,3 +125,20 @@ def lab_robots(*names: str) -> dict[str, Drivable]:
             stats = {"action": {key: values.tolist() for key, values in ends.items()}}
             robots[name] = LabRobot(family.embodiment(name), stats)
     return robots
+
+
+def trained_on(
+    views: Any, shards: ShardSet, folder: Path, objective: str = "forward", frames: int = 12
+) -> Any:
+    """Return a world of a saved model whose robot was trained on these cameras."""
+    spec, count = shards.spec, 1 if isinstance(views, str) else len(views)
+    sizes = {"factored": spec.factored} if spec.kind == "discrete" else {"channels": 3}
+    config = HMAConfig(
+        kind=spec.kind, layers=1, width=16, heads=2, grid=(8, 8), views=count, frames=frames,
+        tokenizer=spec.to_json(), objectives={objective: 1.0}, **sizes,
+    )  # fmt: skip
+    model, robot = HMA(config), shards.embodiment
+    model.add_embodiment(robot, checkpoint.action_stats(stats(2), robot.id))
+    described = {"stats": {robot.id: stats(2)}, "cards": {robot.id: {"data": {"cameras": views}}}}
+    checkpoint.save(model, folder, embodiment_yaml={robot.id: robot.to_yaml()}, **described)
+    return SimpleNamespace(model=HMA.from_pretrained(folder), tokenizer=None)
