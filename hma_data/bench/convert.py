@@ -7,13 +7,13 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hma_data.bench import Bench, make_robot, rss_mib
+from hma_data.bench import Bench, make_robot, rss_mib, waiting
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
@@ -23,11 +23,16 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     from hma_data.conversion.plan import Settings
 
     workers = settings["workers"]
-    with tempfile.TemporaryDirectory() as folder, _cluster(settings["engine"], settings["nodes"]):
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        if wait := settings["wait_ms"]:
+            settings = settings | {"tokenizer": waiting.NAME}
+            stack.enter_context(waiting.offered(Path(folder) / "path", wait))
+        stack.enter_context(_cluster(settings["engine"], settings["nodes"]))
         recording = Path(folder) / "recording.hdf5"
         _record(recording, settings)
         rows = settings["episodes"] * settings["frames"]
-        alone_cpu = _tokenizer_alone(settings, rows)
+        alone_cpu = 0.0 if wait else _tokenizer_alone(settings, rows)
         watch = _Watch(workers, settings["engine"])
         summary = convert(
             make_robot("bench_arm", "hdf5", "actions", "obs/image"),
@@ -54,7 +59,8 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
             "frames_per_second": round(rows * after / (watch.seconds - watch.start_seconds), 1),
             "tokenizer_cpu_seconds": round(alone_cpu * after, 2),
             "worker_cpu_seconds": round(used, 2),
-            "overhead_cpu_share": round(1 - alone_cpu * after / used, 4) if used else None,
+            "overhead_cpu_share": round(1 - alone_cpu * after / used, 4) if used and not wait else None,
+            "frames_per_second_limit": 1e3 * max(workers, 1) / wait if wait else None,
             "ray_cpu_seconds": round(watch.others_cpu_s, 2),
             **watch.memory(),
             "episodes": sum(split["episodes"] for split in summary.manifest.splits.values()),
@@ -216,6 +222,7 @@ BENCH = Bench(
         "frames": 8,  # an episode
         "pixels": 128,  # height and width of the recorded pictures, JPEG
         "tokenizer": "fsq-8",
+        "wait_ms": 0.0,  # a frame, instead of the tokenizer: as if it ran on a GPU
         "workers": 1,
         "engine": "local",  # or ray, on a cluster of so many nodes of one CPU on this machine
         "nodes": 1,

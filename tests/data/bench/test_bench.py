@@ -1,6 +1,8 @@
 """`hma bench`: its settings and the form of what it prints. No figure is asserted."""
 
 import json
+import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +81,16 @@ def test_a_conversion_is_measured_beside_its_tokenizer() -> None:
     (found,) = bench.load("convert").run(bench.load("convert").defaults | small)
     assert (found["episodes"], found["workers"]) == (4, 0)
     assert found["frames_per_second"] > 0 and found["tokenizer_cpu_seconds"] >= 0
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_tokenizer_that_waits_limits_the_frames_a_second(workers: int) -> None:
+    small = {"episodes": 4, "frames": 4, "pixels": 32, "workers": workers, "wait_ms": 1.0, "shard_frames": 8}
+    before = dict(os.environ), list(sys.path)
+    (found,) = bench.load("convert").run(bench.load("convert").defaults | small)
+    assert (dict(os.environ), list(sys.path)) == before
+    assert (found["tokenizer"], found["episodes"]) == ("waiting", 4)
+    assert found["frames_per_second_limit"] == 1_000 * max(workers, 1) and found["overhead_cpu_share"] is None
 
 
 def test_a_format_that_is_not_there_is_refused() -> None:
