@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from hma_data.bench import Bench, make_robot, rss_mib, waiting
+from hma_data.errors import UsageError
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
@@ -26,6 +27,8 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         if wait := settings["wait_ms"]:
+            if settings["tokenizer"] != BENCH.defaults["tokenizer"]:
+                raise UsageError("wait_ms", "stands for a tokenizer", "leave tokenizer out")
             settings = settings | {"tokenizer": waiting.NAME}
             stack.enter_context(waiting.offered(Path(folder) / "path", wait))
         stack.enter_context(_cluster(settings["engine"], settings["nodes"]))
@@ -57,7 +60,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
             "seconds": round(watch.seconds, 2),
             "start_seconds": round(watch.start_seconds, 2),
             "frames_per_second": round(rows * after / (watch.seconds - watch.start_seconds), 1),
-            "tokenizer_cpu_seconds": round(alone_cpu * after, 2),
+            "tokenizer_cpu_seconds": None if wait else round(alone_cpu * after, 2),
             "worker_cpu_seconds": round(used, 2),
             "overhead_cpu_share": round(1 - alone_cpu * after / used, 4) if used and not wait else None,
             "frames_per_second_limit": 1e3 * max(workers, 1) / wait if wait else None,

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 FIGURES = {  # figures of `hma evaluate` as its table names them; the others have their names in the JSON
     "against": "compared with",
+    "unmoved_windows": "windows whose pictures never change",
     "draws": "draws of shuffled actions",
     "loss": "loss, nats a token",
     "shuffled_loss": "loss with shuffled actions",
@@ -39,7 +40,7 @@ FIGURES = {  # figures of `hma evaluate` as its table names them; the others hav
     "psnr_action_gain_last": "last frame, true less shuffled, dB",
 }
 ROLLOUTS = ("true", "shuffled", "none", "copy")
-HIDDEN = ("checkpoint", "data", "seconds_a_frame")  # of the readable form
+HIDDEN = ("checkpoint", "data", "seconds_a_frame", "sees_actions")  # of the readable form
 MEASURES = {"lpips": "LPIPS", "fid": "FID", "fvd": "FVD", "fvd_videogpt": "FVD (VideoGPT)"}
 LPIPS_HELP = "Weights of LPIPS, with their hash."
 

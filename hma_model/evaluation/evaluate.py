@@ -151,8 +151,9 @@ def evaluate(
         `baseline_loss`, `perplexity`, `accuracy`, and both of `masked_scores`. For rollouts with the `true`
         actions, with `shuffled` ones, with `none`, and for `copy`: `psnr` and `ssim` over the horizon,
         `psnr_last`, `psnr_by_frame` and `ssim_by_frame`. `psnr_action_gain_last` is `psnr_last` of true minus
-        that of shuffled. `unmoved_windows` counts those whose true pictures never change. `notes` says in
-        words what else must be known, and `missing` why a metric is absent.
+        that of shuffled. `unmoved_windows` counts those whose true pictures never change, `sees_actions` says
+        whether the model was trained with actions. `notes` says in words what else must be known, and
+        `missing` why a metric is absent.
 
     Raises:
         CheckpointError: the model was trained on another tokenizer.

@@ -40,14 +40,18 @@ class Follower:
 
     def __init__(self, world: World, scenes: Scenes, where: str, memory: int | None = None) -> None:
         self.world, self.commands, self.sessions = world, world.commands(scenes.name), list[int]()
-        self._memory = memory
+        self._memory, self._where = memory, where
         own, robot = self.commands, scenes.robot.embodiment
         if (own.stride, len(own.names)) != (robot.stride, robot.action_dim):
             fault = f"takes {own.stride} commands of {len(own.names)} values of {scenes.name} in a chunk"
             raise HMAError(where, fault, f"the scenes take {robot.stride} of {robot.action_dim}")
 
     def begin(self, arena: Arena) -> None:
-        """Begin with the arena's prompts."""
+        """Begin with the arena's prompts; an HMAError says that it shows more or fewer cameras."""
+        (high, wide), (height, width) = self.world.picture_shape[:2], arena.pictures.shape[1:3]
+        if wide * height != width * high:
+            fault = f"sees {wide // high} views, and the pictures show {width // height}"
+            raise HMAError(self._where, fault, "give a policy that sees the same cameras")
         for session in self.sessions:
             self.world.close(session)
         name, seed = arena.scenes.name, arena.scenes.seed

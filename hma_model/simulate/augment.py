@@ -89,6 +89,12 @@ class Augmentation:
         """Check whether the commands are recorded ones, also with noise, rather than a policy's."""
         return self.commands.partition("=")[0] in ("replay", "perturb")
 
+    @property
+    def looked_at(self) -> bool:
+        """Check whether a probe that was trained on the simulator's pictures looks at those of the model."""
+        stateful = self.commands.startswith(("scripted", "reach", "lerobot:")) and simulated(self.embodiment)
+        return bool(self.judge) or stateful
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -178,6 +184,10 @@ def augment(
     world = world or load_world(checkpoint, device=device, **drawn)
     if world.model.config.kind != "discrete":
         raise HMAError("augment", "takes models of discrete tokens", "choose another checkpoint")
+    if (views := world.model.config.views) > 1 and (shards is None or settings.looked_at):
+        fault = f"the laboratory's simulator shows one camera, and the model sees {views}"
+        remedy = "name shards with --from, and leave out --judge and policies that read the robot's state"
+        raise UsageError("augment", fault, remedy)
     made_by = (
         {"by": "hma augment", "synthetic": True} | asdict(settings) | digests(world, settings.embodiment)
     )
@@ -188,7 +198,7 @@ def augment(
         found = finished(folder, made_by)
         if found is None:
             maker = _Maker(world, settings, begins)
-            batches = maker.run(begun(folder, WORK, made_by), on_progress)
+            batches = maker.run(begun(folder, WORK, made_by, world.model), on_progress)
             chosen, spec = _chosen(batches, settings), world.tokenizer.spec
             found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
             shutil.rmtree(folder / WORK)
@@ -269,11 +279,7 @@ class _Maker:
     def _train(self, on_progress: Callable[[float, str], None]) -> None:
         """Train the judge, or the probe alone, if they are asked for."""
         settings = self.settings
-        stateful = settings.commands.startswith(("scripted", "reach", "lerobot:")) and simulated(
-            settings.embodiment
-        )
-        needed = bool(settings.judge) or stateful
-        if self.probe is not None or not needed:
+        if self.probe is not None or not settings.looked_at:
             return
         on_progress(0, "training the judge")
         name, stride = settings.embodiment, self.scenes.stride

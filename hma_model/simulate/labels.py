@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from hma_data.conversion.output import locked
 from hma_data.errors import EpisodeError, HMAError, OutputError, UsageError
-from hma_data.loading.views import Cameras, Views
+from hma_data.loading.views import Cameras, Views, view_count
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST, Manifest
 from hma_data.shards.reader import EpisodeReader, ShardSet
@@ -160,7 +160,7 @@ def label_actions(
         whole = made_by | {"film_sha256": hashlib.sha256("\n".join(keys).encode()).hexdigest()}
         manifest = finished(folder, whole)
         if manifest is None:
-            work = begun(folder, WORK, made_by)  # what is kept of other film does no harm there
+            work = begun(folder, WORK, made_by, model)  # what is kept of other film does no harm there
             episodes, refused = _label(world, commands, shown, keys, work, on_progress)
             cameras = seen_cameras(trained_cameras(card(model, embodiment)), recorded_cameras(robot))
             spec = world.tokenizer.spec
@@ -368,7 +368,7 @@ class ShardFilm:
         self.name, self._shards, self._step = shards.folder.name, shards, step
         self._rows = shards.episodes.to_pylist()
         cameras = trained_cameras(card(world.model, embodiment or shards.embodiment.id))
-        if embodiment in (None, shards.embodiment.id) or not isinstance(cameras, str):
+        if embodiment in (None, shards.embodiment.id) or view_count(cameras) > 1:
             Views.of(shards, cameras)
         self.cameras = seen_cameras(cameras, shards.manifest.cameras)
         self._reader = EpisodeReader(shards, shards.columns(self.cameras))

@@ -68,6 +68,9 @@ class LeRobotPolicy:
             raise HMAError(self.name, fault, f"{scenes.name} takes {len(scenes.dimensions)}")
 
     def begin(self, arena: Arena) -> None:
+        if arena.pictures.shape[1] != arena.pictures.shape[2]:
+            fault = "takes one camera, and the pictures show several side by side"
+            raise HMAError(self.name, fault, "give a policy that sees the same cameras")
         self._policy.reset()
 
     def act(self, arena: Arena) -> Floats:

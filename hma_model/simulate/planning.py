@@ -229,5 +229,7 @@ def read_planning(words: str, scenes: Scenes, world: World | None) -> Planning:
     kind, options = split_options("plan", words, OPTIONS)
     solver_of(kind)
     if world is None:
-        raise HMAError(f"policy plan:{words}", "has no world to plan in", "give it to hma policy-eval")
+        raise HMAError(
+            f"policy plan:{words}", "has no world to plan in", "give it to hma policy-eval or augment"
+        )
     return Planning(world, scenes, kind, **options)

@@ -189,7 +189,7 @@ def evaluate_policies(
         episodes: N.
         frames: T.
         judge: words as `task_of` takes them, or a trained judge.
-        seed: of scenes, policies, judge and intervals; the same seed gives the same figures.
+        seed: of scenes, policies, judge and intervals; on one device, the same seed gives the same figures.
         out: folder that keeps finished policies until `write_report` has written there; None keeps nothing.
         world: a world instead of a checkpoint.
         unmask_steps, temperature: of the world, as of `World`.
@@ -229,7 +229,7 @@ def evaluate_policies(
         if folder:
             facts = {"embodiment": embodiment, "episodes": episodes, "frames": frames, "seed": seed}
             facts |= {"judge": asdict(judge.task), "sampling": sampling, **digests(world, embodiment)}
-            work = begun(folder, WORK, facts)
+            work = begun(folder, WORK, facts, world.model)
         scored: list[Scored] = []
         for (name, policy), key in zip(made, keys, strict=True):
             told = partial(_tell, tell, len(scored) * frames * episodes, name)

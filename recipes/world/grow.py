@@ -15,6 +15,7 @@ from torch import Tensor
 from hma_data.console import run_script
 from hma_model.checkpoint import io
 from hma_model.checkpoint.folder import Checkpoint
+from hma_model.hub.publish import located
 from hma_model.network.model import HMA
 
 ENDS = ("space.proj", "time.proj", "mlp.fc2", "modulation_out", "action.proj")  # of a block's branches
@@ -27,7 +28,7 @@ def main() -> None:
     parser.add_argument("layers", type=int)
     parser.add_argument("out", type=Path)
     given = parser.parse_args()
-    stored = Checkpoint.open(given.checkpoint)
+    stored = Checkpoint.open(located(given.checkpoint)[0])
     config = stored.config
     if not config.layers < given.layers <= 2 * config.layers:
         most = 2 * config.layers
@@ -36,7 +37,7 @@ def main() -> None:
     apart = "modulation" in config.conditioning and not shared
     if apart or ("add" in config.conditioning and config.add_at == "layers"):
         parser.error(f"{given.checkpoint} has parts of its layers outside of the trunk")
-    small = HMA.from_pretrained(given.checkpoint)
+    small = io.load(stored.folder)
     large = HMA(config.replace(layers=given.layers))
     large.load_trunk(grown(small.trunk_state(), config.layers, given.layers), stored.trunk())
     for name in stored.embodiments:

@@ -142,13 +142,13 @@ class Scene:
             EpisodeError: it is damaged.
         """
         path = self.folder / "metadata.json"
-        return read_json(path, EpisodeError) if path.exists() else {}
+        return _json(path) if path.exists() else {}
 
     def task(self, field: str) -> str:
         """Return the task in words, from task_description.json in a folder above; empty without it."""
         for folder in list(self.folder.parents)[:DEPTH]:
             if (folder / TASKS).is_file():
-                told = read_json(folder / TASKS, EpisodeError).get("_".join(self.folder.name.split("_")[:2]))
+                told = _json(folder / TASKS).get("_".join(self.folder.name.split("_")[:2]))
                 said = told.get(field) if isinstance(told, dict) else None
                 return said if isinstance(said, str) else ""
         return ""
@@ -205,3 +205,10 @@ def _numbers(value: Any, path: Path, key: str, lists: bool = False) -> NDArray[A
     if found.size > MAX_WIDTH and not lists:
         raise EpisodeError(path, f"{key} has {found.size:,} values a sample, more than {MAX_WIDTH:,}")
     return found
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        return read_json(path, EpisodeError)
+    except EpisodeError as fault:
+        raise EpisodeError(path, fault.fault, "copy it again") from fault

@@ -91,6 +91,8 @@ def test_a_tokenizer_that_waits_limits_the_frames_a_second(workers: int) -> None
     assert (dict(os.environ), list(sys.path)) == before
     assert (found["tokenizer"], found["episodes"]) == ("waiting", 4)
     assert found["frames_per_second_limit"] == 1_000 * max(workers, 1) and found["overhead_cpu_share"] is None
+    with pytest.raises(UsageError, match="wait_ms: stands for a tokenizer"):
+        bench.load("convert").run(bench.load("convert").defaults | small | {"tokenizer": "raw"})
 
 
 def test_a_format_that_is_not_there_is_refused() -> None:

@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from hma_data.errors import CheckpointError
 from hma_data.storage.paths import shipped
 from hma_model.checkpoint import io
-from hma_model.checkpoint.folder import STEM, TRUNK, Checkpoint
+from hma_model.checkpoint.folder import README, SAMPLE, STEM, TRUNK, Checkpoint
 from hma_model.network.model import HMA
 from tests.model.robots import make_model, save
 
@@ -19,7 +19,7 @@ HALF = runpy.run_path(str(shipped("recipes") / "world" / "half.py"))["main"]
 
 @pytest.fixture
 def halved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    save(tmp_path / "whole", {"arm": 2, "hand": 3})
+    save(tmp_path / "whole", {"arm": 2, "hand": 3}, samples={"arm": b"a picture"})
     monkeypatch.setattr("sys.argv", ["half.py", str(tmp_path / "whole"), str(tmp_path / "half")])
     HALF()
     return tmp_path / "half"
@@ -32,6 +32,7 @@ def test_weights_are_rounded_and_statistics_are_not(halved: Path) -> None:
         assert half[name].dtype == value.dtype
         assert torch.equal(half[name], value.half().to(value.dtype) if rounded else value)
     home = halved / "embodiments" / "arm"
+    assert (home / SAMPLE).read_bytes() == b"a picture" and SAMPLE in (halved / README).read_text()
     assert load_file(home / STEM)["normalizer.mean"].dtype == torch.float32
     stored = Checkpoint.open(halved)
     assert stored.card("arm")["data"] == {"windows": 12}

@@ -1,6 +1,7 @@
 """Synthetic episodes: shards that verify and say what they are, replays, resumption, LeRobotDatasets."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
 from hma_model.simulate import World
 from hma_model.simulate import augment as augment_module
+from hma_model.simulate.acting import Acting
 from hma_model.simulate.arenas import Scenes, TrueArena
 from hma_model.simulate.augment import Augmentation, augment
 from hma_model.simulate.policies import Still
@@ -233,7 +235,9 @@ def test_other_shards_of_the_same_name_are_not_the_same_job(world: World, real: 
         augment(tmp_path / "out", settings, world=world, shards=tmp_path / "other" / "real")
 
 
-def test_episodes_of_several_cameras_hold_each_in_its_place(tmp_path: Path) -> None:
+def test_episodes_of_several_cameras_hold_each_in_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recording, tokenizer = three.write_hdf5(tmp_path / "three.hdf5"), BlockTokenizer()
     taken = Settings(cameras=("all",))
     convert(three.arm(), recording, tokenizer, tmp_path / "real", settings=taken)
@@ -242,6 +246,13 @@ def test_episodes_of_several_cameras_hold_each_in_its_place(tmp_path: Path) -> N
     settings = Augmentation(real.embodiment.id, "real", episodes=2, frames=2, keep=1.0)
     given: Any = {"world": world, "shards": real.folder, "lerobot": tmp_path / "dataset"}
     augment(tmp_path / "out", settings, **given)
+    for wrong in ({"settings": replace(settings, judge="moved")}, {"shards": None}):
+        with pytest.raises(UsageError, match="simulator shows one camera, and the model sees 2"):
+            augment(tmp_path / "no", **({"settings": settings} | given | {"lerobot": None} | wrong))
+    one = World(trained_on("top", real, tmp_path / "one", "policy", 4).model, tokenizer)
+    monkeypatch.setattr(augment_module, "read_policy", lambda _, scenes, world: Acting(one, scenes, 1, "it"))
+    with pytest.raises(HMAError, match="it: sees 1 views, and the pictures show 2"):
+        augment(tmp_path / "no", replace(settings, commands="hma:it"), **(given | {"lerobot": None}))
     made = ShardSet(tmp_path / "out")
     assert made.manifest.cameras == ["side", "top"] and verify(made.folder) == []
     reader = EpisodeReader(made, made.columns(made.manifest.cameras))

@@ -12,6 +12,7 @@ from hma_data.conversion.plan import Settings
 from hma_data.episodes.sheets import write_mp4
 from hma_data.errors import HMAError, OutputError, UsageError
 from hma_data.lab import family, record
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
@@ -298,11 +299,19 @@ def test_films_of_one_camera_are_refused_by_a_model_of_several(three: ShardSet, 
         labels.film_of(world, tmp_path / "film", three.embodiment.id, 5.0)
 
 
-def test_film_of_the_robot_without_the_models_camera_is_refused(three: ShardSet, tmp_path: Path) -> None:
-    world = trained_on("nose", three, tmp_path / "model")
+@pytest.mark.parametrize("views", ["nose", ["nose"]])
+def test_film_of_the_robot_without_the_models_camera_is_refused(
+    three: ShardSet, views: Any, tmp_path: Path
+) -> None:
+    world = trained_on(views, three, tmp_path / "model")
     with pytest.raises(UsageError, match="three_hdf5 has the cameras top, wrist, side in .* not nose"):
         ShardFilm(world, three, three.row_stride)
-    assert ShardFilm(world, three, three.row_stride, "another").cameras == ["top"]
+    values = cameras.arm().to_dict()
+    people = Embodiment.from_values(values | {"id": "people", "cameras": values["cameras"][:1]}, "people")
+    recording = cameras.write_hdf5(tmp_path / "people.hdf5")
+    convert(people, recording, BlockTokenizer(), tmp_path / "people")
+    film = ShardFilm(world, ShardSet(tmp_path / "people"), three.row_stride, three.embodiment.id)
+    assert film.cameras == ["top"]
 
 
 def test_videos_are_cut_as_the_camera_that_the_model_was_trained_on() -> None:
