@@ -144,11 +144,12 @@ def human_bytes(count: float) -> str:
 
 def human_seconds(seconds: float) -> str:
     """Return a duration as text: 3725 -> 1 h 02 min."""
-    if seconds < 60:
+    if round(seconds, 1) < 60:
         return f"{seconds:.1f} s"
-    if seconds < 3600:
-        return f"{seconds // 60:.0f} min {seconds % 60:02.0f} s"
-    return f"{seconds // 3600:.0f} h {seconds % 3600 // 60:02.0f} min"
+    whole = round(seconds)  # first, or 179.7 s would be 2 min 60 s
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02} min"
 
 
 @contextmanager
@@ -231,7 +232,7 @@ def human_times(elapsed: float, left: float | None) -> str:
 
 
 def _whole_seconds(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 60 else human_seconds(seconds)
+    return f"{seconds:.0f} s" if round(seconds) < 60 else human_seconds(seconds)
 
 
 class _Lines:

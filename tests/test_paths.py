@@ -40,7 +40,7 @@ from hma_data.tokenizers.catalog import EMBEDDED
 from hma_data.tokenizers.training import eval as tokenizer_report
 from hma_data.tokenizers.training import recipe as tokenizer_recipe
 from hma_data.tokenizers.training import train as tokenizer_train
-from hma_data.tokenizers.training.frames import frames_of, read_frames, recording_frames
+from hma_data.tokenizers.training.frames import films_of, read_films, recording_films
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import Checkpoint, resolve, training_checkpoints
 from hma_model.demo.run import demo
@@ -212,10 +212,10 @@ def tokenizer_trained(made: Made, given: Given, out: Path) -> Any:
 def frames(made: Made, given: Given, out: Path) -> Any:
     spec = BlockTokenizer.spec
     taken = [
-        *read_frames(given(made.videos / "a.mp4"), 16, frames=2),
-        *recording_frames(made.arm, given(made.hdf5), spec, frames=2),
-        *frames_of(given(made.hdf5), spec, embodiment=made.arm, frames=2),
-        *frames_of(given(made.shards), spec, frames=2),
+        *read_films(given(made.videos / "a.mp4"), 16, frames=2),
+        *recording_films(made.arm, given(made.hdf5), spec, frames=2),
+        *films_of(given(made.hdf5), spec, embodiment=made.arm, frames=2),
+        *films_of(given(made.shards), spec, frames=2),
     ]
     return [hashlib.sha256(np.ascontiguousarray(picture)).hexdigest() for picture in taken]
 

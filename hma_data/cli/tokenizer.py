@@ -114,12 +114,12 @@ def tokenizer_eval(
     robot = find(embodiment) if embodiment else None
     opened = get_tokenizer(tokenizer, weights=weights, device=device)
     from hma_data.tokenizers.training.eval import evaluate, to_markdown, without_frames, write_report
-    from hma_data.tokenizers.training.frames import frames_of
+    from hma_data.tokenizers.training.frames import films_of
 
     perceptual, missing = _perceptual(lpips, device)
     found, skipped = {}, list[str]()
     for place in data:
-        chosen = frames_of(place, opened.spec, embodiment=robot, frames=frames, on_skip=skipped.append)
+        chosen = films_of(place, opened.spec, embodiment=robot, frames=frames, on_skip=skipped.append)
         found[place] = evaluate(opened, chosen, worst=worst if out else 0, perceptual=perceptual)
     notes = [missing] if missing else []
     if skipped:

@@ -14,7 +14,7 @@ from hma_data.episodes.images import resize
 from hma_data.episodes.sheets import grid
 from hma_data.tokenizers.base import get_tokenizer
 from hma_data.tokenizers.training.eval import psnr_db
-from hma_data.tokenizers.training.frames import read_frames
+from hma_data.tokenizers.training.frames import read_films
 
 SIDE = 256
 
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--columns", type=int, default=6)
     parser.add_argument("--tokenizer", action="append")
     arguments = parser.parse_args()
-    frames = np.stack(list(read_frames(arguments.folder, SIDE)))
+    frames = np.concatenate(list(read_films(arguments.folder, SIDE)))
     shown = np.linspace(0, len(frames) - 1, arguments.columns).astype(int)
     rows, labels = [list(frames[shown])], ["original, 256 x 256"]
     for name in arguments.tokenizer or ["fsq-16", "vae-8", "fsq-8"]:

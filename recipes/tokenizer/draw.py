@@ -105,7 +105,7 @@ def lab_pictures(robots: Sequence[str], count: int, seed: int, episodes: int) ->
     from hma_data.lab import family
     from hma_data.registry.embodiment import find
     from hma_data.tokenizers.base import get_tokenizer
-    from hma_data.tokenizers.training.frames import recording_frames
+    from hma_data.tokenizers.training.frames import recording_films
 
     spec = get_tokenizer("fsq-8").spec
     rng = np.random.default_rng([seed, 3])
@@ -114,7 +114,7 @@ def lab_pictures(robots: Sequence[str], count: int, seed: int, episodes: int) ->
         if robot in LAB:
             with tempfile.TemporaryDirectory() as folder:
                 recording = lab.record(robot, folder, episodes, seed)
-                frames = np.stack(list(recording_frames(find(robot), recording, spec, frames=each)))
+                frames = np.concatenate(list(recording_films(find(robot), recording, spec, frames=each)))
         else:
             body = family.Body.of(robot)
             films = [family.episode(body, seed, n).observations["image"] for n in range(episodes)]

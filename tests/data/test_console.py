@@ -67,3 +67,17 @@ def test_a_script_tells_an_error_in_one_line(fault, said, code, capsys, monkeypa
         monkeypatch.setenv("HMA_DEBUG", "1")
         with pytest.raises(type(fault)):
             console.run_script(main)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (9.94, "9.9 s"),
+        (59.96, "1 min 00 s"),
+        (179.7, "3 min 00 s"),
+        (3599.7, "1 h 00 min"),
+        (3725.0, "1 h 02 min"),
+    ],
+)
+def test_a_duration_never_has_sixty_seconds(seconds: float, text: str) -> None:
+    assert console.human_seconds(seconds) == text

@@ -1,9 +1,10 @@
 """Measure a tokenizer: the error of a round trip, the use of its ids, its size and its speed.
 
-    evaluate(get_tokenizer("fsq-16"), hma_data.tokenizers.training.frames.read_frames(Path("video.mp4"), 256))
+    evaluate(get_tokenizer("fsq-16"), hma_data.tokenizers.training.frames.read_films(Path("video.mp4"), 256))
 
-N frames, S side, h·w grid, D digits. PSNR and SSIM (Wang et al. 2004: grey, Gaussian of 11 taps,
-sigma 1.5) are means over frames of pixels in [0, 1]. LPIPS (Zhang et al. 2018) needs its package and the
+N frames, S side, h·w grid, D digits. What moves is measured by itself too: it may be few of the pixels, and
+is all that commands change. PSNR and SSIM (Wang et al. 2004: grey, Gaussian of 11 taps, sigma 1.5) are means
+over frames of pixels in [0, 1]. LPIPS (Zhang et al. 2018) needs its package and the
 weights of its backbone. `write_report` writes what `hma tokenizer eval --out` leaves behind.
 """
 
@@ -34,6 +35,7 @@ Perceptual = Callable[[Frames, Frames], NDArray[np.float64]]
 Results = dict[str, dict[str, Any]]
 BATCH = 32
 GREY = (0.299, 0.587, 0.114)
+MOVES = 24  # of 255: a channel of a pixel that moves differs by more from the frame before or after
 BACKBONE = "alexnet-owt-7be5be79.pth"  # torchvision's file of AlexNet, 233 MB
 
 
@@ -73,6 +75,15 @@ def ssim(true: Frames, made: Frames) -> NDArray[np.float64]:
     weights = torch.tensor(GREY, dtype=torch.float64) / 255
     first, second = ((torch.from_numpy(frames).double() @ weights)[:, None] for frames in (true, made))
     return ssim_map(first, second).mean(dim=(1, 2, 3)).numpy()
+
+
+def moving(film: Frames) -> NDArray[np.bool_]:
+    """Return which pixels of (n, S, S, 3) frames move, (n, S, S): unlike the frame before or after."""
+    masks = np.zeros(film.shape[:3], np.bool_)
+    changed = np.abs(np.diff(film.astype(np.int16), axis=0)).max(axis=-1) > MOVES
+    masks[1:] |= changed
+    masks[:-1] |= changed
+    return masks
 
 
 def open_lpips(*, download: bool, device: str = "cpu") -> Perceptual:
@@ -183,15 +194,16 @@ def evaluate(
 
     Args:
         tokenizer: the tokenizer to measure.
-        frames_iter: frames (S, S, 3), or batches of them (n, S, S, 3), uint8.
+        frames_iter: frames (S, S, 3), or films (n, S, S, 3) of frames that follow one another, uint8.
         worst: how many of the frames with the lowest PSNR to return as `worst_frames`.
         perceptual: measures LPIPS, see `open_lpips`.
 
     Returns:
         frames, psnr_db (mean over frames, lossless frames counted as 99), psnr_db_min, ssim, bits_per_frame
         (before any entropy coding), encode_frames_per_second, decode_frames_per_second (resizing not
-        counted); `lpips` if it is measured; the fields of `CodebookUse.result` or `LatentMoments.result`;
-        if `worst` is above 0, `worst_frames`, a list of (psnr, index, frame, made).
+        counted); if something moves in a film (`moving`), psnr_moving_db, of all those pixels together, and
+        moving_share, their share; `lpips` if it is measured; the fields of `CodebookUse.result` or
+        `LatentMoments.result`; if `worst` is above 0, `worst_frames`, a list of (psnr, index, frame, made).
 
     Raises:
         TokenizerError: there is no frame, or the frames do not fit.
@@ -201,8 +213,9 @@ def evaluate(
     bits = math.log2(spec.vocab_size) if spec.vocab_size else np.dtype(spec.dtype).itemsize * 8.0
     psnr, similarity, distance = list[float](), list[float](), list[float]()
     lowest = list[tuple[float, int, Frames, Frames]]()
-    encode_s = decode_s = 0.0
-    for batch in _batches(frames_iter):
+    encode_s = decode_s = moving_error = 0.0
+    moved = 0
+    for batch, masks in _batches(frames_iter):
         if not psnr:
             tokenizer.decode(tokenizer.encode(batch[:1]))  # the first pass prepares kernels
         started = time.perf_counter()
@@ -217,6 +230,8 @@ def evaluate(
         lowest = heapq.nsmallest(worst, [*lowest, *found], key=lambda entry: entry[:2])
         psnr += values
         similarity += ssim(batch, made).tolist()
+        moving_error += float(np.square(batch[masks].astype(np.float64) - made[masks]).sum()) / 3
+        moved += int(masks.sum())
         if perceptual is not None:
             distance += perceptual(batch, made).tolist()
     if not psnr:
@@ -233,6 +248,9 @@ def evaluate(
         "decode_frames_per_second": round(len(psnr) / decode_s, 1),
         **use.result(),
     }
+    if moved:
+        result["psnr_moving_db"] = round(_moving_db(moving_error / moved), 3)
+        result["moving_share"] = round(moved / (len(psnr) * spec.image_size**2), 4)
     if distance:
         result["lpips"] = round(float(np.mean(distance)), 4)
     if worst:
@@ -240,11 +258,17 @@ def evaluate(
     return result
 
 
-def _batches(frames_iter: Iterable[Frames]) -> Iterator[Frames]:
-    """Stack single frames and regroup batches into batches of `BATCH`."""
-    single = (frame for item in frames_iter for frame in ([item] if item.ndim == 3 else item))
-    for batch in batched(single, BATCH):
-        yield np.stack(batch)
+def _moving_db(error: float) -> float:
+    return min(10 * math.log10(255.0**2 / error), 99.0) if error else 99.0
+
+
+def _batches(frames_iter: Iterable[Frames]) -> Iterator[tuple[Frames, NDArray[np.bool_]]]:
+    """Regroup films and single frames into batches of `BATCH`, beside which pixels of them move."""
+    films = (item[None] if item.ndim == 3 else item for item in frames_iter)
+    pairs = (pair for film in films for pair in zip(film, moving(film), strict=True))
+    for batch in batched(pairs, BATCH):
+        frames, masks = zip(*batch, strict=True)
+        yield np.stack(frames), np.stack(masks)
 
 
 # -- report
@@ -259,6 +283,8 @@ COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
     "frames": ("frames", str),
     "PSNR dB": ("psnr_db", "{:.2f}".format),
     "lowest dB": ("psnr_db_min", "{:.2f}".format),
+    "where it moves dB": ("psnr_moving_db", "{:.2f}".format),
+    "moves": ("moving_share", "{:.1%}".format),
     "SSIM": ("ssim", "{:.3f}".format),
     "LPIPS": ("lpips", "{:.3f}".format),
     "digits used": ("digit_use", _percent),

@@ -5,7 +5,8 @@ from the pictures and videos that a recipe lists: these are held in memory at a 
 part of one picture, scaled, rotated, mirrored and recoloured. It depends only on (seed, step, index in the
 batch).
 
-N crops, S side of a crop or of the square that the tokenizer takes. All pictures are uint8 RGB.
+A film (n, S, S, 3) holds frames of one video, or of one camera in an episode, in order; a lone picture is
+a film of one. N crops, S side of a crop or of the square that the tokenizer takes. Pictures are uint8 RGB.
 """
 
 import hashlib
@@ -40,7 +41,7 @@ SHARES, SHARE_ODDS = ((0.42, 0.6), (0.3, 1.0), (1.0, 1.0)), (0.45, 0.35, 0.2)  #
 # -- frames to measure on
 
 
-def frames_of(
+def films_of(
     data: StrPath,
     spec: TokenizerSpec,
     *,
@@ -48,7 +49,7 @@ def frames_of(
     frames: int = 64,
     on_skip: Skip = str,
 ) -> Iterator[Frame]:
-    """Return an iterator over the frames of a recording, a shard set's source, pictures or videos.
+    """Return an iterator over films (n, S, S, 3) of a recording, a shard set's source, pictures or videos.
 
     With an embodiment, the data is a recording (a path or URI). Without one, it is a shard set, whose
     source is read, or a picture, a video or a folder of them.
@@ -67,12 +68,12 @@ def frames_of(
         manifest = Manifest.load(path)
         embodiment, uri = manifest.embodiment, manifest.source
     if embodiment is not None:
-        return recording_frames(embodiment, uri, spec, frames=frames, on_skip=on_skip)
+        return recording_films(embodiment, uri, spec, frames=frames, on_skip=on_skip)
     size, resize_filter = spec.image_size, spec.resize_filter
-    return read_frames(path, size, frames=frames, resize_filter=resize_filter, on_skip=on_skip)
+    return read_films(path, size, frames=frames, resize_filter=resize_filter, on_skip=on_skip)
 
 
-def read_frames(
+def read_films(
     path: StrPath,
     size: int,
     *,
@@ -80,7 +81,7 @@ def read_frames(
     resize_filter: Filter = "area",
     on_skip: Skip = str,
 ) -> Iterator[Frame]:
-    """Yield frames of a picture, a video, or every picture and video below a folder.
+    """Yield a film (n, S, S, 3) of a picture, a video, or every picture and video below a folder.
 
     Args:
         path: str or path of the file or folder.
@@ -99,12 +100,15 @@ def read_frames(
         if file.suffix.lower() not in VIDEOS | PICTURES:
             continue
         try:
-            for picture in read_pictures(file, frames):
-                found = True
-                yield resize(picture[None], size, "short_side_crop", resize_filter)[0]
+            pictures = read_pictures(file, frames)
+            film = [resize(picture[None], size, "short_side_crop", resize_filter) for picture in pictures]
         except TokenizerError as fault:
             skipped = f": {fault}"
             on_skip(str(fault))
+            continue
+        if film:
+            found = True
+            yield np.concatenate(film)
     if not found:
         remedy = "name a file or folder of png, jpg, mp4; a recording needs --embodiment"
         raise TokenizerError(path, f"holds no picture and no video that can be decoded{skipped}", remedy)
@@ -138,7 +142,7 @@ def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
         raise TokenizerError(path, f"cannot be decoded as a video: {fault}") from fault
 
 
-def recording_frames(
+def recording_films(
     embodiment: "Embodiment",
     uri: StrPath,
     spec: TokenizerSpec,
@@ -146,7 +150,7 @@ def recording_frames(
     frames: int = 64,
     on_skip: Skip = str,
 ) -> Iterator[Frame]:
-    """Yield frames of a recording as a conversion would tokenize them: every camera, by the robot's YAML.
+    """Yield films (n, S, S, 3) of a recording as a conversion would tokenize it: every camera, by the YAML.
 
     Args:
         uri: str or path of the recording, or its URI.
@@ -170,8 +174,9 @@ def recording_frames(
             episode = source.read(uri, ids[index], embodiment)
             for camera in embodiment.cameras:
                 stream = episode.streams[camera.name]
-                for at in _evenly(len(stream.timestamps), frames):
-                    yield prepare(stream.frames([at]), camera, spec.image_size, spec.resize_filter)[0]
+                drawn = (stream.frames([at]) for at in _evenly(len(stream.timestamps), frames))
+                film = [prepare(frame, camera, spec.image_size, spec.resize_filter) for frame in drawn]
+                yield np.concatenate(film)
             read += 1
         except (EpisodeError, SourceError) as problem:
             fault = str(problem)

@@ -29,7 +29,7 @@ from hma_data.tokenizers.training.eval import (
     to_markdown,
     write_report,
 )
-from hma_data.tokenizers.training.frames import frames_of, read_frames
+from hma_data.tokenizers.training.frames import films_of, read_films
 from tests.conftest import ARM_YAML, write_toy
 from tests.data.tokenizer_files import draw_scene
 
@@ -59,7 +59,8 @@ def arm(tmp_path: Path) -> tuple[Embodiment, Path]:
 
 def test_a_recording_gives_every_camera_as_a_conversion_would(arm, block_tokenizer):
     robot, path = arm
-    found = list(frames_of(path, block_tokenizer.spec, embodiment=robot, frames=2))
+    found = list(films_of(path, block_tokenizer.spec, embodiment=robot, frames=2))
+    assert [len(film) for film in found] == [2] * len(found)
     source = open_source("hdf5")
     expected = []
     for name in source.episode_ids(str(path)):
@@ -67,22 +68,22 @@ def test_a_recording_gives_every_camera_as_a_conversion_would(arm, block_tokeniz
         for camera in robot.cameras:
             raw = clip.frames_at(camera.name, np.array([0, len(clip) - 1]))
             expected.append(prepare(raw, camera, 64, "area"))
-    assert np.array_equal(np.stack(found), np.concatenate(expected))
+    assert np.array_equal(np.concatenate(found), np.concatenate(expected))
 
 
 def test_a_shard_set_is_measured_on_what_it_was_made_of(arm, block_tokenizer, tmp_path):
     robot, path = arm
     convert(robot, str(path), block_tokenizer, tmp_path / "shards")
     spec = block_tokenizer.spec
-    from_shards = list(frames_of(tmp_path / "shards", spec, frames=3))
-    assert np.array_equal(from_shards, list(frames_of(path, spec, embodiment=robot, frames=3)))
+    from_shards = list(films_of(tmp_path / "shards", spec, frames=3))
+    assert np.array_equal(from_shards, list(films_of(path, spec, embodiment=robot, frames=3)))
 
 
 def test_a_file_that_cannot_be_decoded_is_told_and_left_out(pictures):
     (pictures / "1.png").write_bytes(b"junk")
     (pictures / "film.mp4").write_bytes(b"junk")
     skipped: list[str] = []
-    assert len(list(read_frames(pictures, 64, on_skip=skipped.append))) == 2
+    assert len(list(read_films(pictures, 64, on_skip=skipped.append))) == 2
     assert [text.split(": ")[0] for text in skipped] == [str(pictures / n) for n in ("1.png", "film.mp4")]
 
 
@@ -91,7 +92,7 @@ def test_a_file_that_cannot_be_decoded_is_refused_where_it_is_all_there_is(tmp_p
     (tmp_path / name).write_bytes(b"junk")
     for path in (tmp_path, tmp_path / name):
         with pytest.raises(TokenizerError, match=name):
-            list(read_frames(path, 64))
+            list(read_films(path, 64))
 
 
 def test_a_film_without_pictures_is_refused(tmp_path):
@@ -104,12 +105,12 @@ def test_a_film_without_pictures_is_refused(tmp_path):
         container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     with pytest.raises(TokenizerError, match="cannot be decoded as a video"):
-        list(read_frames(tmp_path / "sound.mp4", 64))
+        list(read_films(tmp_path / "sound.mp4", 64))
 
 
 def test_what_is_not_there_is_named(tmp_path):
     with pytest.raises(TokenizerError, match="gone: no such file or folder"):
-        list(read_frames(tmp_path / "gone", 64))
+        list(read_films(tmp_path / "gone", 64))
 
 
 def test_an_episode_that_cannot_be_read_is_told_and_replaced(arm, block_tokenizer, monkeypatch):
@@ -126,8 +127,8 @@ def test_an_episode_that_cannot_be_read_is_told_and_replaced(arm, block_tokenize
     monkeypatch.setattr(source, "read", broken)
     monkeypatch.setattr("hma_data.sources.base.open_source", lambda name: source)
     told: list[str] = []
-    frames = list(frames_of(path, block_tokenizer.spec, embodiment=robot, frames=2, on_skip=told.append))
-    assert len(frames) == 4 and "is broken" in told[0]
+    frames = list(films_of(path, block_tokenizer.spec, embodiment=robot, frames=2, on_skip=told.append))
+    assert sum(map(len, frames)) == 4 and "is broken" in told[0]
 
 
 # -- measures
@@ -144,6 +145,27 @@ def test_moments_of_latents_are_those_of_all_batches_together():
         "latent_mean_scaled": pytest.approx(whole.mean(), abs=1e-4),
         "latent_std_scaled": pytest.approx(whole.std(), abs=1e-4),
     }
+
+
+def test_what_moves_is_measured_by_itself(block_tokenizer):
+    rng = np.random.default_rng(1)
+    films = [np.full((count, 64, 64, 3), 90, np.uint8) for count in (40, 3)]  # one is of two batches
+    for film in films:
+        for at, frame in enumerate(film):
+            frame[10:20, at : at + 9] = rng.integers(0, 256, (10, 9, 3))
+    found = evaluate(block_tokenizer, [*films, films[0][0]])  # a lone picture does not move
+    error, moved = 0.0, 0
+    for film in films:
+        made = block_tokenizer.decode(block_tokenizer.encode(film))
+        for at in range(len(film)):
+            beside = [film[other].astype(int) for other in (at - 1, at + 1) if 0 <= other < len(film)]
+            mask = np.any([np.abs(film[at] - other).max(-1) > 24 for other in beside], axis=0)
+            error += float(np.square(film[at][mask] - made[at][mask].astype(float)).sum())
+            moved += int(mask.sum())
+    assert found["psnr_moving_db"] == pytest.approx(-10 * np.log10(error / 3 / moved / 255**2), abs=1e-3)
+    assert found["moving_share"] == pytest.approx(moved / (44 * 64 * 64), abs=1e-4)
+    assert "| where it moves dB | moves |" in to_markdown({"x": found})
+    assert "psnr_moving_db" not in evaluate(block_tokenizer, films[0][:1])
 
 
 def test_without_its_package_lpips_is_named_with_the_command(monkeypatch):

@@ -159,8 +159,8 @@ def test_the_shipped_weights_are_of_the_shipped_recipe():
 
 @pytest.mark.real
 def test_real_robot_frames_come_back_as_promised(real_data, vae):
-    from hma_data.tokenizers.training.frames import read_frames
+    from hma_data.tokenizers.training.frames import read_films
 
     video = sorted((real_data / "lerobot" / "g1_v21" / "videos").rglob("*.mp4"))[0]
-    result = evaluate(vae, read_frames(video, 256, frames=4))
+    result = evaluate(vae, read_films(video, 256, frames=4))
     assert result["psnr_db"] >= 30 and result["ssim"] >= 0.92

@@ -15,7 +15,7 @@ from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 from hma_data.tokenizers.checkpoints import read_weights, save_weights
 from hma_data.tokenizers.embedded import FsqAutoencoder, FsqConfig, Quantizer
 from hma_data.tokenizers.training.eval import CodebookUse, evaluate, psnr_db, ssim, to_markdown
-from hma_data.tokenizers.training.frames import read_frames
+from hma_data.tokenizers.training.frames import read_films
 from hma_data.tokenizers.training.recipe import load_recipe
 from tests.data.tokenizer_files import draw_scene
 
@@ -374,14 +374,14 @@ def test_no_frames_cannot_be_measured(fsq8, tmp_path):
     with pytest.raises(TokenizerError, match="no frame"):
         evaluate(fsq8, [])
     with pytest.raises(TokenizerError, match="no picture"):
-        list(read_frames(tmp_path, 128))
+        list(read_films(tmp_path, 128))
 
 
 @pytest.mark.real
 def test_real_robot_frames_come_back_as_promised(real_data, fsq16):
     folder = real_data / "lerobot" / "g1_v21" / "videos"
     videos = sorted(folder.rglob("*.mp4"))[:1]
-    result = evaluate(fsq16, read_frames(videos[0], 256, frames=8))
+    result = evaluate(fsq16, read_films(videos[0], 256, frames=8))
     assert result["psnr_db"] >= PROMISED_PSNR_DB and result["ssim"] >= PROMISED_SSIM
 
 

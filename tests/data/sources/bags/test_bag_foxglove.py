@@ -14,7 +14,7 @@ from hma_data.errors import EpisodeError
 from hma_data.inspection.inspect import examine, inspect_recording
 from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_data.tokenizers.training.frames import recording_frames
+from hma_data.tokenizers.training.frames import recording_films
 from tests.data import bag_parts
 from tests.data.bag_files import CAMERA, SOURCE, arm, as_cdr, make_recording, read, ros_message, write_mcap
 from tests.data.sources.bags.test_bag_pictures import LOW_DELAY, VIDEO_YAML
@@ -211,7 +211,7 @@ def test_inspect_doctor_and_eval_look_at_the_embodiments_episodes(
 
     monkeypatch.setattr(type(SOURCE), "read", spy)
     examine(str(path), str(where))
-    list(recording_frames(robot, str(path), _spec(), frames=2))
+    list(recording_films(robot, str(path), _spec(), frames=2))
     assert asked == ["run/0000", "run/0001", "run/0002"] * 2
 
 
