@@ -240,7 +240,7 @@ class _Lines:
 
     def __init__(self, description: str, total: float, unit: str) -> None:
         self._text, self._total, self._unit = description, total, unit
-        self._start = self._shown = time.monotonic()
+        self._start = self._began = self._shown = time.monotonic()
         self._first: float | None = None
         self._done, self._extra = 0.0, ""
         self._told = False  # whether the last call has been shown
@@ -248,8 +248,9 @@ class _Lines:
     def __call__(self, done: float, extra: str = "", total: float | None = None) -> None:
         self._done, self._extra, self._total = done, extra, total or self._total
         self._told = False
-        if self._first is None:
-            self._first = done  # work of an earlier run does not count for the rate
+        if self._first is None or done <= self._first:
+            # Neither the work of an earlier run nor the preparation counts for the rate.
+            self._first, self._began = done, time.monotonic()
         if time.monotonic() - self._shown >= 10:
             self._show()
 
@@ -260,7 +261,7 @@ class _Lines:
     def _show(self) -> None:
         self._shown, self._told = time.monotonic(), True
         elapsed = self._shown - self._start
-        rate = (self._done - (self._first or 0)) / max(elapsed, 1e-9)
+        rate = (self._done - (self._first or 0)) / max(self._shown - self._began, 1e-9)
         missing = self._total - self._done
         left = missing / rate if rate > 0 and missing > 0 else None
         amount = _amount(self._done, self._total, rate, self._unit)

@@ -117,7 +117,11 @@ def convert(
         int | None, Option(min=1, help="Frames in a shard, about.", rich_help_panel=RARE)
     ] = None,
     val_fraction: Annotated[
-        float, Option(help="Share of episodes for validation.", rich_help_panel=DATA)
+        float,
+        Option(
+            help="Share of episodes for validation; a recording with a split of its own keeps that.",
+            rich_help_panel=DATA,
+        ),
     ] = 0.05,
     seed: Annotated[int, Option(help="Seed of the split.", rich_help_panel=DATA)] = 0,
     max_quarantine: Annotated[

@@ -32,6 +32,7 @@ FIGURES = {  # figures of `hma evaluate` as its table names them; the others hav
     "unmoved_windows": "windows whose pictures never change",
     "draws": "draws of shuffled actions",
     "loss": "loss, nats a token",
+    "stored_loss": "loss, nats a stored token",
     "shuffled_loss": "loss with shuffled actions",
     "baseline_loss": "loss of token frequencies alone",
     "accuracy": "accuracy, share of tokens",
@@ -40,7 +41,7 @@ FIGURES = {  # figures of `hma evaluate` as its table names them; the others hav
     "psnr_action_gain_last": "last frame, true less shuffled, dB",
 }
 ROLLOUTS = ("true", "shuffled", "none", "copy")
-HIDDEN = ("checkpoint", "data", "seconds_a_frame", "sees_actions")  # of the readable form
+HIDDEN = ("checkpoint", "data", "seconds_a_frame", "sees_actions", "merge")  # of the readable form
 MEASURES = {"lpips": "LPIPS", "fid": "FID", "fvd": "FVD", "fvd_videogpt": "FVD (VideoGPT)"}
 LPIPS_HELP = "Weights of LPIPS, with their hash."
 
@@ -136,10 +137,11 @@ def _kept(out: Path | None) -> str:
 
 def _print_one(part: "Part") -> None:
     found = part.found
+    hidden = HIDDEN if found.get("merge", 1) > 1 else (*HIDDEN, "stored_loss")
     plain = [
-        [FIGURES.get(key, key), value, _ends(found.get(f"{key}_95"))]
+        [_figure(key, found), value, _ends(found.get(f"{key}_95"))]
         for key, value in found.items()
-        if not isinstance(value, dict | list) and key not in HIDDEN and not key.endswith("_95")
+        if not isinstance(value, dict | list) and key not in hidden and not key.endswith("_95")
     ]
     print_table(["figure", "value", "95 %"], plain)
     columns = {"psnr": "PSNR dB", "psnr_last": "last frame dB", "ssim": "SSIM"}
@@ -178,6 +180,20 @@ def _print_state(state: dict[str, Any] | None) -> None:
     ]
     print_table(["commands", "PSNR dB", "last frame dB", "perplexity"], rows)
     print(f"{state['episodes']} simulated episodes; the probe errs by {state['probe_px']:.2f} px")
+
+
+def _figure(key: str, found: dict[str, Any]) -> str:
+    """Return the name of a figure; what is of squares of tokens says so."""
+    side, name = found.get("merge") or 1, FIGURES.get(key, key)
+    square = f"{side}×{side}"
+    if side == 1:
+        return name
+    names = {
+        "loss": f"loss, nats a square of {square} tokens",
+        "perplexity": f"perplexity of squares of {square} tokens",
+        "accuracy": f"accuracy, share of squares of {square}",
+    }
+    return names.get(key, name)
 
 
 def _ends(ends: Sequence[float] | None) -> str | None:

@@ -74,7 +74,14 @@ def augment(
         typer.Option("--from", help="Shard set of first frames and commands; else the simulator's."),
     ] = None,
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes to make.")] = 64,
-    frames: Annotated[int, typer.Option("--frames", min=4, help="Frames to generate of each.")] = 40,
+    frames: Annotated[
+        int,
+        typer.Option(
+            "--frames",
+            min=4,
+            help="Frames to generate of each; the last, without commands, is not stored.",
+        ),
+    ] = 40,
     commands: Annotated[
         str,
         typer.Option(

@@ -199,6 +199,7 @@ def measure(
         batches = [without_commands(batch) for batch in batches]
     episodes = _episodes(batches)
     table, by_window = _losses(model, shards, batches, episodes, cameras, draws, seed)
+    on_frames(0)  # the losses are done: the clock of the time left starts here
     roll = partial(rollout, model, tokenizer, **settings.sampling)
     rolled = Rolled(first, Judge(networks or Networks()))
     for number, batch in enumerate(batches):
@@ -224,6 +225,7 @@ def measure(
         "prompt": first,
         "draws": draws,
         "sees_actions": model.config.sees_actions,
+        "merge": model.config.merge,
         "against": "decoded tokens",
         "cameras": cameras if isinstance(cameras, str) else ", ".join(cameras),
         **table,
@@ -289,6 +291,8 @@ def _losses(
             [shards], batches, cameras, model.config.factored, model.config.merge
         ).mean(),
     }
+    if table["loss"] is not None:  # a model that takes squares of tokens as one has a loss of squares
+        table["stored_loss"] = round(table["loss"] / model.config.merge**2, 6)
     table |= _perplexity("perplexity", by_window["loss"], seed, episodes)
     table |= summary("accuracy", by_window["accuracy"], seed, digits=6, episodes=episodes)
     table |= _perplexity("masked_perplexity", masked_nats, seed, episodes)
@@ -345,6 +349,12 @@ def _notes(
 ) -> list[str]:
     """Return what must be known to read the figures."""
     notes, config = [], model.config
+    if config.kind == "discrete" and config.merge > 1:
+        square = f"squares of {config.merge}×{config.merge} tokens"
+        notes.append(
+            f"loss, perplexity and accuracy are of {square}, which the model takes as one: compare them with "
+            "those of such models alone, and nats/token with all of the tokenizer"
+        )
     if not config.sees_actions:
         notes.append("no objective of its training sees actions, so all rollouts are without")
     if wrong := sum(int((~part.finite).sum()) for part in joined.values()):

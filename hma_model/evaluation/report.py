@@ -81,6 +81,11 @@ def _below(cell: Any) -> Any:
     return cell.replace(" [", "\n", 1).rstrip("]").replace(", ", " to ") if isinstance(cell, str) else cell
 
 
+def _units(found: dict[str, Any]) -> str:
+    side = found.get("merge") or 1
+    return "tokens" if side == 1 else f"squares of {side}×{side} tokens"
+
+
 def _headline(made: Page, parts: Sequence[Part]) -> None:
     tiles = []
     for part in parts[:6]:
@@ -93,8 +98,8 @@ def _headline(made: Page, parts: Sequence[Part]) -> None:
         for path, digits, unit, about in (
             ("true.psnr_last", 1, " dB", "PSNR of the last frame"),
             ("copy.psnr_last", 1, " dB", "the same of a copy of the prompt's last frame"),
-            ("perplexity", 1, "", "perplexity of a frame's tokens"),
-            ("accuracy", 2, "", "share of tokens predicted right"),
+            ("perplexity", 1, "", f"perplexity of a frame's {_units(found)}"),
+            ("accuracy", 2, "", f"share of {_units(found)} predicted right"),
         ):
             if (figure := value(found, path)) is not None:
                 tiles.append((f"{figure:.{digits}f}{unit}", about))
@@ -117,7 +122,10 @@ def _robot(made: Page, parts: Sequence[Part]) -> None:
 def _curves(parts: Sequence[Part], name: str) -> dict[str, tuple[Any, Any]]:
     """Return the means by frame and their intervals of each checkpoint, and of the first one's baselines."""
     kinds = [(part.checkpoint, part.found["true"]) for part in parts]
-    kinds += [(words, parts[0].found[kind]) for kind, words in BASELINES.items()]
+    several = len(parts) > 1
+    for kind, words in BASELINES.items():  # a copy is the same whatever the model
+        own = f"{words} ({parts[0].checkpoint})" if several and kind != "copy" else words
+        kinds.append((own, parts[0].found[kind]))
     key = f"{name}_by_frame"
     return {
         label: (found[key], found[f"{key}_95"])

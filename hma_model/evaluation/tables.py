@@ -16,6 +16,7 @@ MEAN = "mean over sets"
 # heading, its key among the values of windows, the figure's path, digits, and whether exp is taken
 COLUMNS: tuple[tuple[str, str, str, int, bool], ...] = (
     ("perplexity", "loss", "perplexity", 2, True),
+    ("nats/token", "", "stored_loss", 3, False),
     ("masked", "masked_loss", "masked_perplexity", 2, True),
     ("accuracy", "accuracy", "accuracy", 3, False),
     ("PSNR", "true.psnr", "true.psnr", 2, False),
@@ -32,9 +33,10 @@ COLUMNS: tuple[tuple[str, str, str, int, bool], ...] = (
     ("PSNR copy", "copy.psnr_last", "copy.psnr_last", 2, False),
 )
 WORDS = {
-    "perplexity": "of whole masked frames, given the true past",
+    "perplexity": "of whole masked frames, given the true past; of squares, where the model takes squares",
+    "nats/token": "loss a stored token: comparable between all models of a tokenizer",
     "masked": "perplexity of the tokens that training masks, among its masks",
-    "accuracy": "share of tokens, given the true past",
+    "accuracy": "share of tokens (or of squares of tokens), given the true past",
     "PSNR": "dB, mean over the horizon of rollouts",
     "PSNR last": "dB, last frame",
     "ΔPSNR": "dB, last frame, true less shuffled actions",
@@ -124,9 +126,15 @@ def _cell(figure: Any, ends: Any, digits: int) -> str | None:
 
 
 def absences(parts: Sequence[Part]) -> list[tuple[str, str]]:
-    """Return what is not measured, and what else must be known: (metric or robot, words), each once."""
+    """Return what is not measured, and what else must be known: (metric or whose, words), each once."""
+    several = len({part.checkpoint for part in parts}) > 1
     said = [pair for part in parts for pair in part.found.get("missing", {}).items()]
-    said += [(part.found["embodiment"], note) for part in parts for note in part.found["notes"]]
+    said += [
+        (f"{part.checkpoint} on {robot}" if several else robot, note)
+        for part in parts
+        for robot in [part.found["embodiment"]]
+        for note in part.found["notes"]
+    ]
     said += [
         (part.found["embodiment"], words)
         for part in parts

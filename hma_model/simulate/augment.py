@@ -267,6 +267,7 @@ class _Maker:
             arrays = kept_arrays(path)
             if arrays is None:
                 self._train(on_progress)
+                on_progress(begin * frames, "episodes")  # the clock of the time left starts here
                 numbers = range(begin, min(begin + BATCH, count))
                 batch = self._make(numbers, lambda at, b=begin: on_progress(b * frames + at, "episodes"))  # type: ignore[misc]
                 arrays = vars(batch)

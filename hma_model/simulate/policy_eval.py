@@ -230,6 +230,7 @@ def evaluate_policies(
             facts = {"embodiment": embodiment, "episodes": episodes, "frames": frames, "seed": seed}
             facts |= {"judge": asdict(judge.task), "sampling": sampling, **digests(world, embodiment)}
             work = begun(folder, WORK, facts, world.model)
+        tell(0, "episodes")  # the clock of the time left starts here
         scored: list[Scored] = []
         for (name, policy), key in zip(made, keys, strict=True):
             told = partial(_tell, tell, len(scored) * frames * episodes, name)

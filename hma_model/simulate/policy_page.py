@@ -48,8 +48,9 @@ def _rate(row: dict[str, Any], name: str) -> str:
 def sentences(found: PolicyEvaluation) -> list[str]:
     """Return in words what the table means: the task, the judge, the correlations."""
     share = "not known" if found.followed is None else f"{found.followed:.2f}"
+    scores = "the way it moved" if found.judge.task.name == "moved" else "minus the distance, 0 is best"
     said = [
-        f"success: {found.judge.task.text}; shares with 95 % intervals over episodes, scores in px",
+        f"success: {found.judge.task.text}; shares with 95 % intervals over episodes; scores in px: {scores}",
         f"judge on held-out true episodes: {found.judge.held_out}",
         f"judge on generated frames, against the simulator under the same commands: {found.generated}; "
         f"correlation of the scores {share}",

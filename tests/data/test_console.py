@@ -21,6 +21,21 @@ def test_progress_tells_elapsed_from_remaining_time(
     assert capsys.readouterr().err == ""  # what has been shown is not shown again at the end
 
 
+def test_preparation_does_not_slow_the_rate(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
+    with console.progress("episodes") as update:
+        update(0, "training the judge", total=400)
+        clock[0] = 50.0
+        update(0, total=400)
+        capsys.readouterr()
+        clock[0] = 62.0
+        update(100, total=400)
+    assert capsys.readouterr().err == "episodes: 100/400 frames, 8.3/s, 1 min 02 s so far, 36 s left\n"
+
+
 def test_bytes_have_their_own_unit_and_an_unknown_total_is_left_out(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -13,15 +13,18 @@ from hma_data.tokenizers.base import TokenizerSpec
 from tests.model.robots import SPEC, yaml
 
 
-def episode(rng: np.random.Generator, length: int, dims: int) -> tuple[np.ndarray, np.ndarray]:
-    """Tokens (T, 2, 3) and actions (T, A): the first action's sign moves a mark by one every 2 rows."""
+def episode(
+    rng: np.random.Generator, length: int, dims: int, grid: tuple[int, int] = (2, 3)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Tokens (T, h, w) and actions (T, A): the first action's sign moves a mark by one every 2 rows."""
+    cells = grid[0] * grid[1]
     signs = rng.choice([-1.0, 1.0], size=length)
     signs[1::2] = signs[: len(signs[1::2]) * 2 : 2]
-    place = np.concatenate([[0], np.cumsum(signs)[:-1]]) // 2 + rng.integers(6)
-    tokens = np.full((length, 6), 9)
-    tokens[np.arange(length), place.astype(int) % 6] = 50
+    place = np.concatenate([[0], np.cumsum(signs)[:-1]]) // 2 + rng.integers(cells)
+    tokens = np.full((length, cells), 9)
+    tokens[np.arange(length), place.astype(int) % cells] = 50
     actions = np.concatenate([signs[:, None], rng.normal(size=(length, dims - 1))], axis=1)
-    return tokens.reshape(length, 2, 3), actions.astype(np.float32)
+    return tokens.reshape(length, *grid), actions.astype(np.float32)
 
 
 def make_shards(
@@ -39,7 +42,7 @@ def make_shards(
         "frame_stride": 1,
         "cameras": ["top"],
     }
-    whole = [episode(rng, length, dims) for _ in range(episodes)]
+    whole = [episode(rng, length, dims, spec.grid) for _ in range(episodes)]
     parts = {"train": range(episodes - held_out), "val": range(episodes - held_out, episodes)}
     parts = {split: numbers for split, numbers in parts.items() if numbers}
     for split, numbers in parts.items():

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from hma_data.lab import record
 from hma_data.lab.truth import episode
@@ -18,7 +19,7 @@ from hma_model.evaluation import showcase, suite
 from hma_model.evaluation.report import difference, write_results
 from hma_model.evaluation.simulated import PERTURBATION, perturbed
 from hma_model.evaluation.suite import Settings, evaluate_all
-from hma_model.evaluation.tables import means, results, rows
+from hma_model.evaluation.tables import absences, means, results, rows
 from tests.model.evaluation.test_evaluate import Blocks
 from tests.model.robots import CONFIG, SPEC, make_model, save
 from tests.model.shards import make_shards
@@ -72,6 +73,31 @@ def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_onc
     assert [line[1] for line in lines] == ["arm", "hand", "mean over sets"] * 2 and len(lines[0]) == len(
         names
     )
+
+
+def test_a_model_of_squares_is_compared_by_the_loss_of_a_stored_token(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = replace(SPEC, grid=(2, 4))
+    make_shards(tmp_path / "arm", "arm", held_out=2, spec=spec)
+    for name, merge in (("single", 1), ("square", 2)):  # neither knows anything
+        config = replace(CONFIG, grid=(2, 4), tokenizer=spec.to_json(), merge=merge)
+        model = make_model({"arm": 2}, config=config)
+        torch.nn.init.zeros_(model.readout.linear.weight)
+        torch.nn.init.zeros_(model.readout.linear.bias)
+        save(tmp_path / name, {"arm": 2}, model=model)
+    parts = evaluate_all([tmp_path / "single", tmp_path / "square"], [tmp_path / "arm"], SETTINGS)
+    single, square = (part.found for part in parts)
+    assert square["loss"] == pytest.approx(4 * single["loss"], rel=1e-4)
+    assert single["stored_loss"] == pytest.approx(square["stored_loss"], rel=1e-4)
+    assert single["stored_loss"] == pytest.approx(np.log(64), rel=1e-4)
+    assert {one: whose for whose, one in absences(parts) if "squares of 2×2" in one}.popitem()[1] == (
+        f"{tmp_path / 'square'} on arm"
+    )
+    assert "nats/token" in rows(parts)[0]
+    assert main(["evaluate", str(tmp_path / "square"), str(tmp_path / "arm"), "--windows", "3"]) == 0
+    said = capsys.readouterr().out
+    assert "loss, nats a square of 2×2 tokens" in said and "loss, nats a stored token" in said
 
 
 def test_parts_that_are_done_are_not_computed_again(
