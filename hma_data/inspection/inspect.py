@@ -22,7 +22,7 @@ from hma_data.errors import HMAError, SourceError
 from hma_data.inspection.infer import commands
 from hma_data.registry.components import Sync
 from hma_data.registry.embodiment import Embodiment, find
-from hma_data.sources.base import SAMPLE, Inspection, Source, detect, of_another_format, open_source
+from hma_data.sources.base import SAMPLE, Inspection, LaidOut, Source, detect, of_another_format, open_source
 from hma_data.sources.common.checks import SEVERITIES, Finding, Severity
 from hma_data.sources.common.choice import ids_for_robot
 from hma_data.sources.common.survey import CHECKS, alike, sampled
@@ -42,6 +42,8 @@ def _inspected(uri: str, robot: Embodiment | None, episodes: int) -> tuple[Sourc
     format_name = robot.source.format if robot else detect(uri)
     source = open_source(format_name)
     try:
+        if robot and isinstance(source, LaidOut):
+            return source, source.inspect_as(uri, robot, episodes)
         return source, source.inspect(uri, episodes)
     except SourceError as fault:
         raise of_another_format(uri, format_name, fault) from fault

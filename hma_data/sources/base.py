@@ -187,6 +187,15 @@ class Source(Protocol):
 
 
 @runtime_checkable
+class LaidOut(Protocol):
+    """A source whose recordings have the layout that a YAML states."""
+
+    def inspect_as(self, uri: StrPath, embodiment: Embodiment, episodes: int = SAMPLE) -> Inspection:
+        """Return what the recording holds, as `Source.inspect`, with the episodes of the robot's layout."""
+        ...
+
+
+@runtime_checkable
 class Expecting(Protocol):
     """A source that is told which episodes will be read next, so that it can fetch them ahead."""
 

@@ -35,6 +35,7 @@ HELD_BYTES = 512 << 20  # of decompressed chunks in memory, over all datasets of
 MAX_BYTES = 1 << 30  # of a chunk
 MAX_NUMBERS = 1 << 26  # values read whole; they become float64
 MAX_ROW = 1 << 28  # values of a row: more than any picture has
+MAX_DEPTH = 4  # of the groups above the episodes
 MAX_KEYS = 5_000  # datasets and groups of an episode that are listed
 _EPISODE_NAME = re.compile(r"(demo|episode|ep|traj|trajectory|rollout)[_-]?\d+")
 
@@ -265,7 +266,34 @@ def _guess_pattern(handle: h5py.File) -> str:
     groups = [name for name in handle if isinstance(handle.get(name), h5py.Group)]
     if groups and len(groups) == len(handle) and all(_EPISODE_NAME.fullmatch(name) for name in groups):
         return "*"
-    return WHOLE_FILE
+    return _numbered(handle) or WHOLE_FILE
+
+
+def _numbered(group: h5py.Group, prefix: str = "") -> str:
+    """Return the pattern of groups that differ in a number and each hold pictures and commands, or nothing.
+
+    Cameras and arms may be numbered groups too, but do not hold both.
+    """
+    inner = {name: group[name] for name in group if group.get(name, getlink=True).__class__ is h5py.HardLink}
+    if not inner or not all(isinstance(item, h5py.Group) for item in inner.values()):
+        return ""
+    if len(inner) == 1:
+        name, item = next(iter(inner.items()))
+        return _numbered(item, f"{prefix}{name}/") if prefix.count("/") < MAX_DEPTH else ""
+    if len({re.sub(r"\d+", "#", name) for name in inner}) > 1:
+        return ""
+    ends = sorted(inner, key=_natural)
+    return f"{prefix}*" if all(_is_episode(inner[name]) for name in (ends[0], ends[-1])) else ""
+
+
+def _is_episode(group: h5py.Group) -> bool:
+    """Check whether some dataset may be pictures, and one of as many rows, or one more or less, numbers."""
+    shapes = [(item.shape, item.dtype) for _, item in walk(group) if item.shape]
+    pictures = [
+        shape[0] for shape, dtype in shapes if (dtype == np.uint8 and len(shape) >= 3) or dtype.hasobject
+    ]
+    rows = [shape[0] for shape, dtype in shapes if dtype.kind == "f" and len(shape) == 2]
+    return any(abs(count - other) <= 1 for count in pictures for other in rows)
 
 
 def _matching(group: h5py.Group, parts: list[str]) -> list[str]:

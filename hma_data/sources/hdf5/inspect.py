@@ -51,13 +51,15 @@ class _First:
     robots: Any = None
 
 
-def inspect(uri: str, finder: EpisodeFinder, files: OpenFiles, episodes: int) -> Inspection:
-    """See Source.inspect.
+def inspect(
+    uri: str, finder: EpisodeFinder, files: OpenFiles, episodes: int, pattern: str | None = None
+) -> Inspection:
+    """See Source.inspect; `pattern` names the groups that are episodes, by default the file shows it.
 
     Raises:
         SourceError: nothing can be read.
     """
-    found = finder.all(uri)
+    found = finder.all(uri, pattern)
     order = list(found)
     chosen = {order[i] for i in sampled(len(order), episodes)}
     survey, first = Survey(len(order)), _First()

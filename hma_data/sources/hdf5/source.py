@@ -90,6 +90,13 @@ class Hdf5Source:
 
         return inspect(as_text(uri), self._finder, self._files, episodes)
 
+    def inspect_as(self, uri: StrPath, embodiment: Embodiment, episodes: int = SAMPLE) -> Inspection:
+        """See LaidOut."""
+        from hma_data.sources.hdf5.inspect import inspect
+
+        pattern = layout_of(embodiment).episodes
+        return inspect(as_text(uri), self._finder, self._files, episodes, pattern)
+
     def episode_ids(self, uri: StrPath) -> list[str]:
         """Return the episode ids, with files by name and `demo_2` before `demo_10`."""
         return list(self._finder.all(as_text(uri)))

@@ -13,6 +13,7 @@ import pytest
 
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, HMAError
+from hma_data.inspection.inspect import inspect_recording
 from hma_data.sources.base import open_source
 from tests.data.hdf5_files import H, T, W, embodiment, fill, pictures
 
@@ -347,3 +348,49 @@ def test_a_json_of_the_simulator_may_be_anything(tmp_path: Path) -> None:
             file["data"].attrs["problem_info"] = value
         assert open_source("hdf5").inspect(str(path)).episodes == 1
         assert shown(path, [0]).shape == (1, H, W, 3)
+
+
+# -- groups of other names
+
+
+@pytest.mark.parametrize("names", ["trials/t{:03}", "t{:03}", "episodes/{}", "a/run_b/{}", "2026-11-{}"])
+def test_numbered_groups_with_pictures_and_commands_are_episodes(tmp_path: Path, names: str) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for number in range(8, 12):
+            fill(file.create_group(names.format(number)))
+    source = open_source("hdf5")
+    last = [names.format(number).split("/")[-1] for number in range(8, 12)]
+    assert source.episode_ids(tmp_path / "a.h5") == last
+    assert source.inspect(tmp_path / "a.h5").episodes == 4
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        ["cam_0/rgb", "cam_1/rgb"],  # cameras
+        ["arm_0/q", "arm_1/q"],  # arms
+        ["cam_0/rgb", "cam_1/rgb", "cam_0/pose", "cam_1/pose", "cmd"],  # with what belongs to both
+        ["cam_0/rgb", "cam_1/rgb", "robot/q"],
+        ["t0/rgb", "t0/q"],  # one alone shows nothing
+    ],
+    ids=lambda keys: keys[-1],
+)
+def test_numbered_groups_of_one_episode_are_none(tmp_path: Path, keys: list[str]) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for key in keys:
+            file[key] = pictures(T) if key.endswith("rgb") else np.zeros((T, 3), np.float32)
+    assert open_source("hdf5").episode_ids(tmp_path / "a.h5") == ["a"]
+
+
+def test_a_recording_is_inspected_by_the_layout_of_its_robot(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in ("pick", "place", "push"):
+            fill(file.create_group(f"trials/{name}"))
+    source = open_source("hdf5")
+    assert source.inspect(tmp_path / "a.h5").episodes == 1
+    robot = embodiment(source={"format": "hdf5", "layout": {"episodes": "/trials/*"}})
+    found = source.inspect_as(tmp_path / "a.h5", robot)  # type: ignore[attr-defined]
+    assert found.episodes == 3 and "actions" in [key.key for key in found.keys]
+    path = tmp_path / "robot.yaml"
+    path.write_text(robot.to_yaml())
+    assert inspect_recording(tmp_path / "a.h5", path)["episodes"] == 3
