@@ -214,11 +214,12 @@ class _Draft:
             "target_hz": self._target(),
             "action": {
                 "space": f"{TODO}: one of {', '.join(spaces[:-1])} or {spaces[-1]}?",
-                "components": [self._component(key) for key in self._commands()],
+                "components": _told_apart([self._component(key) for key in self._commands()]),
             },
         }
         if self.states:
-            values["state"] = {"components": [_named(key, key.names) for key in self.states]}
+            states = [_named(key, key.names) for key in self.states]
+            values["state"] = {"components": _told_apart(states)}
         values["cameras"] = self._cameras()
         if self.bag:
             values["sync"] = self._sync(values["cameras"][0]["name"])
@@ -250,7 +251,7 @@ class _Draft:
     def _target(self) -> float | int:
         """Return the rate for the model: the paper's, or as much more as short episodes need."""
         hz, lengths = self._rate(), self.found.lengths
-        if self.bag or not hz or not lengths:
+        if not hz or not lengths:
             return TARGET_HZ
         length, slowest = statistics.median(lengths), max(1, math.floor(hz / TARGET_HZ + 0.5))
         stride = max(1, min(slowest, int(length // SHOWN)))
@@ -364,6 +365,18 @@ def _named(key: KeyInfo, names: tuple[str, ...] | None) -> dict[str, Any]:
     count = dims(key)
     told = names if names and len(names) == count == len(set(names)) else None
     return {"key": key.key, "dims": count} | ({"names": list(told)} if told else {})
+
+
+def _told_apart(components: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Put the last words of the key before names that two components have: linear_x, angular_x."""
+    several = Counter(name for component in components for name in component.get("names", ()))
+    shared = [one for one in components if any(several[name] > 1 for name in one.get("names", ()))]
+    keys = [re.split(r"\W+", one["key"].strip("/")) for one in shared]
+    words = next((n for n in range(1, 9) if len({tuple(key[-n:]) for key in keys}) == len(keys)), 0)
+    for one, key in zip(shared, keys, strict=True):
+        if words:
+            one["names"] = ["_".join([*key[-words:], name]) for name in one["names"]]
+    return components
 
 
 def _lacks(found: Inspection, fault: str, pictures: Sequence[KeyInfo]) -> SourceError:

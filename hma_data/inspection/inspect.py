@@ -152,6 +152,9 @@ def _alike(robot: Embodiment, inspection: Inspection) -> str:
 def _constant(deviations: NDArray[Any], robot: Embodiment) -> list[str]:
     """Return the names of actions that never change; in a chunk, one name stands for several columns."""
     names = robot.action.names()
+    keys = [part.key for part in robot.action.components for _ in range(part.dims)]
+    if len(keys) == len(names):  # two keys may have values of one name
+        names = [f"{key}'s {name}" if names.count(name) > 1 else name for key, name in zip(keys, names)]
     return list(dict.fromkeys(names[i % len(names)] for i in np.flatnonzero(deviations == 0)))
 
 

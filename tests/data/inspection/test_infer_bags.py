@@ -113,6 +113,18 @@ def test_several_commands_are_a_question_that_names_the_others(tmp_path: Path) -
     first_clip(path, values)
 
 
+def test_values_of_two_keys_have_names_of_their_own(tmp_path: Path) -> None:
+    topics = {"/image": (picture_of(), 20), "/cmd_vel": (twist(), 20)}
+    values = inferred(bag(tmp_path / "run", topics, seconds=4))
+    names = [name for one in values["action"]["components"] for name in one["names"]]
+    assert names == ["linear_x", "linear_y", "linear_z", "angular_x", "angular_y", "angular_z"]
+
+
+def test_a_short_bag_gets_a_rate_at_which_a_model_sees_enough(tmp_path: Path) -> None:
+    topics = {"/image": (picture_of(), 20), "/cmd_vel": (twist(), 20)}
+    assert inferred(bag(tmp_path / "run", topics, seconds=4))["target_hz"] == 6.667
+
+
 def test_a_goal_sent_once_or_twice_is_doubted(tmp_path: Path) -> None:
     topics = {"/image": (picture_of(), 10), "/goal_pose": (pose(), 1), "/arm_data": (floats(4), 20)}
     values = inferred(bag(tmp_path / "run", topics, seconds=2))
