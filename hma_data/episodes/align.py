@@ -26,6 +26,7 @@ Moved = tuple[NDArray[np.int64], Floats]
 Timed = tuple[str, Floats, str, float]  # name, times, method and tolerance in seconds of a stream
 RATE_TOLERANCE = 0.1  # share of the stated rate by which the measured one may differ
 OFF_RATE = "off_rate_frames"  # the flag of an episode whose grid has another rate
+PAUSED, PAUSE = "paused_frames", 3.0  # the flag of frames before a pause; its least length in median steps
 ROUNDING_S = 1e-7  # the error of periods added up over hours; far below any sensor's interval
 
 
@@ -313,9 +314,18 @@ def is_off_rate(hz: float, embodiment: Embodiment) -> bool:
 
 
 def rate_flags(clip: Clip, embodiment: Embodiment) -> dict[str, int]:
-    """Return OFF_RATE -> number of frames where a clip's grid is off the embodiment's rate; else nothing."""
-    hz = measured_hz(np.diff(clip.timestamps))
-    return {OFF_RATE: len(clip)} if hz and is_off_rate(hz, embodiment) else {}
+    """Return the counts of a clip's grid, none of them 0.
+
+    OFF_RATE: its frames where it is off the embodiment's rate. PAUSED: frames whose next one comes PAUSE
+    median steps later or more, so that time jumps there.
+    """
+    steps = np.diff(clip.timestamps)
+    hz = measured_hz(steps)
+    if not hz:
+        return {}
+    flags = {OFF_RATE: len(clip)} if is_off_rate(hz, embodiment) else {}
+    paused = int((steps * hz >= PAUSE).sum())
+    return flags | ({PAUSED: paused} if paused else {})
 
 
 def rate_remedy(embodiment: Embodiment) -> str:

@@ -382,7 +382,7 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
 
 def _shard_set(folder: Path) -> Iterator[Finding]:
     from hma_data.inspection.shard_pictures import shard_picture_findings
-    from hma_data.inspection.shard_rate import rate_finding
+    from hma_data.inspection.shard_rate import pause_finding, rate_finding
     from hma_data.shards.reader import ShardSet
     from hma_data.shards.verify import verify
     from hma_data.shards.windows import WindowIndex
@@ -411,4 +411,6 @@ def _shard_set(folder: Path) -> Iterator[Finding]:
         yield Finding("constant", "warn", f"never change: {', '.join(constant)}")
     if off_rate := rate_finding(shards):
         yield off_rate
+    if paused := pause_finding(shards):
+        yield paused
     yield from shard_picture_findings(ShardSet(folder))

@@ -1,4 +1,4 @@
-"""Find the episodes of a shard set whose grid has another rate than its embodiment states.
+"""Find the episodes of a shard set whose grid has another rate than its embodiment states, or has pauses.
 
 A conversion flags them; see `hma_data.episodes.align.rate_flags`. Sets of older releases have no such flag.
 """
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 
-from hma_data.episodes.align import OFF_RATE, measured_hz, rate_remedy
+from hma_data.episodes.align import OFF_RATE, PAUSE, PAUSED, measured_hz, rate_remedy
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.sources.common.checks import Finding
 
@@ -32,6 +32,20 @@ def rate_finding(shards: ShardSet) -> Finding | None:
     remedy = f"{rate_remedy(robot)}, and convert again with --overwrite"
     numbers = {"episodes": count, "hz": hz, "stated_hz": robot.rate_hz}
     return Finding("rate", "error" if count > total / 2 else "warn", said, remedy, numbers=numbers)
+
+
+def pause_finding(shards: ShardSet) -> Finding | None:
+    """Return a finding on frames after which time jumps; None where no episode is flagged."""
+    episodes = shards.episodes
+    flagged = episodes.filter(pc.match_substring(episodes["flags"], f"{PAUSED}="))
+    if not len(flagged):
+        return None
+    count, which = len(flagged), flagged["id"][0].as_py()
+    said = f"{count:,} of {len(episodes):,} episodes have a pause of {PAUSE:g} steps or more, such as {which}"
+    remedy = (
+        "a window across it sees a jump: hma doctor RECORDING says how long; source.exclude leaves them out"
+    )
+    return Finding("gaps", "warn", said, remedy, numbers={"episodes": count})
 
 
 def _measured(shards: ShardSet, rows: list[dict[str, Any]]) -> Iterator[tuple[str, float]]:

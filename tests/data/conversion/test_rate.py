@@ -50,11 +50,15 @@ def test_only_a_rate_that_is_more_than_a_tenth_off_is_flagged(hz: float, flags: 
     assert len(rate_findings(tmp_path / "out")) == len(flags)
 
 
-def test_a_pause_is_not_another_rate(tmp_path: Path) -> None:
+def test_a_pause_is_told_and_is_not_another_rate(tmp_path: Path) -> None:
     path = timed(tmp_path, [10, 10])
     with h5py.File(path, "a") as file:
+        file["data/demo_1/t"][20:] += 0.1  # one frame that is missing
         file["data/demo_0/t"][15:] += 20
-    assert made(path, tmp_path / "out").flags == {}
+    assert made(path, tmp_path / "out").flags == {"paused_frames": 1}
+    assert rate_findings(tmp_path / "out") == []
+    (finding,) = [one for one in examine(tmp_path / "out") if one.check == "gaps"]
+    assert finding.severity == "warn" and "1 of 2 episodes" in finding.message and "demo_0" in finding.message
 
 
 @pytest.mark.parametrize("frames", ["all", "strided"])
