@@ -9,7 +9,7 @@ files are refused, and so are sizes that no recording has.
 
 import os
 import re
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -36,8 +36,13 @@ MAX_BYTES = 1 << 30  # of a chunk
 MAX_NUMBERS = 1 << 26  # values read whole; they become float64
 MAX_ROW = 1 << 28  # values of a row: more than any picture has
 MAX_DEPTH = 4  # of the groups above the episodes
+LOOKED = 8  # most groups looked into to see whether they and their like are episodes
+MIN_ENCODED = 64  # bytes a row: no picture has fewer
 MAX_KEYS = 5_000  # datasets and groups of an episode that are listed
 _EPISODE_NAME = re.compile(r"(demo|episode|ep|traj|trajectory|rollout)[_-]?\d+")
+_PART = re.compile(  # of a robot or a scene; one episode holds several
+    r"(arm|robot|hand|gripper|finger|joint|agent|object|cam|camera|view|sensor|device|kinect|realsense|zed)s?"
+)
 
 
 class OpenFiles:
@@ -266,34 +271,94 @@ def _guess_pattern(handle: h5py.File) -> str:
     groups = [name for name in handle if isinstance(handle.get(name), h5py.Group)]
     if groups and len(groups) == len(handle) and all(_EPISODE_NAME.fullmatch(name) for name in groups):
         return "*"
-    return _numbered(handle) or WHOLE_FILE
+    found = _numbered(handle)
+    return found[0] if found else WHOLE_FILE
 
 
-def _numbered(group: h5py.Group, prefix: str = "") -> str:
-    """Return the pattern of groups that differ in a number and each hold pictures and commands, or nothing.
+def _numbered(group: h5py.Group, depth: int = 0) -> tuple[str, int] | None:
+    """Return the pattern of the groups that are episodes, and the rows of the shortest looked into; or None.
 
-    Cameras and arms may be numbered groups too, but do not hold both.
+    They differ in a number, and most hold pictures and commands. Numbered cameras and arms are none: they do
+    not hold both, or are named as such, or what is as long lies beside them.
     """
-    inner = {name: group[name] for name in group if group.get(name, getlink=True).__class__ is h5py.HardLink}
-    if not inner or not all(isinstance(item, h5py.Group) for item in inner.values()):
-        return ""
-    if len(inner) == 1:
-        name, item = next(iter(inner.items()))
-        return _numbered(item, f"{prefix}{name}/") if prefix.count("/") < MAX_DEPTH else ""
-    if len({re.sub(r"\d+", "#", name) for name in inner}) > 1:
-        return ""
-    ends = sorted(inner, key=_natural)
-    return f"{prefix}*" if all(_is_episode(inner[name]) for name in (ends[0], ends[-1])) else ""
+    inner = {name: group[name] for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)}
+    groups = {name: item for name, item in inner.items() if isinstance(item, h5py.Group)}
+    if not groups or depth > MAX_DEPTH:
+        return None
+    stem, count = Counter(map(_stem, groups)).most_common(1)[0]
+    if "#" not in stem or count < 2:
+        holders = {
+            name: found for name in list(groups)[:LOOKED] if (found := _numbered(groups[name], depth + 1))
+        }
+        return _below(inner, groups, holders)
+    family = sorted((name for name in groups if _stem(name) == stem), key=_natural)
+    pattern = "*" if count == len(groups) else re.sub(r"\d+", "[0-9]*", family[0])
+    matched = {name for name in groups if fnmatchcase(name, pattern)}
+    if _is_part(stem, group) or matched != set(family):
+        return None
+    looked = dict.fromkeys(family[i * (count - 1) // (LOOKED - 1)] for i in range(LOOKED))
+    if found := _numbered(groups[family[0]], depth + 1):  # day_1/t000
+        return (f"{pattern}/{found[0]}", found[1]) if _are_short(inner, matched, found[1]) else None
+    rows = [length for name in looked if (length := _rows_of_episode(groups[name]))]
+    if len(rows) < 2 or 2 * len(rows) <= len(looked) or not _are_short(inner, matched, min(rows)):
+        return None
+    return pattern, min(rows)
 
 
-def _is_episode(group: h5py.Group) -> bool:
-    """Check whether some dataset may be pictures, and one of as many rows, or one more or less, numbers."""
-    shapes = [(item.shape, item.dtype) for _, item in walk(group) if item.shape]
-    pictures = [
-        shape[0] for shape, dtype in shapes if (dtype == np.uint8 and len(shape) >= 3) or dtype.hasobject
-    ]
-    rows = [shape[0] for shape, dtype in shapes if dtype.kind == "f" and len(shape) == 2]
-    return any(abs(count - other) <= 1 for count in pictures for other in rows)
+def _below(
+    inner: dict[str, h5py.Group | h5py.Dataset],
+    groups: dict[str, h5py.Group],
+    holders: dict[str, tuple[str, int]],
+) -> tuple[str, int] | None:
+    """Return the pattern by way of the one group that holds episodes, or of all where they do alike."""
+    if len({pattern for pattern, _ in holders.values()}) != 1:
+        return None
+    if 1 < len(holders) < min(len(groups), LOOKED):
+        return None
+    name, (pattern, _) = next(iter(holders.items()))
+    least = min(rows for _, rows in holders.values())
+    apart, prefix = ({name}, name) if len(holders) == 1 else (set(groups), "*")
+    return (f"{prefix}/{pattern}", least) if _are_short(inner, apart, least) else None
+
+
+def _stem(name: str) -> str:
+    return re.sub(r"\d+", "#", name)
+
+
+def _is_part(stem: str, group: h5py.Group) -> bool:
+    """Check whether numbered groups are named as parts: `wrist_cam_0`, or `robots/0`."""
+    words = re.findall(r"[a-z]+", stem.lower()) or re.findall(r"[a-z]+", str(group.name).lower())
+    return bool(words and _PART.fullmatch(words[-1]))
+
+
+def _are_short(inner: dict[str, h5py.Group | h5py.Dataset], apart: set[str], rows: int) -> bool:
+    """Check that all but the members `apart` has fewer rows than an episode, so is nothing over its time."""
+    for name in inner.keys() - apart:
+        item = inner[name]
+        below = (found for _, found in walk(item)) if isinstance(item, h5py.Group) else [item]
+        if any(one.shape and one.shape[0] >= rows and one.dtype.kind not in "OSU" for one in below):
+            return False
+    return True
+
+
+def _is_coded(dtype: np.dtype[Any]) -> bool:
+    """Check whether a value may be an encoded picture, so is bytes and no text."""
+    string = h5py.check_string_dtype(dtype)
+    return dtype.kind in "OSV" and not (string and string.encoding == "utf-8")
+
+
+def _rows_of_episode(group: h5py.Group) -> int:
+    """Return the rows of what may be pictures, with numbers of as many rows, or one more or less; else 0."""
+    pictures, values = [], []
+    for _, item in walk(group):
+        shape: tuple[int, ...] = item.shape or ()
+        dtype = item.dtype
+        padded = len(shape) == 2 and shape[1] > MIN_ENCODED
+        if (dtype == np.uint8 and (len(shape) >= 3 or padded)) or (len(shape) == 1 and _is_coded(dtype)):
+            pictures.append(shape[0])
+        elif dtype.kind == "f" and len(shape) == 2:
+            values.append(shape[0])
+    return max((count for count in pictures for other in values if abs(count - other) <= 1), default=0)
 
 
 def _matching(group: h5py.Group, parts: list[str]) -> list[str]:

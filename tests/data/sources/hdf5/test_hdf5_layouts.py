@@ -382,6 +382,47 @@ def test_numbered_groups_of_one_episode_are_none(tmp_path: Path, keys: list[str]
     assert open_source("hdf5").episode_ids(tmp_path / "a.h5") == ["a"]
 
 
+@pytest.mark.parametrize("stem", ["arm_{}", "robots/{}", "wrist_cam{}", "side_{}"])
+def test_numbered_parts_with_pictures_and_numbers_are_one_episode(tmp_path: Path, stem: str) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for number in range(3):
+            fill(file.create_group(stem.format(number)))
+        if stem == "side_{}":
+            file["time"] = np.arange(T) / 20  # one for all sides
+    assert open_source("hdf5").episode_ids(tmp_path / "a.h5") == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("names", "ids"),
+    [
+        (["trials/t0", "trials/t1", "trials/t2"], ["t0", "t1", "t2"]),
+        (["t0", "t1", "t2"], ["t0", "t1", "t2"]),
+        (["day_1/t0", "day_1/t1", "day_2/t0", "day_2/t1"], ["day_1/t0", "day_1/t1", "day_2/t0", "day_2/t1"]),
+        (["pick/t0", "pick/t1", "place/t0", "place/t1"], ["pick/t0", "pick/t1", "place/t0", "place/t1"]),
+    ],
+    ids=["below", "at the top", "days", "tasks"],
+)
+def test_what_is_short_beside_numbered_episodes_is_none(
+    tmp_path: Path, names: list[str], ids: list[str]
+) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in names:
+            fill(file.create_group(name))
+        if not names[0].startswith("pick"):
+            file["meta/camera"], file["meta/robot"] = np.eye(3), "ur5"
+        file["version"] = 2
+    assert open_source("hdf5").episode_ids(tmp_path / "a.h5") == ids
+
+
+def test_an_episode_that_was_broken_off_is_one_of_the_others(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for number in range(3):
+            fill(file.create_group(f"trials/t{number}"))
+        file.create_group("trials/t3")
+    found = open_source("hdf5").inspect(tmp_path / "a.h5")
+    assert found.episodes == 4 and "t3: has no frames" in found.problems[0]
+
+
 def test_a_recording_is_inspected_by_the_layout_of_its_robot(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name in ("pick", "place", "push"):
