@@ -191,4 +191,4 @@ def _decoded(made: ShardSet, own: Embodiment, tokenizer: "Tokenizer") -> Iterato
             for camera, view in zip(own.cameras, views, strict=True)
         }
         actions = columns["action"].reshape(-1, own.action_dim)
-        yield LeRobotEpisode(pictures, actions, None, f"{ORIGIN}: {row['id']}")
+        yield LeRobotEpisode(pictures, actions, None, ORIGIN)  # one task: it is what a policy is told
