@@ -298,3 +298,20 @@ def test_not_a_shard_set(tmp_path: Path) -> None:
     done = hma("shards", "verify", str(tmp_path))
     assert done.returncode == 1
     fails(hma("mixture", str(tmp_path / "none")), 1, "not a folder")
+
+
+def test_a_target_above_the_recorded_rate_is_noted(tmp_path: Path) -> None:
+    path = tmp_path / "arm.yaml"
+    text = hma("registry", "show", "pusht_fast").stdout.split("# derived")[0]
+    assert "target_hz: 2.5" in text
+    path.write_text(text.replace("target_hz: 2.5", "target_hz: 40"))
+    done = hma("registry", "validate", str(path))
+    assert done.returncode == 0 and "note: target_hz 40 is above the recorded rate" in done.stdout
+
+
+def test_a_warning_is_one_line_without_its_place_in_the_code() -> None:
+    code = (
+        "import warnings; from hma_model.cli import main; main(['--version']); warnings.warn('two\\nlines')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stderr == "warning: two lines\n"

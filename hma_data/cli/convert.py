@@ -390,6 +390,7 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
                 "left_out": summary.left_out,
                 "changed": summary.changed,
                 "warning": summary.warning,
+                "notes": list(summary.notes),
                 "reasons": summary.reasons,
                 "too_many_quarantined": summary.too_many,
             }
@@ -404,6 +405,8 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
             counts = [f"{count:,} {flag_words(name)}" for name, count in summary.flags.items()]
             print(f"flags: {', '.join(counts)}")
         _print_changes(summary)
+        for note in summary.notes:
+            typer.echo(f"warning: {note}", err=True)
     for reason, count in sorted(summary.reasons.items(), key=lambda item: -item[1])[:SHOWN]:
         typer.echo(f"quarantine: {count:,} × {reason}", err=True)
     if summary.too_many:

@@ -2,14 +2,18 @@
 
 import shlex
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer import Argument, Option
 
 from hma_data.console import human_count, print_json, print_table
 from hma_data.registry import FORMATS
+
+if TYPE_CHECKING:
+    from hma_data.registry.catalog import Entry
 
 registry_app = typer.Typer(no_args_is_help=True, help="Look at embodiments, check and write their YAML.")
 Json = Annotated[bool, Option("--json", help="Print JSON.")]
@@ -131,8 +135,20 @@ def registry_validate(
     else:
         for entry, problem in found:
             print(f"{entry.path}: {_line(problem)}")
+        for path, target, rate in _beyond(judged):
+            said = f"target_hz {target:g} is above the recorded rate: the model sees {rate:g} frames a second"
+            print(f"{path}: note: {said}")
         print(f"{human_count(len(judged), 'file')}, {human_count(len(found), 'problem')}")
     raise typer.Exit(1 if found else 0)
+
+
+def _beyond(judged: "list[Entry]") -> Iterator[tuple[Path, float, float]]:
+    """Yield path, target_hz and rate of the YAMLs that want more frames a second than were recorded."""
+    for entry in judged:
+        facts = entry.facts or {}
+        target, rate = facts.get("target_hz"), facts.get("rate_hz")
+        if target and rate and target > rate and target != 2:  # 2 is the default, which nobody chose
+            yield entry.path, target, rate
 
 
 def _line(problem: dict[str, str | None]) -> str:

@@ -38,7 +38,7 @@ from hma_data.conversion.publish import HubOutput
 from hma_data.conversion.worker import Job, MakeWork, Seen, Tick
 from hma_data.episodes.align import OFF_RATE
 from hma_data.errors import OutputError, RegistryError, SourceError, StorageAwayError, UsageError
-from hma_data.inspection.shard_rate import rate_finding
+from hma_data.inspection.shard_rate import pause_finding, rate_finding, window_finding
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, finish, shard_sizes
 from hma_data.shards.reader import ShardSet
@@ -86,6 +86,7 @@ class Summary:
         too_many: True where more than `max_quarantine` was refused; the command ends with exit code 1.
         changed: what the YAML says now that a finished set did not say yet; empty if nothing.
         warning: the fault of a rate that the recordings do not have; empty if there is none.
+        notes: what else to mend before training, as `hma doctor` says it: no window, pauses.
     """
 
     out: Path
@@ -100,6 +101,7 @@ class Summary:
     left_out: int = 0
     changed: str = ""
     warning: str = ""
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -224,12 +226,14 @@ def convert(
             told = "; ".join(f"{count} × {reason}" for reason, count in worst)
             raise SourceError(conversion.uri, f"gave no usable episode, so nothing was written: {told}")
         warning = _rate_warning(folder, out) if OFF_RATE in flags else ""
+        made_set = ShardSet(folder)
+        notes = tuple(f"{out}: {one}" for one in (window_finding(made_set), pause_finding(made_set)) if one)
         if hub:
             hub.upload()
     episodes = sum(split["episodes"] for split in manifest.splits.values())
     too_many = manifest.quarantined > max_quarantine * (episodes + manifest.quarantined)
     seconds = time.monotonic() - begun
-    more = conversion.pictures, conversion.left_out, conversion.changed, warning
+    more = conversion.pictures, conversion.left_out, conversion.changed, warning, notes
     return Summary(out, manifest, done, made, seconds, reasons, flags, too_many, *more)
 
 

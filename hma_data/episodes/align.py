@@ -328,6 +328,14 @@ def rate_flags(clip: Clip, embodiment: Embodiment) -> dict[str, int]:
     return flags | ({PAUSED: paused} if paused else {})
 
 
+def pause_remedy(embodiment: Embodiment, hz: float | None) -> str:
+    """Return what to do about pauses in a grid of `hz`, if known: a bag may be divided there by the YAML."""
+    if embodiment.source.format != "rosbag":
+        return "split the episodes at the pauses, or leave them out with source.exclude"
+    gap = f"{(PAUSE - 0.5) / hz:.2g}" if hz else "SECONDS"
+    return f"divide the recordings there with source.segments: {{gap_s: {gap}}}"
+
+
 def rate_remedy(embodiment: Embodiment) -> str:
     """Return what to correct in the YAML where `is_off_rate`."""
     return "correct frequency_hz" + ("" if embodiment.source.format in ONE_INDEX else ", or sync.rate_hz")

@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.align import hold, is_off_rate, matched, measured_hz, rate_remedy, to_clip
+from hma_data.episodes.align import (
+    hold,
+    is_off_rate,
+    matched,
+    measured_hz,
+    pause_remedy,
+    rate_remedy,
+    to_clip,
+)
 from hma_data.episodes.episode import Clip, Floats
 from hma_data.episodes.images import describe_resize
 from hma_data.episodes.offset import Offset, measure
@@ -32,7 +40,6 @@ from hma_data.storage.remote import is_remote, place
 NOT_LOOKED = "not looked at"  # the result of a check that the recording does not allow
 TRIED = 20  # episodes tried until one can be read
 SQUARE = 256  # pixels: the side of most tokenizers' pictures
-WINDOW = 12  # frames of the model's window, by default
 LOOKS = ("blank", "still", "colour", "size")  # checks of pictures; they count only for cameras that are used
 ASTRAY = 0.05  # least share of pictures with the command of another picture that is reported
 EMPTY = Finding("readable", "error", "the recording has no episodes")
@@ -329,18 +336,15 @@ def _episodes(
 
 
 def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
+    from hma_data.shards.windows import WINDOW
+
     steps = np.concatenate([np.diff(clip.timestamps) for clip in clips])
     hz = measured_hz(steps)
     if hz and is_off_rate(hz, robot):
         said = f"the grid ticks at {hz:.3g} Hz, the YAML says {robot.rate_hz:g}"
         yield Finding("rate", "error", said, rate_remedy(robot))
     if hz and (steps > 3 / hz).any():
-        yield Finding(
-            "gaps",
-            "warn",
-            f"frames pause for up to {steps.max():.3g} s",
-            "split or trim the episodes at the pauses",
-        )
+        yield Finding("gaps", "warn", f"frames pause for up to {steps.max():.3g} s", pause_remedy(robot, hz))
     needed = WINDOW * robot.stride  # the chunk of the last frame too
     lengths = sorted(len(clip) for clip in clips)
     short = sum(length < needed for length in lengths)
@@ -382,10 +386,9 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
 
 def _shard_set(folder: Path) -> Iterator[Finding]:
     from hma_data.inspection.shard_pictures import shard_picture_findings
-    from hma_data.inspection.shard_rate import pause_finding, rate_finding
+    from hma_data.inspection.shard_rate import pause_finding, rate_finding, window_finding
     from hma_data.shards.reader import ShardSet
     from hma_data.shards.verify import verify
-    from hma_data.shards.windows import WindowIndex
 
     wrong = verify(folder)
     for problem in wrong:
@@ -400,10 +403,8 @@ def _shard_set(folder: Path) -> Iterator[Finding]:
         yield Finding("quarantine", "warn", said)
     if not manifest.splits["train"]["episodes"]:
         yield Finding("split", "error", "no episode is in the train split")
-    elif not WindowIndex.of(shards, "train", WINDOW).count:
-        rows, longest = WINDOW * shards.row_stride, int(shards.index("train").length.max())
-        said = f"no window to train on: {WINDOW} frames need {rows} rows, the longest episode has {longest}"
-        yield Finding("windows", "error", said, "convert with a higher target_hz, or longer episodes")
+    elif short := window_finding(shards):
+        yield short
     if not manifest.splits["val"]["episodes"]:
         yield Finding("split", "warn", "no episode is in the val split", "convert more than one episode")
     deviations = np.asarray(manifest.stats["action"]["std"], np.float64)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 
-from hma_data.episodes.align import OFF_RATE, PAUSE, PAUSED, measured_hz, rate_remedy
+from hma_data.episodes.align import OFF_RATE, PAUSE, PAUSED, measured_hz, pause_remedy, rate_remedy
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.sources.common.checks import Finding
 
@@ -42,10 +42,21 @@ def pause_finding(shards: ShardSet) -> Finding | None:
         return None
     count, which = len(flagged), flagged["id"][0].as_py()
     said = f"{count:,} of {len(episodes):,} episodes have a pause of {PAUSE:g} steps or more, such as {which}"
-    remedy = (
-        "a window across it sees a jump: hma doctor RECORDING says how long; source.exclude leaves them out"
-    )
+    said += "; a window across it sees a jump"
+    hz = next((hz for _, hz in _measured(shards, flagged[:TRIED].to_pylist())), None)
+    remedy = f"{pause_remedy(shards.embodiment, hz)}, and convert again with --overwrite"
     return Finding("gaps", "warn", said, remedy, numbers={"episodes": count})
+
+
+def window_finding(shards: ShardSet) -> Finding | None:
+    """Return a finding where no training episode is as long as a window; None otherwise."""
+    from hma_data.shards.windows import WINDOW, WindowIndex
+
+    if not shards.manifest.splits["train"]["episodes"] or WindowIndex.of(shards, "train", WINDOW).count:
+        return None
+    rows, longest = WINDOW * shards.row_stride, int(shards.index("train").length.max())
+    said = f"no window to train on: {WINDOW} frames need {rows} rows, the longest episode has {longest}"
+    return Finding("windows", "error", said, "convert with a higher target_hz, or longer episodes")
 
 
 def _measured(shards: ShardSet, rows: list[dict[str, Any]]) -> Iterator[tuple[str, float]]:

@@ -29,7 +29,7 @@ from hma_data.episodes.sheets import (
 from hma_data.errors import ShardError, TokenizerError
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_totals, token_column
-from hma_data.shards.windows import WindowIndex
+from hma_data.shards.windows import WINDOW, WindowIndex
 from hma_data.sources.common.choice import chosen_ids
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
@@ -41,7 +41,6 @@ MOST = 16  # strips; of further values only the number is shown
 LABELS, NAMES, FOOT = 240, 120, 16  # pixels left of the strips, of the names in them, and below the strips
 BESIDE = 232  # pixels by which the curves of the video are wider than its picture
 SMALL = 0.36  # scale of the text beside the strips
-WINDOW = 12  # frames of the model's window
 
 
 # -- in figures

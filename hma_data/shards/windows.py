@@ -22,6 +22,8 @@ from hma_data.shards.reader import EpisodeIndex, ShardSet
 Ints = NDArray[np.int64]
 Short = Literal["drop", "pad"]
 
+WINDOW = 12  # frames of the model's window, by default
+
 
 @dataclass(frozen=True)
 class WindowIndex:

@@ -32,14 +32,13 @@ from hma_data.lab import family
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import cache_folder, read_json, to_json, write_atomic
+from hma_model.evaluation.intervals import T95
 
 BANDS = Path(__file__).with_suffix(".json")
 EPISODES, SEED, VAL_FRACTION = 60, 0, 0.1  # of the recording
 FRAMES, PROMPT, WINDOWS, DRAWS = 8, 2, 24, 3  # of the rollouts
 FIGURES = {"loss": -1, "psnr_db": 1, "gain_db": 1, "error_px": -1}  # name -> the sign of what is better
 PLAIN = ["eval_every=0", "checkpoint_every=0", "pictures=0", "report=false", "device=cpu", "frames=8"]
-# Student's t, 1 to 9 degrees of freedom
-T95 = (12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ Every verb imports its modules when it runs, so that --help answers at once.
 import os
 import re
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -87,6 +88,13 @@ def _show_brackets(command: Any) -> None:
         _show_brackets(inner)
 
 
+def _one_line(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """Return a warning as users read it: without the place in the code that gave it."""
+    return f"warning: {' '.join(str(message).split())}\n"
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command, and report an error as one line on stderr.
 
@@ -100,6 +108,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     bound_spinning()
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words or bool(os.environ.get("HMA_DEBUG"))
+    if not debug:
+        warnings.formatwarning = _one_line
     try:
         command = typer.main.get_command(app)
         _show_brackets(command)

@@ -2,12 +2,15 @@
 
 A mean over windows is resampled 1,000 times (Efron 1979); the interval holds the middle 95 % of the means.
 Windows of one episode overlap and resemble each other, so whole episodes are drawn where they are known
-(Davison and Hinkley 1997, 3.8). With fewer than about ten episodes the intervals are still too narrow; of a
-single one there is none.
+(Davison and Hinkley 1997, 3.8). The means of few episodes spread less than they should: their distances from
+the mean are stretched by Student's t over the normal distribution's quantile and by √(n / (n − 1)), as in
+Hesterberg's expanded percentile interval (2015, 4.3): 9 times for n = 2, 1.2 for 10, 1.02 for 100. Of a
+single one there is no interval.
 
-N windows, R resamples.
+N windows, R resamples, n windows or episodes to draw from.
 """
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -18,10 +21,12 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Episodes = Sequence[int] | NDArray[Any] | None  # (N,) which windows belong together; None: none do
 RESAMPLES, LEVELS = 1000, (2.5, 97.5)
+Z95 = 1.959964  # the 97.5 % quantile of the normal distribution, and of Student's t from 1 degree of freedom
+T95 = (12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
 def resampled_means(values: NDArray[Any], seed: int = 0, episodes: Episodes = None) -> Floats:
-    """Return means (R, …) of resamples of values (N, …); NaN where there is but one to draw from."""
+    """Return stretched means (R, …) of resamples of values (N, …); NaN where there is one to draw from."""
     flat = values.reshape(len(values), -1).astype(np.float64)
     if episodes is None:
         count, shares = len(values), _shares(len(values), seed)
@@ -31,7 +36,24 @@ def resampled_means(values: NDArray[Any], seed: int = 0, episodes: Episodes = No
         shares = _shares(count, seed)[:, own]
         shares /= shares.sum(axis=1, keepdims=True)
     means: Floats = (shares @ flat).reshape(RESAMPLES, *values.shape[1:])
-    return means if count > 1 else np.full_like(means, np.nan)
+    if count < 2:
+        return np.full_like(means, np.nan)
+    mean = values.mean(axis=0, dtype=np.float64)
+    return mean + _stretch(count) * (means - mean)
+
+
+@lru_cache(maxsize=64)
+def _stretch(count: int) -> float:
+    """Return by how much the spread of resampled means is too small for that many to draw from."""
+    return students_t(count - 1) / Z95 * math.sqrt(count / (count - 1))
+
+
+def students_t(freedom: int) -> float:
+    """Return the 97.5 % quantile of Student's t: tabled up to 9 degrees of freedom, then within 0.003."""
+    if freedom <= len(T95):
+        return T95[freedom - 1]
+    first, second = (Z95**3 + Z95) / 4, (5 * Z95**5 + 16 * Z95**3 + 3 * Z95) / 96  # Fisher and Cornish 1960
+    return Z95 + first / freedom + second / freedom**2
 
 
 @lru_cache(maxsize=8)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, UsageError
 from hma_data.storage.paths import StrPath
-from hma_model.generation.commands import Floats
+from hma_model.generation.commands import Floats, OutsideRangeWarning
 from hma_model.simulate.prompts import Prompt, read_prompt
 from hma_model.simulate.world import Picture, World, load_world
 
@@ -117,7 +117,8 @@ class Episodes:
             return self.commands.clip(values)
         if outside and not self.warned:
             self.warned = True
-            warnings.warn(f"{outside}; clip=True clips actions to it. This is said once", stacklevel=4)
+            said = f"{outside}, so what the model shows is a guess; clip=True clips actions to it"
+            warnings.warn(f"{said}. This is said once", OutsideRangeWarning, stacklevel=4)
         return values
 
     def seen(self, picture: Picture) -> Picture:

@@ -32,7 +32,8 @@ from hma_data.console import run_script
 from hma_data.lab.family import TRUNK
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
-from hma_model.bench.quality import FRAMES, PLAIN, PROMPT, T95, recorded
+from hma_model.bench.quality import FRAMES, PLAIN, PROMPT, recorded
+from hma_model.evaluation.intervals import T95
 
 WINDOWS, DRAWS, STATES = 16, 2, 16
 NEW = "arm3_55"  # a robot that the embedded trunk has not seen

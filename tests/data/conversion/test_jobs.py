@@ -107,7 +107,7 @@ def test_workers_without_a_shard_are_told_before_the_work_and_by_a_dry_run(
     assert "with --workers 3 in each of 4 tasks" in planned.stdout
     assert empty in hma(*shared).stderr.splitlines()
     assert line in hma(*words).stderr.splitlines()
-    assert "workers" not in hma(*words).stderr  # all shards are there
+    assert "workers have work" not in hma(*words).stderr  # all shards are there
     (tmp_path / "out/val/shard-00000.parquet").unlink()
     assert "1 shard left: 1 of 3 workers has work" in hma(*words).stderr.splitlines()
 

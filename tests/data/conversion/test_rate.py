@@ -10,9 +10,9 @@ import pytest
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
-from hma_data.episodes.align import rate_flags, to_clip
+from hma_data.episodes.align import pause_remedy, rate_flags, to_clip
 from hma_data.inspection.inspect import examine
-from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from tests.command import hma
@@ -55,10 +55,26 @@ def test_a_pause_is_told_and_is_not_another_rate(tmp_path: Path) -> None:
     with h5py.File(path, "a") as file:
         file["data/demo_1/t"][20:] += 0.1  # one frame that is missing
         file["data/demo_0/t"][15:] += 20
-    assert made(path, tmp_path / "out").flags == {"paused_frames": 1}
+    summary = made(path, tmp_path / "out")
+    assert summary.flags == {"paused_frames": 1}
+    assert any("have a pause of 3 steps" in note and "source.exclude" in note for note in summary.notes)
     assert rate_findings(tmp_path / "out") == []
     (finding,) = [one for one in examine(tmp_path / "out") if one.check == "gaps"]
     assert finding.severity == "warn" and "1 of 2 episodes" in finding.message and "demo_0" in finding.message
+
+
+def test_a_bag_with_pauses_is_told_how_to_be_divided() -> None:
+    told = "divide the recordings there with source.segments: {gap_s: 0.083}"
+    assert pause_remedy(find("mover_52"), 30) == told
+    for other in ("pusht_fast", "rh20t_cfg1"):
+        assert "source.exclude" in pause_remedy(find(other), 30)
+
+
+def test_a_set_without_a_window_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "toy.hdf5"
+    write_toy(path, [8] * 2)
+    (note,) = made(path, tmp_path / "out", yaml=ARM_YAML).notes
+    assert "no window to train on: 12 frames need" in note and "target_hz" in note
 
 
 @pytest.mark.parametrize("frames", ["all", "strided"])

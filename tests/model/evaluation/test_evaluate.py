@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.stats
 import torch
 
 from hma_data.errors import CheckpointError, UsageError
@@ -29,7 +30,7 @@ from hma_model.evaluation.evaluate import (
     verdict,
     windows,
 )
-from hma_model.evaluation.intervals import interval, over_datasets
+from hma_model.evaluation.intervals import interval, over_datasets, students_t
 from hma_model.evaluation.metrics import masked_scores, teacher_forced, token_hits, token_nats
 from hma_model.network.model import HMA
 from tests.model.robots import CONFIG, SPEC, make_model
@@ -344,7 +345,8 @@ def test_episodes_are_resampled_whole():
     assert np.allclose(whole, interval(level[::10]), atol=0.01)
     uneven = np.concatenate([np.zeros(30), np.ones(10)])  # a mean of windows, not of episodes
     ends = interval(uneven, 0, np.repeat([0, 1], [30, 10]))
-    assert tuple(ends) == (0, 1)
+    stretch = students_t(1) / 1.959964 * math.sqrt(2)  # 0 and 1 are the ends of the resamples of two
+    assert tuple(ends) == pytest.approx((0.25 - 0.25 * stretch, 0.25 + 0.75 * stretch))
     mean, ends = over_datasets([values, values], episodes=[episodes, np.zeros(200)])
     assert mean == pytest.approx(values.mean()) and ends is None
 
@@ -373,6 +375,20 @@ def test_intervals_are_the_middle_of_resampled_means(tmp_path, model):
         (values.mean() - 1.96 * error, values.mean() + 1.96 * error), abs=0.06
     )
     assert np.allclose(interval(values[:, None].repeat(2, axis=1))[:, 0], interval(values))
+
+
+def test_intervals_of_few_episodes_hold_the_mean_as_often_as_they_say():
+    assert [students_t(n) for n in (1, 5, 9, 10, 30)] == pytest.approx(
+        [scipy.stats.t.ppf(0.975, n) for n in (1, 5, 9, 10, 30)], rel=2e-3
+    )
+    rng = np.random.default_rng(3)
+    for episodes in (2, 3, 6):
+        held = 0
+        for _ in range(300):
+            values = np.repeat(rng.normal(0, 1, episodes), 4)  # windows of one episode are alike
+            low, high = interval(values, 0, np.repeat(np.arange(episodes), 4))
+            held += low <= 0 <= high
+        assert held / 300 > 0.9
 
 
 def test_over_datasets_each_set_counts_once():

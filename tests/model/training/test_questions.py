@@ -1,9 +1,11 @@
 """The script of the paper's questions: its rows, its intervals, and the baseline it compares with."""
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from scipy import stats
@@ -12,6 +14,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.bench.quality import PLAIN
+from hma_model.evaluation.rollouts import rollout
 from hma_model.training.recipe import load_recipe
 from tests.model.shards import make_shards
 
@@ -60,6 +63,17 @@ def test_the_baseline_learns_and_keeps_the_prompt_out_of_its_frames(tmp_path: Pa
         given[0][:, :1], given[1], frames=3, generator=torch.Generator().manual_seed(0), steps=4
     )
     assert made.shape == given[0][:, 1:].shape and bool(made.isfinite().all())
+    assert rollout(model, Blank(spec), batch, prompt=1).finite.all()  # type: ignore[arg-type]
+
+
+@dataclass
+class Blank:
+    """A tokenizer whose pictures are black."""
+
+    spec: TokenizerSpec
+
+    def decode(self, latents: np.ndarray) -> np.ndarray:
+        return np.zeros((len(latents), 16, 16, 3), np.uint8)
 
 
 @pytest.mark.slow
