@@ -187,6 +187,8 @@ class HMAConfig:
     # discrete: how a token's digits are predicted. "together": independently of one another (paper).
     # "chain": one after the other, the low one first, each given those before it.
     digit_order: str = "together"
+    # discrete: how likely each digit stays as in the frame before is predicted, beside its value.
+    copy_previous: bool = False
 
     diffusion_target: str = "velocity"  # what the head predicts: defined at full noise too; "noise" (paper)
     diffusion_depth: int = 3

@@ -18,6 +18,7 @@ from torch.nn.functional import cross_entropy
 
 from hma_data.errors import UsageError
 from hma_model.network.conditioning import Groups, align, condition
+from hma_model.network.copying import known_digits
 from hma_model.network.objectives import Layout
 from hma_model.network.stem import to_digits
 
@@ -192,7 +193,8 @@ def _at_once(model: "HMA", batch: "Batch") -> Tensor:
     x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)), layout.previous)
     features = model.trunk(x, condition(model, given, groups, layout.times.positions), layout.times)
     true = to_digits(groups.sort(frames[:, 1:]), config.digits)
-    scores = model.token_readout(model.video_features(features)[:, count:], true)
+    before = known_digits(groups.sort(frames[:, :-1]), config)
+    scores = model.token_readout(model.video_features(features)[:, count:], true, before)
     return groups.unsort(model.token_readout.split(scores)).unflatten(2, config.token_grid)
 
 

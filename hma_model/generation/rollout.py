@@ -37,6 +37,7 @@ from hma_model.generation.unmask import (
     masked_after,
 )
 from hma_model.network.conditioning import Groups
+from hma_model.network.copying import known_digits
 from hma_model.network.model import HMA
 from hma_model.network.stem import split_tokens, unpatchify
 
@@ -372,7 +373,9 @@ class Rollout:
         values = self.state.blank(len(rows))
         generators = self.state.drawing(rows[: len(rows) // (1 + self.twins)])
         if self.config.kind == "discrete":
-            return TokenFrame(values, self.config.mask_id, self.decoding, generators, 1 + self.twins)
+            before = known_digits(self.state.newest(rows), self.config) if self.config.copy_previous else None
+            mask, copies = self.config.mask_id, 1 + self.twins
+            return TokenFrame(values, mask, self.decoding, generators, copies, before=before)
         return PatchFrame(values, self.decoding, generators)
 
     def _show(self, values: Tensor) -> Tensor:

@@ -68,6 +68,7 @@ class TokenFrame:
 
     Attributes:
         values: (B, S) int64 ids of the trunk's tokens; `mask_id` means masked.
+        before: (B, S, F) int64 digits of the frame before; None for models that do not copy it.
         nats: (B,) entropy of the predictions of the tokens decided so far, if it is measured.
     """
 
@@ -80,11 +81,12 @@ class TokenFrame:
         copies: int = 1,
         rank: Tensor | None = None,
         noise: Tensor | None = None,
+        before: Tensor | None = None,
     ) -> None:
         self.values, self.mask_id, self.decoding = values, mask_id, decoding
         self.generators, self.copies = generators, copies
         self.rank = _ranks(values, generators, copies) if rank is None else rank
-        self.noise = noise
+        self.noise, self.before = noise, before
         self.nats = torch.zeros(len(values), device=values.device)
 
     def laid_out(
@@ -95,7 +97,8 @@ class TokenFrame:
         asked = count if self.decoding.order == "random" else values.shape[1]
         noise = self._noise(readout, asked)
         noise = None if noise is None else lay_out(noise.repeat(self.copies, 1, 1, 1))
-        return TokenFrame(values, self.mask_id, self.decoding, (), self.copies, rank, noise)
+        before = None if self.before is None else lay_out(self.before)
+        return TokenFrame(values, self.mask_id, self.decoding, (), self.copies, rank, noise, before)
 
     @property
     def masked(self) -> Tensor:
@@ -111,9 +114,10 @@ class TokenFrame:
         masked = self.masked
         if self.decoding.order == "random":
             chosen = _top(self.rank, masked, count)
-            tokens, _, entropy = self._sample(readout, _gather(features, chosen))
+            before = None if self.before is None else _gather(self.before, chosen)
+            tokens, _, entropy = self._sample(readout, _gather(features, chosen), before)
         else:
-            everything, confidence, entropy = self._sample(readout, features)
+            everything, confidence, entropy = self._sample(readout, features, self.before)
             chosen = _top(confidence, masked, count)
             tokens = everything.gather(1, chosen)
             entropy = entropy.gather(1, chosen) if self.decoding.measure else entropy
@@ -121,7 +125,9 @@ class TokenFrame:
             self.nats = self.nats + entropy.sum(1)
         return self.values.scatter(1, chosen, tokens)
 
-    def _sample(self, readout: TokenReadout, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _sample(
+        self, readout: TokenReadout, features: Tensor, before: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return token ids (B, k); if asked for, their log probabilities and the entropies, both (B, k)."""
         way, sure, unsure = self.decoding, [], []
         noise = self._noise(readout, features.shape[1]) if self.noise is None else self.noise
@@ -141,7 +147,7 @@ class TokenFrame:
                 sure.append(scores.log_softmax(-1).gather(-1, taken.unsqueeze(-1)).squeeze(-1).sum(1))
             return taken if self.copies == 1 else taken.repeat(self.copies, 1, 1)
 
-        tokens = readout.ids(readout.decide(features, choose).transpose(1, 2))
+        tokens = readout.ids(readout.decide(features, choose, before).transpose(1, 2))
         confidence, entropy = (sum(some, torch.zeros(())) for some in (sure, unsure))
         return tokens, confidence.repeat(self.copies, 1), entropy.repeat(self.copies, 1)
 

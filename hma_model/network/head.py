@@ -8,6 +8,7 @@ M rows, C values of a sample, W width of the diffusion head.
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import accumulate
 from operator import mul
 
@@ -16,6 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hma_model.config import ActionSpace, HMAConfig, Readout
+from hma_model.network.copying import CopyGain, Copying
 from hma_model.network.product import Linear
 from hma_model.network.trunk import rows_at
 
@@ -102,7 +104,8 @@ class DigitChain(nn.Module):
 class TokenReadout(nn.Module):
     """The readout of the discrete model: scores of every digit's values, and their cross-entropy.
 
-    With `digit_order == "chain"`, a digit's scores also depend on the digits before it.
+    With `digit_order == "chain"`, a digit's scores also depend on the digits before it; with `copy_previous`,
+    the scores of what the frame before has at the same place gain.
     """
 
     worth: Tensor
@@ -117,27 +120,39 @@ class TokenReadout(nn.Module):
         nn.init.normal_(self.linear.weight, std=0.02)
         nn.init.zeros_(self.linear.bias)
         self.chain = DigitChain(config) if config.digit_order == "chain" else None
+        self.copy = CopyGain(config) if config.copy_previous else None
 
-    def forward(self, features: Tensor, digits: Tensor | None = None) -> Tensor:
+    def forward(self, features: Tensor, digits: Tensor | None = None, before: Tensor | None = None) -> Tensor:
         """Map features (..., D) to scores (..., sum of V) float32, digit after digit, low digit first.
 
-        `digits` (..., F) are those that a chain's later digits are given; by default the likeliest.
+        Args:
+            digits: (..., F) those that a chain's later digits are given; by default the likeliest.
+            before: (..., F) those of the frame before, or -1; by default no frame is before.
         """
-        if self.chain is None:
-            return self._alone(features)
-        if digits is not None:
-            return self._alone(features) + self.chain(features, digits).float()
+        if self.chain is None or digits is not None:
+            scores, given = self._alone(features), None
+            if self.chain is not None and digits is not None:
+                scores, given = scores + self.chain(features, digits).float(), digits
+            if self.copy is None or before is None:
+                return scores
+            return self.copy(scores, features, given, before)
         made: list[Tensor] = []
 
         def likeliest(scores: Tensor, first: int) -> Tensor:
             made.append(scores)
             return scores.argmax(-1)
 
-        self.decide(features.flatten(0, -2).unsqueeze(0), likeliest)
+        before = None if before is None else before.flatten(0, -2).unsqueeze(0)
+        self.decide(features.flatten(0, -2).unsqueeze(0), likeliest, before)
         return torch.cat(made, dim=-1).view(*features.shape[:-1], -1)
 
-    def decide(self, features: Tensor, choose: Choose) -> Tensor:
-        """Return the digits (B, F, k) chosen for features (B, k, D): at once, or in a chain one by one."""
+    def decide(self, features: Tensor, choose: Choose, before: Tensor | None = None) -> Tensor:
+        """Return the digits (B, F, k) chosen for features (B, k, D): at once, or in a chain one by one.
+
+        `before` (B, k, F) are those of the frame before, or -1; by default no frame is before.
+        """
+        if copying := Copying.of(self.copy, features, before):
+            choose = partial(copying.chosen, choose)
         alone = self._alone(features)
         if self.chain is None:
             return choose(self.split(alone).transpose(1, 2), 0)
@@ -160,15 +175,18 @@ class TokenReadout(nn.Module):
         padded = [F.pad(part, (0, widest - part.shape[-1]), value=lowest) for part in parts]
         return torch.stack(padded, dim=-2)
 
-    def loss(self, features: Tensor, digits: Tensor) -> Tensor:
-        """Return the cross-entropy (M,), summed over digits, of features (M, D) and digits (M, F)."""
+    def loss(self, features: Tensor, digits: Tensor, before: Tensor | None = None) -> Tensor:
+        """Return the cross-entropy (M,), summed over digits, of features (M, D) and digits (M, F).
+
+        `before` (M, F) are the digits of the frame before, or -1.
+        """
         if len(set(self.factored)) == 1:
-            scores = self.split(self(features, digits)).flatten(0, 1)
+            scores = self.split(self(features, digits, before)).flatten(0, 1)
             losses = F.cross_entropy(
                 scores, digits.flatten(), reduction="none", label_smoothing=self.smoothing
             )
             return losses.view(digits.shape).sum(1)
-        parts = self(features, digits).split(list(self.factored), dim=-1)
+        parts = self(features, digits, before).split(list(self.factored), dim=-1)
         each = [
             F.cross_entropy(part, digits[:, i], reduction="none", label_smoothing=self.smoothing)
             for i, part in enumerate(parts)

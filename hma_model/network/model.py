@@ -19,6 +19,7 @@ from hma_data.errors import CheckpointError, HMAError
 from hma_data.storage.paths import StrPath
 from hma_model.config import POLICY, READOUTS, ActionSpace, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition, unknown
+from hma_model.network.copying import frames_before
 from hma_model.network.head import ActionHead, Generators, LatentReadout, TokenReadout
 from hma_model.network.stem import (
     LatentEmbedding,
@@ -216,9 +217,13 @@ class HMA(nn.Module):
         self._require("discrete", "video_logits")
         groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
         conditioning = self._condition(actions, action_mask, groups, times)
-        x = self.embed_tokens(groups.sort(self.frame_values(tokens)), first=self._first(first, groups))
+        values = groups.sort(self.frame_values(tokens))
+        x = self.embed_tokens(values, first=self._first(first, groups))
         given = None if true is None else to_digits(groups.sort(self.frame_values(true)), self.config.digits)
-        scores = self.token_readout(self.video_features(self.trunk(x, conditioning, times)), given)
+        before = None
+        if self.config.copy_previous:
+            before = frames_before(values, list(range(-1, values.shape[1] - 1)), self.config)
+        scores = self.token_readout(self.video_features(self.trunk(x, conditioning, times)), given, before)
         return groups.unsort(self.token_readout.split(scores)).unflatten(2, self.config.token_grid)
 
     def video_conditions(

@@ -16,6 +16,7 @@ from torch import Tensor
 from hma_data.errors import HMAError
 from hma_model.config import OBJECTIVES, HMAConfig, Objective, Readout
 from hma_model.network.conditioning import Groups, align, condition
+from hma_model.network.copying import frames_before
 from hma_model.network.head import device_of, randn, uniform
 from hma_model.network.stem import from_digits, to_digits
 from hma_model.network.trunk import TimePositions, paired_times
@@ -143,7 +144,7 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
         given = align(config, batch.actions, known, count)
         given = given.frames(order) if paired else given
     conditioning = condition(model, given, groups, times.positions)
-    x = _embed(model, seen, first, video, layout, groups, generator)
+    x, shown = _embed(model, seen, first, video, layout, groups, generator)
     features = model.trunk(x, conditioning, times)
 
     video_loss = action_loss = logits = None
@@ -157,11 +158,16 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
         predictors = own
         if config.kind == "continuous":
             predictors = model.latent_readout(own, times.positions[predicted])
-        video_loss, per_sample = _video_loss(model, predictors, frames, video.masked, groups, generator)
+        before = frames_before(shown, layout.previous[predicted], config) if config.copy_previous else None
+        video_loss, per_sample = _video_loss(
+            model, predictors, frames, before, video.masked, groups, generator
+        )
         if config.kind == "discrete" and not model.training:
             every = torch.cat([model.video_features(features)[:, :1], own], dim=1) if paired else own
+            if paired and before is not None:
+                before = torch.cat([torch.full_like(before[:, :1], -1), before], dim=1)
             true = to_digits(groups.sort(model.frame_values(stored)), config.digits)
-            scores = model.token_readout.split(model.token_readout(every.detach(), true))
+            scores = model.token_readout.split(model.token_readout(every.detach(), true, before))
             logits = groups.unsort(scores).unflatten(2, config.token_grid)
         if paired:
             video.masked = F.pad(video.masked, (0, 0, 1, 0))
@@ -190,38 +196,44 @@ def _embed(
     layout: Layout,
     groups: Groups,
     generator: torch.Generator | None,
-) -> Tensor:
-    """Mask, corrupt and embed the frames; return the samples sorted by embodiment."""
+) -> tuple[Tensor, Tensor]:
+    """Mask, corrupt and embed the frames; return them and their embedding, both sorted by embodiment."""
     if model.config.kind == "discrete":
-        corrupted = corrupt_tokens(model.config, frames, video, generator)
-        x = model.embed_tokens(groups.sort(corrupted), layout.previous, groups.sort(first))
+        shown = groups.sort(corrupt_tokens(model.config, frames, video, generator))
+        x = model.embed_tokens(shown, layout.previous, groups.sort(first))
     else:
         masked = video.masked.to(frames.device).unsqueeze(-1)
         if spread := model.config.latent_noise:
             rate = spread * video.corruption.to(frames.device)[..., None, None]
             frames = frames + rate * randn(frames.shape, generator, frames.device)
-        x = model.embed_patches(groups.sort(frames), groups.sort(masked), layout.previous, groups.sort(first))
+        shown = groups.sort(frames)
+        x = model.embed_patches(shown, groups.sort(masked), layout.previous, groups.sort(first))
     if model.trunk.noise is not None:
         x = x + model.trunk.noise(groups.sort(video.corruption.to(x.device)))
-    return x
+    return x, shown
 
 
 def _video_loss(
     model: "HMA",
     features: Tensor,
     frames: Tensor,
+    before: Tensor | None,
     masked: Tensor,
     groups: Groups,
     generator: torch.Generator | None,
 ) -> tuple[Tensor, Tensor]:
-    """Return the mean loss over masked tokens, and each sample's (B,), in the batch's order."""
+    """Return the mean loss over masked tokens, and each sample's (B,), in the batch's order.
+
+    `before` (B, T, S, F) are the digits of the frames before, sorted by embodiment as the features.
+    """
     masked = groups.sort(masked)
     rows = masked.flatten().nonzero().squeeze(1)  # on the generator's device, so no wait for an accelerator
     sample = (rows // masked[0].numel()).to(features.device)
     rows = rows.to(features.device)
     chosen, targets = features.flatten(0, 2)[rows], groups.sort(frames).flatten(0, 2)[rows]
     if model.config.kind == "discrete":
-        losses = model.token_readout.loss(chosen, to_digits(targets, model.config.digits))
+        near = None if before is None else before.flatten(0, 2)[rows]
+        losses = model.token_readout.loss(chosen, to_digits(targets, model.config.digits), near)
     else:
         losses = model.latent_readout.diffusion.loss(targets, chosen, generator)
     return losses.sum() / max(len(rows), 1), groups.unsort(_means(losses, sample, len(frames)))

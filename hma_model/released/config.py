@@ -35,6 +35,7 @@ _OURS = (
     "told_noise",
     "told_first",
     "digit_order",
+    "copy_previous",
     "action_waves",
 )  # and what must be off
 _CONTINUOUS_NEEDS: dict[str, Any] = {

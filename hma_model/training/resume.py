@@ -67,7 +67,10 @@ TRAINED_BY = {
     *("training_pass", "whole_share", "position_init", "latent_noise", "drop_commands"),
 }
 # fields that a run may turn on for a checkpoint's trunk, and their parameters, which change nothing at first
-ADDED = {"told_noise": "trunk.noise.", "told_first": "trunk.first.", "digit_order": "readout.chain."}
+ADDED = {
+    "told_noise": "trunk.noise.", "told_first": "trunk.first.",
+    "digit_order": "readout.chain.", "copy_previous": "readout.copy.",
+}  # fmt: skip
 WAVES = "action_waves"
 
 

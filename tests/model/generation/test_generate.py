@@ -28,6 +28,7 @@ LAYOUTS = {
     "previous": {"masked_input": "previous"},
     "merged": {"merge": 2, "masked_input": "previous"},
     "chain": {"digit_order": "chain", "factored": (4, 2, 2)},
+    "copies": {"digit_order": "chain", "factored": (4, 2, 2), "copy_previous": True},
 }  # fmt: skip
 
 

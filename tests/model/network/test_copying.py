@@ -1,0 +1,199 @@
+"""A readout that can keep the tokens of the frame before."""
+
+import math
+
+import pytest
+import torch
+
+from hma_data.loading.rows import Batch
+from hma_model.evaluation.metrics import teacher_forced
+from hma_model.network.copying import frames_before, known_digits
+from hma_model.network.head import TokenReadout
+from hma_model.network.stem import from_digits, merge_tokens, split_tokens, to_digits
+from tests.model.network_parts import small_batch, small_config, small_model
+
+NAMES = ["arm", "hand.v1", "arm"]
+CHANGES = [
+    {},
+    {"digit_order": "chain"},
+    {"digit_order": "chain", "factored": (4, 4), "merge": 2},
+    {"factored": (5, 3, 2)},
+    {"digit_order": "chain", "training_pass": "pairs", "masked_input": "previous"},
+]
+
+
+def _seed(value: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(value)
+
+
+def _model(**changes):
+    """Return a small model whose gains are not zero."""
+    model = small_model(copy_previous=True, **changes)
+    gain = model.token_readout.copy
+    with torch.no_grad():
+        gain.linear.weight.copy_(torch.randn(gain.linear.weight.shape, generator=_seed(7)))
+        gain.linear.bias.copy_(torch.randn(gain.linear.bias.shape, generator=_seed(8)))
+    return model
+
+
+def _batch(config):
+    made = small_batch(config, NAMES)
+    return Batch(NAMES, made.actions, made.action_mask, tokens=made.tokens)
+
+
+def _near(digits, config, share=0.7):
+    """Return digits of a frame before, many of them the same, and some unknown."""
+    other = torch.stack(
+        [torch.randint(0, v, (len(digits),), generator=_seed(v + 9)) for v in config.digits], 1
+    )
+    before = torch.where(torch.rand(digits.shape, generator=_seed(3)) < share, digits, other)
+    before[::4] = -1
+    return before
+
+
+@pytest.mark.parametrize("changes", CHANGES[:4], ids=str)
+def test_the_loss_is_that_of_gains_written_out(changes):
+    model = _model(label_smoothing=0.0, **changes)
+    readout, config = model.token_readout, model.config
+    rows, count = 16, len(config.digits)
+    features = torch.randn(rows, config.width, generator=_seed())
+    digits = torch.stack([torch.randint(0, v, (rows,), generator=_seed(v)) for v in config.digits], dim=1)
+    before, chained = _near(digits, config), config.digit_order == "chain"
+    alone = [part.double() for part in readout(features, digits).split(list(config.digits), dim=-1)]
+    gains = readout.copy.linear(features).double().view(rows, count, 3)
+    per_token = count // config.merge**2
+    for row in range(rows):
+        expected = 0.0
+        for place in range(count):
+            differs = [int(digits[row, i] != before[row, i]) for i in range(place)]
+            own = differs[place // per_token * per_token :]
+            state = (2 if any(own) else int(any(differs))) if chained else 0
+            scores = alone[place][row].clone()
+            if before[row, place] >= 0:
+                scores[before[row, place]] += gains[row, place, state]
+            expected -= float(scores.log_softmax(-1)[digits[row, place]].detach())
+        assert math.isclose(readout.loss(features, digits, before)[row], expected, abs_tol=1e-4)
+
+
+@pytest.mark.parametrize("changes", CHANGES[:4], ids=str)
+def test_digits_are_chosen_from_the_scores_of_the_loss(changes):
+    model = _model(**changes)
+    readout, config = model.token_readout, model.config
+    features = torch.randn(9, config.width, generator=_seed())
+    digits = torch.stack([torch.randint(0, v, (9,), generator=_seed(v)) for v in config.digits], dim=1)
+    before, seen = _near(digits, config), []
+
+    def true_digit(scores, first):
+        seen.append(scores[0])
+        return digits.T[first : first + scores.shape[1]].unsqueeze(0)
+
+    readout.decide(features.unsqueeze(0), true_digit, before.unsqueeze(0))
+    scores = readout.split(readout(features, digits, before)).transpose(0, 1)
+    for place, made in enumerate(part for group in seen for part in group):
+        assert torch.allclose(made, scores[place][:, : made.shape[-1]], atol=1e-5)
+
+
+def test_it_learns_what_stays():
+    torch.manual_seed(0)
+    before = torch.randint(0, 4, (512, 2))
+    stays = torch.rand(512, 1) < 0.8
+    digits = torch.where(stays, before, torch.randint(0, 4, (512, 2)))
+    features, losses = torch.zeros(512, 32), {}
+    for copies in (False, True):
+        config = small_config(factored=(4, 4), digit_order="chain", label_smoothing=0.0, copy_previous=copies)
+        readout = TokenReadout(config)
+        optimizer = torch.optim.Adam(readout.parameters(), lr=0.05)
+        for _ in range(80):
+            optimizer.zero_grad()
+            loss = readout.loss(features, digits, before).mean()
+            loss.backward()
+            optimizer.step()
+        losses[copies] = loss.item()
+    kept = 0.8 + 0.2 / 16  # all 16 pairs are as likely where a pair is drawn anew
+    entropy = -kept * math.log(kept) - 15 * (0.2 / 16) * math.log(0.2 / 16)
+    assert abs(losses[True] - entropy) < 0.15 and losses[False] > 2 * entropy
+
+
+def test_a_masked_place_and_a_frame_without_one_before_gain_nothing():
+    config = small_config(factored=(4, 4))
+    frames = torch.tensor([[[0, 5, 16], [7, 16, 16]]])
+    digits = frames_before(frames, [-1, 0, 1], config)
+    assert torch.equal(digits[0, 0], torch.full((3, 2), -1))
+    assert torch.equal(digits[0, 1:], known_digits(frames, config)[0])
+    assert digits[0, 1].tolist() == [[0, 0], [1, 1], [-1, -1]]
+    readout = _model(factored=(4, 4)).token_readout
+    features = torch.randn(6, 32, generator=_seed())
+    nothing = torch.full((6, 2), -1)
+    assert torch.equal(readout(features, None, nothing), readout(features))
+
+
+@pytest.mark.parametrize("changes", CHANGES[:2], ids=str)
+def test_an_untrained_gain_changes_nothing(changes):
+    torch.manual_seed(0)
+    without, model = small_model(**changes), small_model(copy_previous=True, **changes)
+    model.load_state_dict({**model.state_dict(), **without.state_dict()})
+    with torch.no_grad():
+        for parameter in model.token_readout.copy.parameters():
+            parameter.zero_()
+    batch = _batch(without.config)
+    assert torch.allclose(without(batch, None, _seed()).loss, model(batch, None, _seed()).loss)
+    assert torch.allclose(teacher_forced(without, batch)[0], teacher_forced(model, batch)[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("changes", CHANGES, ids=str)
+def test_rollouts_with_and_without_the_cache_are_equal(changes):
+    model = _model(**changes)
+    batch = small_batch(model.config, NAMES)
+    prompt, actions = batch.tokens[:, :2], batch.actions
+    given = {"frames": 2, "unmask_steps": 2, "temperature": 0.5}
+    made = [
+        model.generate(prompt, actions, NAMES, generator=_seed(), cache=cache, **given)
+        for cache in (True, False)
+    ]
+    assert torch.equal(*made)
+    alone = model.generate(prompt[1:2], actions[1:2], NAMES[1:2], generator=_seed(), **given)
+    assert alone.shape == made[0][1:2].shape
+
+
+@pytest.mark.parametrize("changes", CHANGES, ids=str)
+def test_a_frame_in_one_pass_is_the_likeliest_that_the_logits_say(changes):
+    model = _model(**changes)
+    config, batch = model.config, small_batch(model.config, NAMES)
+    how = {"unmask_steps": 1, "temperature": 0}
+    made = model.generate(batch.tokens[:, :3], batch.actions, NAMES, frames=1, **how)[:, 0]
+    window = batch.tokens[:, :4].clone()
+    window[:, 3] = config.vocab_size
+    digits = model.video_logits(window, batch.actions, NAMES)[:, 3].argmax(-1)
+    tokens = from_digits(digits, config.digits).flatten(1)
+    assert torch.equal(made, split_tokens(tokens, config.merge, config.vocab_size, config.token_grid))
+
+
+@pytest.mark.parametrize("changes", CHANGES, ids=str)
+def test_teacher_forced_losses_are_those_of_single_masked_frames(changes):
+    model = _model(**changes)
+    config, batch = model.config, _batch(model.config)
+    nats, _ = teacher_forced(model, batch)
+    true = merge_tokens(batch.tokens, config.merge, config.vocab_size)
+    for frame in range(1, 4):
+        window = batch.tokens[:, : frame + 1].clone()
+        window[:, frame] = config.vocab_size
+        own = batch.tokens[:, : frame + 1]
+        scores = model.video_logits(
+            window, batch.actions[:, : frame + 1], NAMES, batch.action_mask[:, : frame + 1], own
+        )
+        digits = to_digits(true[:, frame], config.digits)
+        logs = scores[:, frame].flatten(1, 2).log_softmax(-1)
+        expected = -logs.gather(-1, digits.unsqueeze(-1)).sum((-1, -2)).mean(1)
+        assert torch.allclose(nats[:, frame - 1], expected, atol=1e-3)
+
+
+def test_training_copies_the_past_that_it_shows():
+    """A past whose digits are all replaced is copied as it is shown, not as it was."""
+    model = small_model(copy_previous=True, training_pass="pairs", corrupt_max=0.2, label_smoothing=0.0)
+    with torch.no_grad():
+        model.token_readout.copy.linear.bias.fill_(30.0)  # whatever is before is copied
+    batch = _batch(model.config)
+    still = Batch(NAMES, batch.actions, batch.action_mask, tokens=batch.tokens[:, :1].expand_as(batch.tokens))
+    corrupted = model(still, "forward", _seed()).loss
+    model.config = model.config.replace(corrupt_max=0.0)
+    assert model(still, "forward", _seed()).loss < 1e-3 < corrupted
