@@ -179,7 +179,8 @@ class HMA(nn.Module):
         """Mask, corrupt and predict a batch of windows.
 
         Args:
-            batch: windows of one or several embodiments, on the model's device.
+            batch: windows of one or several embodiments, on the model's device. Any object with the fields of
+                `Batch` will do; it may lack `frame_mask`, `earlier` and `context`.
             objective: forward, passive, policy, full or inverse; by default drawn by its weight.
             generator: the generator of every random draw; the draws take place on its device.
 

@@ -162,6 +162,11 @@ def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
     return names[min(index, len(names) - 1)]
 
 
+def _optional(batch: "Batch", name: str) -> Tensor | None:
+    """Return a field that a caller's own class of batches may lack."""
+    return getattr(batch, name, None)
+
+
 def _hide_tokens(
     config: HMAConfig,
     batch: "Batch",
@@ -175,9 +180,9 @@ def _hide_tokens(
         video = draw_pairs_mask(config, size, count, layout.past, generator)
     else:
         video = draw_video_mask(config, size, count, generator, drift=objective.predicts_video)
-    if batch.frame_mask is not None:  # padding of a short episode has no loss
-        inside = batch.frame_mask[:, layout.frames]
-        video.masked &= inside.to(video.masked.device).unsqueeze(-1)
+    inside = _optional(batch, "frame_mask")
+    if inside is not None:  # padding of a short episode has no loss
+        video.masked &= inside[:, layout.frames].to(video.masked.device).unsqueeze(-1)
     if not objective.predicts_video:
         video.masked = torch.zeros_like(video.masked)
     return video
@@ -224,10 +229,11 @@ def _embed(
     `true` are the values (B, T, S, …) of the window's frames. The model sees those of `batch.context`
     instead, if there are any.
     """
-    frames = true if batch.context is None else model.frame_values(batch.context)
+    context, earlier = _optional(batch, "context"), _optional(batch, "earlier")
+    frames = true if context is None else model.frame_values(context)
     if layout.paired:
         frames = torch.cat([frames[:, : layout.past], true[:, 1:]], dim=1)
-    first = true[:, 0] if batch.earlier is None else model.frame_values(batch.earlier.unsqueeze(1))[:, 0]
+    first = true[:, 0] if earlier is None else model.frame_values(earlier.unsqueeze(1))[:, 0]
     if model.config.kind == "discrete":
         corrupted = corrupt_tokens(model.config, frames, video, generator)
         x = model.embed_tokens(groups.sort(corrupted), layout.previous, groups.sort(first))

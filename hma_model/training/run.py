@@ -33,7 +33,6 @@ from hma_model.training.parallel import ParallelModel, World, gathered, require_
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import (
     OtherVersionError,
-    Start,
     State,
     TrainingState,
     data_digests,
@@ -45,6 +44,7 @@ from hma_model.training.resume import (
 )
 from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment, require_memory
 from hma_model.training.scheduled_sampling import forwarded, rolled, share_at
+from hma_model.training.start import Start
 
 
 class Run:
