@@ -27,7 +27,8 @@ from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint import weights as stored
 from hma_model.checkpoint.folder import README, Checkpoint, require_tokenizer, resolve
 from hma_model.config import HMAConfig
-from hma_model.network.model import HMA, waves_of_stem
+from hma_model.network.model import HMA
+from hma_model.network.stem import waves_of_stem
 from hma_model.training.alike import FETCHED, candidates
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import TRAINED_BY
