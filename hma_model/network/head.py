@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hma_model.config import ActionSpace, HMAConfig, Readout
-from hma_model.network.product import Linear
+from hma_model.network.linear import Linear
 from hma_model.network.trunk import rows_at
 
 _LEVEL_VALUES = 256  # sinusoids that describe a noise level

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from hma_data.errors import CheckpointError
 from hma_model.config import ActionSpace, HMAConfig
-from hma_model.network.product import Linear
+from hma_model.network.linear import Linear
 
 # -- frames
 

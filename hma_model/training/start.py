@@ -1,9 +1,9 @@
 """Start a run from a checkpoint of another run or of a hub.
 
 The run keeps its own copy of the checkpoint in `.start/`, so it can resume even if the source changes. Robots
-that the checkpoint has continue from their stem and head, with the statistics these were trained with; other
-robots get fresh ones, or begin with the stem of their like (`hma_model.training.alike`). From a hub only the
-trunk, the robots of the data, and a few that may be like them are fetched.
+that the checkpoint has continue from their stem and head, with the statistics these were trained with. Other
+robots get fresh ones, or begin with the stem of a robot like them (`hma_model.training.new_stem`). From a hub
+only the trunk, the robots of the data, and a few that may be like them are fetched.
 
 With a frozen trunk, the run's checkpoints keep the same files of the trunk and, if the source is on this
 machine, of all other robots. With a tuned trunk they leave out the other robots, which belong to the old one.
@@ -29,7 +29,7 @@ from hma_model.checkpoint.folder import README, Checkpoint, require_tokenizer, r
 from hma_model.config import HMAConfig
 from hma_model.network.model import HMA
 from hma_model.network.stem import waves_of_stem
-from hma_model.training.alike import FETCHED, candidates
+from hma_model.training.new_stem import FETCHED, candidates
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import TRAINED_BY
 from hma_model.training.runtime import RECIPE, START

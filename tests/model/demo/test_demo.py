@@ -10,7 +10,7 @@ from hma_data.errors import OutputError
 from hma_data.shards.verify import verify
 from hma_model.demo import report
 from hma_model.demo import run as demos
-from hma_model.demo.made import Demo
+from hma_model.demo.results import Demo
 from tests.model.embedded import embedded
 
 
