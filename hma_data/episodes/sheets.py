@@ -23,20 +23,20 @@ INK, PAPER = (30, 30, 30), (250, 250, 250)
 BAR, NEGATIVE = (0, 114, 178), (213, 94, 0)  # safe without colour vision
 
 
-def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = (), gap: int = GAP) -> Images:
+def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = ()) -> Images:
     """Return a picture (H, W, 3) of pictures of one size in rows, with a label above each row."""
     label_height = LABEL if labels else 0
     height, width = rows[0][0].shape[:2]
     columns = max(map(len, rows))
     sheet = np.full(
-        (len(rows) * (height + gap + label_height) + gap, columns * (width + gap) + gap, 3), PAPER, np.uint8
+        (len(rows) * (height + GAP + label_height) + GAP, columns * (width + GAP) + GAP, 3), PAPER, np.uint8
     )
     for i, row in enumerate(rows):
-        top = gap + i * (height + gap + label_height)
+        top = GAP + i * (height + GAP + label_height)
         if labels:
-            write_text(sheet, fitted(labels[i], sheet.shape[1] - 2 * gap), (gap, top + 13))
+            write_text(sheet, fitted(labels[i], sheet.shape[1] - 2 * GAP), (GAP, top + 13))
         for j, picture in enumerate(row):
-            left = gap + j * (width + gap)
+            left = GAP + j * (width + GAP)
             sheet[top + label_height : top + label_height + height, left : left + width] = picture
     return sheet
 

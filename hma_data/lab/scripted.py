@@ -125,18 +125,14 @@ class SeenPush:
 
 
 class SeenPose:
-    """The state of a robot of the family or `planar_arm`; the arguments are those of `seen_state`.
+    """The state of a robot of the family or `planar_arm`; the arguments are those of `seen_state`."""
 
-    Args:
-        seed: of the poses that the first search begins from.
-    """
-
-    def __init__(self, robot: str, own: NDArray[np.int64], places: Floats, seed: int = 0) -> None:
+    def __init__(self, robot: str, own: NDArray[np.int64], places: Floats) -> None:
         self._forward, self._own = truth.own_places(robot), own
         self._body = Body.of(robot) if FAMILY.fullmatch(robot) else None
         low, high = np.array([[-np.pi, -np.pi], [np.pi, np.pi]]) if self._body is None else self._body.limits
         self._width = high - low
-        starts = np.random.default_rng(seed).uniform(low, high, (STARTS, len(low)))
+        starts = np.random.default_rng(0).uniform(low, high, (STARTS, len(low)))
         found = [self._search(start, places) for start in starts]
         self.pose = min(found, key=lambda pose: self._far(pose, places))
         self._blocks = places[len(self._forward(self.pose)) :]

@@ -277,6 +277,8 @@ class Batch:
             episodes are not padded.
         earlier: (B, h, w) int64 or (B, c, H, W) float32, a frame of the window's episode, drawn from those up
             to the window's first. None unless asked for.
+        context: like `tokens` or `latents`, the frames that the model sees in their place; the loss is of the
+            true ones. None for these.
     """
 
     embodiment: list[str]
@@ -289,6 +291,7 @@ class Batch:
     camera: Tensor | None = None
     frame_mask: Tensor | None = None
     earlier: Tensor | None = None
+    context: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.embodiment)

@@ -10,7 +10,7 @@ the cache, each frame follows the one before it. Without the cache, each frame i
 again. In a batch, the time of a frame is the time of the step divided by the batch size.
 
 `gflop_per_frame` counts the products of a frame; `limit_gflop_per_second` is the rate at which this machine
-does them when it does nothing else (`hma_model.bench.work`); `share_of_limit` is the share of a frame's time
+does them when it does nothing else (`hma_model.bench.flops`); `share_of_limit` is the share of a frame's time
 that they would then take. Each case runs in its own process. The fastest step after a warm-up counts.
 """
 
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from hma_data.bench import Bench, in_fresh_process
 from hma_data.errors import UsageError
+from hma_model.bench.flops import products_of, rate_of
 from hma_model.bench.speed import (
     COMMON,
     KINDS,
@@ -32,7 +33,6 @@ from hma_model.bench.speed import (
     random_frames,
     set_threads,
 )
-from hma_model.bench.work import products_of, rate_of
 
 if TYPE_CHECKING:
     import torch

@@ -11,7 +11,6 @@ B batch, T frames, h,w token grid.
 import math
 from pathlib import Path
 from statistics import fmean
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from hma_data.bench import Bench
@@ -22,6 +21,7 @@ from hma_model.config import ActionSpace, HMAConfig
 if TYPE_CHECKING:
     import torch
 
+    from hma_data.loading.rows import Batch
     from hma_model.network.model import HMA
 
 SPACE = ActionSpace("mover", 1, 1, (0.0,), (1.0,), (True,))
@@ -73,9 +73,11 @@ def _numbers(text: Any, kind: type) -> list[Any]:
     return values
 
 
-def windows(batch: int, generator: "torch.Generator") -> Any:
+def windows(batch: int, generator: "torch.Generator") -> "Batch":
     """Return a batch in which the action (B, T, 1) of -1, 0 or 1 shifts each frame to the next."""
     import torch
+
+    from hma_data.loading.rows import Batch
 
     cells = _GRID[0] * _GRID[1]
     patterns = torch.randint(0, 256, (_PATTERNS, cells), generator=torch.Generator().manual_seed(0))
@@ -85,12 +87,11 @@ def windows(batch: int, generator: "torch.Generator") -> Any:
     index = (torch.arange(cells) + offset.unsqueeze(-1)) % cells
     chosen = patterns[torch.randint(0, _PATTERNS, (batch,), generator=generator)]
     tokens = chosen.unsqueeze(1).expand(-1, _FRAMES, -1).gather(2, index)
-    return SimpleNamespace(
-        tokens=tokens.unflatten(2, _GRID),
-        latents=None,
+    return Batch(
+        embodiment=[SPACE.id] * batch,
         actions=moves.unsqueeze(-1).float(),
         action_mask=torch.ones(batch, _FRAMES, dtype=torch.bool),
-        embodiment=[SPACE.id] * batch,
+        tokens=tokens.unflatten(2, _GRID),
     )
 
 

@@ -10,7 +10,6 @@ can only slow a step down.
 import os
 import time
 from statistics import median
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from hma_data.bench import Bench, in_fresh_process, peak_rss_mib
@@ -19,6 +18,7 @@ from hma_data.errors import UsageError
 if TYPE_CHECKING:
     import torch
 
+    from hma_data.loading.rows import Batch
     from hma_model.network.model import HMA
 
 ROBOT = "arm"
@@ -207,15 +207,17 @@ def step_seconds(model: "HMA", settings: dict[str, Any]) -> list[float]:
     return seconds[1:]
 
 
-def _windows(model: "HMA", settings: dict[str, Any], generator: "torch.Generator") -> Any:
+def _windows(model: "HMA", settings: dict[str, Any], generator: "torch.Generator") -> "Batch":
     import torch
+
+    from hma_data.loading.rows import Batch
 
     b, t = settings["batch"], model.config.frames
     frames = random_frames(model, b, t, generator)
     robot, space = next(iter(model.embodiments.items()))
     actions = torch.randn(b, t, space.chunk_dim, generator=generator)
     discrete = model.config.kind == "discrete"
-    return SimpleNamespace(
+    return Batch(
         embodiment=[robot] * b,
         actions=actions.to(model.device),
         action_mask=torch.ones(b, t, dtype=torch.bool, device=model.device),

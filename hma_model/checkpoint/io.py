@@ -157,7 +157,7 @@ def load(folder: StrPath, embodiments: Iterable[str] | None = None, device: str 
 
 def add_embodiment(model: "HMA", checkpoint: Checkpoint, embodiment: str) -> None:
     """Load one embodiment's stem and head beside a trunk that is already loaded."""
-    from hma_model.network.model import waves_of_stem
+    from hma_model.network.stem import waves_of_stem
 
     space, stem, head = read_embodiment(checkpoint, embodiment)
     model.add_embodiment(space, waves=waves_of_stem(stem) or None)

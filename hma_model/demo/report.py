@@ -20,7 +20,7 @@ from hma_data.registry.embodiment import find
 from hma_data.shards.preview import tokenizer_of
 from hma_data.sources.base import open_source
 from hma_data.storage.files import write_atomic
-from hma_model.demo.made import Demo
+from hma_model.demo.results import Demo
 from hma_model.evaluation.pages import Page, held_out_losses, psnr_over_horizon
 from hma_model.training.logging import read_metrics
 

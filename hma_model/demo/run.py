@@ -32,8 +32,8 @@ from hma_data.shards.windows import WindowIndex
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
-from hma_model.demo.made import TIMINGS, Demo
 from hma_model.demo.report import FINETUNED, SCRATCH, SHOWN, TAU, write_report
+from hma_model.demo.results import TIMINGS, Demo
 
 if TYPE_CHECKING:
     from hma_model.evaluation.evaluate import Sampling

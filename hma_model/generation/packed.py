@@ -15,7 +15,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from hma_model.network.product import has_kernels
+from hma_model.network.linear import has_kernels
 from hma_model.network.trunk import MLP
 
 _OPS: Any = torch.ops.mkldnn

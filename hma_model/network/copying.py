@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from hma_model.config import HMAConfig
-from hma_model.network.product import Linear
+from hma_model.network.linear import Linear
 from hma_model.network.stem import to_digits
 
 # Nothing before a digit differs; only other tokens of its square do; its own token does.

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from hma_model.config import ActionSpace, HMAConfig, Readout
 from hma_model.network.copying import CopyGain, Copying
-from hma_model.network.product import Linear
+from hma_model.network.linear import Linear
 from hma_model.network.trunk import rows_at
 
 _LEVEL_VALUES = 256  # sinusoids that describe a noise level

@@ -27,7 +27,9 @@ from hma_model.network.stem import (
     TokenEmbedding,
     merge_tokens,
     patchify,
+    space_of_stem,
     to_digits,
+    waves_of_stem,
 )
 from hma_model.network.trunk import Conditioning, TimePositions, Trunk, window_times
 
@@ -180,7 +182,8 @@ class HMA(nn.Module):
         """Mask, corrupt and predict a batch of windows.
 
         Args:
-            batch: windows of one or several embodiments, on the model's device.
+            batch: windows of one or several embodiments, on the model's device. Any object with the fields of
+                `Batch` will do; it may lack `frame_mask`, `earlier` and `context`.
             objective: forward, passive, policy, full or inverse; by default drawn by its weight.
             generator: the generator of every random draw; the draws take place on its device.
 
@@ -499,27 +502,3 @@ def check_fit(where: object, state: Mapping[str, Tensor], own: Mapping[str, Tens
         if len(faults) > MOST_NAMED:
             faults[MOST_NAMED:] = [f"and {len(faults) - MOST_NAMED} more"]
         raise CheckpointError(where, "; ".join(faults), "load it into the configuration it was saved from")
-
-
-def space_of_stem(embodiment: str, stem: Mapping[str, Tensor]) -> ActionSpace:
-    """Return the action space for which a stem's state was made.
-
-    Raises:
-        CheckpointError: the state is not that of a stem.
-    """
-    try:
-        mean, std, mask = (stem[f"normalizer.{name}"] for name in ("mean", "std", "normalize"))
-        chunk_dim = stem["input.weight"].shape[1]
-    except KeyError as error:
-        fault = f"the state of a stem lacks {error.args[0]}"
-        raise CheckpointError(f"{embodiment}: stem", fault, "load a stem's state") from error
-    values = tuple(mean.tolist()), tuple(std.tolist()), tuple(mask.bool().tolist())
-    rule = "divide" if "normalizer.divide" in stem else "zero"
-    return ActionSpace(embodiment, mean.numel(), chunk_dim // mean.numel(), *values, zero_variance=rule)
-
-
-def waves_of_stem(stem: Mapping[str, Tensor]) -> int:
-    """Return the octaves of waves of the commands in a stem's state."""
-    if "waves.weight" not in stem or "input.weight" not in stem:
-        return 0
-    return stem["waves.weight"].shape[-1] // max(2 * stem["input.weight"].shape[-1], 1)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.config import OBJECTIVES, HMAConfig, Objective, Readout
-from hma_model.network.conditioning import Groups, align, condition
+from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
 from hma_model.network.copying import frames_before
 from hma_model.network.head import device_of, randn, uniform
 from hma_model.network.stem import from_digits, to_digits
@@ -96,9 +96,14 @@ class Layout:
         return cls([*range(past), *range(1, count)], previous, past, times)
 
     @property
+    def paired(self) -> bool:
+        """Check whether masked copies of the frames follow the frames."""
+        return self.past < len(self.frames)
+
+    @property
     def predicted(self) -> slice:
         """Return the frames of the pass that predict video."""
-        return slice(0 if self.past == len(self.frames) else self.past, None)
+        return slice(self.past if self.paired else 0, None)
 
 
 def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torch.Generator | None) -> Output:
@@ -111,70 +116,44 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
     stored = batch.tokens if config.kind == "discrete" else batch.latents
     if stored is None:
         raise HMAError("batch", f"has no frames for a {config.kind} model", "use the model's tokenizer")
-    frames, count, size = model.frame_values(stored), batch.actions.shape[1], len(batch.actions)
-    groups, layout = Groups.of(batch.embodiment, size), Layout.of(model, count, chosen)
-    times, order, predicted = layout.times, layout.frames, layout.predicted
+    frames, groups = model.frame_values(stored), Groups.of(batch.embodiment, len(batch.actions))
+    layout = Layout.of(model, batch.actions.shape[1], chosen)
 
-    context = getattr(batch, "context", None)  # the frames that the model sees, if not the true ones
-    seen = frames if context is None else model.frame_values(context)
-    earlier = getattr(batch, "earlier", None)
-    first = frames[:, 0] if earlier is None else model.frame_values(earlier.unsqueeze(1))[:, 0]
-    paired = layout.past < len(order)
-    if paired:
-        video = draw_pairs_mask(config, size, count, layout.past, generator)
-        seen = torch.cat([seen[:, : layout.past], frames[:, 1:]], dim=1)
-        frames = frames[:, 1:]  # those that are predicted
-    else:
-        video = draw_video_mask(config, size, count, generator, drift=chosen.predicts_video)
-    inside = getattr(batch, "frame_mask", None)
-    if inside is not None:  # padding of a short episode has no loss
-        video.masked &= inside[:, order].to(video.masked.device).unsqueeze(-1)
-    if not chosen.predicts_video:
-        video.masked = torch.zeros_like(video.masked)
-    dropped = torch.zeros_like(batch.action_mask)
-    if chosen.readout is not None:
-        read = count - chosen.readout.lag  # the chunks after these have no frame to be read from
-        dropped[:, :read] = drop_chunks(batch.action_mask[:, :read], generator)
-
-    given = None
-    if chosen.sees_actions:
-        known = batch.action_mask & ~dropped
-        if config.drop_commands and model.training and chosen.predicts_video:
-            known &= uniform((size, 1), generator, known.device) >= config.drop_commands
-        given = align(config, batch.actions, known, count)
-        given = given.frames(order) if paired else given
-    conditioning = condition(model, given, groups, times.positions)
-    x, shown = _embed(model, seen, first, video, layout, groups, generator)
-    features = model.trunk(x, conditioning, times)
+    video = _hide_tokens(config, batch, chosen, layout, generator)
+    dropped = _hide_chunks(batch, chosen.readout, generator)
+    given = _shown_chunks(model, batch, chosen, dropped, layout, generator)
+    conditioning = condition(model, given, groups, layout.times.positions)
+    x, shown = _embed(model, batch, frames, video, layout, groups, generator)
+    features = model.trunk(x, conditioning, layout.times)
 
     video_loss = action_loss = logits = None
-    per_sample = torch.zeros(size, device=features.device)
+    masked, per_sample = video.masked, torch.zeros(groups.batch, device=features.device)
     if chosen.readout is not None:
         action_loss, per_sample = _action_loss(
             model, features[:, : layout.past], batch, dropped, chosen.readout, groups, generator
         )
     if chosen.predicts_video:
-        own, video.masked = model.video_features(features)[:, predicted], video.masked[:, predicted]
+        own, masked = model.video_features(features)[:, layout.predicted], masked[:, layout.predicted]
+        targets = frames[:, 1:] if layout.paired else frames
         predictors = own
         if config.kind == "continuous":
-            predictors = model.latent_readout(own, times.positions[predicted])
-        before = frames_before(shown, layout.previous[predicted], config) if config.copy_previous else None
-        video_loss, per_sample = _video_loss(
-            model, predictors, frames, before, video.masked, groups, generator
-        )
+            predictors = model.latent_readout(own, layout.times.positions[layout.predicted])
+        before = None
+        if config.copy_previous:
+            before = frames_before(shown, layout.previous[layout.predicted], config)
+        video_loss, per_sample = _video_loss(model, predictors, targets, before, masked, groups, generator)
+        if layout.paired:  # no copy is of the first frame
+            own = torch.cat([model.video_features(features)[:, :1], own], dim=1)
+            masked = F.pad(masked, (0, 0, 1, 0))
+            before = None if before is None else F.pad(before, (0, 0, 0, 0, 1, 0), value=-1)
         if config.kind == "discrete" and not model.training:
-            every = torch.cat([model.video_features(features)[:, :1], own], dim=1) if paired else own
-            if paired and before is not None:
-                before = torch.cat([torch.full_like(before[:, :1], -1), before], dim=1)
-            true = to_digits(groups.sort(model.frame_values(stored)), config.digits)
-            scores = model.token_readout.split(model.token_readout(every.detach(), true, before))
+            true = to_digits(groups.sort(frames), config.digits)
+            scores = model.token_readout.split(model.token_readout(own.detach(), true, before))
             logits = groups.unsort(scores).unflatten(2, config.token_grid)
-        if paired:
-            video.masked = F.pad(video.masked, (0, 0, 1, 0))
     loss = torch.zeros((), device=features.device)
     loss = loss if video_loss is None else loss + video_loss
     loss = loss if action_loss is None else loss + config.action_loss_weight * action_loss
-    masked = video.masked.to(features.device).unflatten(2, config.token_grid)
+    masked = masked.to(features.device).unflatten(2, config.token_grid)
     return Output(loss, video_loss, action_loss, per_sample.detach(), masked, name, logits)
 
 
@@ -188,16 +167,78 @@ def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
     return names[min(index, len(names) - 1)]
 
 
+def _optional(batch: "Batch", name: str) -> Tensor | None:
+    """Return a field that a caller's own class of batches may lack."""
+    return getattr(batch, name, None)
+
+
+def _hide_tokens(
+    config: HMAConfig,
+    batch: "Batch",
+    objective: Objective,
+    layout: Layout,
+    generator: torch.Generator | None,
+) -> VideoMask:
+    """Draw the masked tokens of a pass and the corruption of the others; mask none without a video loss."""
+    size, count = batch.action_mask.shape
+    if layout.paired:
+        video = draw_pairs_mask(config, size, count, layout.past, generator)
+    else:
+        video = draw_video_mask(config, size, count, generator, drift=objective.predicts_video)
+    inside = _optional(batch, "frame_mask")
+    if inside is not None:  # padding of a short episode has no loss
+        video.masked &= inside[:, layout.frames].to(video.masked.device).unsqueeze(-1)
+    if not objective.predicts_video:
+        video.masked = torch.zeros_like(video.masked)
+    return video
+
+
+def _hide_chunks(batch: "Batch", readout: Readout | None, generator: torch.Generator | None) -> Tensor:
+    """Draw the chunks that the model does not see because it must predict them, (B, T) bool."""
+    dropped = torch.zeros_like(batch.action_mask)
+    if readout is not None:
+        read = dropped.shape[1] - readout.lag  # the chunks after these have no frame to be read from
+        dropped[:, :read] = drop_chunks(batch.action_mask[:, :read], generator)
+    return dropped
+
+
+def _shown_chunks(
+    model: "HMA",
+    batch: "Batch",
+    objective: Objective,
+    dropped: Tensor,
+    layout: Layout,
+    generator: torch.Generator | None,
+) -> ActionConditioning | None:
+    """Return the chunks that the frames of a pass see; None for no actions at all."""
+    if not objective.sees_actions:
+        return None
+    config, known = model.config, batch.action_mask & ~dropped
+    if config.drop_commands and model.training and objective.predicts_video:
+        known &= uniform((len(known), 1), generator, known.device) >= config.drop_commands
+    given = align(config, batch.actions, known, known.shape[1])
+    return given.frames(layout.frames) if layout.paired else given
+
+
 def _embed(
     model: "HMA",
-    frames: Tensor,
-    first: Tensor,
+    batch: "Batch",
+    true: Tensor,
     video: VideoMask,
     layout: Layout,
     groups: Groups,
     generator: torch.Generator | None,
 ) -> tuple[Tensor, Tensor]:
-    """Mask, corrupt and embed the frames; return them and their embedding, both sorted by embodiment."""
+    """Mask, corrupt and embed the frames of a pass; return their embedding and them, sorted by embodiment.
+
+    `true` are the values (B, T, S, …) of the window's frames. The model sees those of `batch.context`
+    instead, if there are any.
+    """
+    context, earlier = _optional(batch, "context"), _optional(batch, "earlier")
+    frames = true if context is None else model.frame_values(context)
+    if layout.paired:
+        frames = torch.cat([frames[:, : layout.past], true[:, 1:]], dim=1)
+    first = true[:, 0] if earlier is None else model.frame_values(earlier.unsqueeze(1))[:, 0]
     if model.config.kind == "discrete":
         shown = groups.sort(corrupt_tokens(model.config, frames, video, generator))
         x = model.embed_tokens(shown, layout.previous, groups.sort(first))

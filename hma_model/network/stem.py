@@ -5,7 +5,7 @@ c channels, H,W latent grid, p patch side, A values of an action, K = stride*A v
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from itertools import accumulate
 from operator import mul
@@ -14,8 +14,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from hma_data.errors import CheckpointError
 from hma_model.config import ActionSpace, HMAConfig
-from hma_model.network.product import Linear
+from hma_model.network.linear import Linear
 
 # -- frames
 
@@ -312,3 +313,27 @@ class Stem(nn.Module):
             turns = values.unsqueeze(-1) * (2.0**octaves * (math.pi / 4))
             hidden = hidden + self.waves(torch.cat([turns.sin(), turns.cos()], dim=-1).flatten(-2))
         return self.output(F.relu(self.norm(hidden)))
+
+
+def space_of_stem(embodiment: str, stem: Mapping[str, Tensor]) -> ActionSpace:
+    """Return the action space for which a stem's state was made.
+
+    Raises:
+        CheckpointError: the state is not that of a stem.
+    """
+    try:
+        mean, std, mask = (stem[f"normalizer.{name}"] for name in ("mean", "std", "normalize"))
+        chunk_dim = stem["input.weight"].shape[1]
+    except KeyError as error:
+        fault = f"the state of a stem lacks {error.args[0]}"
+        raise CheckpointError(f"{embodiment}: stem", fault, "load a stem's state") from error
+    values = tuple(mean.tolist()), tuple(std.tolist()), tuple(mask.bool().tolist())
+    rule = "divide" if "normalizer.divide" in stem else "zero"
+    return ActionSpace(embodiment, mean.numel(), chunk_dim // mean.numel(), *values, zero_variance=rule)
+
+
+def waves_of_stem(stem: Mapping[str, Tensor]) -> int:
+    """Return the octaves of waves of the commands in a stem's state."""
+    if "waves.weight" not in stem or "input.weight" not in stem:
+        return 0
+    return stem["waves.weight"].shape[-1] // max(2 * stem["input.weight"].shape[-1], 1)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
-from hma_model.network.product import Linear, after_gelu, after_norm, light
+from hma_model.network.linear import Linear, after_gelu, after_norm, recomputed
 from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv, turns_of
 from hma_model.network.stem import FirstFrame, LatentEmbedding, Modulation, NoiseEmbedding, TokenEmbedding
 
@@ -330,7 +330,7 @@ class Block(nn.Module):
         if self.adds and conditioning.embedding is not None:
             x = x + conditioning.embedding.unsqueeze(2)
         if conditioning.modulation is not None:
-            x = x + light(self.modulation_out, self.modulate, x, conditioning, layer)
+            x = x + recomputed(self.modulation_out, self.modulate, x, conditioning, layer)
         if self.action is not None and conditioning.embedding is not None:
             x = x + self.action(self.action_norm(x), conditioning.embedding, times, cache)
         x = x + self.time(x, self.time_norm, times, cache)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
 from hma_data.tokenizers.training.muon import muon_step
-from hma_model.network.model import waves_of_stem
+from hma_model.network.stem import waves_of_stem
 from hma_model.training.parallel import gathered, like, local, whole
 
 if TYPE_CHECKING:

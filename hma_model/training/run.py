@@ -27,13 +27,12 @@ from hma_model.evaluation import evaluate
 from hma_model.evaluation.metrics import perplexity
 from hma_model.evaluation.rollout_video import newest_sheets, write_sheets
 from hma_model.network.model import HMA
-from hma_model.training import alike, guards, optim
+from hma_model.training import guards, new_stem, optim
 from hma_model.training.data import TrainData
 from hma_model.training.parallel import ParallelModel, World, gathered, require_shardable
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import (
     OtherVersionError,
-    Start,
     State,
     TrainingState,
     data_digests,
@@ -45,6 +44,7 @@ from hma_model.training.resume import (
 )
 from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment, require_memory
 from hma_model.training.scheduled_sampling import forwarded, rolled, share_at
+from hma_model.training.start import Start
 
 
 class Run:
@@ -152,7 +152,7 @@ class Run:
     def begin(self) -> None:
         """Begin with what no step must learn: token frequencies in the readout's bias, or like stems."""
         if self.start:
-            self._begin_alike(self.start.checkpoint)
+            self._begin_like(self.start.checkpoint)
             return
         if self.recipe.readout_bias == "zero" or self.model.config.kind != "discrete":
             return
@@ -164,18 +164,18 @@ class Run:
         own = self.model.token_readout.linear.bias
         own.copy_(torch.from_numpy(bias).to(own))
 
-    def _begin_alike(self, start: Checkpoint) -> None:
+    def _begin_like(self, start: Checkpoint) -> None:
         """Give new robots the stems of like ones, where these have a lower loss."""
         cameras, objective = self.recipe.cameras, self.objective.name
         for name, shards in self.sets.items():
             if name in start.embodiments or self.recipe.new_stem == "fresh":
                 continue
-            choose = partial(alike.choose, self.model, name, start, shards, cameras, objective)
-            if begun := self.world.once(choose):
-                alike.take(self.model, name, start, begun.stem)
-                self.likes[name] = begun.stem
-                better = f"loss {begun.loss:.3g}, with a fresh one {begun.fresh:.3g}"
-                self.notes.append(f"{name} begins with the stem of {begun.stem}: {better}")
+            choose = partial(new_stem.choose, self.model, name, start, shards, cameras, objective)
+            if chosen := self.world.once(choose):
+                new_stem.copy_stem(self.model, name, start, chosen.like)
+                self.likes[name] = chosen.like
+                better = f"loss {chosen.loss:.3g}, with a fresh one {chosen.fresh_loss:.3g}"
+                self.notes.append(f"{name} begins with the stem of {chosen.like}: {better}")
 
     def prepare(self, kept: TrainingState | None) -> None:
         """Distribute the model over the ranks, and make its optimizer and average, from `kept` if given."""

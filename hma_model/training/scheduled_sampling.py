@@ -13,7 +13,7 @@ predictions of an untrained model teach nothing. (The paper corrupts the past at
 B batch, T frames of a window, L of a longer batch, h,w token grid, c,H,W latents, D frames replaced.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -29,13 +29,6 @@ if TYPE_CHECKING:
     from hma_model.training.recipe import Recipe
 
 SAMPLE_STEPS = 8  # of the diffusion head; enough for a past to learn from
-
-
-@dataclass
-class Forwarded(Batch):
-    """A batch in which the model sees other frames than those of the loss."""
-
-    context: Tensor | None = None  # (B, T, h, w) tokens or (B, T, c, H, W) latents that the model sees
 
 
 def share_at(step: int, recipe: "Recipe", share: float) -> float:
@@ -88,8 +81,7 @@ def rolled(
     shown = windows.tokens if windows.tokens is not None else windows.latents
     assert shown is not None
     context[:, -1] = shown[:, -1]
-    given = {f.name: getattr(windows, f.name) for f in fields(Batch)}
-    return Forwarded(**given, context=context)
+    return replace(windows, context=context)
 
 
 def _cut(batch: Batch, begin: Tensor, frames: int) -> Batch:
@@ -120,6 +112,9 @@ def forwarded(
         share: the probability that a window gets predicted frames.
         depth: D, the number of consecutive frames that are replaced. Their start is drawn; the first and the
             last frame of the window stay true.
+
+    Returns:
+        The batch with `context`; the same batch if no window was drawn.
     """
     true = batch.tokens if batch.tokens is not None else batch.latents
     assert true is not None
@@ -141,10 +136,9 @@ def forwarded(
         at = first[chosen] + offset
         context[rows, at] = _predicted(model, context, at, own, generator)
     model.train(training)
-    seen = (batch.context if isinstance(batch, Forwarded) and batch.context is not None else true).clone()
+    seen = (true if batch.context is None else batch.context).clone()
     seen[chosen] = context
-    given = {f.name: getattr(batch, f.name) for f in fields(Batch)}
-    return Forwarded(**given, context=seen)
+    return replace(batch, context=seen)
 
 
 def _predicted(

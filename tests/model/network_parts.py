@@ -1,10 +1,10 @@
 """Small models and batches that the network's tests share."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import torch
 
+from hma_data.loading.dataset import Batch
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.network.model import HMA
 
@@ -35,7 +35,7 @@ def small_model(seed: int = 0, **changes: Any) -> HMA:
     return model.eval()
 
 
-def small_batch(config: HMAConfig, embodiment: list[str], seed: int = 0, frames: int | None = None) -> Any:
+def small_batch(config: HMAConfig, embodiment: list[str], seed: int = 0, frames: int | None = None) -> Batch:
     """Windows of random tokens, latents and actions."""
     generator = torch.Generator().manual_seed(seed)
     b, t = len(embodiment), frames or config.frames
@@ -43,7 +43,7 @@ def small_batch(config: HMAConfig, embodiment: list[str], seed: int = 0, frames:
     for row, name in enumerate(embodiment):
         if name == HAND.id:
             actions[row, :, HAND.chunk_dim :] = 0
-    return SimpleNamespace(
+    return Batch(
         embodiment=embodiment,
         actions=actions,
         action_mask=torch.ones(b, t, dtype=torch.bool),

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from hma_data.errors import UsageError
 from hma_data.tokenizers.network import NetworkTokenizer
-from hma_model.bench import generation, play, speed, waiting, work
+from hma_model.bench import flops, generation, play, speed, waiting
 from hma_model.cli import app
 
 SMALL = {
@@ -65,9 +65,9 @@ def test_the_embedded_model_is_measured_to_pictures() -> None:
 
 def test_the_work_of_a_frame_is_that_of_its_products() -> None:
     linear, x = torch.nn.Linear(32, 48), torch.randn(2, 5, 32)
-    products = work.products_of(lambda: lambda: (linear(x), torch.bmm(x, x.mT)))
+    products = flops.products_of(lambda: lambda: (linear(x), torch.bmm(x, x.mT)))
     assert products == {("product", 10, 32, 48): 2 * 10 * 32 * 48, ("other", 0, 0, 0): 2 * 2 * 5 * 5 * 32}
-    assert work.rate_of(products, torch.device("cpu")) > 0
+    assert flops.rate_of(products, torch.device("cpu")) > 0
 
 
 @pytest.mark.slow

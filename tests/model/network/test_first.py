@@ -1,7 +1,6 @@
 """The first frame that the model is told at every frame."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -24,7 +23,7 @@ def _frames(model, batch):
 
 
 def _with_earlier(batch, earlier):
-    return SimpleNamespace(**vars(batch), earlier=earlier)
+    return dataclasses.replace(batch, earlier=earlier)
 
 
 @KINDS

@@ -2,6 +2,7 @@
 
 import ast
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -73,6 +74,16 @@ def test_losses_follow_the_row(kind: str, objective: Objective) -> None:
     assert learned == ({objective.readout.name} if objective.readout else set())
     stem = model.stem("arm").input.weight.grad
     assert (stem is not None and bool(stem.any())) == objective.sees_actions
+
+
+@pytest.mark.parametrize("objective", sorted(OBJECTIVES))
+def test_a_callers_own_batch_needs_no_more_than_frames_actions_and_names(objective: str) -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm", "hand.v1"])
+    names = ("embodiment", "actions", "action_mask", "tokens", "latents")
+    own = SimpleNamespace(**{name: getattr(batch, name) for name in names})
+    losses = [model(one, objective, torch.Generator().manual_seed(0)).loss for one in (batch, own)]
+    assert torch.equal(*losses)
 
 
 def test_an_unknown_name_is_refused() -> None:

@@ -14,6 +14,7 @@ from hma_model.checkpoint.io import Checkpoint
 from hma_model.hub import publish as hub
 from hma_model.training.loop import TrainResult, finetune, train
 from hma_model.training.recipe import make_recipe
+from tests.command import fails, hma
 from tests.model.processes import run_command
 from tests.model.robots import SPEC
 from tests.model.runs import TINY, same, weights
@@ -211,9 +212,9 @@ def test_the_command_takes_shards_overrides_and_json(base, leg, tmp_path):
 
 
 def test_the_command_says_what_is_wrong_in_one_line(base, tmp_path):
-    words = ["finetune", "--from", str(base.out), "--data", str(tmp_path / "none")]
-    done = run_command(tmp_path, *words, "--out", str(tmp_path / "run"))
-    assert done.returncode == 1 and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    done = hma("finetune", "--from", base.out, "--data", tmp_path / "none", "--out", tmp_path / "run")
+    fails(done, 1, str(tmp_path / "none"))
+    assert done.stderr.count("\n") == 1
 
 
 def test_another_source_is_no_way_to_go_on_and_the_same_one_elsewhere_is(base, leg, tmp_path):

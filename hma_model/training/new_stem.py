@@ -1,11 +1,12 @@
-"""Begin a new robot's stem as that of a robot of the checkpoint whose commands do alike.
+"""Begin the stem of a new robot as a copy of the stem of a robot that takes its commands alike.
 
-A new stem hears nothing, so the first minutes of training go into that alone. A robot of a kind that the
-checkpoint knows, the same arm at another desk or the same simulator in other colours, can begin with the
-stem of its like. The data says which: each robot of the checkpoint with as many action dims is tried on a few
-training windows. The one with the lowest loss is taken, if a new stem's is higher.
+A freshly initialised stem passes nothing of the commands on, and the first minutes of training go into that
+alone. If the checkpoint knows a robot of the same kind (the same arm at another desk, the same simulator in
+other colours), the new robot can begin with the stem of that one. Each robot of the checkpoint with as many
+action dims is tried on a few training windows. The stem with the lowest loss is taken, if a fresh one's loss
+is higher.
 
-A actions dims, D width.
+A action dims, D width.
 """
 
 import math
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 FETCHED = 4  # robots of a hub that are fetched for a new one; of a folder all are tried
-WINDOWS, FRAMES = 8, 4  # on which they are
+WINDOWS, FRAMES = 8, 4  # on which they are tried
 OWN = "normalizer."  # the statistics, which stay those of the new robot
 INPUT, WAVES = "input.weight", "waves.weight"
 
@@ -36,12 +37,12 @@ type State = Mapping[str, "Tensor"]
 
 
 @dataclass(frozen=True)
-class Begun:
-    """How the stem of a new robot begins."""
+class ChosenStem:
+    """The stem with which a new robot begins."""
 
-    stem: str  # the robot of the checkpoint whose stem it was
-    loss: float  # with it, before training
-    fresh: float  # and with a new one
+    like: str  # the robot of the checkpoint whose stem it is
+    loss: float  # of the new robot's windows with this stem, before training
+    fresh_loss: float  # of the same windows with a fresh stem
 
 
 def candidates(cards: Mapping[str, Mapping[str, Any]], robot: "Embodiment") -> list[str]:
@@ -62,7 +63,7 @@ def candidates(cards: Mapping[str, Mapping[str, Any]], robot: "Embodiment") -> l
 @torch.no_grad()
 def choose(
     model: "HMA", name: str, checkpoint: Checkpoint, shards: ShardSet, cameras: Cameras, objective: str
-) -> Begun | None:
+) -> ChosenStem | None:
     """Find the robot whose stem gives a new robot's training windows the lowest loss; None: a fresh one does.
 
     Args:
@@ -88,15 +89,15 @@ def choose(
     fresh = lowest = loss()
     chosen = ""
     for like in candidates(cards, shards.embodiment):
-        take(model, name, checkpoint, like)
+        copy_stem(model, name, checkpoint, like)
         tried = loss()
         if tried < lowest:
             chosen, lowest = like, tried
         _load(model, name, *own)
-    return Begun(chosen, lowest, fresh) if chosen else None
+    return ChosenStem(chosen, lowest, fresh) if chosen else None
 
 
-def take(model: "HMA", name: str, checkpoint: Checkpoint, like: str) -> None:
+def copy_stem(model: "HMA", name: str, checkpoint: Checkpoint, like: str) -> None:
     """Give a robot of the model another one's stem, and its head if it fits; the statistics stay."""
     own_stem, own_head = _states(model, name)
     space, stem, head = checkpoints.read_embodiment(checkpoint, like)

@@ -5,8 +5,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from hma_model.network import product
-from hma_model.network.product import Linear, after_gelu, after_norm
+from hma_model.network import linear as linears
+from hma_model.network.linear import Linear, after_gelu, after_norm
 from tests.data.fresh import run_fresh
 
 ROWS, INPUTS, OUTPUTS = (3, 50), 24, 40
@@ -22,9 +22,9 @@ def values_and_gradients(function, parameters: list[nn.Parameter], x: Tensor, gr
 @pytest.mark.parametrize("before", ["nothing", "norm", "gelu"])
 @pytest.mark.parametrize("kernels", [True, False])
 def test_values_and_gradients_equal_float64(before, bias, kernels, monkeypatch):
-    if kernels and not product.has_kernels():
+    if kernels and not linears.has_kernels():
         pytest.skip("this processor has no AVX-512")
-    monkeypatch.setattr(product, "has_kernels", lambda: kernels)
+    monkeypatch.setattr(linears, "has_kernels", lambda: kernels)
     torch.manual_seed(0)
     linear, norm = Linear(INPUTS, OUTPUTS, bias=bias), nn.LayerNorm(INPUTS)
     nn.init.normal_(norm.weight)
@@ -61,7 +61,7 @@ def test_frozen_weights_and_autocast():
 
 KEPT = """
 import os, sys
-import hma_model.network.product
+import hma_model.network.linear
 assert os.environ["ONEDNN_PRIMITIVE_CACHE_CAPACITY"] == sys.argv[1]
 """
 

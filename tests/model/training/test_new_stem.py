@@ -17,7 +17,7 @@ from hma_model.config import ActionSpace
 from hma_model.evaluation.losses import validation_losses, windows
 from hma_model.hub import publish as hub
 from hma_model.network.stem import Stem
-from hma_model.training import alike
+from hma_model.training import new_stem
 from hma_model.training.loop import TrainResult, finetune, train
 from hma_model.training.recipe import make_recipe
 from tests.model.robots import CONFIG
@@ -54,7 +54,7 @@ def test_a_command_that_is_held_means_the_same_at_every_stride(steps, own_steps,
     if theirs.waves is not None:
         kept = theirs.waves.weight.detach().view(-1, 2 * steps, 2, waves)
         torch.nn.init.normal_(kept[..., : min(waves, own_waves)])
-    fitted = alike._fitted(theirs.state_dict(), own.state_dict(), steps, own_steps)
+    fitted = new_stem._fitted(theirs.state_dict(), own.state_dict(), steps, own_steps)
     own.load_state_dict(fitted)
     held = torch.randn(3, 4, 2)
     a, b = (stem(held.repeat(1, 1, n)) for stem, n in ((theirs, steps), (own, own_steps)))
@@ -63,8 +63,8 @@ def test_a_command_that_is_held_means_the_same_at_every_stride(steps, own_steps,
 
 def test_each_command_goes_where_its_time_is():
     weight = torch.arange(4.0).view(1, 4, 1)  # four steps of one dim
-    assert alike._resampled(weight, 4, 2).flatten().tolist() == [0 + 1, 2 + 3]
-    assert alike._resampled(weight + 1, 4, 8).flatten().tolist() == [0, 1, 0, 2, 0, 3, 0, 4]
+    assert new_stem._resampled(weight, 4, 2).flatten().tolist() == [0 + 1, 2 + 3]
+    assert new_stem._resampled(weight + 1, 4, 8).flatten().tolist() == [0, 1, 0, 2, 0, 3, 0, 4]
 
 
 def test_the_stem_with_the_lowest_loss_is_taken(base, twin, tmp_path):
@@ -72,20 +72,20 @@ def test_the_stem_with_the_lowest_loss_is_taken(base, twin, tmp_path):
     model = checkpoint.load(base.checkpoint)
     model.add_embodiment(shards.embodiment, action_stats(shards.manifest.stats, "twin"))
     before = {name: value.clone() for name, value in model.state_dict().items()}
-    begun = alike.choose(model, "twin", opened, shards, "first", "forward")
+    chosen = new_stem.choose(model, "twin", opened, shards, "first", "forward")
     assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
-    given: dict = {"batch_size": alike.WINDOWS}
+    given: dict = {"batch_size": new_stem.WINDOWS}
 
     def loss() -> float:
-        found = windows(shards, "train", alike.FRAMES, alike.WINDOWS, **given)
+        found = windows(shards, "train", new_stem.FRAMES, new_stem.WINDOWS, **given)
         return validation_losses(model, found)[0].mean()
 
     losses = {"": loss()}
     for name in ("arm", "cart"):
-        alike.take(model, "twin", opened, name)
+        new_stem.copy_stem(model, "twin", opened, name)
         losses[name] = loss()
-    assert begun is not None and begun.fresh == losses[""]
-    assert (begun.loss, begun.stem) == min((value, name) for name, value in losses.items())
+    assert chosen is not None and chosen.fresh_loss == losses[""]
+    assert (chosen.loss, chosen.like) == min((value, name) for name, value in losses.items())
 
 
 def test_a_new_robot_begins_with_it_and_the_card_says_so(base, twin, tmp_path):
@@ -132,4 +132,4 @@ def test_only_robots_with_as_many_dims_are_tried_the_nearest_rate_first():
     class Robot:
         action_dim, effective_hz = 2, 10.0
 
-    assert alike.candidates(cards, Robot()) == ["near", "slow", "odd"]  # type: ignore[arg-type]
+    assert new_stem.candidates(cards, Robot()) == ["near", "slow", "odd"]  # type: ignore[arg-type]

@@ -41,7 +41,7 @@ class Linear(nn.Linear):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (..., I) to (..., O)."""
-        if _quick(self, x):
+        if _suits_onednn(self, x):
             made: Tensor = _Product.apply(x, self.weight, self.bias)
             return made
         return super().forward(x)
@@ -49,34 +49,34 @@ class Linear(nn.Linear):
 
 def after_norm(norm: nn.Module, linear: nn.Module, x: Tensor) -> Tensor:
     """Apply a norm and a linear map to (..., I); the backward pass recomputes the norm."""
-    if isinstance(norm, nn.LayerNorm) and _quick(linear, x):
+    if isinstance(norm, nn.LayerNorm) and _suits_onednn(linear, x):
         made: Tensor = _NormProduct.apply(x, norm.weight, norm.bias, norm.eps, linear.weight, linear.bias)
         return made
-    return light(linear, lambda x: linear(norm(x)), x)
+    return recomputed(linear, lambda x: linear(norm(x)), x)
 
 
 def after_gelu(linear: nn.Module, x: Tensor) -> Tensor:
     """Apply a GELU and a linear map to (..., I); the backward pass recomputes the GELU."""
-    if _quick(linear, x):
+    if _suits_onednn(linear, x):
         made: Tensor = _GeluProduct.apply(x, linear.weight, linear.bias)
         return made
-    return light(linear, lambda x: linear(F.gelu(x)), x)
+    return recomputed(linear, lambda x: linear(F.gelu(x)), x)
 
 
-def light(linear: nn.Module | None, function: Callable[..., Tensor], x: Tensor, *others: Any) -> Tensor:
+def recomputed(linear: nn.Module | None, function: Callable[..., Tensor], x: Tensor, *others: Any) -> Tensor:
     """Call a function of (..., I) that ends in a linear map, and keep only its inputs for the backward pass.
 
     The backward pass recomputes the operations before the product. It does not recompute the product, because
     the recomputation stops once all tensors for the backward pass exist. With oneDNN it would; so there all
     tensors are kept.
     """
-    if not torch.is_grad_enabled() or (linear is not None and _quick(linear, x)):
+    if not torch.is_grad_enabled() or (linear is not None and _suits_onednn(linear, x)):
         return function(x, *others)
     out: Tensor = checkpoint(function, x, *others, use_reentrant=False, preserve_rng_state=False)
     return out
 
 
-def _quick(linear: nn.Module, x: Tensor) -> bool:
+def _suits_onednn(linear: nn.Module, x: Tensor) -> bool:
     """Check whether oneDNN is to compute this product."""
     if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu"):
         return False

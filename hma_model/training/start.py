@@ -1,0 +1,231 @@
+"""Start a run from a checkpoint of another run or of a hub.
+
+The run keeps its own copy of the checkpoint in `.start/`, so it can resume even if the source changes. Robots
+that the checkpoint has continue from their stem and head, with the statistics these were trained with. Other
+robots get fresh ones, or begin with the stem of a robot like them (`hma_model.training.new_stem`). From a hub
+only the trunk, the robots of the data, and a few that may be like them are fetched.
+
+With a frozen trunk, the run's checkpoints keep the same files of the trunk and, if the source is on this
+machine, of all other robots. With a tuned trunk they leave out the other robots, which belong to the old one.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hma_data.errors import CheckpointError, HubError, RecipeError
+from hma_data.loading.views import view_count
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.reader import ShardSet
+from hma_data.storage.files import read_json
+from hma_data.storage.paths import addressed, is_repository
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.checkpoint import io as checkpoints
+from hma_model.checkpoint import weights as stored
+from hma_model.checkpoint.folder import README, Checkpoint, require_tokenizer, resolve
+from hma_model.config import HMAConfig
+from hma_model.network.model import HMA
+from hma_model.network.stem import waves_of_stem
+from hma_model.training.new_stem import FETCHED, candidates
+from hma_model.training.recipe import Recipe
+from hma_model.training.resume import TRAINED_BY
+from hma_model.training.runtime import RECIPE, START
+
+# fields that a run may turn on for a checkpoint's trunk, and their parameters, which change nothing at first
+ADDED = {
+    "told_noise": "trunk.noise.", "told_first": "trunk.first.",
+    "digit_order": "readout.chain.", "copy_previous": "readout.copy.",
+}  # fmt: skip
+WAVES = "action_waves"
+
+
+@dataclass(frozen=True)
+class Start:
+    """A checkpoint from which a run starts."""
+
+    checkpoint: Checkpoint  # the run's own copy
+    frozen: bool  # the trunk is not trained
+    source: str  # where the checkpoint is from, for notes
+
+    @classmethod
+    def bring(cls, recipe: Recipe, sets: Mapping[str, ShardSet], out: Path) -> None:
+        """Fetch the recipe's checkpoint into the run's folder, unless it is there already.
+
+        Raises:
+            HubError, CheckpointError: the checkpoint does not exist, or is damaged.
+            CheckpointError: the data is of another tokenizer.
+        """
+        from hma_model.hub import publish as hub
+
+        assert recipe.start is not None
+        place = out / START
+        if (place / README).is_file():  # written last
+            _require_source(recipe.start, out)
+            return
+        source, revision = addressed(recipe.start)
+        local = not is_repository(source) and "://" not in source
+        if local:
+            found = Checkpoint.open(resolve(Path(source).expanduser()))
+            require_tokenizer(found.config, _spec(sets), found.folder)
+            found.trunk()
+            source = str(found.folder)
+        try:
+            wanted, likes = _robots(recipe, sets, source, revision, local)
+            try:
+                hub.pull(source, sorted(wanted | likes), place, revision)
+            except CheckpointError as fault:
+                if not likes - wanted:
+                    raise
+                remedy = f"{fault.remedy}, or with new_stem=fresh go without the robots like yours"
+                raise CheckpointError(fault.where, fault.fault, remedy) from fault
+        except HubError as fault:
+            if local or "://" in source:
+                raise
+            both = f"is no folder here; as a repository of the hub: {fault.fault}"
+            remedy = f"give the path of a checkpoint or run, or: {fault.remedy}"
+            raise HubError(recipe.start, both, remedy) from fault
+
+    @classmethod
+    def open(cls, recipe: Recipe, sets: Mapping[str, ShardSet], out: Path) -> "Start":
+        """Open the copy that `bring` has fetched.
+
+        Raises:
+            CheckpointError: the copy is damaged, or the data is of another tokenizer.
+        """
+        start = cls(Checkpoint.open(out / START), recipe.freeze == "trunk", str(recipe.start))
+        require_tokenizer(start.checkpoint.config, _spec(sets), start.source)
+        return start
+
+    def network(self, recipe: Recipe) -> HMAConfig:
+        """Return the configuration of the checkpoint's network, with the recipe's training options.
+
+        Raises:
+            RecipeError: the recipe asks for another network.
+        """
+        config = self.checkpoint.config
+        changes: dict[str, Any] = {"objectives": recipe.objectives}
+        for key, value in recipe.model.items():
+            if key == WAVES:  # `waves` looks after them: each stem may have its own
+                changes.update({} if self.frozen else {key: value})
+            elif key in TRAINED_BY or (key in self._off() and not self.frozen):
+                changes[key] = value
+            elif getattr(config.replace(**{key: value}), key) != getattr(config, key):
+                fault = f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}"
+                remedy = "leave it out: the network is the checkpoint's"
+                raise RecipeError(f"recipe: model.{key}", fault, remedy)
+        spec = TokenizerSpec.from_json(dict(config.tokenizer)) if recipe.digits and config.tokenizer else None
+        if spec and config.factored and recipe.factored(spec) != tuple(config.factored):
+            fault = f"gives digits of {recipe.factored(spec)}, the checkpoint has {tuple(config.factored)}"
+            raise RecipeError("recipe: digits", fault, "leave it out: the network is the checkpoint's")
+        if (views := view_count(recipe.cameras)) != config.views:
+            fault = f"are {views} in a frame, the checkpoint that the run starts from has {config.views}"
+            raise RecipeError("recipe: cameras", fault, "name as many, or train from scratch")
+        if config.time_position == "learned" and recipe.frames > config.frames:
+            fault = f"{recipe.frames} are more than the checkpoint's {config.frames}"
+            raise RecipeError("recipe: frames", fault, "use fewer")
+        return config.replace(**changes)
+
+    def stats(self, shards: ShardSet) -> dict[str, Any]:
+        """Return a robot's statistics: those of the checkpoint if it has the robot, else those of the shards.
+
+        Raises:
+            CheckpointError: the checkpoint has the robot with other actions.
+        """
+        name = shards.embodiment.id
+        if name not in self.checkpoint.embodiments:
+            return shards.manifest.stats
+        theirs, ours = self.checkpoint.embodiment(name), shards.embodiment
+        for key in ("action_dim", "stride", "normalize_mask"):
+            a, b = getattr(theirs, key), getattr(ours, key)
+            if not np.array_equal(a, b):
+                fault = f"has {name} with {key} {a}, the shards have {b}"
+                raise CheckpointError(self.source, fault, "give the robot of the shards another id")
+        return self.checkpoint.stats(name)
+
+    def waves(self, robot: Embodiment, recipe: Recipe) -> int | None:
+        """Return the octaves of waves of a robot's stem; None for those of the network.
+
+        They are the checkpoint's; of a robot that it lacks the recipe's, else the most that a like robot has.
+        """
+        name, own = robot.id, recipe.model.get(WAVES)
+        if name in self.checkpoint.embodiments:
+            return self._waves(name) or own
+        if own is not None or recipe.new_stem == "fresh":
+            return own
+        cards = {one: self.checkpoint.card(one) for one in self.checkpoint.embodiments}
+        return max(map(self._waves, candidates(cards, robot)), default=0) or None
+
+    def _waves(self, name: str) -> int:
+        _, stem, _ = checkpoints.read_embodiment(self.checkpoint, name)
+        return waves_of_stem(stem)
+
+    def fill(self, model: HMA) -> None:
+        """Load the checkpoint's weights for the model's embodiments; freeze trunk and readout if required."""
+        kept = stored.trunk(self.checkpoint)
+        added = tuple(self._off().values())
+        model.load_trunk({n: t for n, t in model.trunk_state().items() if n.startswith(added)} | kept)
+        for name in model.embodiments:
+            if name in self.checkpoint.embodiments:
+                checkpoints.add_embodiment(model, self.checkpoint, name)
+        if self.frozen:
+            model.trunk.requires_grad_(False)
+            model.readout.requires_grad_(False)
+
+    def _off(self) -> dict[str, str]:
+        """Return the fields of ADDED that the checkpoint's network is without, and their parameters."""
+        config = self.checkpoint.config
+        return {key: begin for key, begin in ADDED.items() if getattr(config, key) == getattr(HMAConfig, key)}
+
+    def remarks(self, names: Iterable[str]) -> list[str]:
+        """Return notes on the trunk, and on which robots continue and which get a fresh stem and head."""
+        known = [name for name in names if name in self.checkpoint.embodiments]
+        fresh = [name for name in names if name not in known]
+        notes = [f"from {self.source}: trunk {'frozen' if self.frozen else 'tuned'}"]
+        if fresh:
+            notes.append(f"new stem and head: {', '.join(fresh)}")
+        if known:
+            notes.append(f"stem, head and statistics from the checkpoint: {', '.join(known)}")
+        return notes
+
+
+def _robots(
+    recipe: Recipe, sets: Mapping[str, ShardSet], source: str, revision: str | None, local: bool
+) -> tuple[set[str], set[str]]:
+    """Return the robots of a checkpoint that the run takes, and those with whose stem a new one may begin."""
+    from hma_model.hub import publish as hub
+
+    known = hub.embodiment_ids(hub.open_store(source, revision).files())
+    wanted = {name for name in known if name in sets or (recipe.freeze == "trunk" and local)}
+    fresh, likes = set(sets) - set(known), set[str]()
+    if fresh and recipe.new_stem == "like":
+        rows = [row for row in hub.list_embodiments(source, revision) if not row["problems"]]
+        cards = {row["embodiment"]: {**row, "effective_hz": row["hz"]} for row in rows}
+        for name in fresh:
+            some = [one for one in candidates(cards, sets[name].embodiment) if one in known]
+            likes |= set(some if local else some[:FETCHED])
+    return wanted, likes
+
+
+def _require_source(source: str, out: Path) -> None:
+    """Raise if a resumed run names a checkpoint with another trunk; it may have moved, or be gone."""
+    from hma_model.hub.listing import survey
+
+    before = read_json(out / RECIPE).get("start") if (out / RECIPE).is_file() else None
+    if before in (None, source):
+        return
+    address, revision = addressed(source)
+    path = Path(address).expanduser()
+    if is_repository(address) or "://" in address:
+        trunk = survey(address, revision)[0]["trunk_sha256"]
+    else:
+        trunk = Checkpoint.open(resolve(path)).trunk_sha256 if path.exists() else None
+    if trunk not in (None, Checkpoint.open(out / START).trunk_sha256):
+        fault = f"was started from {before}, not from {source}"
+        raise RecipeError(out, fault, "train into another folder, or name the first")
+
+
+def _spec(sets: Mapping[str, ShardSet]) -> Any:
+    return next(iter(sets.values())).spec
