@@ -233,8 +233,9 @@ def registry_infer(
     for line in text.splitlines()[1:2]:
         if line.startswith("# "):
             print(line[2:])
-    if pairing := values.get("provenance", {}).get("sync"):
-        print(pairing)
+    for said in ("sync", "segments"):
+        if measured := values.get("provenance", {}).get(said):
+            print(measured)
     for path, question in todos(values):
         print(f"answer {path}: {question}")
     print(f"then: hma registry validate {shlex.quote(str(out))}")

@@ -227,7 +227,8 @@ def convert(
             raise SourceError(conversion.uri, f"gave no usable episode, so nothing was written: {told}")
         warning = _rate_warning(folder, out) if OFF_RATE in flags else ""
         made_set = ShardSet(folder)
-        notes = tuple(f"{out}: {one}" for one in (window_finding(made_set), pause_finding(made_set)) if one)
+        found = (window_finding(made_set), pause_finding(made_set))
+        notes = tuple(f"{out}: {one}" for one in found if one and one.severity != "info")
         if hub:
             hub.upload()
     episodes = sum(split["episodes"] for split in manifest.splits.values())

@@ -68,7 +68,8 @@ class TopicInfo:
     Attributes:
         name: of the topic.
         type: of its messages.
-        gap_ms: the longest interval between two of them; None for fewer than two.
+        gap_ms: the longest interval between two of them in which a camera saw something; of a camera, the
+            longest interval; None for fewer than two.
         delay_ms: median from header stamp to receipt; None where messages carry no time.
         goes_back: whether header stamps go back in time.
         offsets: how the messages lie between the pictures of each camera; of topics with numbers only.

@@ -291,6 +291,13 @@ def test_a_clock_counts_what_was_done_to_it() -> None:
     assert clock.hz == pytest.approx(30, rel=0.02)
 
 
+def test_a_pause_changes_neither_rate_nor_jitter() -> None:
+    times = np.arange(100) / 10 + 30.0 * (np.arange(100) >= 40)
+    assert checks.rate(times) == (pytest.approx(10), pytest.approx(0, abs=1e-6))
+    bursts = np.concatenate([start + np.arange(5) / 1000 for start in range(20)])
+    assert checks.rate(bursts)[0] == pytest.approx(5, rel=0.1)
+
+
 def test_lost_frames_are_told_for_cameras_alone() -> None:
     times = np.delete(np.arange(100) / 10, [20, 40, 41, 60])
     (finding,) = checks.time_findings("cam", measure(times), camera=True)
