@@ -143,7 +143,7 @@ def registry_validate(
 
 
 def _notes(judged: "list[Entry]") -> Iterator[tuple[Path, str]]:
-    """Yield path and note of the YAMLs that want more frames a second than were recorded, or than they get."""
+    """Yield path and note of the YAMLs that want more frames a second than were recorded."""
     for entry in judged:
         facts = entry.facts or {}
         target, rate, stride = (facts.get(name) for name in ("target_hz", "rate_hz", "stride"))

@@ -229,7 +229,7 @@ class _Draft:
         source = {"format": found.format, "uri": found.uri, "episodes": max(found.episodes, 1)}
         said = self._instruction()
         source |= {"instruction": said} if said else {}
-        layout = {key: facts[key] for key in ("timestamps", "pairing") if facts.get(key)}
+        layout = {key: facts[key] for key in ("timestamps", "pixels", "pairing") if facts.get(key)}
         source |= {"layout": layout} if layout else {}
         values |= {"source": source, "provenance": self._provenance()}
         taken = {key.key for key in self.used} | {said, ""}

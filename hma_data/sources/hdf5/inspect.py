@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 
 from hma_data.episodes.images import decode_image
 from hma_data.errors import EpisodeError, HMAError
+from hma_data.registry.components import Hdf5Layout
 from hma_data.sources.base import Inspection, KeyInfo, local_path, unfollowed
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, is_times, seconds_a_unit, seconds_of
@@ -29,7 +30,8 @@ from hma_data.sources.hdf5.file import (
     text,
     walk,
 )
-from hma_data.sources.hdf5.source import TEXT_KEYS, as_rgb, encoded, json_of, picture_kind
+from hma_data.sources.hdf5.pictures import as_bytes, as_rgb, encoded, picture_kind, pixels_of
+from hma_data.sources.hdf5.source import TEXT_KEYS, json_of
 from hma_data.sources.hdf5.videos import SUFFIXES
 
 MAX_LISTED = 1_000  # files beside an HDF5 file among which videos are looked for
@@ -47,6 +49,7 @@ class _First:
     name: str = ""
     keys: dict[str, KeyInfo] = field(default_factory=dict)
     facts: dict[str, str] = field(default_factory=dict)
+    pixels: dict[str, str] = field(default_factory=dict)  # camera -> range, where it is not uint8
     rate: float | None = None
     robots: Any = None
 
@@ -114,8 +117,10 @@ def inspect(
 def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: EpisodeGroup) -> None:
     said = _environment(files.get(place.file))
     first.robots = said.get("robots")
-    first.keys = {info.key: info for info in _keys(group, place)}
+    first.pixels = _pixels(group)
+    first.keys = {info.key: info for info in _keys(group, place, first.pixels)}
     first.facts = _facts(group, said, place)
+    first.facts["pixels"] = next(iter(first.pixels.values()), "")
     first.facts["videos beside it"] = _videos(place.file)
     first.rate, first.facts["rate"], first.facts["timestamps"] = _rate(group, said, first.keys, str(place))
 
@@ -147,7 +152,7 @@ def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: in
         try:
             with explained(where):
                 if info.kind == "camera":
-                    _pictures(name, key, item, info, survey, pairs)
+                    _pictures(name, key, item, info, survey, pairs, first.pixels.get(key))
                 elif info.kind == "vector" and item.size <= MAX_VALUES:
                     _values(name, key, numbers(group, key, name), info, survey, first)
         except HMAError as fault:
@@ -166,10 +171,25 @@ def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, fir
             survey.note(found)
 
 
-def _pictures(name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, pairs: int) -> None:
+def _pixels(group: h5py.Group) -> dict[str, str]:
+    """Return camera -> range of the colours that are not uint8, for `layout.pixels`, which is one for all."""
+    found: dict[str, str] = {}
+    for key, item in walk(group):
+        if item.shape and item.shape[0] and is_plausible(item):
+            stated = pixels_of(item, sorted({0, item.shape[0] // 2, item.shape[0] - 1}))
+            found |= {key: stated} if stated else {}
+    first = next(iter(found.values()), "")
+    return {key: stated for key, stated in found.items() if stated == first}
+
+
+def _pictures(
+    name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, pairs: int, pixels: str | None
+) -> None:
+    layout = Hdf5Layout.model_validate({"pixels": pixels})
     for run in checks.runs(checks.choose(item.shape[0], pairs)):
         found = rows(item, run)
         if info.codec == "raw":
+            found = as_bytes(found, layout, f"{name} {key}")
             survey.pictures(name, key, as_rgb(found), run, info.codec)
             continue
         pictures = [
@@ -238,10 +258,13 @@ def _stated_rate(group: h5py.Group, said: dict[str, Any]) -> tuple[float | None,
     return None, ""
 
 
-def _keys(group: h5py.Group, place: EpisodeGroup) -> Iterator[KeyInfo]:
+def _keys(group: h5py.Group, place: EpisodeGroup, pixels: Container[str]) -> Iterator[KeyInfo]:
     for key, item in walk(group):
         count = item.shape[0] if item.shape else None
         kind, shape, codec = _kind(item, f"{place} {key}")
+        if key in pixels:
+            sides = item.shape[1:]
+            kind, shape, codec = "camera", sides if sides[2] == 3 else (*sides[1:], 3), "raw"
         kind = "other" if key in _BESIDE else kind
         yield KeyInfo(key, kind, shape, str(item.dtype), codec=codec, count=count)
 

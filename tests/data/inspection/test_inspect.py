@@ -305,6 +305,15 @@ def test_lost_frames_are_told_for_cameras_alone() -> None:
     assert not list(checks.time_findings("arm", measure(times)))
 
 
+def test_tables_beside_videos_are_told(tmp_path: Path) -> None:
+    (tmp_path / "videos").mkdir()
+    encode_video(tmp_path / "videos/a.mp4", range(24))
+    (tmp_path / "videos/robot.csv").write_text("t,x\n")
+    (finding,) = [one for one in inspect_recording(str(tmp_path))["findings"] if one["check"] == "files"]
+    assert finding["severity"] == "info" and "beside them are 1 .csv" in finding["message"]
+    assert "HDF5 with videos beside it" in finding["remedy"]
+
+
 def test_events_have_no_pauses() -> None:
     times = np.cumsum(np.random.default_rng(0).exponential(5.0, 200) ** 2)
     assert not list(checks.time_findings("/button", measure(times)))
