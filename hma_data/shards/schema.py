@@ -206,6 +206,8 @@ def flags_text(trimmed: int, counts: Mapping[str, int], pauses: Mapping[int, int
 
 def flag_pauses(flags: str) -> dict[int, int]:
     """Return the pauses that `flags_text` wrote."""
+    if PAUSES not in flags:
+        return {}
     found = re.search(rf"(?:^|,){PAUSES}(\d+:\d+(?:;\d+:\d+)*)", flags)
     pairs = (pair.split(":") for pair in found[1].split(";")) if found else ()
     return {int(frame): int(steps) for frame, steps in pairs}

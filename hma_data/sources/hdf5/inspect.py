@@ -37,6 +37,7 @@ from hma_data.sources.hdf5.videos import SUFFIXES
 MAX_LISTED = 1_000  # files beside an HDF5 file among which videos are looked for
 LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
+_ENDS = ("episode_ends", "episode_lengths", "terminals", "timeouts", "dones")  # of episodes end to end
 _BESIDE = ("compress_len",)  # not rows over time: the bytes of ALOHA's JPEGs, (cameras, T)
 _MEASURED = "measured from"
 _SIMULATORS = {1: "robosuite", 2: "gym", 3: "iGibson"}  # robomimic's env_args.type
@@ -83,6 +84,7 @@ def inspect(
                 if not first.keys:
                     first.name = name
                     _tell(first, group, files, place)
+                    _end_to_end(name, group, place, survey)
                 held.update(sizes)
                 series = [key for key, info in first.keys.items() if info.kind in ("camera", "vector")]
                 survey.lengths(name, lengths[name], sizes, series)
@@ -123,6 +125,23 @@ def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: EpisodeGrou
     first.facts["pixels"] = next(iter(first.pixels.values()), "")
     first.facts["videos beside it"] = _videos(place.file)
     first.rate, first.facts["rate"], first.facts["timestamps"] = _rate(group, said, first.keys, str(place))
+
+
+def _end_to_end(name: str, group: h5py.Group, place: EpisodeGroup, survey: Survey) -> None:
+    """Warn where a whole file is taken for one episode, but states that it holds several."""
+    for key in _ENDS if place.group == WHOLE_FILE else ():
+        item = group.get(key)
+        if not isinstance(item, h5py.Dataset) or len(item.shape or ()) != 1 or item.size > MAX_VALUES:
+            continue
+        ends = item[()].astype(bool)  # a run of True counts once
+        count = len(item) if key.startswith("episode") else int(np.diff(ends, prepend=False)[ends].sum())
+        if count > 1:
+            said = f"{name} is read as one episode, but {key} tells of {count:,}"
+            remedy = (
+                "write each as a group of its own, data/demo_0, data/demo_1, …, or windows cross their ends"
+            )
+            survey.note(Finding("rows", "warn", said, remedy, key, {"episodes": count}))
+            return
 
 
 def _videos(file: Path) -> str:

@@ -503,7 +503,8 @@ def test_the_script_that_packs_pictures_and_tables_makes_episodes(tmp_path: Path
         (folder := tmp_path / f"recordings/take_{take}" / "images").mkdir(parents=True)
         for i, picture in enumerate(seen[take]):
             cv2.imwrite(str(folder / f"{i:06d}.png"), picture[..., ::-1])
-        (folder.parent / "actions.csv").write_text("x,y\n" + "".join(f"{i},{take}\n" for i in range(5)))
+        rows = [f"{i / 5},{i},{take}\n" for i in range(5)]
+        (folder.parent / "actions.csv").write_text("t,x,y\n" + "".join(rows))
     page = (ROOT / "docs/adding-a-robot.md").read_text()
     script = re.search(r"```python\n(# pack\.py.*?)```", page, re.DOTALL)
     assert script
@@ -511,7 +512,9 @@ def test_the_script_that_packs_pictures_and_tables_makes_episodes(tmp_path: Path
     path = tmp_path / "arm.hdf5"
     source = open_source("hdf5")
     assert source.inspect(str(path)).lengths == (5, 5)
-    clip = first_clip(path, inferred(path))
+    values = inferred(path)
+    assert values["frequency_hz"] == 5 and values["source"]["layout"] == {"timestamps": "time"}
+    clip = first_clip(path, values)
     np.testing.assert_array_equal(clip.frames_at(next(iter(clip.frame_indices)), np.arange(5)), seen[0])
     np.testing.assert_array_equal(clip.actions, [[i, 0] for i in range(5)])
     with pytest.raises(UsageError, match="not an id"):

@@ -211,6 +211,25 @@ def test_a_rate_measured_in_one_episode_is_not_called_stated(tmp_path: Path) -> 
     assert told and all("timestamps: runs at 30 Hz, demo_0 at 20" in one for one in told)
 
 
+@pytest.mark.parametrize(
+    ("key", "values", "count"),
+    [
+        ("episode_ends", [10, 20, 30], 3),
+        ("terminals", [0] * 9 + [1] + [0] * 19 + [1], 2),
+        ("dones", [False] * 20 + [True] * 10, None),
+        ("episode_ends", [30], None),
+    ],
+)
+def test_episodes_end_to_end_in_one_file_are_told(
+    tmp_path: Path, key: str, values: list, count: int | None
+) -> None:
+    with h5py.File(tmp_path / "flat.hdf5", "w") as file:
+        file["images"] = np.random.default_rng(0).integers(0, 256, (30, 16, 16, 3), np.uint8)
+        file["actions"], file[key] = np.random.default_rng(0).normal(size=(30, 3)), values
+    told = found(open_source("hdf5").inspect(str(tmp_path / "flat.hdf5"))).get("rows", [])
+    assert any(f"{key} tells of {count} — write" in said for said in told) == (count is not None)
+
+
 def test_a_bag_tells_skew_and_lost_frames(tmp_path: Path) -> None:
     path = write_ros1(tmp_path / "run.bag", make_recording())
     inspection = open_source("rosbag").inspect(str(path))
