@@ -14,12 +14,14 @@ real frame change no prediction before them.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.shards.reader import EpisodeIndex, ShardSet
+from hma_data.shards.schema import flag_pauses
 
 Ints = NDArray[np.int64]
 Short = Literal["drop", "pad"]
@@ -155,6 +157,18 @@ class WindowIndex:
         last = np.array([after - 1])
         row = min(int(self.first_rows(last)[0]) + self.span - 1, int(self.last_rows(last)[0]))
         return int(np.searchsorted(self.edges, row, side="right")) - 1
+
+
+def piece_lengths(flags: str, length: int, stride: int, frame_stride: int) -> list[int]:
+    """Return the rows of each piece of an episode of `length` rows with these flags.
+
+    Args:
+        stride: least recorded steps of a pause that divides an episode.
+        frame_stride: recorded steps a row.
+    """
+    after = {frame // frame_stride + 1 for frame, steps in flag_pauses(flags).items() if steps >= stride}
+    edges = [0, *sorted(row for row in after if row < length), length]
+    return [end - begin for begin, end in pairwise(edges)]
 
 
 def _row_groups(per_shard: list[tuple[int, ...]]) -> tuple[Ints, Ints]:

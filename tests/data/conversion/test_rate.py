@@ -16,6 +16,7 @@ from hma_data.inspection.infer import infer
 from hma_data.inspection.inspect import examine
 from hma_data.loading.dataset import WindowDataset
 from hma_data.registry.embodiment import Embodiment, find
+from hma_data.shards.memmap import export
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import flag_pauses
 from hma_data.shards.verify import verify
@@ -95,6 +96,9 @@ def test_no_window_crosses_a_pause(frames, tmp_path: Path) -> None:
     wanted = [*range(cut - span + 1), *range(cut, rows - span + 1)]
     assert first.tolist() == wanted and windows.index.divided_episodes == 1
     assert windows.batch(range(len(windows))).frame.tolist() == wanted
+    export(out, tmp_path / "flat", split="train")
+    ids = np.fromfile(tmp_path / "flat/segment_ids.bin", "<i4")
+    assert np.bincount(ids).tolist() == [cut, rows - cut]
     (note,) = summary.notes
     assert "training windows would cross one and are left out" in note
     assert verify(out) == [] and [one.severity for one in examine(out)] == ["warn", "warn"]
