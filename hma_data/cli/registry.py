@@ -131,24 +131,26 @@ def registry_validate(
     found = [(entry, problem) for entry in judged for problem in entry.problems]
     if json:
         listed = [{"file": str(entry.path), "problem": _line(problem), **problem} for entry, problem in found]
-        print_json({"files": len(judged), "problems": listed})
+        notes = [{"file": str(path), "note": note} for path, note in _notes(judged)]
+        print_json({"files": len(judged), "problems": listed, "notes": notes})
     else:
         for entry, problem in found:
             print(f"{entry.path}: {_line(problem)}")
-        for path, target, rate in _beyond(judged):
-            said = f"target_hz {target:g} is above the recorded rate: the model sees {rate:g} frames a second"
-            print(f"{path}: note: {said}")
+        for path, note in _notes(judged):
+            print(f"{path}: note: {note}")
         print(f"{human_count(len(judged), 'file')}, {human_count(len(found), 'problem')}")
     raise typer.Exit(1 if found else 0)
 
 
-def _beyond(judged: "list[Entry]") -> Iterator[tuple[Path, float, float]]:
-    """Yield path, target_hz and rate of the YAMLs that want more frames a second than were recorded."""
+def _notes(judged: "list[Entry]") -> Iterator[tuple[Path, str]]:
+    """Yield path and note of the YAMLs that want more frames a second than were recorded."""
     for entry in judged:
         facts = entry.facts or {}
-        target, rate = facts.get("target_hz"), facts.get("rate_hz")
+        target, rate, stride = (facts.get(name) for name in ("target_hz", "rate_hz", "stride"))
         if target and rate and target > rate and target != 2:  # 2 is the default, which nobody chose
-            yield entry.path, target, rate
+            sees = f"the model sees {rate / (stride or 1):.4g} frames a second"
+            given = f" with the stride {stride} that is given" if stride and stride > 1 else ""
+            yield entry.path, f"target_hz {target:g} is above the recorded rate: {sees}{given}"
 
 
 def _line(problem: dict[str, str | None]) -> str:
@@ -233,8 +235,9 @@ def registry_infer(
     for line in text.splitlines()[1:2]:
         if line.startswith("# "):
             print(line[2:])
-    if pairing := values.get("provenance", {}).get("sync"):
-        print(pairing)
+    for said in ("sync", "segments"):
+        if measured := values.get("provenance", {}).get(said):
+            print(measured)
     for path, question in todos(values):
         print(f"answer {path}: {question}")
     print(f"then: hma registry validate {shlex.quote(str(out))}")

@@ -227,7 +227,8 @@ def convert(
             raise SourceError(conversion.uri, f"gave no usable episode, so nothing was written: {told}")
         warning = _rate_warning(folder, out) if OFF_RATE in flags else ""
         made_set = ShardSet(folder)
-        notes = tuple(f"{out}: {one}" for one in (window_finding(made_set), pause_finding(made_set)) if one)
+        found = (window_finding(made_set), pause_finding(made_set))
+        notes = tuple(f"{out}: {one}" for one in found if one and one.severity != "info")
         if hub:
             hub.upload()
     episodes = sum(split["episodes"] for split in manifest.splits.values())
@@ -292,12 +293,14 @@ class _Conversion:
     resources: Resources = RESOURCES
 
     def __post_init__(self) -> None:
+        if not isinstance(self.tokenizer, str) or str(self.out).startswith("memory:"):
+            self.workers = 0  # no other process sees them
         if isinstance(self.tokenizer, str):
-            self._opened = get_tokenizer(self.tokenizer, weights=self.weights, device=self.device)
+            # Workers open it on the device; this process needs what it is, and may have no such device.
+            device = "cpu" if self.workers or self.engine == "ray" else self.device
+            self._opened = get_tokenizer(self.tokenizer, weights=self.weights, device=device)
         else:
             self._opened = self.tokenizer
-        if self._opened is self.tokenizer or str(self.out).startswith("memory:"):
-            self.workers = 0  # no other process sees them
         self._whole, self.uri = plan_conversion(self.embodiment, self.source, self._opened, self.settings)
         self.pictures: dict[str, tuple[int, int]] = {}
         self.changed = ""

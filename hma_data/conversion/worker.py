@@ -26,7 +26,7 @@ from hma_data.conversion.extend import Content, kept_frames
 from hma_data.conversion.output import Made
 from hma_data.conversion.plan import ShardUnit, camera_fault, read_clip
 from hma_data.cpu import usable_cores
-from hma_data.episodes.align import rate_flags
+from hma_data.episodes.align import pauses, rate_flags
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import PictureCheck, picture_flags, prepared
 from hma_data.errors import (
@@ -330,7 +330,7 @@ def _row(item: _Episode, unit: ShardUnit, start: int, rows: int) -> EpisodeRow:
         skew_max_ms=worst[2],
         skew=json.dumps(skew),
         trimmed=clip.trimmed,
-        flags=flags_text(clip.trimmed, clip.flags | item.flags),
+        flags=flags_text(clip.trimmed, clip.flags | item.flags, pauses(clip.timestamps)),
         group=item.ref.group,
         content=item.content.text(),
     )

@@ -316,24 +316,38 @@ def is_off_rate(hz: float, embodiment: Embodiment) -> bool:
 def rate_flags(clip: Clip, embodiment: Embodiment) -> dict[str, int]:
     """Return the counts of a clip's grid, none of them 0.
 
-    OFF_RATE: its frames where it is off the embodiment's rate. PAUSED: frames whose next one comes PAUSE
-    median steps later or more, so that time jumps there.
+    OFF_RATE: its frames where it is off the embodiment's rate. PAUSED: frames before a pause, see `pauses`.
     """
-    steps = np.diff(clip.timestamps)
-    hz = measured_hz(steps)
+    hz = measured_hz(np.diff(clip.timestamps))
     if not hz:
         return {}
     flags = {OFF_RATE: len(clip)} if is_off_rate(hz, embodiment) else {}
-    paused = int((steps * hz >= PAUSE).sum())
+    paused = len(pauses(clip.timestamps))
     return flags | ({PAUSED: paused} if paused else {})
 
 
+def pauses(times: Floats) -> dict[int, int]:
+    """Return where a grid's time jumps: frame -> median steps to the next frame, if PAUSE or more.
+
+    A pause as long as a step of the model ends a window there, see `hma_data.shards.windows`.
+    """
+    steps = np.diff(times)
+    ratios = steps * (measured_hz(steps) or 0.0)
+    found = np.flatnonzero(ratios >= PAUSE)
+    return dict(zip(found.tolist(), np.rint(ratios[found]).astype(np.int64).tolist(), strict=True))
+
+
 def pause_remedy(embodiment: Embodiment, hz: float | None) -> str:
-    """Return what to do about pauses in a grid of `hz`, if known: a bag may be divided there by the YAML."""
-    if embodiment.source.format != "rosbag":
-        return "split the episodes at the pauses, or leave them out with source.exclude"
-    gap = f"{(PAUSE - 0.5) / hz:.2g}" if hz else "SECONDS"
-    return f"divide the recordings there with source.segments: {{gap_s: {gap}}}"
+    """Return what can be done about the pauses in a grid of `hz`; empty unless it is a bag's."""
+    if embodiment.source.format != "rosbag" or not hz:
+        return ""
+    stride = embodiment.stride if embodiment.rate_hz else 1
+    return divide_remedy((max(PAUSE, stride) - 0.5) / hz)
+
+
+def divide_remedy(gap_s: float) -> str:
+    """Return what divides a bag at the pauses of its primary camera that are longer than `gap_s`."""
+    return f"source.segments: {{gap_s: {gap_s:.2g}}} in the YAML makes the parts episodes of their own"
 
 
 def rate_remedy(embodiment: Embodiment) -> str:

@@ -36,6 +36,7 @@ from hma_data.registry.catalog import entries
 from hma_data.registry.components import Space
 from hma_data.registry.embodiment import ID_PATTERN, ONE_INDEX, TODO, Embodiment, find
 from hma_data.sources.base import Inspection, KeyInfo, detect, open_source, require_utf8
+from hma_data.sources.common.checks import Finding
 from hma_data.storage.paths import StrPath
 
 LINE = 110
@@ -228,7 +229,7 @@ class _Draft:
         source = {"format": found.format, "uri": found.uri, "episodes": max(found.episodes, 1)}
         said = self._instruction()
         source |= {"instruction": said} if said else {}
-        layout = {key: facts[key] for key in ("timestamps", "pairing") if facts.get(key)}
+        layout = {key: facts[key] for key in ("timestamps", "pixels", "pairing") if facts.get(key)}
         source |= {"layout": layout} if layout else {}
         values |= {"source": source, "provenance": self._provenance()}
         taken = {key.key for key in self.used} | {said, ""}
@@ -331,7 +332,14 @@ class _Draft:
                 said["max_skew_ms"] = f"{factor}; intervals, measured: {gaps}"
             if late := infer_topics.needs_receive_times(self.used):
                 said["stamp"] = late
+            if pause := self._pause():
+                said["segments"] = str(pause)
         return said
+
+    def _pause(self) -> Finding | None:
+        """Return the finding on pauses of the primary camera, if it has any."""
+        key, found = self.seen.keys[0].key, self.found.findings
+        return next((one for one in found if one.check == "gaps" and one.key == key), None)
 
     def _rate_from(self) -> str:
         if self.found.facts.get("pairing"):

@@ -344,7 +344,8 @@ def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
         said = f"the grid ticks at {hz:.3g} Hz, the YAML says {robot.rate_hz:g}"
         yield Finding("rate", "error", said, rate_remedy(robot))
     if hz and (steps > 3 / hz).any():
-        yield Finding("gaps", "warn", f"frames pause for up to {steps.max():.3g} s", pause_remedy(robot, hz))
+        said = f"frames pause for up to {steps.max():.3g} s; no window crosses a pause of a model's step"
+        yield Finding("gaps", "warn", said, pause_remedy(robot, hz))
     needed = WINDOW * robot.stride  # the chunk of the last frame too
     lengths = sorted(len(clip) for clip in clips)
     short = sum(length < needed for length in lengths)

@@ -11,8 +11,9 @@ import pyarrow.compute as pc
 
 from hma_data.episodes.align import OFF_RATE, PAUSE, PAUSED, measured_hz, pause_remedy, rate_remedy
 from hma_data.shards.reader import EpisodeReader, ShardSet
-from hma_data.sources.common.checks import Finding
+from hma_data.sources.common.checks import Finding, Severity
 
+COSTLY = 0.1  # share of the windows above which the loss is a warning
 TRIED = 20  # flagged episodes of which the first with more than one row is measured
 
 
@@ -35,17 +36,25 @@ def rate_finding(shards: ShardSet) -> Finding | None:
 
 
 def pause_finding(shards: ShardSet) -> Finding | None:
-    """Return a finding on frames after which time jumps; None where no episode is flagged."""
+    """Return a finding on the windows that pauses cost; None where no episode is flagged.
+
+    It is a warning where they cost more than a tenth of the windows.
+    """
+    from hma_data.shards.windows import WINDOW, WindowIndex
+
     episodes = shards.episodes
     flagged = episodes.filter(pc.match_substring(episodes["flags"], f"{PAUSED}="))
     if not len(flagged):
         return None
     count, which = len(flagged), flagged["id"][0].as_py()
+    whole = int(np.maximum(0, shards.index("train").length - WINDOW * shards.row_stride + 1).sum())
+    lost = whole - WindowIndex.of(shards, "train", WINDOW).count
     said = f"{count:,} of {len(episodes):,} episodes have a pause of {PAUSE:g} steps or more, such as {which}"
-    said += "; a window across it sees a jump"
+    said += f"; {lost:,} of {whole:,} training windows would cross one and are left out" if lost else ""
     hz = next((hz for _, hz in _measured(shards, flagged[:TRIED].to_pylist())), None)
-    remedy = f"{pause_remedy(shards.embodiment, hz)}, and convert again with --overwrite"
-    return Finding("gaps", "warn", said, remedy, numbers={"episodes": count})
+    severity: Severity = "warn" if lost > COSTLY * whole else "info"
+    numbers = {"episodes": count, "windows": lost}
+    return Finding("gaps", severity, said, pause_remedy(shards.embodiment, hz), numbers=numbers)
 
 
 def window_finding(shards: ShardSet) -> Finding | None:

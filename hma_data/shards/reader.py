@@ -13,7 +13,7 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import ShardError, UsageError
 from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile
-from hma_data.shards.schema import mask_columns, to_numpy, token_column
+from hma_data.shards.schema import flag_pauses, mask_columns, to_numpy, token_column
 from hma_data.storage.files import cache_folder, file_sha256, parse_json, part_of
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath
@@ -50,6 +50,8 @@ class EpisodeIndex:
         start: first row in the shard.
         length: number of rows.
         camera: index of the camera whose rows these are; 0 where the rows hold all cameras.
+        pauses: (P, 3) the jumps of time: entry of these arrays, its row before the jump, and how many
+            recorded steps it lasts.
     """
 
     episode_index: Ints
@@ -57,6 +59,7 @@ class EpisodeIndex:
     start: Ints
     length: Ints
     camera: Ints
+    pauses: Ints = field(default_factory=lambda: np.zeros((0, 3), np.int64))
 
 
 class ShardSet:
@@ -153,9 +156,9 @@ class ShardSet:
     def index(self, split: str) -> EpisodeIndex:
         """Return the split's episodes, in row order."""
         cameras = self.manifest.layout.rows_a_frame
-        columns = ["episode_index", "split", "shard", "row_start", "length"]
-        table = self._episodes(columns, read_dictionary=["split", "shard"])
-        splits, names = _words(table["split"]), _words(table["shard"])
+        columns = ["episode_index", "split", "shard", "row_start", "length", "flags"]
+        table = self._episodes(columns, read_dictionary=["split", "shard", "flags"])
+        splits, names, flags = (_words(table[name]) for name in ("split", "shard", "flags"))
         mine = np.array([word == split for word in splits[1]], np.bool_)[splits[0]]
         order = {name: i for i, name in enumerate(self.shards(split))}
         shard = np.array([order.get(word, -1) for word in names[1]], np.int64)[names[0][mine]]
@@ -164,8 +167,9 @@ class ShardSet:
         )
         starts = (start[:, None] + np.arange(cameras) * length[:, None]).ravel()
         number = np.tile(np.arange(cameras), len(index))
+        pauses = _pauses(flags[0][mine], flags[1], self.manifest.frame_stride, cameras)
         index, shard, length = (np.repeat(values, cameras) for values in (index, shard, length))
-        return EpisodeIndex(index, shard, starts, length, number)
+        return EpisodeIndex(index, shard, starts, length, number, pauses)
 
     def read(self, shard: str, row_groups: Sequence[int], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Read columns of some row groups of a shard, (N,) or (N, width) each.
@@ -275,6 +279,18 @@ class EpisodeReader:
         if len(parts) == 1:
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in self._columns}
+
+
+def _pauses(flags: Ints, words: Sequence[str], frame_stride: int, cameras: int) -> Ints:
+    """Return `EpisodeIndex.pauses` from the word (N,) of each episode; an episode has `cameras` entries."""
+    of_word = {i: pauses for i, word in enumerate(words) if (pauses := flag_pauses(word))}
+    found = [
+        (episode * cameras + camera, frame // frame_stride, steps)
+        for episode in np.flatnonzero(np.isin(flags, list(of_word))).tolist()
+        for frame, steps in of_word[int(flags[episode])].items()
+        for camera in range(cameras)
+    ]
+    return np.array(found, np.int64).reshape(-1, 3)
 
 
 def _words(column: pa.ChunkedArray) -> tuple[Ints, list[str]]:

@@ -32,6 +32,7 @@ MALFORMED = (KeyError, TypeError, ValueError, AttributeError, RecursionError)  #
 _FOOTER = b"hma"
 # a footer as `to_metadata` writes it; in a text of JSON, quotes have a backslash before them
 _EPISODES_OF_TEXT = re.compile(rb'(.*?), "episodes": (\[.*\])(, "quarantine": .*)')
+PAUSES = "pauses="  # begins the word of an episode's flags that states its pauses
 PLAN_HASH = b"hma.plan_hash"  # states the plan beside the footer's JSON, for those who need no more
 
 
@@ -50,7 +51,7 @@ class EpisodeRow:
         skew_p50_ms, skew_p95_ms, skew_max_ms: skew of the stream that was moved furthest.
         skew: stream -> [p50, p95, max] in ms, as JSON.
         trimmed: frames cut at the ends, where some streams had no data.
-        flags: remarks, comma separated, counts as `masked_actions=12`; see `flags_text`.
+        flags: remarks, comma separated, counts as `masked_actions=12`, pauses; see `flags_text`.
         group: shared by the episodes of one recording, which belong in one split; empty for an episode
             that has a recording of its own.
         source: source of the episode if it differs from the set's.
@@ -190,10 +191,26 @@ def check_version(values: dict[str, Any], where: object) -> None:
         raise ShardError(where, fault, "read it with the release that wrote it")
 
 
-def flags_text(trimmed: int, counts: Mapping[str, int]) -> str:
-    """Return the flags of an episode: trimmed, then each count as name=count."""
+def flags_text(trimmed: int, counts: Mapping[str, int], pauses: Mapping[int, int] | None = None) -> str:
+    """Return the flags of an episode: trimmed, each count as name=count, then the pauses.
+
+    Args:
+        pauses: frame -> recorded steps to the next frame, written as `pauses=frame:steps;frame:steps`.
+    """
     words = ["trimmed"] if trimmed else []
-    return ",".join([*words, *(f"{name}={count}" for name, count in sorted(counts.items()))])
+    words += [f"{name}={count}" for name, count in sorted(counts.items())]
+    if pauses:
+        words.append(PAUSES + ";".join(f"{frame}:{steps}" for frame, steps in pauses.items()))
+    return ",".join(words)
+
+
+def flag_pauses(flags: str) -> dict[int, int]:
+    """Return the pauses that `flags_text` wrote."""
+    if PAUSES not in flags:
+        return {}
+    found = re.search(rf"(?:^|,){PAUSES}(\d+:\d+(?:;\d+:\d+)*)", flags)
+    pairs = (pair.split(":") for pair in found[1].split(";")) if found else ()
+    return {int(frame): int(steps) for frame, steps in pairs}
 
 
 def flag_counts(flags: str) -> dict[str, int]:

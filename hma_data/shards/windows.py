@@ -1,10 +1,12 @@
 """Find the windows of a shard set by arithmetic, without a list of windows or a scan of the shards.
 
 A window is T frames `stride` apart with their T action chunks, so it spans T·stride recorded
-rows of one episode and never leaves it. Rows of a split are numbered through all its shards;
-windows are numbered in row order. The index takes memory per episode and row group, not per window.
+rows of one episode and never leaves it. It crosses no pause as long as a step of the model, `stride` recorded
+steps: time would jump in it. Such pauses divide an episode into pieces; most episodes are one piece. Rows of
+a split are numbered through all its shards; windows are numbered in row order. The index takes memory per
+piece and row group, not per window.
 
-An episode shorter than a window is dropped or padded. A padded episode gives one window from its first row;
+A piece shorter than a window is dropped or padded. A padded piece gives one window from its first row;
 the missing frames repeat its last row and are masked. Attention is causal in time, so frames after the last
 real frame change no prediction before them.
 """
@@ -12,12 +14,14 @@ real frame change no prediction before them.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.shards.reader import EpisodeIndex, ShardSet
+from hma_data.shards.schema import flag_pauses
 
 Ints = NDArray[np.int64]
 Short = Literal["drop", "pad"]
@@ -34,8 +38,9 @@ class WindowIndex:
         row_stride: rows from one frame to the next.
         span: rows a window covers, T · row_stride.
         count: number of windows.
-        short_episodes: number of episodes left out because they are too short.
-        padded_episodes: number of short episodes that are padded and give one window.
+        short_episodes: number of episodes left out because they, or all their pieces, are too short.
+        padded_episodes: number of short pieces that are padded and give one window.
+        divided_episodes: number of episodes that a pause divides.
         unit_first: (G+1,) number of windows before each row group; row group g starts windows
             unit_first[g] to unit_first[g+1].
         edges: (G+1,) first row of each row group.
@@ -48,13 +53,14 @@ class WindowIndex:
     count: int
     short_episodes: int
     padded_episodes: int
+    divided_episodes: int
     unit_first: Ints
     edges: Ints
     groups: Ints
-    _starts: Ints  # (N,) first row of each episode that has windows
-    _lengths: Ints  # (N,) rows of each episode
+    _starts: Ints  # (N,) first row of each piece that has windows
+    _lengths: Ints  # (N,) rows of each piece
     _cameras: NDArray[np.int16]  # (N,) index of the camera whose rows these are; 0 where rows hold them all
-    _before: Ints  # (N+1,) number of windows before each episode
+    _before: Ints  # (N+1,) number of windows before each piece
 
     @classmethod
     def of(
@@ -71,7 +77,7 @@ class WindowIndex:
         Args:
             frames: T.
             row_stride: rows between frames; None takes the embodiment's.
-            short: "drop" or "pad" for episodes shorter than a window; an episode of a single frame is always
+            short: "drop" or "pad" for pieces shorter than a window; a piece of a single frame is always
                 dropped.
             cameras: indices of the cameras whose rows have windows, in a set whose cameras have rows of
                 their own. In other sets a window has all cameras.
@@ -80,27 +86,30 @@ class WindowIndex:
         span = frames * stride
         edges, groups = _row_groups(shards.row_groups(split))
         episodes = shards.index(split)
-        starts = _first_rows(shards, split, episodes)
+        owner, starts, lengths = _pieces(shards, split, episodes, stride * shards.manifest.frame_stride)
         wanted = np.isin(episodes.camera, cameras) | (not shards.manifest.layout.camera_rows)
-        windows = np.where(wanted, np.maximum(0, episodes.length - span + 1), 0)
-        padded = wanted & (windows == 0) & (episodes.length > stride) & (short == "pad")
+        windows = np.where(wanted[owner], np.maximum(0, lengths - span + 1), 0)
+        padded = wanted[owner] & (windows == 0) & (lengths > stride) & (short == "pad")
         windows[padded] = 1
         order = np.argsort(starts, kind="stable")
         keep = order[windows[order] > 0]
         before = np.concatenate([[0], np.cumsum(windows[keep])]).astype(np.int64)
+        used = np.zeros(len(wanted), np.bool_)
+        used[owner[keep]] = True
         index = cls(
             frames=frames,
             row_stride=stride,
             span=span,
             count=int(before[-1]),
-            short_episodes=int((wanted & (windows == 0)).sum()),
+            short_episodes=int((wanted & ~used).sum()),
             padded_episodes=int(padded.sum()),
+            divided_episodes=len(np.unique(owner[1:][(np.diff(owner) == 0) & wanted[owner[1:]]])),
             unit_first=np.zeros(0, np.int64),
             edges=edges,
             groups=groups,
             _starts=starts[keep],
-            _lengths=episodes.length[keep],
-            _cameras=episodes.camera[keep].astype(np.int16),
+            _lengths=lengths[keep],
+            _cameras=episodes.camera[owner[keep]].astype(np.int16),
             _before=before,
         )
         object.__setattr__(index, "unit_first", index._windows_before(edges))
@@ -119,22 +128,22 @@ class WindowIndex:
         inside = np.minimum(rows - self._starts[at], np.diff(self._before)[at])
         return np.where(at < 0, 0, self._before[at] + inside)
 
-    def _episodes(self, windows: Ints) -> Ints:
+    def _piece(self, windows: Ints) -> Ints:
         return np.searchsorted(self._before, windows, side="right") - 1
 
     def first_rows(self, windows: Ints) -> Ints:
         """Return the first row of each window."""
-        at = self._episodes(windows)
+        at = self._piece(windows)
         return self._starts[at] + (windows - self._before[at])
 
     def last_rows(self, windows: Ints) -> Ints:
-        """Return the last row of each window's episode; beyond it the window is padded."""
-        at = self._episodes(windows)
+        """Return the last row of each window's piece; beyond it the window is padded."""
+        at = self._piece(windows)
         return self._starts[at] + self._lengths[at] - 1
 
     def cameras(self, windows: Ints) -> Ints:
         """Return the index of the camera whose rows each window has; 0 where rows hold all cameras."""
-        return self._cameras[self._episodes(windows)].astype(np.int64)
+        return self._cameras[self._piece(windows)].astype(np.int64)
 
     def units(self) -> Ints:
         """Return the row groups in which at least one window starts."""
@@ -150,6 +159,18 @@ class WindowIndex:
         return int(np.searchsorted(self.edges, row, side="right")) - 1
 
 
+def piece_lengths(flags: str, length: int, stride: int, frame_stride: int) -> list[int]:
+    """Return the rows of each piece of an episode of `length` rows with these flags.
+
+    Args:
+        stride: least recorded steps of a pause that divides an episode.
+        frame_stride: recorded steps a row.
+    """
+    after = {frame // frame_stride + 1 for frame, steps in flag_pauses(flags).items() if steps >= stride}
+    edges = [0, *sorted(row for row in after if row < length), length]
+    return [end - begin for begin, end in pairwise(edges)]
+
+
 def _row_groups(per_shard: list[tuple[int, ...]]) -> tuple[Ints, Ints]:
     """Return the first rows (G+1,) and the places (G, 2) of all row groups of a split."""
     sizes = np.array([rows for groups in per_shard for rows in groups], np.int64)
@@ -158,6 +179,26 @@ def _row_groups(per_shard: list[tuple[int, ...]]) -> tuple[Ints, Ints]:
     shard = np.repeat(np.arange(len(per_shard)), counts)
     first = np.repeat(np.cumsum(counts) - counts, counts)
     return edges, np.stack([shard, np.arange(len(sizes)) - first], axis=1).astype(np.int64)
+
+
+def _pieces(shards: ShardSet, split: str, episodes: EpisodeIndex, stride: int) -> tuple[Ints, Ints, Ints]:
+    """Return the episode's entry (N,), the first row (N,) and the rows (N,) of each piece, in their order.
+
+    Args:
+        stride: least recorded steps of a pause that divides an episode.
+    """
+    starts = _first_rows(shards, split, episodes)
+    entry, row, steps = episodes.pauses.T
+    cut = (steps >= stride) & (row + 1 < episodes.length[entry])
+    if not cut.any():
+        return np.arange(len(starts)), starts, episodes.length
+    owner = np.concatenate([np.arange(len(starts)), entry[cut]])
+    begin = np.concatenate([np.zeros(len(starts), np.int64), row[cut] + 1])
+    order = np.lexsort((begin, owner))
+    owner, begin = owner[order], begin[order]
+    last = np.append(np.diff(owner) > 0, True)
+    end = np.where(last, episodes.length[owner], np.append(begin[1:], 0))
+    return owner, starts[owner] + begin, end - begin
 
 
 def _first_rows(shards: ShardSet, split: str, episodes: EpisodeIndex) -> Ints:

@@ -28,11 +28,12 @@ from hma_data.registry import FORMATS, MORE, known_formats
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.common.checks import Finding
-from hma_data.storage.kinds import misplaced, unreadable
+from hma_data.storage.kinds import misplaced, own_layout, unreadable
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import RangeFile, RemotePath, is_remote, place
 
 SAMPLE = 20  # episodes that inspect looks into
+RECIPE = "docs/adding-a-robot.md, Pictures and tables"
 PACKED = {  # the command that unpacks a file, by the end of its name
     ".tar": "tar xf", ".tar.gz": "tar xf", ".tgz": "tar xf", ".tar.bz2": "tar xf", ".tar.xz": "tar xf",
     ".tar.zst": "tar xf", ".zip": "unzip", ".7z": "7z x", ".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz",
@@ -68,7 +69,8 @@ class TopicInfo:
     Attributes:
         name: of the topic.
         type: of its messages.
-        gap_ms: the longest interval between two of them; None for fewer than two.
+        gap_ms: the longest interval between two of them in which a camera saw something; of a camera, the
+            longest interval; None for fewer than two.
         delay_ms: median from header stamp to receipt; None where messages carry no time.
         goes_back: whether header stamps go back in time.
         offsets: how the messages lie between the pictures of each camera; of topics with numbers only.
@@ -289,7 +291,10 @@ def detect(uri: StrPath) -> str:
     known = [recognition.label for recognition in (*ours.values(), *theirs.values())]
     if other := misplaced(path, "a recording"):
         raise SourceError(uri, *other)
-    remedy = _unpack_first(files) or f"expected {', '.join(known[:-1])}, or {known[-1]}"
+    expected = f"expected {', '.join(known[:-1])}, or {known[-1]}"
+    if own := own_layout(files):
+        expected += f"; its files ({own}) can be packed into HDF5: {RECIPE}"
+    remedy = _unpack_first(files) or expected
     if files:
         fault, remedy = unreadable(files[0], "is not a recording of a known format", remedy)
         raise nothing_there(uri, path, fault, remedy)

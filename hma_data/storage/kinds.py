@@ -4,6 +4,8 @@ Only names and first bytes are looked at, and only after something else has fail
 """
 
 import os
+from collections import Counter
+from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from hma_data.storage.remote import is_remote
 
 LFS = b"version https://git-lfs.github.com/spec/"
 _RECORDED = (".hdf5", ".h5", ".bag", ".mcap", ".db3", ".mp4", ".mkv", ".avi", ".mov", ".webm")
+_ARRAYS, _TABLES = (".zarr", ".png", ".jpg", ".jpeg", ".npz", ".npy", ".pkl"), (".csv", ".json")
 _DESCRIBED = ("meta/info.json", "features.json", "dataset_info.json", "metadata.yaml")
 _USE = {
     "a recording": "hma inspect shows it, hma convert makes shards of it",
@@ -42,6 +45,16 @@ def misplaced(path: Path, wanted: str) -> tuple[str, str] | None:
     """Return fault and remedy where a path holds something else of the toolkit than what is wanted."""
     kind = kind_of(path)
     return (f"is {kind}, not {wanted}", _USE[kind]) if kind and kind != wanted else None
+
+
+def own_layout(files: Iterable[Path]) -> str:
+    """Return the pictures, arrays and tables among the files, such as `60 .png, 2 .csv`.
+
+    The result is empty without pictures or arrays: then it is no recording in a layout of somebody's own.
+    """
+    counts = Counter(".zarr" if ".zarr/" in file.as_posix() else file.suffix.lower() for file in files)
+    held = [f"{counts[suffix]:,} {suffix}" for suffix in (*_ARRAYS, *_TABLES) if counts[suffix]]
+    return ", ".join(held) if any(counts[suffix] for suffix in _ARRAYS) else ""
 
 
 def unreadable(path: Path, fault: str, remedy: str) -> tuple[str, str]:

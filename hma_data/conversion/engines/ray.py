@@ -56,6 +56,8 @@ def run(
     ours = not ray.is_initialized()
     if ours:
         _join(ray)
+    if not os.environ.get("RAY_ADDRESS"):
+        _check_room(ray, {"CPU": cpus, "GPU": gpus}, ours)
     ledger = Ledger(units, limits, on_event)
     count = min(max(workers, 1), max(len(ledger.units), 1))
     # no task events: for its dashboard, Ray keeps a record of each call in three processes
@@ -101,6 +103,19 @@ def _join(ray: Any) -> None:
         where = f"the Ray cluster at {address}" if address else "Ray on this machine"
         what = f"cannot be {'joined' if address else 'started'}: {_first_line(fault)}"
         raise HMAError(where, what, "see `ray status`, or leave out --engine ray") from fault
+
+
+def _check_room(ray: Any, wanted: dict[str, float], ours: bool) -> None:
+    """Raise HMAError if no node has what a worker reserves; a cluster of this machine does not grow."""
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    if any(all(node.get(kind, 0) >= count for kind, count in wanted.items()) for node in nodes):
+        return
+    if ours:
+        ray.shutdown()
+    best = {kind: max((node.get(kind, 0) for node in nodes), default=0) for kind in wanted}
+    text = " and ".join(f"{count:g} {kind} (of {best[kind]:g})" for kind, count in wanted.items() if count)
+    remedy = "set RAY_ADDRESS to a larger cluster, or change --worker-cpus, --worker-gpus or --device"
+    raise HMAError("Ray on this machine", f"has no room for a worker, which reserves {text}", remedy)
 
 
 # -- in an actor

@@ -240,6 +240,7 @@ class _BagInspection:
             said = f"{', '.join(self._frozen[:8])}: header stamps never change; receive times are used"
             survey.note(Finding("stamps", "warn", said, numbers={"topics": self._frozen}))
         self._skew()
+        self.keys = self._with_gaps()
         self.clocks: dict[str, _Clock] = {}
         for name, topic in self._topics.items():
             if len(topic.track):
@@ -335,6 +336,23 @@ class _BagInspection:
             encoding=stated or None,
             high=high,
         )
+
+    def _with_gaps(self) -> list[KeyInfo]:
+        """Return the keys; leave intervals in which no camera saw anything out of the topics' `gap_ms`."""
+        names = {key.topic.name for key in self.keys if key.kind == "camera" and key.topic}
+        seen = [self._topics[name].track.seconds("header") for name in names]
+        return [
+            replace(key, topic=replace(key.topic, gap_ms=self._gap_ms(key.topic, np.concatenate(seen))))
+            if seen and key.topic and key.topic.name not in names
+            else key
+            for key in self.keys
+        ]
+
+    def _gap_ms(self, topic: TopicInfo, seen: Floats) -> float | None:
+        times = np.sort(self._topics[topic.name].track.seconds("header"))
+        during = np.searchsorted(times, seen, side="right") - 1
+        during = during[(during >= 0) & (during < len(times) - 1)]
+        return float(np.diff(times)[during].max() * 1e3) if len(during) else topic.gap_ms
 
     def _skew(self) -> None:
         """Measure the skew of each camera and vector stream from the frames of the first camera."""

@@ -25,6 +25,7 @@ from hma_data.episodes.images import BLANK, Images, PictureCheck
 Severity = Literal["error", "warn", "info"]
 SEVERITIES: tuple[Severity, ...] = ("info", "warn", "error")
 PAUSE, PAUSE_S = 10, 0.5  # a pause is longer than this many median intervals and this many seconds
+RARE = 0.05  # largest share of pauses among the intervals, for a rate without them; one always may be
 REGULAR = 0.8  # least share of intervals within a third of the median, for counting lost frames
 STREAM = 0.5  # least such share for reporting pauses; below it, the topic carries events
 LOST = 0.01  # share of lost frames above which they are reported
@@ -124,22 +125,36 @@ def measure(times: Floats) -> StreamTimes:
 
 
 def rate(times: Floats) -> tuple[float | None, float | None]:
-    """Return Hz and jitter_ms, the standard deviation of the intervals.
+    """Return Hz and jitter_ms, the standard deviation of the intervals; leave out a few pauses from both.
 
-    The rate comes from the median interval, which a pause does not change. Where bursts make the median and
-    the mean differ by half, it comes from the mean interval.
+    The rate comes from the median interval. Where bursts make the median and the mean differ by half, it
+    comes from the mean interval.
     """
     steps = np.diff(times)
     if len(steps) < 2 or steps.sum() <= 0:
         return None, None
-    median, mean = float(np.median(steps)), float(np.mean(steps))
+    median = float(np.median(steps))
+    usual = _usual(steps, median)
+    if len(steps) - len(usual) <= max(1, RARE * len(steps)) and usual.sum() > 0:
+        steps = usual
+    mean = float(np.mean(steps))
     period = median if 1 / 1.5 < median / mean < 1.5 else mean
     return 1 / period, float(np.std(steps) * 1e3)
 
 
+def _usual(steps: Floats, period: float) -> Floats:
+    """Return the intervals that are no pauses, given the median one."""
+    return steps[steps <= pause_s(period)]
+
+
+def pause_s(period: float) -> float:
+    """Return the seconds beyond which an interval is a pause, given the median one."""
+    return max(PAUSE * period, PAUSE_S)
+
+
 def _lost(steps: Floats, period: float) -> int:
     """Count lost frames from the intervals that are multiples of the median one; leave out pauses."""
-    usual = steps[steps <= max(PAUSE * period, PAUSE_S)]
+    usual = _usual(steps, period)
     return max(int(np.sum(np.rint(usual / period) - 1)), 0)  # a late frame is not a lost one
 
 
@@ -164,7 +179,7 @@ def time_findings(key: str, times: StreamTimes, camera: bool = False, episode: s
     if times.back:
         remedy = "set stamp: receive in the YAML" if not episode else ""
         yield found("back", f"{times.back} stamps go back in time", remedy, count=times.back)
-    if times.regular >= STREAM and times.gap_s > max(PAUSE * times.period_s, PAUSE_S):
+    if times.regular >= STREAM and times.gap_s > pause_s(times.period_s):
         said = f"pauses for {times.gap_s:.3g} s after {times.gap_at_s:.3g} s"
         yield found("gaps", said, gap_s=times.gap_s, at_s=times.gap_at_s)
     if camera and times.lost and times.lost > LOST * times.count:

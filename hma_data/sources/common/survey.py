@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.episodes.align import divide_remedy
 from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import Images
 from hma_data.errors import HMAError
@@ -79,7 +80,8 @@ class Survey:
     Args:
         episodes: how many the recording has.
         alone: whether findings leave out the names of episodes (a bag that is one episode).
-        by_field: whether a YAML picks single fields of a message, so that constant ones do no harm.
+        by_field: whether the episodes are bags: a YAML picks single fields of a message, so that constant
+            ones do no harm, and may divide an episode.
     """
 
     def __init__(self, episodes: int, alone: bool = False, by_field: bool = False) -> None:
@@ -273,7 +275,11 @@ class Survey:
             for check, count in Counter(one.check for one in found).items():
                 first = next(one for one in found if one.check == check)
                 more = f" (and in {count - 1} more episodes)" if count > 1 else ""
-                yield replace(first, message=first.message + more)
+                remedy = first.remedy
+                if check == "gaps" and held.camera and self.by_field:  # a bag may be divided there
+                    period = max(times.period_s for times in held.met.values())
+                    remedy = f"no window crosses it; {divide_remedy(checks.pause_s(period))}"
+                yield replace(first, message=first.message + more, remedy=remedy)
 
     def _finite(self) -> Iterator[Finding]:
         for key, held in self._numbers.items():

@@ -8,7 +8,8 @@ R hands found.
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,9 @@ from hma_data.sources.hands.runs import (
 from hma_data.storage.files import atomic_path, cache_folder
 
 BATCH = 8  # frames decoded together: 200 MB of 4K pictures
+TABLES = (".csv", ".json", ".npz", ".npy", ".parquet", ".h5", ".hdf5")  # a robot's numbers, perhaps
+NEAR = 2_000  # files among which they are looked for
+ROBOT = "docs/adding-a-robot.md, HDF5 with videos beside it"
 LOOKED_AT, FRAMES = 5, 12  # most videos that are searched for hands by an inspection, and frames of each
 
 
@@ -101,6 +105,10 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
     survey = Survey(len(videos))
     for link in unfollowed(local_path(uri)):
         survey.note(link)
+    beside = Counter(item.suffix.lower() for item in _near(local_path(uri)))
+    if tables := ", ".join(f"{beside[suffix]:,} {suffix}" for suffix in TABLES if beside[suffix]):
+        said = f"these videos are read as videos of hands; beside them are {tables}"
+        survey.note(Finding("files", "info", said, f"for a robot's videos: {ROBOT}"))
     headers: dict[str, Header] = {}
     for name, video in videos.items():
         try:
@@ -143,6 +151,11 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
         findings=survey.findings(measured),
         checks=survey.checks(),
     )
+
+
+def _near(root: Path) -> Iterator[Path]:
+    """Return some of the files in the folder of the videos."""
+    return islice((root if root.is_dir() else root.parent).rglob("*"), NEAR)
 
 
 def _look(name: str, video: Video, header: Header, survey: Survey, pairs: int) -> None:

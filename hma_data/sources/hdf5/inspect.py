@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 
 from hma_data.episodes.images import decode_image
 from hma_data.errors import EpisodeError, HMAError
+from hma_data.registry.components import Hdf5Layout
 from hma_data.sources.base import Inspection, KeyInfo, local_path, unfollowed
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, is_times, seconds_a_unit, seconds_of
@@ -29,12 +30,14 @@ from hma_data.sources.hdf5.file import (
     text,
     walk,
 )
-from hma_data.sources.hdf5.source import TEXT_KEYS, as_rgb, encoded, json_of, picture_kind
+from hma_data.sources.hdf5.pictures import as_bytes, as_rgb, encoded, picture_kind, pixels_of
+from hma_data.sources.hdf5.source import TEXT_KEYS, json_of
 from hma_data.sources.hdf5.videos import SUFFIXES
 
 MAX_LISTED = 1_000  # files beside an HDF5 file among which videos are looked for
 LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
+_ENDS = ("episode_ends", "episode_lengths", "terminals", "timeouts", "dones")  # of episodes end to end
 _BESIDE = ("compress_len",)  # not rows over time: the bytes of ALOHA's JPEGs, (cameras, T)
 _MEASURED = "measured from"
 _SIMULATORS = {1: "robosuite", 2: "gym", 3: "iGibson"}  # robomimic's env_args.type
@@ -47,6 +50,7 @@ class _First:
     name: str = ""
     keys: dict[str, KeyInfo] = field(default_factory=dict)
     facts: dict[str, str] = field(default_factory=dict)
+    pixels: dict[str, str] = field(default_factory=dict)  # camera -> range, where it is not uint8
     rate: float | None = None
     robots: Any = None
 
@@ -80,6 +84,7 @@ def inspect(
                 if not first.keys:
                     first.name = name
                     _tell(first, group, files, place)
+                    _end_to_end(name, group, place, survey)
                 held.update(sizes)
                 series = [key for key, info in first.keys.items() if info.kind in ("camera", "vector")]
                 survey.lengths(name, lengths[name], sizes, series)
@@ -114,10 +119,29 @@ def inspect(
 def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: EpisodeGroup) -> None:
     said = _environment(files.get(place.file))
     first.robots = said.get("robots")
-    first.keys = {info.key: info for info in _keys(group, place)}
+    first.pixels = _pixels(group)
+    first.keys = {info.key: info for info in _keys(group, place, first.pixels)}
     first.facts = _facts(group, said, place)
+    first.facts["pixels"] = next(iter(first.pixels.values()), "")
     first.facts["videos beside it"] = _videos(place.file)
     first.rate, first.facts["rate"], first.facts["timestamps"] = _rate(group, said, first.keys, str(place))
+
+
+def _end_to_end(name: str, group: h5py.Group, place: EpisodeGroup, survey: Survey) -> None:
+    """Warn where a whole file is taken for one episode, but states that it holds several."""
+    for key in _ENDS if place.group == WHOLE_FILE else ():
+        item = group.get(key)
+        if not isinstance(item, h5py.Dataset) or len(item.shape or ()) != 1 or item.size > MAX_VALUES:
+            continue
+        ends = item[()].astype(bool)  # a run of True counts once
+        count = len(item) if key.startswith("episode") else int(np.diff(ends, prepend=False)[ends].sum())
+        if count > 1:
+            said = f"{name} is read as one episode, but {key} tells of {count:,}"
+            remedy = (
+                "write each as a group of its own, data/demo_0, data/demo_1, …, or windows cross their ends"
+            )
+            survey.note(Finding("rows", "warn", said, remedy, key, {"episodes": count}))
+            return
 
 
 def _videos(file: Path) -> str:
@@ -147,7 +171,7 @@ def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: in
         try:
             with explained(where):
                 if info.kind == "camera":
-                    _pictures(name, key, item, info, survey, pairs)
+                    _pictures(name, key, item, info, survey, pairs, first.pixels.get(key))
                 elif info.kind == "vector" and item.size <= MAX_VALUES:
                     _values(name, key, numbers(group, key, name), info, survey, first)
         except HMAError as fault:
@@ -166,10 +190,25 @@ def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, fir
             survey.note(found)
 
 
-def _pictures(name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, pairs: int) -> None:
+def _pixels(group: h5py.Group) -> dict[str, str]:
+    """Return camera -> range of the colours that are not uint8, for `layout.pixels`, which is one for all."""
+    found: dict[str, str] = {}
+    for key, item in walk(group):
+        if item.shape and item.shape[0] and is_plausible(item):
+            stated = pixels_of(item, sorted({0, item.shape[0] // 2, item.shape[0] - 1}))
+            found |= {key: stated} if stated else {}
+    first = next(iter(found.values()), "")
+    return {key: stated for key, stated in found.items() if stated == first}
+
+
+def _pictures(
+    name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, pairs: int, pixels: str | None
+) -> None:
+    layout = Hdf5Layout.model_validate({"pixels": pixels})
     for run in checks.runs(checks.choose(item.shape[0], pairs)):
         found = rows(item, run)
         if info.codec == "raw":
+            found = as_bytes(found, layout, f"{name} {key}")
             survey.pictures(name, key, as_rgb(found), run, info.codec)
             continue
         pictures = [
@@ -238,10 +277,13 @@ def _stated_rate(group: h5py.Group, said: dict[str, Any]) -> tuple[float | None,
     return None, ""
 
 
-def _keys(group: h5py.Group, place: EpisodeGroup) -> Iterator[KeyInfo]:
+def _keys(group: h5py.Group, place: EpisodeGroup, pixels: Container[str]) -> Iterator[KeyInfo]:
     for key, item in walk(group):
         count = item.shape[0] if item.shape else None
         kind, shape, codec = _kind(item, f"{place} {key}")
+        if key in pixels:
+            sides = item.shape[1:]
+            kind, shape, codec = "camera", sides if sides[2] == 3 else (*sides[1:], 3), "raw"
         kind = "other" if key in _BESIDE else kind
         yield KeyInfo(key, kind, shape, str(item.dtype), codec=codec, count=count)
 

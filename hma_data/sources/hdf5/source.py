@@ -51,14 +51,12 @@ from hma_data.sources.hdf5.file import (
     text,
     walk,
 )
+from hma_data.sources.hdf5.pictures import as_bytes, as_rgb, axes_of, encoded, picture_kind, remedy_of
 from hma_data.sources.hdf5.videos import SUFFIXES as VIDEO_SUFFIXES
 from hma_data.sources.hdf5.videos import VideoRows, is_video, video_fingerprints, video_path
 from hma_data.storage.paths import StrPath, as_text
 
 TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
-PIXELS = {"0-1": 1.0, "0-255": 255.0, "0-65535": 65535.0}
-_CHANNELS = (1, 3, 4)
-_SLACK = 1e-3  # share of the range by which values may exceed it, as resizing can cause
 _SPLITS = {"train": "train"} | dict.fromkeys(("valid", "val", "validation"), "val")
 
 
@@ -354,9 +352,9 @@ class PictureRows:
         self._kind = picture_kind(found, layout)
         if self._kind is None:
             fault = f"{key!r} holds {found.shape} {found.dtype}, not colour pictures"
-            raise EpisodeError(place, fault, _remedy(found, layout))
+            raise EpisodeError(place, fault, remedy_of(found, layout))
         if self._kind == "raw":
-            _axes(found.shape, layout, self._where)
+            axes_of(found.shape, layout, self._where)
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
         """See Stream."""
@@ -365,7 +363,7 @@ class PictureRows:
             found = rows(self._files.cached(self._place.file, group, self._key, str(self._place)), indices)
         if self._kind == "raw":
             return as_rgb(
-                _as_bytes(found, self._layout, self._where), _axes(found.shape, self._layout, self._where)
+                as_bytes(found, self._layout, self._where), axes_of(found.shape, self._layout, self._where)
             )
         if not len(found):
             return np.zeros((0, 1, 1, 3), np.uint8)
@@ -376,78 +374,3 @@ class PictureRows:
         if len({picture.shape for picture in pictures}) > 1:
             raise EpisodeError(self._place, f"{self._key!r} has pictures of several sizes")
         return np.stack(pictures)
-
-
-def picture_kind(found: h5py.Dataset, layout: Hdf5Layout | None = None) -> str | None:
-    """Return `raw` or `encoded` by dtype and shape; None where the dataset cannot hold pictures."""
-    shape: tuple[int, ...] = found.shape or ()
-    if found.dtype == np.uint8 or (layout and layout.pixels and found.dtype.kind in "fiu"):
-        channels_first = layout.axes == "TCHW" if layout and layout.axes else shape[1:2] in ((1,), (3,))
-        if len(shape) == 3 or (len(shape) == 4 and (shape[3] in _CHANNELS or channels_first)):
-            return "raw"
-    padded = found.dtype == np.uint8 and len(shape) == 2
-    one_a_row = len(shape) == 1 and (found.dtype.kind in "SV" or _is_bytes(found.dtype))
-    return "encoded" if padded or one_a_row else None
-
-
-def as_rgb(pictures: NDArray[np.uint8], axes: str | None = None) -> Images:
-    """Convert (n, H, W), (n, H, W, 1|3|4) or (n, 1|3|4, H, W) to (n, H, W, 3)."""
-    if pictures.ndim == 3:
-        pictures = pictures[..., None]
-    elif axes == "TCHW" or (axes is None and pictures.shape[3] not in _CHANNELS):
-        pictures = pictures.transpose(0, 2, 3, 1)
-    if pictures.shape[3] == 1:
-        pictures = np.repeat(pictures, 3, axis=3)
-    return np.ascontiguousarray(pictures[..., :3])
-
-
-def encoded(row: Any) -> NDArray[np.uint8]:
-    """Return the bytes of one encoded picture, a row of bytes; zeros after its end do no harm."""
-    if isinstance(row, np.ndarray):
-        return row.view(np.uint8).reshape(-1)
-    return np.frombuffer(row.tobytes() if isinstance(row, np.void) else row, np.uint8)
-
-
-def _axes(shape: tuple[int, ...], layout: Hdf5Layout, where: str) -> str:
-    """Return THW, THWC or TCHW: from the YAML, else by the axis whose size is a number of channels."""
-    if len(shape) == 3:
-        return "THW"
-    last, first = shape[3] in _CHANNELS, shape[1] in _CHANNELS
-    if layout.axes:
-        if not (first if layout.axes == "TCHW" else last):
-            fault = f"holds pictures {shape[1:]}, source.layout.axes says {layout.axes}"
-            raise EpisodeError(where, fault, "correct source.layout.axes in the YAML")
-        return layout.axes
-    if last and first:
-        fault = f"holds pictures {shape[1:]}, whose channels may be first or last"
-        raise EpisodeError(where, fault, "set source.layout.axes to TCHW or THWC")
-    return "THWC" if last else "TCHW"
-
-
-def _as_bytes(pictures: NDArray[Any], layout: Hdf5Layout, where: str) -> NDArray[np.uint8]:
-    """Convert pictures of another number type to uint8, by the range in `layout.pixels`."""
-    if pictures.dtype == np.uint8:
-        return pictures
-    highest = PIXELS[layout.pixels or "0-255"]
-    values = pictures.astype(np.float32)
-    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
-    if not (-_SLACK * highest <= low and high <= highest * (1 + _SLACK)):  # false for NaN too
-        fault = f"holds values from {low:g} to {high:g}, source.layout.pixels says {layout.pixels}"
-        raise EpisodeError(where, fault, f"set it to one of {', '.join(PIXELS)}")
-    return np.rint(np.clip(values, 0, highest) * (255 / highest)).astype(np.uint8)
-
-
-def _is_bytes(dtype: np.dtype[Any]) -> bool:
-    """Check whether rows of varying length are bytes or text, not references or other numbers."""
-    inner = h5py.check_vlen_dtype(dtype)
-    if inner is None:
-        return h5py.check_string_dtype(dtype) is not None
-    return np.dtype(inner).kind in "iu" and np.dtype(inner).itemsize == 1
-
-
-def _remedy(found: h5py.Dataset, layout: Hdf5Layout) -> str:
-    shape: tuple[int, ...] = found.shape or ()
-    numbers = found.dtype.kind in "fiu" and found.dtype != np.uint8
-    if numbers and len(shape) == 4 and 3 in (shape[1], shape[3]) and not layout.pixels:
-        return f"if they are colours, set source.layout.pixels to their range: {', '.join(PIXELS)}"
-    return "expected (T, H, W, 3) uint8, or encoded pictures"

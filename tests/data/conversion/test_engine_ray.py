@@ -97,6 +97,18 @@ def test_an_actor_that_is_killed_between_two_units_costs_nothing(cluster, tmp_pa
 
 
 @on_a_cluster
+@pytest.mark.parametrize(("wanted", "said"), [({"gpus": 1}, r"1 GPU \(of 0\)"), ({"cpus": 500}, "500 CPU")])
+def test_a_worker_that_no_node_of_this_machine_can_hold_is_one_error(
+    cluster, monkeypatch: pytest.MonkeyPatch, wanted: dict[str, float], said: str
+) -> None:
+    from hma_data.conversion.engines import ray as engine
+
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    with pytest.raises(HMAError, match=f"has no room for a worker.*{said}"):
+        list(engine.run(PLAIN, Unreadable(), 1, lambda number, event: None, LIMITS, **wanted))
+
+
+@on_a_cluster
 def test_workers_that_cannot_be_made_are_one_error(
     cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

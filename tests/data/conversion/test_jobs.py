@@ -49,6 +49,33 @@ def whole(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str,
     return contents(tmp_path / "whole")
 
 
+@pytest.mark.parametrize(
+    ("options", "device"),
+    [({"workers": 0}, "cuda:7"), ({"workers": 2}, "cpu"), ({"workers": 0, "engine": "ray"}, "cpu")],
+)
+def test_only_who_tokenizes_opens_the_tokenizer_on_the_device(
+    options, device: str, toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, monkeypatch
+) -> None:
+    opened = []
+
+    def get(name: str, *, weights: str | None, device: str) -> BlockTokenizer:
+        opened.append(device)
+        raise OutputError(name, "enough")
+
+    monkeypatch.setattr("hma_data.conversion.job.get_tokenizer", get)
+    with pytest.raises(OutputError, match="enough"):
+        convert(toy_arm, toy_recording, "fsq-8", tmp_path / "out", device="cuda:7", **options)
+    assert opened == [device]
+
+
+def test_a_device_that_workers_lack_is_one_error(
+    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(HMAError, match="cannot run on device 'no such'"):
+        convert(toy_arm, toy_recording, "fsq-8", tmp_path / "out", device="no such", workers=1)
+    assert not contents(tmp_path / "out")
+
+
 # -- shares
 
 

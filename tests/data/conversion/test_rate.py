@@ -7,13 +7,18 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import yaml
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.episodes.align import pause_remedy, rate_flags, to_clip
+from hma_data.inspection.infer import infer
 from hma_data.inspection.inspect import examine
+from hma_data.loading.dataset import WindowDataset
 from hma_data.registry.embodiment import Embodiment, find
+from hma_data.shards.memmap import export
 from hma_data.shards.reader import ShardSet
+from hma_data.shards.schema import flag_pauses
 from hma_data.shards.verify import verify
 from tests.command import hma
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
@@ -57,17 +62,67 @@ def test_a_pause_is_told_and_is_not_another_rate(tmp_path: Path) -> None:
         file["data/demo_0/t"][15:] += 20
     summary = made(path, tmp_path / "out")
     assert summary.flags == {"paused_frames": 1}
-    assert any("have a pause of 3 steps" in note and "source.exclude" in note for note in summary.notes)
     assert rate_findings(tmp_path / "out") == []
     (finding,) = [one for one in examine(tmp_path / "out") if one.check == "gaps"]
-    assert finding.severity == "warn" and "1 of 2 episodes" in finding.message and "demo_0" in finding.message
+    assert finding.severity == "info" and "1 of 2 episodes" in finding.message and "demo_0" in finding.message
 
 
-def test_a_bag_with_pauses_is_told_how_to_be_divided() -> None:
-    told = "divide the recordings there with source.segments: {gap_s: 0.083}"
-    assert pause_remedy(find("mover_52"), 30) == told
-    for other in ("pusht_fast", "rh20t_cfg1"):
-        assert "source.exclude" in pause_remedy(find(other), 30)
+def paused_bag(path: Path, pause_s: int, frames: int = 90) -> Path:
+    """A bag at 10 Hz of which all topics pause in the middle, the camera for 0.1 s longer."""
+    whole = bag_files.make_recording(frames)
+    middle = bag_files.START_NS + frames // 2 * 100_000_000
+
+    def late(times: np.ndarray) -> np.ndarray:
+        return np.where(times >= middle, times + pause_s * 1_000_000_000, times)
+
+    names = ("picture_ns", "joint_ns", "command_ns")
+    moved = replace(whole, **{name: late(getattr(whole, name)) for name in names})
+    moved.picture_ns[frames // 2 :] += 100_000_000
+    return bag_files.write_mcap(path, moved, bag_files.as_cdr())
+
+
+@pytest.mark.parametrize("frames", ["all", "strided"])
+def test_no_window_crosses_a_pause(frames, tmp_path: Path) -> None:
+    path, out = paused_bag(tmp_path / "run.mcap", 20), tmp_path / "out"
+    robot = Embodiment.from_values(bag_files.arm().to_dict() | {"target_hz": 5}, "arm")
+    settings = Settings(val_fraction=0, frames=frames)
+    summary = convert(robot, path, BlockTokenizer(), out, settings=settings)
+    (row,) = ShardSet(out).episodes.to_pylist()
+    assert row["flags"] == "trimmed,paused_frames=1,pauses=44:202" and flag_pauses(row["flags"]) == {44: 202}
+    step, rows, cut = (1, 89, 45) if frames == "all" else (2, 44, 23)
+    windows = WindowDataset(out, "train", 5, short="pad")
+    span = 5 * 2 // step
+    first = windows.index.first_rows(np.arange(len(windows)))
+    wanted = [*range(cut - span + 1), *range(cut, rows - span + 1)]
+    assert first.tolist() == wanted and windows.index.divided_episodes == 1
+    assert windows.batch(range(len(windows))).frame.tolist() == wanted
+    export(out, tmp_path / "flat", split="train")
+    ids = np.fromfile(tmp_path / "flat/segment_ids.bin", "<i4")
+    assert np.bincount(ids).tolist() == [cut, rows - cut]
+    (note,) = summary.notes
+    assert "training windows would cross one and are left out" in note
+    assert verify(out) == [] and [one.severity for one in examine(out)] == ["warn", "warn"]
+
+
+def test_a_bag_with_pauses_is_told_how_to_be_divided_and_the_line_divides_it(tmp_path: Path) -> None:
+    path = paused_bag(tmp_path / "run.mcap", 20)
+    (found,) = [one for one in examine(path) if one.check == "gaps" and one.key == bag_files.CAMERA]
+    line = "source.segments: {gap_s: 1} in the YAML makes the parts episodes of their own"
+    assert found.remedy == f"no window crosses it; {line}"
+    values = yaml.safe_load(infer(path, "arm"))
+    assert values["frequency_hz"] == 10 and values["sync"]["max_skew_ms"] == 60
+    assert values["provenance"]["segments"].endswith(line)
+    robot = bag_files.arm().to_dict()
+    robot["source"] = robot["source"] | {"segments": {"gap_s": 1}}
+    made = convert(Embodiment.from_values(robot, "arm"), path, BlockTokenizer(), tmp_path / "out")
+    assert made.flags == {} and ShardSet(tmp_path / "out").episodes["length"].to_pylist() == [45, 44]
+
+
+def test_the_line_follows_the_step_of_the_model() -> None:
+    for stride, gap_s in ((1, 0.083), (15, 0.48)):
+        robot = Embodiment.from_values(find("mover_52").to_dict() | {"stride": stride}, "mover")
+        assert f"{{gap_s: {gap_s}}}" in pause_remedy(robot, 30)
+    assert pause_remedy(find("pusht_fast"), 30) == ""
 
 
 def test_a_set_without_a_window_is_told(tmp_path: Path) -> None:

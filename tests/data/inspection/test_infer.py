@@ -1,6 +1,9 @@
 """Infer: the YAML of every format says what the recording says, asks the rest, and then reads it."""
 
 import json
+import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,7 @@ from hma_data.inspection.infer import from_inspection, infer
 from hma_data.registry.embodiment import Embodiment, find, problems
 from hma_data.sources.base import Inspection, KeyInfo, open_source
 from hma_data.storage.yaml_io import parse_yaml
-from tests.command import hma
+from tests.command import ROOT, hma
 from tests.data import rlds_files
 from tests.data.inferring import H, T, W, answered, first_clip, inferred, keys, numbers, pictures, questions
 from tests.data.rlds_files import TEXT, features_dict, image, png, tensor
@@ -280,6 +283,28 @@ def test_other_hdf5_takes_rate_and_times_from_the_recording(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
+    ("factor", "dtype", "axes", "pixels"),
+    [(1 / 255, "f4", "THWC", "0-1"), (1, "f8", "TCHW", "0-255"), (257, "u2", "THWC", "0-65535")],
+)
+def test_colours_of_other_numbers_than_bytes_are_cameras_with_their_range(
+    tmp_path: Path, factor: float, dtype: str, axes: str, pixels: str
+) -> None:
+    path, seen = tmp_path / "run.hdf5", np.random.default_rng(0).integers(0, 256, (T, 24, 32, 3))
+    seen[[0, -1], 0, 0] = 255
+    stored = (seen * factor).astype(dtype)
+    with h5py.File(path, "w") as file:
+        file["front"] = stored if axes == "THWC" else stored.transpose(0, 3, 1, 2)
+        file["points"] = stored / stored.max() - 0.5  # x, y, z of each pixel
+        file["action"] = numbers(T, 3)
+    values = inferred(path)
+    assert [(one["key"], one["size"]) for one in values["cameras"]] == [("front", [24, 32])]
+    assert values["source"]["layout"] == {"pixels": pixels}
+    clip = first_clip(path, values)
+    (name,) = clip.frame_indices
+    np.testing.assert_array_equal(clip.frames_at(name, np.arange(T)), seen)
+
+
+@pytest.mark.parametrize(
     ("attributes", "times", "hz"),
     [
         ({"fps": 12}, None, 12),
@@ -465,6 +490,33 @@ def test_what_is_no_recording_is_one_clear_error(tmp_path: Path) -> None:
         infer(str(tmp_path), "mine")
     with pytest.raises(SourceError, match="does not exist"):
         infer(str(tmp_path / "nowhere"), "mine")
+    for name in ("take/images/0.png", "take/images/1.png", "take/actions.csv"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("x")
+    with pytest.raises(SourceError, match=r"\(2 \.png, 1 \.csv\) can be packed into HDF5"):
+        infer(str(tmp_path), "mine")
+
+
+def test_the_script_that_packs_pictures_and_tables_makes_episodes(tmp_path: Path) -> None:
+    seen = np.random.default_rng(0).integers(0, 256, (2, 5, 24, 32, 3), np.uint8)
+    for take in range(2):
+        (folder := tmp_path / f"recordings/take_{take}" / "images").mkdir(parents=True)
+        for i, picture in enumerate(seen[take]):
+            cv2.imwrite(str(folder / f"{i:06d}.png"), picture[..., ::-1])
+        rows = [f"{i / 5},{i},{take}\n" for i in range(5)]
+        (folder.parent / "actions.csv").write_text("t,x,y\n" + "".join(rows))
+    page = (ROOT / "docs/adding-a-robot.md").read_text()
+    script = re.search(r"```python\n(# pack\.py.*?)```", page, re.DOTALL)
+    assert script
+    subprocess.run([sys.executable, "-c", script[1]], cwd=tmp_path, check=True)
+    path = tmp_path / "arm.hdf5"
+    source = open_source("hdf5")
+    assert source.inspect(str(path)).lengths == (5, 5)
+    values = inferred(path)
+    assert values["frequency_hz"] == 5 and values["source"]["layout"] == {"timestamps": "time"}
+    clip = first_clip(path, values)
+    np.testing.assert_array_equal(clip.frames_at(next(iter(clip.frame_indices)), np.arange(5)), seen[0])
+    np.testing.assert_array_equal(clip.actions, [[i, 0] for i in range(5)])
     with pytest.raises(UsageError, match="not an id"):
         infer(str(tmp_path), "a..b")
 

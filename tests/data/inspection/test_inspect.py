@@ -211,6 +211,25 @@ def test_a_rate_measured_in_one_episode_is_not_called_stated(tmp_path: Path) -> 
     assert told and all("timestamps: runs at 30 Hz, demo_0 at 20" in one for one in told)
 
 
+@pytest.mark.parametrize(
+    ("key", "values", "count"),
+    [
+        ("episode_ends", [10, 20, 30], 3),
+        ("terminals", [0] * 9 + [1] + [0] * 19 + [1], 2),
+        ("dones", [False] * 20 + [True] * 10, None),
+        ("episode_ends", [30], None),
+    ],
+)
+def test_episodes_end_to_end_in_one_file_are_told(
+    tmp_path: Path, key: str, values: list, count: int | None
+) -> None:
+    with h5py.File(tmp_path / "flat.hdf5", "w") as file:
+        file["images"] = np.random.default_rng(0).integers(0, 256, (30, 16, 16, 3), np.uint8)
+        file["actions"], file[key] = np.random.default_rng(0).normal(size=(30, 3)), values
+    told = found(open_source("hdf5").inspect(str(tmp_path / "flat.hdf5"))).get("rows", [])
+    assert any(f"{key} tells of {count} — write" in said for said in told) == (count is not None)
+
+
 def test_a_bag_tells_skew_and_lost_frames(tmp_path: Path) -> None:
     path = write_ros1(tmp_path / "run.bag", make_recording())
     inspection = open_source("rosbag").inspect(str(path))
@@ -291,11 +310,27 @@ def test_a_clock_counts_what_was_done_to_it() -> None:
     assert clock.hz == pytest.approx(30, rel=0.02)
 
 
+def test_a_pause_changes_neither_rate_nor_jitter() -> None:
+    times = np.arange(100) / 10 + 30.0 * (np.arange(100) >= 40)
+    assert checks.rate(times) == (pytest.approx(10), pytest.approx(0, abs=1e-6))
+    bursts = np.concatenate([start + np.arange(5) / 1000 for start in range(20)])
+    assert checks.rate(bursts)[0] == pytest.approx(5, rel=0.1)
+
+
 def test_lost_frames_are_told_for_cameras_alone() -> None:
     times = np.delete(np.arange(100) / 10, [20, 40, 41, 60])
     (finding,) = checks.time_findings("cam", measure(times), camera=True)
     assert finding.check == "frames" and finding.numbers["lost"] == 4
     assert not list(checks.time_findings("arm", measure(times)))
+
+
+def test_tables_beside_videos_are_told(tmp_path: Path) -> None:
+    (tmp_path / "videos").mkdir()
+    encode_video(tmp_path / "videos/a.mp4", range(24))
+    (tmp_path / "videos/robot.csv").write_text("t,x\n")
+    (finding,) = [one for one in inspect_recording(str(tmp_path))["findings"] if one["check"] == "files"]
+    assert finding["severity"] == "info" and "beside them are 1 .csv" in finding["message"]
+    assert "HDF5 with videos beside it" in finding["remedy"]
 
 
 def test_events_have_no_pauses() -> None:

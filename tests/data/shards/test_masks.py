@@ -16,7 +16,7 @@ from hma_data.inspection.inspect import inspect_recording
 from hma_data.loading.dataset import MixtureDataset, WindowDataset
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.schema import flag_counts, flags_text, mask_columns
+from hma_data.shards.schema import flag_counts, flag_pauses, flags_text, mask_columns
 from hma_data.shards.verify import check_shard, verify
 from hma_data.storage.files import file_sha256
 from tests.conftest import BlockTokenizer
@@ -125,6 +125,9 @@ def test_flags_are_read_back_as_they_were_written() -> None:
         flags_text(3, {"masked_actions": 12, "held_frames": 4}) == "trimmed,held_frames=4,masked_actions=12"
     )
     assert flag_counts("trimmed,held_frames=4,masked_actions=12") == {"held_frames": 4, "masked_actions": 12}
+    both = flags_text(0, {"paused_frames": 2}, {7: 3, 40: 12})
+    assert both == "paused_frames=2,pauses=7:3;40:12" and flag_pauses(both) == {7: 3, 40: 12}
+    assert flag_counts(both) == {"paused_frames": 2} and flag_pauses("trimmed,pauses=x") == {}
     assert flag_counts("") == flag_counts("trimmed") == flag_counts("odd=,=,x=y,z=-1") == {}
 
 

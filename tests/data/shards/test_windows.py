@@ -1,5 +1,6 @@
 """The arithmetic of windows against counting them, and against sets that contradict themselves."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -29,7 +30,7 @@ def fake(lengths: list[int], stride: int = 1, cameras: int = 1, group: int = 7, 
     return SimpleNamespace(
         folder="a set",
         row_stride=stride,
-        manifest=SimpleNamespace(layout=SimpleNamespace(camera_rows=cameras > 1)),
+        manifest=SimpleNamespace(layout=SimpleNamespace(camera_rows=cameras > 1), frame_stride=1),
         row_groups=lambda split: groups,
         index=lambda split: index,
     )
@@ -47,6 +48,25 @@ def test_window_arithmetic_equals_counting(
     for wanted in (range(cameras), last):
         made = fake(lengths, stride, cameras, shards=shards)
         check_index(WindowIndex.of(made, "train", frames, cameras=wanted), lengths, cameras, wanted)
+
+
+def test_a_pause_as_long_as_a_step_divides_an_episode_into_pieces() -> None:
+    made = fake([20, 6, 30])
+    pauses = np.array([[2, 9, 3], [0, 4, 2], [2, 12, 40], [2, 29, 9]])  # entry, row before, recorded steps
+    index = replace(made.index("train"), pauses=pauses)
+    made.index = lambda split: index
+    for stride, pieces in ((2, [5, 15, 6, 10, 3, 17]), (3, [20, 6, 10, 3, 17]), (9, [20, 6, 13, 17])):
+        starts = np.cumsum([0, *pieces])
+        for frames in (1, 2, 3):
+            span, first, last = frames * stride, [], []
+            for begin, length in zip(starts, pieces):
+                found = [*range(begin, begin + max(0, length - span + 1))]
+                found += [begin] if not found and length > stride else []
+                first, last = first + found, last + [begin + length - 1] * len(found)
+            windows = WindowIndex.of(made, "train", frames, stride, "pad")
+            every = np.arange(windows.count)
+            assert windows.first_rows(every).tolist() == first and windows.last_rows(every).tolist() == last
+            assert windows.divided_episodes == len(pieces) - 3 - (stride < 9)
 
 
 def check_index(index: WindowIndex, lengths: list[int], cameras: int, wanted: range) -> None:
