@@ -32,7 +32,8 @@ from hma_model.checkpoint.folder import Checkpoint
 from hma_model.simulate import messages
 from hma_model.simulate.engine import Engine
 from hma_model.simulate.films import KINDS, film
-from hma_model.simulate.scenes import Drivable, describe
+from hma_model.simulate.pads import describe
+from hma_model.simulate.scenes import Drivable
 from hma_model.simulate.session import Frame, Sampling, Session
 
 if TYPE_CHECKING:
