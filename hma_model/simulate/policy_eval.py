@@ -16,6 +16,7 @@ M policies, N episodes, T frames after the prompt, S pixels a side.
 
 import hashlib
 import json
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
@@ -40,6 +41,7 @@ from hma_model.evaluation.agreement import (
     share_interval,
 )
 from hma_model.evaluation.judge import StateJudge, task_of, train_judge
+from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.simulate.arenas import Arena, Floats, ModelArena, Picture, Scenes, TrueArena
 from hma_model.simulate.fingerprints import object_sha256, policy_facts, world_facts
 from hma_model.simulate.policies import Judged, Policy, begin, checked, read_policy
@@ -339,10 +341,13 @@ def run(
     Raises:
         HMAError: the policy fails.
     """
-    pictures, commands = [arena.pictures], []
+    pictures, commands, said = [arena.pictures], list[Floats](), ""
     begin(name, policy, arena)
     for _ in range(frames * arena.scenes.stride):
         commands.append(checked(name, policy, arena))
+        if not said and isinstance(arena, ModelArena) and (said := arena.outside(commands[-1])):
+            guess = "what the model shows of such commands is a guess"
+            warnings.warn(f"policy {name}: {said}; {guess}", OutsideRangeWarning, stacklevel=2)
         arena.step(commands[-1])
         if arena.fresh:
             pictures.append(arena.pictures)
