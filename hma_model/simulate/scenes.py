@@ -342,6 +342,25 @@ def drivable(
     return found
 
 
+def opening(robots: Mapping[str, Drivable], embodiment: str | None, source: str | None) -> str | None:
+    """Return the key of the robot that a page opens with; None lets the page choose.
+
+    Args:
+        robots: by key.
+        embodiment: its id, if a person named one.
+        source: where it begins if possible, as of `Drivable.source`.
+
+    Raises:
+        UsageError: there is no such robot.
+    """
+    own = [key for key, robot in robots.items() if embodiment in (None, robot.embodiment.id)]
+    if not own:
+        known = ", ".join(dict.fromkeys(robot.embodiment.id for robot in robots.values()))
+        raise UsageError("--embodiment", f"there is no robot {embodiment!r} to drive", f"known: {known}")
+    wished = [key for key in own if robots[key].source == source]
+    return (wished or own)[0] if embodiment or wished else None
+
+
 def trained_on(checkpoint: Checkpoint) -> list[ShardSet]:
     """Return the shard sets of a training run whose robots have no simulator, as far as they are here.
 
