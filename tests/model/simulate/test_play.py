@@ -60,7 +60,7 @@ def test_a_damaged_trunk_is_refused(
 
 
 @pytest.mark.slow
-def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, served: list[Any]) -> None:
+def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     yaml = tmp_path / "rover.yaml"
     yaml.write_text(Checkpoint.open("embedded").embodiment("mover_10").to_yaml().replace("mover_10", "rover"))
     words = ["convert", "-e", str(yaml), "--source", str(record("mover_10", tmp_path, 2)), "--tokenizer"]
@@ -69,6 +69,7 @@ def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, served: list[An
     data, out = str(tmp_path / "shards"), str(tmp_path / "run")
     assert main(["finetune", "--from", "embedded", "--data", data, "--out", out, *small]) == 0
     assert json.loads((tmp_path / "run/recipe.json").read_text())["data"] == [data]
+    served = request.getfixturevalue("served")  # from here on no tokenizer is real
     assert main(["play", out, "--no-browser"]) == 0
     assert list(served[0][2]) == ["rover:recordings"]
 
