@@ -387,3 +387,17 @@ def test_the_pictures_and_the_run_button_fit_on_the_screen_side_by_side(
     button = page.locator("#run").bounding_box()
     assert button and button["y"] + button["height"] <= height
     context.close()
+
+
+def test_the_question_mark_explains_the_page_and_the_keys_rest_meanwhile(page: "Page", engine: Engine) -> None:
+    page.keyboard.press("?")
+    page.wait_for_selector("#about:has-text('A neural network predicts every picture')")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("p")
+    page.wait_for_timeout(100)
+    session = session_of(engine, page)
+    assert session.paused and session.held.tolist() == [0, 0]
+    page.keyboard.press("Escape")
+    page.wait_for_selector("#about", state="hidden")
+    page.keyboard.press("p")
+    frames(page, 2)
