@@ -61,14 +61,18 @@ def sentences(found: PolicyEvaluation) -> list[str]:
         said.append(f"correlations over policies are not computed: {reason}")
     else:
         said += [_correlation(what, one) for what, one in correlated.items()]
-    if found.generated.too_few:
-        few = f"too few {found.generated.too_few} to tell whether the judge is better than chance"
-        said.append(f"on generated frames there are {few}: the model's success rates mean nothing")
+    return [*said, *doubt(found)]
+
+
+def doubt(found: PolicyEvaluation) -> list[str]:
+    """Return the sentence that says why the model's success rates mean nothing, if they do."""
+    if few := found.generated.too_few:
+        why = f"there are too few {few} to tell whether the judge is better than chance"
     elif not found.generated.better_than_chance:
-        said.append(
-            "on generated frames the judge is no better than chance: the model's success rates mean nothing"
-        )
-    return said
+        why = "the judge is no better than chance"
+    else:
+        return []
+    return [f"on generated frames {why}: the model's success rates mean nothing"]
 
 
 def _correlation(what: str, found: Correlation) -> str:
@@ -111,8 +115,10 @@ def html(found: PolicyEvaluation) -> str:
             (_value(found.generated.balanced), "and on generated ones; 0.5 is chance"),
         ]
     )
+    for sentence in doubt(found):  # before anybody reads the rates
+        page.section("Do not rely on the model's rates", sentence[:1].upper() + sentence[1:] + ".")
     page.table(COLUMNS, table(found))
-    for sentence in sentences(found):
+    for sentence in [one for one in sentences(found) if one not in doubt(found)]:
         page.text(sentence[:1].upper() + sentence[1:] + ".")
     page.section("Success rates", "A policy is a point; bars are 95 % intervals over episodes.")
     page.picture(_plot(found), "svg+xml", "Success in the simulator and in the model")

@@ -389,7 +389,9 @@ def test_the_pictures_and_the_run_button_fit_on_the_screen_side_by_side(
     context.close()
 
 
-def test_the_question_mark_explains_the_page_and_the_keys_rest_meanwhile(page: "Page", engine: Engine) -> None:
+def test_the_question_mark_explains_the_page_and_the_keys_rest_meanwhile(
+    page: "Page", engine: Engine
+) -> None:
     page.keyboard.press("?")
     page.wait_for_selector("#about:has-text('A neural network predicts every picture')")
     page.keyboard.press("ArrowRight")
