@@ -32,6 +32,7 @@ from hma_data.errors import UsageError
 from hma_data.storage.files import atomic_path, kept_arrays
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.agreement import (
+    MIN_EPISODES,
     Accuracy,
     Bools,
     Estimate,
@@ -102,7 +103,7 @@ class PolicyEvaluation:
         success, score: correlation over policies of the success rates, and of the mean scores.
         generated: accuracy of the judge on generated frames, against the simulator under the same commands.
         followed: how the scores of single episodes, as judged on generated frames, correlate with the true
-            ones under the same commands; None if they do not vary.
+            ones under the same commands; None if they do not vary or are few.
     """
 
     embodiment: str
@@ -291,6 +292,8 @@ def _tell(tell: Progress, begun: float, name: str, done: float) -> None:
 
 
 def _correlation(one: Scores, other: Scores) -> float | None:
+    if len(one) < MIN_EPISODES:
+        return None
     found = float(pearson(one, other))
     return None if np.isnan(found) else found
 

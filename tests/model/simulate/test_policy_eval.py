@@ -204,10 +204,11 @@ def test_a_policy_that_leaves_the_range_of_training_is_named_once(world: World, 
     flawless: Any = FlawlessWorld(world)
     flawless.commands = lambda name: seen
     with pytest.warns(OutsideRangeWarning) as warned:
-        evaluate_policies(
+        found = evaluate_policies(
             ROBOT, [("wild", Called(Wild)), "still"], world=flawless, judge=judge, episodes=2, frames=4
         )
     (said,) = [str(one.message) for one in warned]
+    assert found.followed is None  # of four episodes it would say nothing
     assert said.startswith("policy wild: rails_03: an action is outside") and "(action_0 -50 to 50)" in said
 
 
