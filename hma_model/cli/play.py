@@ -31,6 +31,9 @@ def play(
         list[Path] | None,
         typer.Option("--prompt", help="A picture to begin from; repeat it for several, in their order."),
     ] = None,
+    embodiment: Annotated[
+        str | None, typer.Option("-e", "--embodiment", help="The robot that the page opens with.")
+    ] = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one.")] = 0,
     host: Annotated[
         str, typer.Option("--host", help="Address to listen on; any but loopback needs a token.")
@@ -55,7 +58,7 @@ def play(
     from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
     from hma_model.hub.publish import located
     from hma_model.simulate.pictures import read_picture
-    from hma_model.simulate.scenes import drivable, trained_on
+    from hma_model.simulate.scenes import drivable, opening, trained_on
 
     # what is wrong with it, the data or the pictures is said before torch is imported
     sets, pictures = list(map(ShardSet, data or ())), list(map(read_picture, prompt or ()))
@@ -68,7 +71,11 @@ def play(
 
         return get_tokenizer(opened.config.tokenizer["name"], device=device)
 
-    robots = drivable(opened, sets or trained_on(opened), tokenizer, pictures)
+    sets = sets or trained_on(opened)
+    robots = drivable(opened, sets, tokenizer, pictures)
+    first = opening(robots, embodiment, "pictures" if pictures else "recordings" if sets else None)
+    if len(opened.embodiments) > 1 and pictures and embodiment is None:
+        print("the picture is offered for every robot; -e ROBOT opens the page with yours", file=sys.stderr)
     from hma_model.simulate.server import LOOPBACK, serve
 
     listener = _listen(host, port)
@@ -84,7 +91,7 @@ def play(
         if browser and has_display():
             webbrowser.open(address)
 
-    settings: dict[str, Any] = {"device": device, "precision": precision, "compile": compile}
+    settings: dict[str, Any] = {"device": device, "precision": precision, "compile": compile, "first": first}
     try:
         asyncio.run(serve(opened, name, robots, tokenizer(), listener, host, token, ready, **settings))
     except KeyboardInterrupt:

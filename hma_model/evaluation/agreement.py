@@ -138,9 +138,9 @@ def correlations(one: Floats, other: Floats, seed: int = 0) -> dict[str, Estimat
 def _too_little(one: Floats, other: Floats) -> str:
     policies, episodes = one.shape
     if policies < MIN_POLICIES:
-        return f"{policies} of the {MIN_POLICIES} policies that it takes"
+        return f"{policies} of at least {MIN_POLICIES} policies"
     if episodes < MIN_EPISODES:
-        return f"{episodes} of the {MIN_EPISODES} episodes that it takes"
+        return f"{episodes} of at least {MIN_EPISODES} episodes"
     for values, where in ((one, "the simulator"), (other, "the model")):
         if np.ptp(values.mean(axis=1)) < 1e-12:
             return f"all policies are alike in {where}"

@@ -225,6 +225,15 @@ class ModelArena:
             self.pictures, _ = self._env.reset(seed=seed, options={"prompt": given, "reset_mask": mask})
         self._seen: list[SeenState] | None = None
 
+    def outside(self, commands: Floats) -> str:
+        """Say which of the commands (N, A) leave the range seen in training; "" for none.
+
+        The environment then says it no more.
+        """
+        said = self._env.episodes.commands.outside(commands)
+        self._env.episodes.warned |= bool(said)
+        return said
+
     @property
     def fresh(self) -> bool:
         return self._steps % self.scenes.stride == 0

@@ -36,7 +36,8 @@ class Engine:
         robots: those that can be driven, by key.
         orders: those in which the model can decode a frame.
         most: sessions at a time.
-        idle_s: seconds after which a session in which nobody does anything is closed.
+        idle_s: seconds after which a session in which nobody does anything is paused, or closed if nobody
+            watches it.
     """
 
     def __init__(
@@ -92,11 +93,13 @@ class Engine:
         """
         robot = self._robot(key)
         if len(self.sessions) >= self.most:
-            left = [session for session in self.sessions.values() if session.viewer is None]
+            now = time.monotonic()
+            left = [one for one in self.sessions.values() if one.viewer is None or self._idle(one, now)]
             if not left:
                 fault = f"all {self.most} places are taken"
                 raise UsageError("sessions", fault, "close another page, or try again in a few minutes")
-            self.close(min(left, key=lambda session: session.touched).name, "its place was needed")
+            said = "Closed: nothing was done here for a while, and another page needed the place."
+            self.close(min(left, key=lambda one: (one.viewer is not None, one.touched)).name, said)
         session = Session(
             secrets.token_urlsafe(18), robot, number, self._world, self._sampling, time.monotonic()
         )
@@ -143,6 +146,19 @@ class Engine:
         if session.viewer and reason:
             session.viewer.tell({"kind": "closed", "text": reason})
 
+    def _idle(self, session: Session, now: float) -> bool:
+        return now - session.touched > self.idle_s
+
+    def _rest(self, session: Session) -> None:
+        """Pause a session in which nobody does anything, or close it if nobody watches it."""
+        if session.viewer is None:
+            self.close(session.name)
+        elif not session.paused:
+            session.paused = True
+            session.viewer.tell(session.status())
+            text = f"Paused, because nothing was done for {self.idle_s / 60:.0f} minutes."
+            session.viewer.tell({"kind": "error", "text": text})
+
     def _robot(self, key: str) -> Drivable:
         if key not in self.robots:
             raise UsageError("robot", f"there is no {key[:40]!r}", f"known: {', '.join(self.robots)}")
@@ -164,9 +180,8 @@ class Engine:
         """Step the sessions that are due, and return the seconds until the next one is."""
         now = time.monotonic()
         for session in list(self.sessions.values()):
-            if now - session.touched > self.idle_s:
-                minutes = f"{self.idle_s / 60:.0f} minutes"
-                self.close(session.name, f"Closed, because nothing was done for {minutes}.")
+            if self._idle(session, now):
+                self._rest(session)
         due = [session for session in self.sessions.values() if session.ready(now)]
         together: dict[Sampling, list[Session]] = {}
         for session in due:

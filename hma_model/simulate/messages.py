@@ -3,7 +3,7 @@
 A page sends JSON, at most MOST_BYTES a message. The server sends JSON, and binary messages with a frame:
 
     2 bytes   length of the header, big-endian
-    header    JSON: serial, frame, psnr, ms, rate, input, command, parted, bytes of the model's JPEG
+    header    JSON: serial, frame, psnr, still, ms, rate, input, command, parted, bytes of the model's JPEG
     JPEG      the model's picture, then the true one if it is known
 """
 
@@ -125,6 +125,12 @@ def parse(text: str) -> Message:
 
 def frame_bytes(frame: Frame, facts: dict[str, Any], serial: int) -> bytes:
     """Return a frame as the server sends it."""
-    about = {"serial": serial, "frame": frame.number, "psnr": frame.psnr, "model": len(frame.model)}
+    about = {
+        "serial": serial,
+        "frame": frame.number,
+        "psnr": frame.psnr,
+        "still": frame.still,
+        "model": len(frame.model),
+    }
     header = json.dumps(about | facts).encode()
     return struct.pack(">H", len(header)) + header + frame.model + (frame.true or b"")

@@ -16,6 +16,7 @@ M policies, N episodes, T frames after the prompt, S pixels a side.
 
 import hashlib
 import json
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
@@ -31,6 +32,7 @@ from hma_data.errors import UsageError
 from hma_data.storage.files import atomic_path, kept_arrays
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.agreement import (
+    MIN_EPISODES,
     Accuracy,
     Bools,
     Estimate,
@@ -40,6 +42,7 @@ from hma_model.evaluation.agreement import (
     share_interval,
 )
 from hma_model.evaluation.judge import StateJudge, task_of, train_judge
+from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.simulate.arenas import Arena, Floats, ModelArena, Picture, Scenes, TrueArena
 from hma_model.simulate.fingerprints import object_sha256, policy_facts, world_facts
 from hma_model.simulate.policies import Judged, Policy, begin, checked, read_policy
@@ -100,7 +103,7 @@ class PolicyEvaluation:
         success, score: correlation over policies of the success rates, and of the mean scores.
         generated: accuracy of the judge on generated frames, against the simulator under the same commands.
         followed: how the scores of single episodes, as judged on generated frames, correlate with the true
-            ones under the same commands; None if they do not vary.
+            ones under the same commands; None if they do not vary or are few.
     """
 
     embodiment: str
@@ -289,6 +292,8 @@ def _tell(tell: Progress, begun: float, name: str, done: float) -> None:
 
 
 def _correlation(one: Scores, other: Scores) -> float | None:
+    if len(one) < MIN_EPISODES:
+        return None
     found = float(pearson(one, other))
     return None if np.isnan(found) else found
 
@@ -339,10 +344,13 @@ def run(
     Raises:
         HMAError: the policy fails.
     """
-    pictures, commands = [arena.pictures], []
+    pictures, commands, said = [arena.pictures], list[Floats](), ""
     begin(name, policy, arena)
     for _ in range(frames * arena.scenes.stride):
         commands.append(checked(name, policy, arena))
+        if not said and isinstance(arena, ModelArena) and (said := arena.outside(commands[-1])):
+            guess = "what the model shows of such commands is a guess"
+            warnings.warn(f"policy {name}: {said}; {guess}", OutsideRangeWarning, stacklevel=2)
         arena.step(commands[-1])
         if arena.fresh:
             pictures.append(arena.pictures)

@@ -12,7 +12,7 @@ from hma_data.console import print_table
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.storage.files import atomic_path
 from hma_model.evaluation.pages import COLOURS, MARKERS, Page, label_axes, svg_bytes
-from hma_model.simulate.policy_eval import WORK, PolicyEvaluation, Scored
+from hma_model.simulate.policy_eval import WORK, Correlation, PolicyEvaluation, Scored
 
 COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same commands, sim.")
 CHOSEN = 2  # episodes of each kind on the page
@@ -54,17 +54,31 @@ def sentences(found: PolicyEvaluation) -> list[str]:
         f"judge on held-out true episodes: {found.judge.held_out}",
         f"judge on generated frames, against the simulator under the same commands: {found.generated}; "
         f"correlation of the scores {share}",
-        f"success rates over policies: Pearson {found.success.pearson}, ranks {found.success.spearman}",
-        f"mean scores over policies: Pearson {found.score.pearson}, ranks {found.score.spearman}",
     ]
-    if found.generated.too_few:
-        few = f"too few {found.generated.too_few} to tell whether the judge is better than chance"
-        said.append(f"on generated frames there are {few}: the model's success rates mean nothing")
+    correlated = {"success rates": found.success, "mean scores": found.score}
+    missing = {one.pearson.reason for one in correlated.values()}
+    if len(missing) == 1 and (reason := missing.pop()):
+        said.append(f"correlations over policies are not computed: {reason}")
+    else:
+        said += [_correlation(what, one) for what, one in correlated.items()]
+    return [*said, *doubt(found)]
+
+
+def doubt(found: PolicyEvaluation) -> list[str]:
+    """Return the sentence that says why the model's success rates mean nothing, if they do."""
+    if few := found.generated.too_few:
+        why = f"there are too few {few} to tell whether the judge is better than chance"
     elif not found.generated.better_than_chance:
-        said.append(
-            "on generated frames the judge is no better than chance: the model's success rates mean nothing"
-        )
-    return said
+        why = "the judge is no better than chance"
+    else:
+        return []
+    return [f"on generated frames {why}: the model's success rates mean nothing"]
+
+
+def _correlation(what: str, found: Correlation) -> str:
+    if found.pearson.reason:  # of the ranks it is the same
+        return f"{what} over policies: no correlation, {found.pearson.reason}"
+    return f"{what} over policies: Pearson {found.pearson}, ranks {found.spearman}"
 
 
 def show(found: PolicyEvaluation) -> None:
@@ -101,8 +115,10 @@ def html(found: PolicyEvaluation) -> str:
             (_value(found.generated.balanced), "and on generated ones; 0.5 is chance"),
         ]
     )
+    for sentence in doubt(found):  # before anybody reads the rates
+        page.section("Do not rely on the model's rates", sentence[:1].upper() + sentence[1:] + ".")
     page.table(COLUMNS, table(found))
-    for sentence in sentences(found):
+    for sentence in [one for one in sentences(found) if one not in doubt(found)]:
         page.text(sentence[:1].upper() + sentence[1:] + ".")
     page.section("Success rates", "A policy is a point; bars are 95 % intervals over episodes.")
     page.picture(_plot(found), "svg+xml", "Success in the simulator and in the model")

@@ -68,7 +68,8 @@ class Part:
         count = default_frames(model) if self.frames is None else self.frames
         last = start + (count - 1) * stride
         if count < 1 or start < 0 or last >= length:
-            fault = f"{count} frames, {stride} steps apart, from {start} on do not fit an episode of {length}"
+            apart = "" if stride == 1 else f", {stride} rows apart"
+            fault = f"{count} frames{apart}, from row {start} on do not fit an episode of {length} rows"
             raise UsageError("prompt", fault, "choose another start or fewer frames")
         return np.arange(start, last + 1, stride)
 

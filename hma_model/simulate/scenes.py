@@ -8,7 +8,6 @@ P frames of a prompt, H×W pixels, A action dims, K = stride * A values of a chu
 """
 
 import math
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.images import resize
 from hma_data.errors import UsageError
-from hma_data.lab import FAMILY
 from hma_data.lab.simulator import SIZE, LabSimulator, simulated
 from hma_data.loading.views import FIRST, Cameras
 from hma_data.registry.components import Component
@@ -44,7 +42,6 @@ Floats = NDArray[np.float32]
 
 PROMPT = 4  # frames; two would show velocities, more also show what stands still
 LONGEST = 64  # frames of a window of a recording
-ARENAS = {"pusht_fast": 512.0}  # side of the picture in units of the command, for targets in the plane
 RETURNING = ("joint_velocity", "base_velocity", "joint_delta", "eef_delta")  # spaces whose rest is zero
 
 
@@ -345,6 +342,25 @@ def drivable(
     return found
 
 
+def opening(robots: Mapping[str, Drivable], embodiment: str | None, source: str | None) -> str | None:
+    """Return the key of the robot that a page opens with; None lets the page choose.
+
+    Args:
+        robots: by key.
+        embodiment: its id, if a person named one.
+        source: where it begins if possible, as of `Drivable.source`.
+
+    Raises:
+        UsageError: there is no such robot.
+    """
+    own = [key for key, robot in robots.items() if embodiment in (None, robot.embodiment.id)]
+    if not own:
+        known = ", ".join(dict.fromkeys(robot.embodiment.id for robot in robots.values()))
+        raise UsageError("--embodiment", f"there is no robot {embodiment!r} to drive", f"known: {known}")
+    wished = [key for key in own if robots[key].source == source]
+    return (wished or own)[0] if embodiment or wished else None
+
+
 def trained_on(checkpoint: Checkpoint) -> list[ShardSet]:
     """Return the shard sets of a training run whose robots have no simulator, as far as they are here.
 
@@ -374,42 +390,3 @@ def _dimension(space: str, name: str, part: Component, low: float, high: float) 
         top = max(abs(low), abs(high))
         return Dimension(name, unit, -top, top, "rate")
     return Dimension(name, unit, low, high, "target")
-
-
-def pad(robot: Drivable) -> dict[str, Any] | None:
-    """Return how the picture of a robot that moves in the plane becomes a pad to drive on, else None.
-
-    Returns:
-        kind ("target": the pointer is the target, or "rate": the way from where it was pressed is the
-        velocity), the numbers of the dimensions along x and y, with `up` 1 where y grows upward, and for
-        targets the values `low` and `high` at the picture's edges.
-    """
-    names = [dim.name for dim in robot.dimensions]
-    for x, y, up in (("x", "y", 0), ("vx", "vy", 0), ("turn", "speed", 1)):
-        if x in names and y in names:
-            across, along = names.index(x), names.index(y)
-            dims = robot.dimensions[across], robot.dimensions[along]
-            values = {"kind": dims[0].kind, "x": across, "y": along, "up": up}
-            if dims[0].kind == "rate":
-                return values
-            side = ARENAS.get(robot.embodiment.id, float(SIZE))
-            known = robot.embodiment.id in ARENAS or FAMILY.fullmatch(robot.embodiment.id)
-            low = [0.0, 0.0] if known else [dim.low for dim in dims]
-            high = [side, side] if known else [dim.high for dim in dims]
-            return values | {"low": low, "high": high}
-    return None
-
-
-def describe(robot: Drivable) -> dict[str, Any]:
-    """Return what the page shows of a robot, as plain values."""
-    text = re.sub(r"^A made-up ", "", robot.embodiment.description) or robot.embodiment.id
-    return {
-        "key": robot.key,
-        "id": robot.embodiment.id,
-        "about": text[:1].upper() + text[1:],
-        "source": robot.source,
-        "hz": robot.embodiment.rate_hz,
-        "stride": robot.embodiment.stride,
-        "dimensions": [vars(dim) for dim in robot.dimensions],
-        "pad": pad(robot),
-    }

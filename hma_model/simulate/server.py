@@ -32,7 +32,8 @@ from hma_model.checkpoint.folder import Checkpoint
 from hma_model.simulate import messages
 from hma_model.simulate.engine import Engine
 from hma_model.simulate.films import KINDS, film
-from hma_model.simulate.scenes import Drivable, describe
+from hma_model.simulate.pads import describe
+from hma_model.simulate.scenes import Drivable
 from hma_model.simulate.session import Frame, Sampling, Session
 
 if TYPE_CHECKING:
@@ -159,10 +160,18 @@ class Server:
         model: a name for the model, shown on the page.
         host: the address that it listens on.
         token: what every request must carry, or None.
+        first: the key of the robot that a page opens with; None for the best known one.
     """
 
-    def __init__(self, engine: Engine, model: str, host: str = LOOPBACK[0], token: str | None = None) -> None:
-        self.engine, self.model = engine, model
+    def __init__(
+        self,
+        engine: Engine,
+        model: str,
+        host: str = LOOPBACK[0],
+        token: str | None = None,
+        first: str | None = None,
+    ) -> None:
+        self.engine, self.model, self.first = engine, model, first or FIRST
         self.viewers = 0
         self._page = files("hma_model.simulate").joinpath("page.html").read_text("utf-8")
         self._saving = asyncio.Semaphore(1)
@@ -243,7 +252,7 @@ class Connection:
         self._credit, self._filled = BURST, time.monotonic()
         robots = [describe(robot) for robot in self.engine.robots.values()]
         orders = list(self.engine.orders)
-        hello = {"model": server.model, "robots": robots, "orders": orders, "first": FIRST}
+        hello = {"model": server.model, "robots": robots, "orders": orders, "first": server.first}
         self.page.tell({"kind": "hello", **hello})
 
     async def receive(self) -> None:
@@ -377,6 +386,7 @@ async def serve(
     token: str | None,
     ready: Callable[[], None],
     device: str = "cpu",
+    first: str | None = None,
     **settings: Any,
 ) -> None:
     """Serve a checkpoint until the process is interrupted.
@@ -388,6 +398,7 @@ async def serve(
         listener: a socket that listens.
         ready: called when the page can be opened.
         device: of the network.
+        first: as of `Server`.
         settings: of `World`.
 
     Raises:
@@ -402,7 +413,7 @@ async def serve(
     engine = Engine(World(model, tokenizer, **settings), robots, orders=("random", *confidence))
     engine.start()
     try:
-        await run(Server(engine, name, host, token).app, listener, lambda server: ready())
+        await run(Server(engine, name, host, token, first).app, listener, lambda server: ready())
     finally:
         engine.stop()
 

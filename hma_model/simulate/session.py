@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.images import opencv
 from hma_data.errors import UsageError
-from hma_model.simulate.scenes import Drivable, Floats, LabScene, Picture, describe
+from hma_model.simulate.pads import describe
+from hma_model.simulate.scenes import Drivable, Floats, LabScene, Picture
 
 WINDOW = 8  # frames that a restart of the model is given
 KEPT = 3000  # frames to save
-DROP, ROW = 6.0, 3  # dB: twice the tokenizer's own error, in so many frames in a row; then they have parted
+DROP = 6.0  # dB: twice the tokenizer's own error
+LEAST_ROW = 3  # frames that are bad in a row before model and truth have parted; a second of them
 QUALITY = 92  # of JPEG
 
 
@@ -60,6 +62,7 @@ class Frame:
         commands: (stride, A).
         state: (S,) of the simulator after it, or None.
         psnr: of the two pictures in dB, or None.
+        still: PSNR of a picture that stands still since the beginning or the last sync, or None.
     """
 
     number: int
@@ -68,6 +71,7 @@ class Frame:
     commands: Floats
     state: Floats | None
     psnr: float | None
+    still: float | None = None
 
 
 class Viewer(Protocol):
@@ -133,14 +137,14 @@ class Session:
         self.frames: deque[Frame] = deque(maxlen=KEPT)
         self.count, self.ended, self.steps = 0, False, 0
         self.parted: int | None = None
-        self._low = 0  # frames in a row below the threshold
+        self._bad = 0  # frames in a row in which the model is no better than a still
 
     def _set_start(self) -> None:
         """Take the prompt's last frame as the tokenizer shows it, which the model cannot surpass."""
         true, shown = self._true[-1], self._world.picture(self.row)
-        self._best = psnr(shown, true)
+        self._best, self._still = psnr(shown, true), true
         none = np.zeros((0, 0), np.float32)
-        self.start = Frame(0, jpeg(shown), jpeg(true), none, self._state, self._best)
+        self.start = Frame(0, jpeg(shown), jpeg(true), none, self._state, self._best, 60.0)
 
     def sync(self) -> None:
         """Restart the model from the true last frames.
@@ -151,8 +155,9 @@ class Session:
         if not self._true:
             raise UsageError("sync", "the true frames are unknown here", "reset first, or drive a simulator")
         self._world.reset(self.row, *self._history())
-        self._best = psnr(self._world.picture(self.row), self._true[-1])
-        self.parted, self._low = None, 0
+        self._still = self._true[-1]
+        self._best = psnr(self._world.picture(self.row), self._still)
+        self.parted, self._bad = None, 0
 
     def _history(self) -> tuple[Picture, Floats]:
         """Return the true last frames, and the chunks between them."""
@@ -193,12 +198,14 @@ class Session:
             self._true.clear()
         else:
             self._true.append(self._truth)
-        score = None if self._truth is None else psnr(picture, self._truth)
-        self._judge(score)
+        score = still = None
+        if self._truth is not None:
+            score, still = psnr(picture, self._truth), psnr(self._still, self._truth)
+            self._judge(score, still)
         stride = self.robot.embodiment.stride
         commands = self._chunks[-1].reshape(stride, -1)
         true = None if self._truth is None else jpeg(self._truth)
-        frame = Frame(self.count, jpeg(picture), true, commands, self._state, score)
+        frame = Frame(self.count, jpeg(picture), true, commands, self._state, score, still)
         self.frames.append(frame)
         if self.replays:
             self.touched, self.held = now, commands[-1].copy()
@@ -216,13 +223,21 @@ class Session:
         """Return the state (S,) of the simulator, if there is one."""
         return self.scene.simulator.state if isinstance(self.scene, LabScene) else None
 
-    def _judge(self, score: float | None) -> None:
-        """Note the moment from which on the model's pictures are much worse than the tokenizer's."""
-        if score is None or self.parted is not None:
+    def _judge(self, score: float, still: float) -> None:
+        """Note the moment from which on, for a second, the model's pictures are no better than a still.
+
+        They must be much worse than the tokenizer's own too: a still is exact while nothing moves.
+        """
+        if self.parted is not None:
             return
-        self._low = self._low + 1 if score < self._best - DROP else 0
-        if self._low == ROW:
-            self.parted = self.count - ROW + 1
+        self._bad = self._bad + 1 if score <= still and score < self._best - DROP else 0
+        if self._bad == self.row_of_bad:
+            self.parted = self.count - self._bad + 1
+
+    @property
+    def row_of_bad(self) -> int:
+        """Return how many bad frames in a row it takes to say that model and truth have parted."""
+        return max(LEAST_ROW, round(self.robot.embodiment.rate_hz / self.robot.embodiment.stride))
 
     def _rate(self, now: float) -> float:
         """Return the frames a second of the last 2 s or so."""
@@ -236,15 +251,15 @@ class Session:
         return {
             "kind": "status", "paused": self.paused, "replays": self.replays, "fast": self.fast,
             "sampling": vars(self.sampling), "scene": self.number, "frame": self.count, "ended": self.ended,
-            "knows": bool(self._true),
+            "knows": bool(self._true), "parted": self.parted,
         }  # fmt: skip
 
     def opened(self) -> dict[str, Any]:
         """Return all that a page needs to go on with the session, as plain values."""
-        scores = [[frame.number, frame.psnr] for frame in list(self.frames)[-600:]]
+        scores = [[frame.number, frame.psnr, frame.still] for frame in list(self.frames)[-600:]]
         about = {"session": self.name, "robot": describe(self.robot), "held": self.held.tolist()}
         about |= {"input": self.input}
-        return self.status() | about | {"kind": "opened", "scores": scores, "parted": self.parted}
+        return self.status() | about | {"kind": "opened", "scores": scores}
 
     def last(self) -> Frame:
         """Return the newest frame; before the first, the prompt's last one."""

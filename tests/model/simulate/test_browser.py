@@ -6,6 +6,7 @@ import shutil
 import socket
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Engine]:
-    made = Engine(TrueWorld(), lab_robots("mover_04", "mover_02", "arm4_04"))
+    made = Engine(TrueWorld(), lab_robots("mover_04", "mover_02", "arm4_04", "rails_03"))
     made.start()
     yield made
     made.stop()
@@ -30,8 +31,14 @@ def engine() -> Iterator[Engine]:
 
 @pytest.fixture(scope="module")
 def address(engine: Engine) -> Iterator[str]:
-    """Serve in a thread, as `hma play` does."""
-    listener = socket.create_server(("127.0.0.1", 0))
+    with serving(engine) as port:
+        yield f"http://127.0.0.1:{port}/"
+
+
+@contextmanager
+def serving(engine: Engine, port: int = 0) -> Iterator[int]:
+    """Serve in a thread, as `hma play` does; give the port."""
+    listener = socket.create_server(("127.0.0.1", port))
     ready, servers = threading.Event(), []
 
     def started(server: Any) -> None:
@@ -42,7 +49,7 @@ def address(engine: Engine) -> Iterator[str]:
     thread = threading.Thread(target=lambda: asyncio.run(run(app, listener, started)), daemon=True)
     thread.start()
     assert ready.wait(20)
-    yield f"http://127.0.0.1:{listener.getsockname()[1]}/"
+    yield listener.getsockname()[1]
     servers[0].should_exit = True
     thread.join(20)
 
@@ -72,9 +79,9 @@ def opened(page: "Page", address: str, robot: str = "mover_04") -> "Page":
     page.on("pageerror", lambda fault: pytest.fail(str(fault)))
     page.goto(address)
     page.wait_for_selector("body[data-frame='0']")
-    if robot != "mover_04":
+    if page.input_value("#robot") != robot:
         page.select_option("#robot", robot)
-        page.wait_for_selector("#dims label")
+        page.wait_for_function("(key) => robot.key === key", arg=robot)
     return page
 
 
@@ -290,5 +297,109 @@ def test_a_closed_session_offers_to_start_again(page: "Page", engine: Engine) ->
     assert "nothing was done" in (page.text_content("#veil-text") or "")
     page.click("#again")
     page.wait_for_selector("#veil", state="hidden")
+    page.keyboard.press("p")
+    frames(page, 2)
+
+
+def test_the_picture_says_how_to_begin_and_that_it_stands_still(page: "Page") -> None:
+    assert page.text_content("#start") == "←→↑↓ or drag here to drive"
+    assert page.text_content("#driven") == "nothing yet"
+    page.keyboard.press("ArrowRight")
+    frames(page, 2)
+    page.wait_for_selector("#start", state="hidden")
+    page.keyboard.press("p")
+    page.wait_for_selector("#start:has-text('Paused')")
+    assert re.fullmatch(r"\d\.\d s, \d+ frames", page.text_content("#driven") or "")
+
+
+def test_two_fingers_drive_two_sliders(browser: "Browser", address: str, engine: Engine) -> None:
+    context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    page = opened(context.new_page(), address, "rails_03")
+    page.wait_for_selector("#start:has-text('Drag here to drive')")
+    box = page.locator("#stage").bounding_box()
+    assert box
+    left, right = ({"x": box["x"] + box["width"] * share, "y": box["y"] + 180} for share in (0.2, 0.8))
+    touch = context.new_cdp_session(page)
+
+    def fingers(kind: str, *points: dict[str, float]) -> None:
+        touches = [point | {"id": number} for number, point in enumerate(points)]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
+
+    fingers("touchStart", left)
+    fingers("touchStart", left, right)
+    fingers("touchMove", left | {"y": left["y"] + 120}, right | {"y": right["y"] - 120})
+    frames(page, 2)
+    session = session_of(engine, page)
+    first, second = session.robot.dimensions
+    assert session.held.tolist() == pytest.approx([first.high, second.low])  # down, and up
+    fingers("touchEnd")
+    frames(page, session.count + 3)
+    assert session.held.tolist() == [0, 0]
+    context.close()
+
+
+def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", engine: Engine) -> None:
+    session = session_of(engine, page)
+    engine.call(lambda: engine._world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
+    page.locator("input[value=fast]").check(force=True)
+    page.click("#run")
+    page.wait_for_selector("#parted:has-text('parted at 0.1 s')")
+    assert "Sync restarts the model" in (page.text_content("#note") or "")
+    assert page.get_attribute("#sync", "class") == "call"
+    engine.call(lambda: engine._world.blind.clear()).result(10)  # type: ignore[attr-defined]
+    page.keyboard.press("y")
+    page.wait_for_selector("#parted:has-text('parted')", state="hidden")
+    assert page.get_attribute("#sync", "class") == ""
+
+
+def test_a_page_whose_server_stopped_says_so_and_goes_on_when_it_is_back(
+    browser: "Browser", engine: Engine
+) -> None:
+    page = browser.new_context().new_page()
+    with serving(engine) as port:
+        opened(page, f"http://127.0.0.1:{port}/")
+        page.keyboard.press("ArrowRight")
+        frames(page, 2)
+        page.keyboard.press("p")
+    page.wait_for_selector("#veil:has-text('hma play was stopped')")
+    session = session_of(engine, page)
+    with serving(engine, port):
+        page.wait_for_selector("#veil", state="hidden")
+        page.keyboard.press("p")
+        frames(page, session.count + 2)
+        page.context.close()
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (667, 375), (820, 1180), (1024, 600)])
+def test_the_pictures_and_the_run_button_fit_on_the_screen_side_by_side(
+    browser: "Browser", address: str, width: int, height: int
+) -> None:
+    context = browser.new_context(viewport={"width": width, "height": height})
+    page = opened(context.new_page(), address)
+    page.wait_for_timeout(100)
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+    boxes = [page.locator(one).bounding_box() for one in ("#stage", "#true-view", ".side .card >> nth=0")]
+    for number, one in enumerate(boxes):
+        for other in boxes[number + 1 :]:
+            assert one and other
+            apart = one["x"] + one["width"] <= other["x"] or one["y"] + one["height"] <= other["y"]
+            assert apart or other["x"] + other["width"] <= one["x"]
+    button = page.locator("#run").bounding_box()
+    assert button and button["y"] + button["height"] <= height
+    context.close()
+
+
+def test_the_question_mark_explains_the_page_and_the_keys_rest_meanwhile(
+    page: "Page", engine: Engine
+) -> None:
+    page.keyboard.press("?")
+    page.wait_for_selector("#about:has-text('A neural network predicts every picture')")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("p")
+    page.wait_for_timeout(100)
+    session = session_of(engine, page)
+    assert session.paused and session.held.tolist() == [0, 0]
+    page.keyboard.press("Escape")
+    page.wait_for_selector("#about", state="hidden")
     page.keyboard.press("p")
     frames(page, 2)

@@ -9,7 +9,7 @@ from hma_data.errors import UsageError
 from hma_data.lab.simulator import LabSimulator
 from hma_model.simulate.engine import Engine
 from hma_model.simulate.scenes import PROMPT, SEED
-from hma_model.simulate.session import ROW, Sampling, Session
+from hma_model.simulate.session import Sampling, Session
 from tests.model.simulate.worlds import TrueWorld, Watcher, lab_robots
 
 ROBOTS = ("mover_04", "arm3_04", "pendulum")
@@ -109,15 +109,28 @@ def test_replay_gives_the_commands_of_the_recorded_episode() -> None:
     np.testing.assert_array_equal(driven, commands[-len(driven) :])
 
 
-def test_the_moment_they_part_is_the_first_of_some_bad_frames() -> None:
+def test_they_part_when_for_a_second_a_still_is_as_near_to_the_truth_as_the_model() -> None:
     bench = Bench()
     session, _ = bench.open()
     bench.step(7)
     bench.world.blind.add(session.row)
-    bench.step(ROW - 1)
+    assert session.row_of_bad == 10  # frames a second
+    bench.step(9)
     assert session.parted is None
     bench.step(2)
     assert session.parted == 8
+    session.sync()
+    assert session.parted is None and session.status()["parted"] is None
+
+
+def test_a_model_that_is_wrong_but_nearer_to_the_truth_than_a_still_has_not_parted() -> None:
+    bench = Bench()
+    session, viewer = bench.open()
+    session._best = 80.0  # every picture of the model counts as wrong
+    session.held = np.array([60, 60], np.float32)
+    bench.step(15)
+    last = viewer.frames[-1]
+    assert session.parted is None and last.psnr == 60 and last.still is not None and last.still < 30
 
 
 def test_sync_restarts_the_model_from_the_true_frames_and_their_commands() -> None:
@@ -155,13 +168,27 @@ def test_a_new_scene_begins_anew_and_the_same_scene_is_the_same() -> None:
     assert session.start.model == first
 
 
-def test_idle_sessions_are_closed_with_a_reason() -> None:
+def test_an_idle_session_is_paused_and_keeps_its_frames_but_is_closed_if_nobody_watches() -> None:
     bench = Bench(idle_s=60.0)
-    (idle, viewer), (busy, _) = bench.open(), bench.open()
-    idle.touched -= 61
+    (idle, viewer), (busy, _), (left, away) = bench.open(), bench.open(), bench.open()
     bench.step()
-    assert list(bench.engine.sessions) == [busy.name] and list(bench.world.rows) == [busy.row]
+    for session in (idle, left):
+        session.touched -= 61
+    bench.engine.detach(left.name, away)
+    bench.step(3)
+    assert list(bench.engine.sessions) == [idle.name, busy.name]
+    assert list(bench.world.rows) == [idle.row, busy.row]
+    assert idle.paused and len(idle.frames) == 1 and len(busy.frames) == 4
+    assert [told["kind"] for told in viewer.told] == ["status", "error"]
     assert "nothing was done" in viewer.told[-1]["text"]
+
+
+def test_an_idle_session_gives_its_place_to_a_new_page() -> None:
+    bench = Bench(most=1, idle_s=60.0)
+    idle, viewer = bench.open()
+    idle.touched -= 61
+    bench.open()
+    assert idle.name not in bench.engine.sessions and "another page" in viewer.told[-1]["text"]
 
 
 def test_a_full_engine_refuses_and_gives_the_places_of_those_who_left() -> None:

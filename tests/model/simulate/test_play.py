@@ -60,7 +60,7 @@ def test_a_damaged_trunk_is_refused(
 
 
 @pytest.mark.slow
-def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, served: list[Any]) -> None:
+def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     yaml = tmp_path / "rover.yaml"
     yaml.write_text(Checkpoint.open("embedded").embodiment("mover_10").to_yaml().replace("mover_10", "rover"))
     words = ["convert", "-e", str(yaml), "--source", str(record("mover_10", tmp_path, 2)), "--tokenizer"]
@@ -69,8 +69,28 @@ def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, served: list[An
     data, out = str(tmp_path / "shards"), str(tmp_path / "run")
     assert main(["finetune", "--from", "embedded", "--data", data, "--out", out, *small]) == 0
     assert json.loads((tmp_path / "run/recipe.json").read_text())["data"] == [data]
+    served = request.getfixturevalue("served")  # from here on no tokenizer is real
     assert main(["play", out, "--no-browser"]) == 0
     assert list(served[0][2]) == ["rover:recordings"]
+
+
+def test_the_page_opens_with_the_robot_that_was_named_or_the_picture_that_was_given(
+    published: Hub, served: list[Any], picture: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words, last = ["play", REPO, "--prompt", picture, "--no-browser"], list(ROBOTS)[-1]
+    assert main([*words, "-e", last]) == 0
+    assert main(words) == 0
+    assert "-e ROBOT opens the page with yours" in capsys.readouterr().err
+    assert main(["play", "-e", "mover_04", "--no-browser"]) == 0
+    assert main(["play", "--no-browser"]) == 0
+    assert [kept[-1]["first"] for kept in served] == [
+        f"{last}:pictures",
+        f"{next(iter(ROBOTS))}:pictures",
+        "mover_04",
+        None,
+    ]
+    assert main([*words, "-e", "nobody"]) == 2
+    assert "there is no robot 'nobody' to drive" in capsys.readouterr().err
 
 
 def test_the_device_and_precision_reach_the_world(
@@ -80,4 +100,4 @@ def test_the_device_and_precision_reach_the_world(
     save(tmp_path / "model", {"arm": 2})
     words = ["play", str(tmp_path / "model"), "--prompt", picture, "--no-browser"]
     assert main([*words, "--precision", "bf16", "--device", "cuda", "--compile"]) == 0
-    assert served[0][-1] == {"device": "cuda", "precision": "bf16", "compile": True}
+    assert served[0][-1] == {"device": "cuda", "precision": "bf16", "compile": True, "first": "arm:pictures"}

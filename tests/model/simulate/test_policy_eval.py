@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,11 @@ from hma_data.lab import truth
 from hma_data.lab.simulator import LabSimulator
 from hma_model.evaluation.agreement import Accuracy
 from hma_model.evaluation.judge import StateJudge, task_of
+from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.network.model import HMA
 from hma_model.simulate import World, policy_eval
 from hma_model.simulate.arenas import Scenes, TrueArena
-from hma_model.simulate.policies import begin, checked, read_policy
+from hma_model.simulate.policies import Called, begin, checked, read_policy
 from hma_model.simulate.policy_eval import WORK, PolicyEvaluation, Scored, evaluate_policies, score_policy
 from hma_model.simulate.policy_page import html, sentences, write_report
 from tests.model.simulate.worlds import TrueWorld
@@ -83,7 +85,9 @@ def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJu
     assert np.array_equal(found.policies[2].true_pictures, found.policies[2].model_pictures)
     assert found.policies[3].true.scores.max() == 0 and found.policies[0].true.scores.max() > 2
     assert found.generated.balanced == 1 and found.followed == pytest.approx(1)
-    assert found.success.pearson.value is None and "4 of the 8 episodes" in sentences(found)[3]
+    (reason,) = [one for one in sentences(found) if "correlation" in one and "policies" in one]
+    assert found.success.pearson.value is None
+    assert reason == "correlations over policies are not computed: 4 of at least 8 episodes"
 
 
 @pytest.mark.slow
@@ -130,7 +134,10 @@ def test_shares_have_exact_intervals_and_too_few_successes_are_said(world: World
     found = evaluate_policies(ROBOT, ["still"], world=world, judge=judge, episodes=8, frames=4)
     (row,) = found.rows()
     assert row["true_success"] == 0 and row["true_success_interval"] == pytest.approx((0, 0.369), abs=1e-3)
-    assert "there are too few successes to tell whether the judge is better" in sentences(found)[-1]
+    doubt = "there are too few successes to tell whether the judge is better"
+    assert doubt in sentences(found)[-1]
+    page = html(found)
+    assert page.count(doubt) == 1 and page.index(doubt) < page.index("<table")
 
 
 @pytest.mark.slow
@@ -183,6 +190,26 @@ def test_a_random_command_is_held_for_a_chunk_and_stays_in_range(world: World) -
     assert (chunks == chunks[:, :1]).all() and (chunks[0] != chunks[1]).all()
     high = np.array([dim.high for dim in arena.scenes.dimensions])
     assert (np.abs(chunks) <= high).all()
+
+
+class Wild:
+    """A policy that commands what no robot was trained on."""
+
+    def __call__(self, picture: np.ndarray) -> list[float]:
+        return [900, 0]
+
+
+def test_a_policy_that_leaves_the_range_of_training_is_named_once(world: World, judge: StateJudge) -> None:
+    seen = replace(world.commands(ROBOT), seen=np.array([[-50, -50], [50, 50]], np.float32))
+    flawless: Any = FlawlessWorld(world)
+    flawless.commands = lambda name: seen
+    with pytest.warns(OutsideRangeWarning) as warned:
+        found = evaluate_policies(
+            ROBOT, [("wild", Called(Wild)), "still"], world=flawless, judge=judge, episodes=2, frames=4
+        )
+    (said,) = [str(one.message) for one in warned]
+    assert found.followed is None  # of four episodes it would say nothing
+    assert said.startswith("policy wild: rails_03: an action is outside") and "(action_0 -50 to 50)" in said
 
 
 class Counter:

@@ -116,7 +116,7 @@ def test_windows_that_are_not_there_are_refused(model: HMA, shards: Path) -> Non
         read_prompt(model, MOVER, {"shards": shards, "episode": 7})
     with pytest.raises(HMAError, match="has no episode -1 — give 0 to 1, or an id"):
         read_prompt(model, MOVER, {"shards": shards, "episode": -1})
-    with pytest.raises(HMAError, match="4 frames, 5 steps apart, from 900 on do not fit an episode of"):
+    with pytest.raises(HMAError, match="4 frames, 5 rows apart, from row 900 on do not fit an episode of"):
         read_prompt(model, MOVER, {"shards": shards, "start": 900})
     with pytest.raises(HMAError, match="5 actions of 2 values in a chunk — planar_arm takes 3 of 2"):
         read_prompt(model, ARM, shards)

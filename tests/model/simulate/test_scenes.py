@@ -13,38 +13,78 @@ from hma_data.episodes.align import to_clip
 from hma_data.episodes.images import resize
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.errors import UsageError
+from hma_data.lab import family
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.simulate.films import film, lerobot_episode
-from hma_model.simulate.scenes import PROMPT, LabRobot, RecordedRobot, apart, drivable, pad
+from hma_model.simulate.pads import Pad, hint, pads
+from hma_model.simulate.scenes import PROMPT, LabRobot, RecordedRobot, apart, drivable
 from hma_model.simulate.session import Frame, Sampling, Session, jpeg
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
 from tests.model.robots import save
 from tests.model.simulate.worlds import TrueWorld, lab_robots
 
-KINDS = {  # robot -> kinds of its values, and what its picture is as a pad
-    "mover_04": (["rate", "rate"], "rate"),
-    "mover_02": (["target", "target"], "target"),
-    "pusht_fast": (["target", "target"], "target"),
-    "pusht_slow": (["rate", "rate", "switch"], "rate"),
-    "pendulum": (["rate"], None),
-    "arm1_03": (["target"], None),
-    "arm4_04": (["target"] * 4 + ["switch"], None),
-    "crane_01": (["rate", "rate", "switch"], None),
+RIGHT_DOWN, UP = (False, False), (False, True)
+HALVES = (0.0, 0.0, 0.5, 1.0), (0.5, 0.0, 1.0, 1.0)
+KINDS: dict[str, tuple[list[str], list[Pad]]] = {  # robot -> kinds of its values, and its picture's pads
+    "mover_04": (["rate"] * 2, [Pad(0, 1)]),
+    "mover_02": (["target"] * 2, [Pad(0, 1, RIGHT_DOWN, (0, 0), (128, 128))]),
+    "mover_10": (["rate"] * 2, [Pad(1, 0, UP)]),
+    "pusht_fast": (["target"] * 2, [Pad(0, 1, RIGHT_DOWN, (0, 0), (512, 512))]),
+    "pusht_slow": (["rate", "rate", "switch"], [Pad(0, 1)]),
+    "pendulum": (["rate"], [Pad(0, None, UP)]),
+    "arm1_03": (["target"], [Pad(0, None, (True, True))]),  # hangs from above: clockwise is to the left
+    "arm4_04": (["target"] * 4 + ["switch"], [Pad(0, 1, UP, zone=HALVES[0]), Pad(2, 3, UP, zone=HALVES[1])]),
+    "crane_01": (["rate", "rate", "switch"], [Pad(0, 1, UP)]),
+    "gantry_04": (["rate"] * 3, [Pad(0, 1)]),
 }
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_each_value_of_a_command_rests_or_stays_as_its_robot_means_it(name: str) -> None:
     (robot,) = lab_robots(name).values()
-    kinds, planar = KINDS[name]
+    kinds, dragged = KINDS[name]
     assert [dim.kind for dim in robot.dimensions] == kinds
-    assert (pad(robot) or {"kind": None})["kind"] == planar
+    assert pads(robot) == dragged
     for dim in robot.dimensions:
         assert dim.low < dim.high and (dim.kind != "rate" or dim.low == -dim.high)
+
+
+def test_a_drag_moves_the_slider_of_the_rail_that_is_pressed() -> None:
+    (upright,), (level,) = (lab_robots(name).values() for name in ("rails_03", "rails_09"))
+    assert [(pad.x, pad.y) for pad in pads(upright)] == [(None, 1), (None, 0)]  # the right one has the arrows
+    first, second = pads(level)[:2]
+    assert (first.x, first.y, first.high) == (0, None, (128, 128))
+    assert first.zone[:2] == (0, 0) and first.zone[3] == second.zone[1]
+
+
+PARTS = ["arm1_03", "arm1_17", "arm2_12", "arm3_05", "mover_02", "gantry_04", "rails_03"]
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_drag_to_the_right_or_down_moves_a_part_there(name: str) -> None:
+    (robot,) = lab_robots(name).values()
+    body, pad = family.Body.of(name), pads(robot)[0 if name.startswith("arm") else -1]
+    pose = np.zeros(len(body.axes)) if name.startswith("arm") else body.limits.mean(0)
+    moved = [k for k, i in enumerate((pad.x, pad.y)) if i == 0 or (i and not name.startswith("arm"))]
+    assert moved  # of an arm, the first link
+    for k in moved:
+        command = np.where([dim.kind == "rate" for dim in robot.dimensions], 0.0, pose)
+        command[(pad.x, pad.y)[k]] += -0.1 if pad.flips[k] else 0.1
+        before, after = (body.mechanism.tip(one)[0] for one in (pose, body.moved(pose, command)))
+        assert after[k] > before[k]
+
+
+def test_a_robot_says_what_a_drag_on_its_picture_does() -> None:
+    said = {name: hint(robot) for name, robot in lab_robots("mover_04", "rails_03", "arm4_04").items()}
+    assert said["mover_04"] == "Drag on the picture to steer"
+    assert said["rails_03"] == "Drag on the picture, along either rail"
+    assert said["arm4_04"].endswith(
+        "on its left half joint 1 and joint 2, on its right half joint 3 and joint 4"
+    )
 
 
 def test_all_robots_of_the_embedded_model_can_be_driven() -> None:

@@ -130,7 +130,7 @@ def test_a_reload_goes_on_where_it_was(client: TestClient) -> None:
         page = Page(socket)
         page.send("resume", session=name)
         opened = page.message("opened")
-        assert opened["frame"] == 1 and opened["scores"] == [[1, 60.0]]
+        assert opened["frame"] == 1 and opened["scores"] == [[1, 60.0, 60.0]]
         page.send("step")
         assert [page.frame()[0]["frame"] for _ in range(2)] == [1, 2]
         page.send("resume", session="../../etc/passwd")
