@@ -52,6 +52,7 @@ ROWS: dict[str, list[str]] = {
     "copies the frame before": ["model.copy_previous=true"],
     "copies the frame before, digit after digit": ["model.copy_previous=true", "model.digit_order=chain"],
     "waves, copies the frame before": ["model.action_waves=5", "model.copy_previous=true"],
+    "waves, copies, batch of 2": ["model.action_waves=5", "model.copy_previous=true", "batch_size=2"],
     "waves of the commands": ["model.action_waves=5"],
     "waves of the commands, batch of 2": ["model.action_waves=5", "batch_size=2"],
     "16×16 tokens": ["model.merge=1"],
