@@ -184,12 +184,14 @@ def _print_state(state: dict[str, Any] | None) -> None:
 
 def _figure(key: str, found: dict[str, Any]) -> str:
     """Return the name of a figure; what is of squares of tokens says so."""
+    from hma_model.config import token_words
+
     side, name = found.get("merge") or 1, FIGURES.get(key, key)
     square = f"{side}×{side}"
     if side == 1:
         return name
     names = {
-        "loss": f"loss, nats a square of {square} tokens",
+        "loss": f"loss, nats a {token_words(side)}",
         "perplexity": f"perplexity of squares of {square} tokens",
         "accuracy": f"accuracy, share of squares of {square}",
     }

@@ -70,9 +70,20 @@ def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_onc
     low, high = first["true.psnr_95"]
     assert low < first["true.psnr"] < high
     names, lines = rows(parts)
+    assert [line[names.index("episodes")] for line in lines] == [2, 2, 4] * 2
     assert [line[1] for line in lines] == ["arm", "hand", "mean over sets"] * 2 and len(lines[0]) == len(
         names
     )
+
+
+def test_what_holds_for_every_part_is_said_of_all_and_the_rest_of_its_own(made: Path) -> None:
+    parts = run(made, checkpoints=BOTH)
+    for part in parts:
+        part.found["notes"] = ["of each"]
+    parts[1].found["notes"] = ["of each", "of one"]
+    whose = {text: name for name, text in absences(parts)}
+    assert whose["of each"] == "all" and whose["of one"] == f"{made / 'one'} on hand"
+    assert {text: name for name, text in absences(parts[:1])}["of each"] == "arm"
 
 
 def test_a_model_of_squares_is_compared_by_the_loss_of_a_stored_token(

@@ -42,7 +42,9 @@ def test_the_hubs_filters_find_a_model_by_its_data_and_its_base(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("tokenizer", "views"), [("fsq-lab", 1), ("fsq-lab", 2), pytest.param("vae-8", 1, marks=pytest.mark.slow)]
 )
-def test_the_cards_code_runs_as_pasted(tokenizer: str, views: int, tmp_path: Path) -> None:
+def test_the_cards_code_runs_as_pasted(
+    tokenizer: str, views: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     spec = get_tokenizer(tokenizer).spec
     numbers = {"factored": spec.factored} if spec.kind == "discrete" else {"channels": spec.channels}
     config = HMAConfig(
@@ -55,7 +57,8 @@ def test_the_cards_code_runs_as_pasted(tokenizer: str, views: int, tmp_path: Pat
     found = re.search(r"```python\n(.*?)```", card.text, re.DOTALL)
     assert found
     made: dict[str, Any] = {}
-    exec(found[1].replace('"PATH"', repr(str(tmp_path / "hub"))), made)
+    monkeypatch.chdir(tmp_path / "hub")  # the card says: in this folder
+    exec(found[1], made)
     assert made["film"].shape == (6, spec.image_size, spec.image_size, 3) and made["film"].dtype == np.uint8
 
 
