@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
@@ -33,6 +32,7 @@ from hma_model.evaluation.losses import (
     Means,
     digit_frequencies,
     masked_val_loss,
+    no_window,
     opened,
     unconditional_baseline,
     validation_losses,
@@ -192,8 +192,7 @@ def measure(
     split, seed, draws = settings.split, settings.seed, settings.draws
     cameras = cameras_for(model, shards, settings.cameras)
     if not len(WindowDataset(shards, split, length, cameras=cameras)):
-        fault = f"has no window of {length} frames in {split}"
-        raise UsageError(shards.folder, fault, "give another --split or fewer --frames")
+        raise no_window(shards, split, length)
     batches = list(windows(shards, split, length, settings.windows, settings.batch_size, cameras))
     if not model.config.sees_actions:  # it knows only how frames without commands go on
         batches = [without_commands(batch) for batch in batches]

@@ -34,6 +34,7 @@ from hma_data.storage.files import finite, kept_arrays, to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.evaluation.evaluate import Settings, measure
+from hma_model.evaluation.losses import no_window
 from hma_model.evaluation.perceptual import Networks
 from hma_model.evaluation.rollouts import cameras_for, default_prompt
 from hma_model.evaluation.simulated import measure_state
@@ -151,8 +152,7 @@ def _check(model: "HMA", shards: ShardSet, settings: Settings) -> None:
         fault = f"{settings.prompt} true frames leave none to predict in windows of {length}"
         raise UsageError("--prompt", fault, "give fewer, or more --frames")
     if not len(WindowDataset(shards, settings.split, length, cameras=cameras)):
-        fault = f"has no window of {length} frames in {settings.split}"
-        raise UsageError(shards.folder, fault, "give another --split or fewer --frames")
+        raise no_window(shards, settings.split, length)
     if settings.state and not simulated(shards.embodiment.id):
         fault = "is no robot of the laboratory, so its state is not known"
         raise UsageError(shards.embodiment.id, fault, "leave --state out")

@@ -35,6 +35,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         save(folder / name, {"arm": 2, "hand": 3}, seed)
     make_shards(folder / "arm", "arm", held_out=2)
     make_shards(folder / "hand", "hand", dims=3, seed=4, held_out=2)
+    make_shards(folder / "alone", "arm", episodes=1, held_out=0)
     return folder
 
 
@@ -164,6 +165,10 @@ def test_the_difference_is_black_where_pictures_are_equal() -> None:
     ("words", "message"),
     [
         (["{made}/one", "{made}/arm", "--frames", "40"], "arm: has no window of 40 frames in val"),
+        (
+            ["{made}/one", "{made}/alone"],
+            "alone: has no episode in val — give --split train, or convert more",
+        ),
         (["{made}/one", "{made}/arm", "--prompt", "4"], "--prompt: 4 true frames leave none to predict"),
         (["{made}/one", "{made}/arm", "{made}/arm"], "arm: is the embodiment of two arguments"),
         (["{made}/one", "{made}/arm", "--beside", "{made}/one"], "is the checkpoint of two arguments"),
