@@ -72,6 +72,18 @@ def test_a_shard_sets_card_tells_the_viewer_its_tables(tmp_path: Path) -> None:
     assert data.license == "apache-2.0" and data.task_categories == ["robotics"]
 
 
+def test_a_shard_sets_code_runs_as_pasted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = get_tokenizer("fsq-lab").spec
+    push_data(make_shards(tmp_path / "shards", "arm", spec=spec), tmp_path / "hub")
+    found = re.search(r"```python\n(.*?)```", (tmp_path / "hub" / "README.md").read_text(), re.DOTALL)
+    assert found
+    monkeypatch.chdir(tmp_path / "hub")
+    monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path / "cache")
+    made: dict[str, Any] = {}
+    exec(found[1], made)
+    assert made["pictures"].shape == (8, 128, 128, 3) and made["pictures"].dtype == np.uint8
+
+
 def test_a_token_is_in_no_file_log_or_error(
     server: Hub, source: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
