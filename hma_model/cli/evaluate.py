@@ -203,14 +203,13 @@ def _ends(ends: Sequence[float] | None) -> str | None:
 
 
 def _print_table(parts: "Sequence[Part]") -> None:
-    from hma_model.evaluation.evaluate import verdict
-    from hma_model.evaluation.tables import rows
+    from hma_model.evaluation.tables import rows, verdicts
 
     names, lines = rows(parts, intervals=False)
     print_table(names, [[_number(cell) for cell in line] for line in lines])
     _print_absences(parts)
-    for part in parts:
-        print(f"{part.checkpoint} on {part.found['embodiment']} {verdict(part.found)}")
+    for whose, said in verdicts(parts):
+        print(f"{whose} {said}")
 
 
 def _number(cell: Any) -> Any:

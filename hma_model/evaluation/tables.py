@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hma_data.storage.files import finite
+from hma_model.evaluation.evaluate import verdict
 from hma_model.evaluation.intervals import over_datasets
 from hma_model.evaluation.suite import Part
 
@@ -152,12 +153,18 @@ def absences(parts: Sequence[Part]) -> list[tuple[str, str]]:
     return found
 
 
+def verdicts(parts: Sequence[Part]) -> list[tuple[str, str]]:
+    """Return for each part whose it is, and a sentence on whether the model follows its actions."""
+    return [(f"{part.checkpoint} on {part.found['embodiment']}", verdict(part.found)) for part in parts]
+
+
 def markdown(parts: Sequence[Part], command: str) -> str:
     """Return the content of results.md."""
     names, lines = rows(parts)
     text = ["# Evaluation", "", f"`{command}`", "", _line(names), _line(["---"] * len(names))]
     text += [_line(["–" if cell is None else cell for cell in line]) for line in lines]
     text += ["", "In brackets: 95 % intervals, by bootstrap of whole episodes (1,000 resamples).", ""]
+    text += [*(f"- {whose} {said}" for whose, said in verdicts(parts)), ""]
     text += [f"- {name}: {WORDS[name]}" for name in names if name in WORDS]
     if said := absences(parts):
         text += ["", "Not measured, or to be known:", ""]

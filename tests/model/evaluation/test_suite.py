@@ -16,6 +16,7 @@ from hma_data.lab.truth import episode
 from hma_data.registry.embodiment import find
 from hma_model.cli import main
 from hma_model.evaluation import showcase, suite
+from hma_model.evaluation.evaluate import verdict
 from hma_model.evaluation.report import difference, write_results
 from hma_model.evaluation.simulated import PERTURBATION, perturbed
 from hma_model.evaluation.suite import Settings, evaluate_all
@@ -151,6 +152,8 @@ def test_the_page_is_one_file_that_shows_each_robot_and_checkpoint(made: Path, t
     assert "recorded pictures are not shown" in page and "--lpips FILE" in page
     table = (tmp_path / "results.md").read_text()
     assert table.count("mean over sets") == 2 and "ΔPSNR" in table
+    said = verdict(run(made)[0].found)
+    assert said in page and f"- {made / 'one'} on arm {said}" in table
 
 
 def test_the_difference_is_black_where_pictures_are_equal() -> None:
