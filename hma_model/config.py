@@ -300,6 +300,11 @@ class HMAConfig:
         return cls(**values)
 
 
+def token_words(merge: int) -> str:
+    """Return in words what a loss or an accuracy is of: a token, or the square of tokens taken as one."""
+    return "token" if merge == 1 else f"square of {merge}×{merge} tokens"
+
+
 def _refuse(name: str, value: object, allowed: str) -> RecipeError:
     return RecipeError(f"model.{name}", f"{value!r} is not allowed", f"give {allowed}")
 

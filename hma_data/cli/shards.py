@@ -160,7 +160,7 @@ def shards_preview(
             exclude=exclude or (),
             on_progress=_in(update),
         )
-    print(f"wrote {shown.sheet} and {shown.video} ({len(shown.episodes)} episodes)")
+    print(f"wrote {shown.sheet} and {shown.video} ({human_count(len(shown.episodes), 'episode')})")
     for line in shown.resized:
         print(line)
 

@@ -263,11 +263,19 @@ def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Find
     if not inspection.episodes:
         yield EMPTY
     elif robot is None:
-        yield from inspection.findings
+        yield from _without_robot(inspection)
         yield from proposed(commands(inspection))
     else:
         yield from _for_robot(inspection, robot)
         yield from _episodes(uri, robot, source, sample, inspection)
+
+
+def _without_robot(inspection: Inspection) -> Iterator[Finding]:
+    """Yield the findings; blank pictures are a warning where no other camera is there to be used."""
+    cameras = {info.key for info in inspection.keys if len(info.shape) == 3}
+    blank = {finding.key for finding in inspection.findings if finding.check == "blank"}
+    for finding in inspection.findings:
+        yield replace(finding, severity="warn") if finding.check == "blank" and cameras <= blank else finding
 
 
 def _answered(finding: Finding, robot: Embodiment) -> bool:

@@ -65,7 +65,13 @@ def window_finding(shards: ShardSet) -> Finding | None:
         return None
     rows, longest = WINDOW * shards.row_stride, int(shards.index("train").length.max())
     said = f"no window to train on: {WINDOW} frames need {rows} rows, the longest episode has {longest}"
-    return Finding("windows", "error", said, "convert with a higher target_hz, or longer episodes")
+    fits, frames, remedies = longest // WINDOW, longest // shards.row_stride, []
+    if 0 < fits < shards.row_stride:
+        hz = shards.embodiment.rate_hz / shards.manifest.frame_stride / fits
+        remedies.append(f"set target_hz: {hz:.3g} in its YAML and convert again with --overwrite")
+    if frames > 1:
+        remedies.append(f"train with windows of fewer frames (frames={frames})")
+    return Finding("windows", "error", said, ", or ".join(remedies) or "record longer episodes")
 
 
 def _measured(shards: ShardSet, rows: list[dict[str, Any]]) -> Iterator[tuple[str, float]]:

@@ -40,7 +40,7 @@ def render(
     Args:
         config: the values of config.json.
         cards: id -> the values of card.json.
-        repo: the name of the checkpoint for a reader; None for the reader's own path.
+        repo: the name of the checkpoint for a reader; None for the folder that the card lies in.
         samples: files that are there of `ID/sample.gif` (a film) and `ID/sample.png`; the film is shown.
     """
     pictures = [
@@ -57,7 +57,7 @@ def render(
         _about(config),
         "## Embodiments\n\n" + _table(cards),
         *pictures,
-        "## How to use\n\n" + _usage(repo or "PATH", config, cards),
+        "## How to use\n\n" + _usage(repo or ".", config, cards),
         f"Format version {line(config.get('format_version'))}. Each `card.json` names its trunk by SHA-256: "
         "parts that do not belong together are refused on loading.",
     ]
@@ -147,8 +147,9 @@ def _usage(name: str, config: Mapping[str, Any], cards: Mapping[str, Any]) -> st
         views="" if views == 1 else f".repeat({line(views)}, axis=-2)  # one picture a camera, stacked",
         first="" if views == 1 else f"[..., :{line(height)}, :]",
     )  # fmt: skip
+    where = "In this folder:\n\n" if name == "." else ""
     return (
-        f"```python\n{code}\n```\n\n"
+        f"{where}```python\n{code}\n```\n\n"
         "```sh\n"
         f"hma hub pull {name} --embodiment {example} --out model\n"
         "hma generate model SHARDS --out rollout.mp4\n"

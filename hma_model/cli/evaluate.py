@@ -184,12 +184,14 @@ def _print_state(state: dict[str, Any] | None) -> None:
 
 def _figure(key: str, found: dict[str, Any]) -> str:
     """Return the name of a figure; what is of squares of tokens says so."""
+    from hma_model.config import token_words
+
     side, name = found.get("merge") or 1, FIGURES.get(key, key)
     square = f"{side}×{side}"
     if side == 1:
         return name
     names = {
-        "loss": f"loss, nats a square of {square} tokens",
+        "loss": f"loss, nats a {token_words(side)}",
         "perplexity": f"perplexity of squares of {square} tokens",
         "accuracy": f"accuracy, share of squares of {square}",
     }
@@ -201,14 +203,13 @@ def _ends(ends: Sequence[float] | None) -> str | None:
 
 
 def _print_table(parts: "Sequence[Part]") -> None:
-    from hma_model.evaluation.evaluate import verdict
-    from hma_model.evaluation.tables import rows
+    from hma_model.evaluation.tables import rows, verdicts
 
     names, lines = rows(parts, intervals=False)
     print_table(names, [[_number(cell) for cell in line] for line in lines])
     _print_absences(parts)
-    for part in parts:
-        print(f"{part.checkpoint} on {part.found['embodiment']} {verdict(part.found)}")
+    for whose, said in verdicts(parts):
+        print(f"{whose} {said}")
 
 
 def _number(cell: Any) -> Any:

@@ -133,7 +133,11 @@ def _print(result: "TrainResult") -> None:
     print(f"{result.out}: {done}, checkpoint {result.checkpoint}")
     found, base = result.masked_val_loss, result.baseline
     if found is not None and base is not None:
-        print(f"held-out loss {found:.4f} nats a token; token frequencies alone {base:.4f}")
+        from hma_model.checkpoint.folder import Checkpoint
+        from hma_model.config import token_words
+
+        unit = token_words(Checkpoint.open(result.checkpoint).config.merge)
+        print(f"held-out loss {found:.4f} nats a {unit}; token frequencies alone {base:.4f}")
     if result.skipped:
         print(f"{result.skipped} steps were skipped; see skipped in {result.out}/metrics.jsonl")
     if (result.out / "report.html").is_file():

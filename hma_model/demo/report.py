@@ -20,6 +20,7 @@ from hma_data.registry.embodiment import find
 from hma_data.shards.preview import tokenizer_of
 from hma_data.sources.base import open_source
 from hma_data.storage.files import write_atomic
+from hma_model.config import token_words
 from hma_model.demo.results import Demo
 from hma_model.evaluation.pages import Page, held_out_losses, psnr_over_horizon
 from hma_model.training.logging import read_metrics
@@ -108,7 +109,7 @@ def _headline(page: Page, made: Demo) -> None:
     page.figures(
         [
             (f"{sum(split['frames'] for split in splits):,}", "frames of the new robots"),
-            (f"{result.masked_val_loss:.2f}", "held-out loss, nats a token"),
+            (f"{result.masked_val_loss:.2f}", f"held-out loss, nats a {_unit(made)}"),
             (f"{scratch.masked_val_loss:.2f}", "held-out loss from scratch"),
             (f"{result.baseline:.2f}", "held-out loss of the token frequencies"),
             (f"{other / own - 1:+.0%}", "loss when given shuffled actions"),
@@ -164,9 +165,14 @@ def _mixture(page: Page, made: Demo) -> None:
         page.picture(path.read_bytes(), "svg+xml", "How often each robot is drawn")
 
 
+def _unit(made: Demo) -> str:
+    return token_words(made.start.config.merge)
+
+
 def _training(page: Page, made: Demo) -> None:
+    unit = _unit(made)
     said = (
-        f"{name}: {result.step:,} steps, {result.seconds:.0f} s, {result.masked_val_loss:.2f} nats a token"
+        f"{name}: {result.step:,} steps, {result.seconds:.0f} s, {result.masked_val_loss:.2f} nats a {unit}"
         for name, result in made.runs.items()
     )
     page.section("Training", f"The same recipe and network, trained on both robots. {'; '.join(said)}.")
@@ -174,7 +180,7 @@ def _training(page: Page, made: Demo) -> None:
     baseline = made.runs[FINETUNED].baseline
     assert baseline is not None
     caption = "Held-out loss (whole frames masked) over the time spent in training steps"
-    page.picture(held_out_losses(curves, baseline), "svg+xml", caption)
+    page.picture(held_out_losses(curves, baseline, unit), "svg+xml", caption)
 
 
 def _course(result: "TrainResult") -> list[tuple[float, float]]:

@@ -32,6 +32,7 @@ from hma_data.shards.windows import WindowIndex
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
+from hma_model.config import token_words
 from hma_model.demo.report import FINETUNED, SCRATCH, SHOWN, TAU, write_report
 from hma_model.demo.results import TIMINGS, Demo
 
@@ -185,8 +186,9 @@ def train_both(made: Demo, steps: int | None, seed: int) -> None:
     network = {"model": network_values(config), "frames": config.frames, "digits": config.factored[0]}
     scratch = recipes[SCRATCH].model_copy(update={**network, "steps": limits[SCRATCH]})
     made.runs[SCRATCH] = _finished(train(scratch, out=made.out / "scratch"))
+    unit = token_words(config.merge)
     for name, result in made.runs.items():
-        said = f"held-out loss {result.masked_val_loss:.3f} nats a token after {result.seconds:.0f} s"
+        said = f"held-out loss {result.masked_val_loss:.3f} nats a {unit} after {result.seconds:.0f} s"
         print(f"  {name}: {said}", flush=True)
     print(f"  token frequencies alone: {made.runs[FINETUNED].baseline:.3f}", flush=True)
 

@@ -20,19 +20,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.config import OBJECTIVES
+from hma_model.config import OBJECTIVES, token_words
 from hma_model.evaluation.commands import gaussian, shuffled, shuffled_actions, without_commands
 from hma_model.evaluation.intervals import ends_of, interval, rounded, summary
 from hma_model.evaluation.losses import (
     Means,
     digit_frequencies,
     masked_val_loss,
+    no_window,
     opened,
     unconditional_baseline,
     validation_losses,
@@ -192,8 +192,7 @@ def measure(
     split, seed, draws = settings.split, settings.seed, settings.draws
     cameras = cameras_for(model, shards, settings.cameras)
     if not len(WindowDataset(shards, split, length, cameras=cameras)):
-        fault = f"has no window of {length} frames in {split}"
-        raise UsageError(shards.folder, fault, "give another --split or fewer --frames")
+        raise no_window(shards, split, length)
     batches = list(windows(shards, split, length, settings.windows, settings.batch_size, cameras))
     if not model.config.sees_actions:  # it knows only how frames without commands go on
         batches = [without_commands(batch) for batch in batches]
@@ -233,7 +232,7 @@ def measure(
         **summary("psnr_action_gain_last", gain, seed, digits=6, episodes=episodes),
         **extra,
         "missing": missing,
-        "notes": _notes(model, joined, table, rolled.still, len(gain)),
+        "notes": _notes(model, joined, table, rolled.still, len(gain), len(np.unique(episodes))),
         "seconds_a_frame": round(1 / shards.embodiment.effective_hz, 6),
     }
     by_window["episode"] = episodes.astype(np.float64)
@@ -254,12 +253,20 @@ def verdict(found: Mapping[str, Any]) -> str:
     gain = found["psnr_action_gain_last"]
     if gain is None:
         return "cannot be judged: its predictions are not finite"
+    ends, count = found.get("psnr_action_gain_last_95"), found.get("episodes", 0)
     said = f"{gain:+.1f} dB on the last frame, true less shuffled actions"
+    if ends:
+        said += f", 95 %: {ends[0]:+.1f} to {ends[1]:+.1f} over {count} episodes"
+    elif count == 1:
+        said += ", of one episode"
+    if gain >= FOLLOWS_DB and ends and ends[0] <= 0:
+        return f"may follow its actions: {said}, too few to be sure"
     if gain >= FOLLOWS_DB:
         return f"follows its actions: {said}"
     loss, shuffled_loss = found.get("loss"), found.get("shuffled_loss")
     if loss and shuffled_loss and shuffled_loss >= HEARS * loss:
-        nats = f"{loss:.2f} nats a token, {shuffled_loss:.2f} with shuffled ones"
+        unit = token_words(found.get("merge") or 1)
+        nats = f"{loss:.2f} nats a {unit}, {shuffled_loss:.2f} with shuffled ones"
         return f"hears its actions ({nats}), but its rollouts show little of it yet: {said}"
     return f"does not follow its actions yet ({said})"
 
@@ -345,9 +352,14 @@ def _paper(
 
 
 def _notes(
-    model: "HMA", joined: "Mapping[str, Scores]", table: Mapping[str, Any], still: int, count: int
+    model: "HMA",
+    joined: "Mapping[str, Scores]",
+    table: Mapping[str, Any],
+    still: int,
+    count: int,
+    episodes: int,
 ) -> list[str]:
-    """Return what must be known to read the figures."""
+    """Return what must be known to read the figures; `count` windows are of so many episodes."""
     notes, config = [], model.config
     if config.kind == "discrete" and config.merge > 1:
         square = f"squares of {config.merge}×{config.merge} tokens"
@@ -370,4 +382,9 @@ def _notes(
     blind = any(not OBJECTIVES[name].sees_actions for name, often in config.objectives.items() if often)
     if not config.drop_commands and not blind:
         notes.append("the model was not trained without commands, so its rollouts with none may be poor")
+    if episodes == 1:
+        notes.append(
+            "all windows are of one episode, so no figure has an interval, and others may differ much: "
+            "convert more episodes, or with a larger --val-fraction"
+        )
     return notes

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import FIRST, Cameras, Views
 from hma_data.shards.reader import ShardSet
@@ -73,6 +74,19 @@ def windows(
     alone = rest == 1 and whole and batch_size > 1
     parts = np.array_split(chosen, whole + 1 if alone else range(batch_size, len(chosen), batch_size))
     yield from map(dataset.batch, parts)
+
+
+def no_window(shards: ShardSet, split: str, frames: int) -> UsageError:
+    """Return the error of a split that has no window of so many frames."""
+    if shards.manifest.splits[split]["episodes"]:
+        fault, remedy = (
+            f"has no window of {frames} frames in {split}",
+            "give another --split or fewer --frames",
+        )
+    else:
+        other = "train" if split == "val" else "val"
+        fault, remedy = f"has no episode in {split}", f"give --split {other}, or convert more episodes"
+    return UsageError(shards.folder, fault, remedy)
 
 
 @torch.no_grad()

@@ -49,8 +49,9 @@ td small { color:var(--soft) }
 figure { margin:1rem 0 } figcaption { font-size:.9rem; margin-top:.3rem; max-width:48rem }
 img { max-width:100%; height:auto; border-radius:8px; border:1px solid var(--line) }
 .plot img { background:#fff; padding:.5rem }
-dl { display:grid; grid-template-columns:minmax(8rem, max-content) 1fr; gap:.2rem 1rem; font-size:.9rem }
-dt { font-weight:600 } dd { margin:0; color:var(--soft); overflow-wrap:anywhere }
+dl { display:grid; grid-template-columns:fit-content(16rem) 1fr; gap:.2rem 1rem; font-size:.9rem }
+dt { font-weight:600; min-width:8rem; overflow-wrap:anywhere }
+dd { margin:0; color:var(--soft); overflow-wrap:anywhere }
 h3 { font-size:1rem; margin:1.6rem 0 0 } h3 + p { margin:.1rem 0 .5rem }
 .strips { display:grid; grid-template-columns:8.5rem 1fr; gap:.3rem .8rem; align-items:center }
 .strips span { color:var(--soft); font-size:.86rem } .strips img { display:block; border-radius:4px }
@@ -182,14 +183,15 @@ def loss_curves(
     return svg_bytes(figure)
 
 
-def held_out_losses(curves: Mapping[str, Sequence[tuple[float, float]]], baseline: float) -> bytes:
+def held_out_losses(curves: Mapping[str, Sequence[tuple[float, float]]], baseline: float, unit: str) -> bytes:
     """Plot held-out losses over the time spent in training.
 
     Args:
-        curves: name -> (seconds, nats a token).
+        curves: name -> (seconds, nats).
         baseline: the loss of the token frequencies, as a dotted line.
+        unit: what the nats are of, as `token_words` has it.
     """
-    figure, axes = _axes("seconds of training", "held-out loss, nats a token")
+    figure, axes = _axes("seconds of training", f"held-out loss, nats a {unit}")
     for i, (name, points) in enumerate(curves.items()):
         seconds, nats = np.array(points, float).T
         axes.plot(seconds, nats, color=COLOURS[i], ls=STYLES[i], marker=MARKERS[i], ms=5, label=name)

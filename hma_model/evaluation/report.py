@@ -20,7 +20,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.pages import Page, over_horizon
 from hma_model.evaluation.showcase import Showcase, choose
 from hma_model.evaluation.suite import RESULTS, Part
-from hma_model.evaluation.tables import WORDS, absences, markdown, results, rows, value
+from hma_model.evaluation.tables import WORDS, absences, markdown, results, rows, value, verdicts
 
 Images = NDArray[np.uint8]
 GIVEN, PREDICTED, GAP = (150, 150, 150), (0, 158, 115), (128, 128, 128)
@@ -56,6 +56,8 @@ def page(parts: Sequence[Part], command: str) -> str:
     )
     made = Page(f"Evaluation of {', '.join(labels)}", lead)
     _headline(made, parts)
+    made.section("Does it follow its commands?")
+    made.definitions(verdicts(parts))
     made.section("Figures", "Below a figure: the 95 % interval of its mean, by bootstrap of whole episodes.")
     names, lines = rows(parts)
     made.table(names, [[_below(cell) for cell in line] for line in lines])

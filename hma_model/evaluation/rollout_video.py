@@ -30,6 +30,7 @@ from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.evaluate import Sampling, cameras_for, rollout, shuffled, windows
+from hma_model.evaluation.losses import no_window
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -89,9 +90,11 @@ def rollout_video(
     length = prompt + frames if frames else max(model.config.frames, prompt + 1)
     dataset = WindowDataset(shards, split, length, cameras=cameras_for(model, shards, cameras))
     chosen, count = [window] if isinstance(window, int) else list(window), len(dataset)
+    if not count:
+        raise no_window(shards, split, length)
     if max(chosen) >= count:
         fault = f"has {count} windows of {length} frames in {split}, none with number {max(chosen)}"
-        raise UsageError(shards.folder, fault)
+        raise UsageError(shards.folder, fault, f"they are 0 to {count - 1}")
     batch = dataset.batch(chosen)
     theirs = dataset.batch(other or [(number + count // 2) % count for number in chosen])
     if count == 1:

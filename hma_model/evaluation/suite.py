@@ -13,7 +13,7 @@ bytes of results.json.
 import hashlib
 import io
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -34,6 +34,7 @@ from hma_data.storage.files import finite, kept_arrays, to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.evaluation.evaluate import Settings, measure
+from hma_model.evaluation.losses import no_window
 from hma_model.evaluation.perceptual import Networks
 from hma_model.evaluation.rollouts import cameras_for, default_prompt
 from hma_model.evaluation.simulated import measure_state
@@ -109,8 +110,8 @@ def evaluate_all(
             part = _kept(folder, mark, label, shards) if folder else None
             about = f"{label}, {shards.embodiment.id}"
             if part is None:
-                update(done, about)
                 counter = _Counter(update, done, about)
+                counter.begins("losses first")
                 part = _measured(label, model, shards, settings, networks, counter)
                 if folder:
                     _keep(folder, mark, part)
@@ -122,11 +123,14 @@ def evaluate_all(
 
 @dataclass
 class _Counter:
-    """Adds predicted frames up, and shows them."""
+    """Adds predicted frames up, and shows them; also what takes time and predicts none of them."""
 
     update: Update
     done: int
     about: str
+
+    def begins(self, what: str) -> None:
+        self.update(self.done, f"{self.about}: {what}")
 
     def __call__(self, frames: int) -> None:
         self.done += frames
@@ -148,8 +152,7 @@ def _check(model: "HMA", shards: ShardSet, settings: Settings) -> None:
         fault = f"{settings.prompt} true frames leave none to predict in windows of {length}"
         raise UsageError("--prompt", fault, "give fewer, or more --frames")
     if not len(WindowDataset(shards, settings.split, length, cameras=cameras)):
-        fault = f"has no window of {length} frames in {settings.split}"
-        raise UsageError(shards.folder, fault, "give another --split or fewer --frames")
+        raise no_window(shards, settings.split, length)
     if settings.state and not simulated(shards.embodiment.id):
         fault = "is no robot of the laboratory, so its state is not known"
         raise UsageError(shards.embodiment.id, fault, "leave --state out")
@@ -193,13 +196,14 @@ def _measured(
     shards: ShardSet,
     settings: Settings,
     networks: Networks,
-    on_frames: Callable[[int], None],
+    counter: _Counter,
 ) -> Part:
     tokenizer = _tokenizer(str(shards.folder), str(model.device))
     sampling: Any = dict(settings.sampling)
-    measured = measure(model, tokenizer, shards, settings, networks, on_frames)
+    measured = measure(model, tokenizer, shards, settings, networks, counter)
     found, robot = measured.found, shards.embodiment.id
     if settings.state:
+        counter.begins("its state, in new episodes")
         found["state"] = measure_state(
             model, tokenizer, robot, frames=found["frames"], prompt=found["prompt"], episodes=settings.state,
             seed=settings.seed, **sampling,

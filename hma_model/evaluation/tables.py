@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hma_data.storage.files import finite
+from hma_model.evaluation.evaluate import verdict
 from hma_model.evaluation.intervals import over_datasets
 from hma_model.evaluation.suite import Part
 
@@ -72,6 +73,7 @@ def means(parts: Sequence[Part]) -> list[dict[str, Any]]:
         own = [part for part in parts if part.checkpoint == label]
         row: dict[str, Any] = {"checkpoint": label, "embodiment": MEAN, "sets": len(own)}
         row["windows"] = sum(part.found["windows"] for part in own)
+        row["episodes"] = sum(part.found["episodes"] for part in own)
         for _, key, path, _, exponential in present(own):
             figures = [value(part.found, path) for part in own]
             if None in figures:
@@ -100,7 +102,7 @@ def results(parts: Sequence[Part]) -> dict[str, Any]:
 def rows(parts: Sequence[Part], intervals: bool = True) -> tuple[list[str], list[list[Any]]]:
     """Return the headings and rows of the table: a row a checkpoint and set, then the means over sets."""
     columns = present(parts)
-    names = ["checkpoint", "robot", "windows", *(column[0] for column in columns)]
+    names = ["checkpoint", "robot", "windows", "episodes", *(column[0] for column in columns)]
     lines: list[list[Any]] = []
     averages = {row["checkpoint"]: row for row in means(parts)}
     for label in averages:
@@ -108,7 +110,7 @@ def rows(parts: Sequence[Part], intervals: bool = True) -> tuple[list[str], list
         entries = own + ([averages[label]] if len(own) > 1 else [])
         for found in entries:
             mean = found is averages[label]
-            line = [label, found["embodiment"], found["windows"]]
+            line = [label, found["embodiment"], found["windows"], found["episodes"]]
             for _, _, path, digits, _ in columns:
                 figure = found.get(path) if mean else value(found, path)
                 ends = found.get(f"{path}_95") if mean else value(found, f"{path}_95")
@@ -126,7 +128,10 @@ def _cell(figure: Any, ends: Any, digits: int) -> str | None:
 
 
 def absences(parts: Sequence[Part]) -> list[tuple[str, str]]:
-    """Return what is not measured, and what else must be known: (metric or whose, words), each once."""
+    """Return what is not measured, and what else must be known: (metric or whose, words), each once.
+
+    What holds for every one of several parts is of `all`.
+    """
     several = len({part.checkpoint for part in parts}) > 1
     said = [pair for part in parts for pair in part.found.get("missing", {}).items()]
     said += [
@@ -140,8 +145,17 @@ def absences(parts: Sequence[Part]) -> list[tuple[str, str]]:
         for part in parts
         if (words := value(part.found, "state.missing")) is not None
     ]
-    words = dict.fromkeys(text for _, text in said)
-    return [(", ".join(dict.fromkeys(name for name, other in said if other == text)), text) for text in words]
+    everywhere = {text for text in parts[0].found["notes"] if all(text in p.found["notes"] for p in parts)}
+    found = []
+    for text in dict.fromkeys(text for _, text in said):
+        whose = dict.fromkeys(name for name, other in said if other == text)
+        found.append(("all" if len(parts) > 1 and text in everywhere else ", ".join(whose), text))
+    return found
+
+
+def verdicts(parts: Sequence[Part]) -> list[tuple[str, str]]:
+    """Return for each part whose it is, and a sentence on whether the model follows its actions."""
+    return [(f"{part.checkpoint} on {part.found['embodiment']}", verdict(part.found)) for part in parts]
 
 
 def markdown(parts: Sequence[Part], command: str) -> str:
@@ -150,6 +164,7 @@ def markdown(parts: Sequence[Part], command: str) -> str:
     text = ["# Evaluation", "", f"`{command}`", "", _line(names), _line(["---"] * len(names))]
     text += [_line(["–" if cell is None else cell for cell in line]) for line in lines]
     text += ["", "In brackets: 95 % intervals, by bootstrap of whole episodes (1,000 resamples).", ""]
+    text += [*(f"- {whose} {said}" for whose, said in verdicts(parts)), ""]
     text += [f"- {name}: {WORDS[name]}" for name in names if name in WORDS]
     if said := absences(parts):
         text += ["", "Not measured, or to be known:", ""]

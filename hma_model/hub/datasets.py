@@ -13,6 +13,7 @@ from hma_data.shards.manifest import BESIDE, EPISODES, FINDER, MANIFEST, SHARD_N
 from hma_data.storage.files import file_sha256, write_atomic
 from hma_data.storage.paths import REPOSITORY, StrPath, as_address, as_path
 from hma_data.storage.yaml_io import write_yaml
+from hma_data.tokenizers.catalog import other_weights
 from hma_model.checkpoint.model_card import licence, line, number
 from hma_model.hub.publish import Store, open_store
 
@@ -156,21 +157,46 @@ def _is(path: Path, sha256: str) -> bool:
 
 def _page(manifest: Manifest, repo: str | None) -> bytes:
     """Return README.md of a set; `repo` is None if the set lies in a folder."""
-    name, robot = repo or "PATH", manifest.embodiment
-    usage = (
-        f"```sh\nhma hub pull-data {name} --out shards\nhma shards preview shards --out seen\n```\n\n"
-        f'```python\nfrom datasets import load_dataset\n\nframes = load_dataset("{name}", "frames")\n```'
-    )
+    robot = manifest.embodiment
     parts = [
         f"---\n{write_yaml(_front(manifest))}---",
         f"# {line(robot.id)}",
         line(robot.description) or "Recordings of one robot, tokenized.",
         _facts(manifest),
         "## Splits\n\n" + _table(manifest),
-        "## How to use\n\n" + usage,
+        "## How to use\n\n" + _usage(manifest, repo),
         "Made with hma-toolkit: one row is one frame; `manifest.json` lists every file with its SHA-256.",
     ]
     return ("\n\n".join(parts) + "\n").encode()
+
+
+_CODE = """
+{first}import numpy as np
+from datasets import load_dataset
+from hma_data import get_tokenizer
+
+frames = load_dataset({place}, "frames", split="{split}")
+stored = np.array(frames[:8]["{column}"], np.{dtype}).reshape(-1, {shape})
+pictures = get_tokenizer("{tokenizer}"{weights}).decode(stored)  # (8, {side}, {side}, 3) uint8
+"""
+
+
+def _usage(manifest: Manifest, repo: str | None) -> str:
+    name, spec = repo or ".", manifest.tokenizer
+    split = next((s for s in _SPLITS if any(shard.split == s for shard in manifest.shards)), "train")
+    code = _CODE.strip().format(
+        first="" if repo else "from pathlib import Path\n\n",
+        place=f'"{repo}"' if repo else "str(Path.cwd())",
+        split=_SPLITS[split], dtype=line(spec.dtype), shape=", ".join(map(str, spec.cells)),
+        column="tokens" if spec.kind == "discrete" else "latents",
+        tokenizer=line(spec.name), side=spec.image_size,
+        weights=', weights="WEIGHTS"' if other_weights(spec.to_json()) else "",
+    )  # fmt: skip
+    where = "" if repo else "In this folder:\n\n"
+    return (
+        f"{where}```sh\nhma hub pull-data {name} --out shards\nhma shards preview shards --out seen\n```\n\n"
+        f"```python\n{code}\n```"
+    )
 
 
 def _front(manifest: Manifest) -> dict[str, Any]:

@@ -11,7 +11,8 @@ from typing import Any
 from hma_data.console import human_seconds
 from hma_data.storage.files import read_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.config import OBJECTIVES
+from hma_model.checkpoint.folder import Checkpoint, training_checkpoints
+from hma_model.config import OBJECTIVES, token_words
 from hma_model.evaluation.pages import Page, course, loss_curves
 from hma_model.evaluation.rollout_video import SHEETS
 from hma_model.training.logging import read_metrics
@@ -42,7 +43,7 @@ def write_report(out: StrPath) -> None:
     if steps:
         _headline(page, recipe, steps, evaluations)
         _robots(page, steps, evaluations)
-        _curves(page, recipe, steps, evaluations)
+        _curves(page, out, recipe, steps, evaluations)
     _samples(page, out)
     if steps:
         _course(page, steps)
@@ -86,7 +87,7 @@ def _robots(page: Page, steps: Lines, evaluations: Lines) -> None:
     page.table(["robot", "training loss", "held-out loss", "token frequencies", "accuracy"], rows)
 
 
-def _curves(page: Page, recipe: dict[str, Any], steps: Lines, evaluations: Lines) -> None:
+def _curves(page: Page, out: Path, recipe: dict[str, Any], steps: Lines, evaluations: Lines) -> None:
     curves: list[dict[str, list[tuple[int, float]]]] = []
     for lines in (steps, evaluations):
         curves.append({})
@@ -96,10 +97,16 @@ def _curves(page: Page, recipe: dict[str, Any], steps: Lines, evaluations: Lines
                     curves[-1].setdefault(name, []).append((line["step"], loss))
     video = any(OBJECTIVES[name].predicts_video for name in recipe["objectives"])
     discrete = any("perplexity" in line for line in evaluations)
-    label = "loss, nats a token" if video and discrete else "loss"
+    label = f"loss, nats a {_unit(out)}" if video and discrete else "loss"
     page.section("Losses")
     plot = loss_curves(curves[0], curves[1], label)
     page.picture(plot, "svg+xml", "Training (lines) and held-out (markers) loss by robot")
+
+
+def _unit(out: Path) -> str:
+    """Return what the losses of a run are of, as its newest checkpoint says."""
+    kept = training_checkpoints(out)
+    return token_words(Checkpoint.open(kept[-1]).config.merge) if kept else "token"
 
 
 def _samples(page: Page, out: Path) -> None:

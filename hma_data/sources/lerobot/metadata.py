@@ -134,7 +134,7 @@ class Folder:
         local = Path(uri.removeprefix("file://")).expanduser()
         self.root = self._fetch_meta(self.repo) if self.repo else local
         if not (self.root / "meta" / "info.json").is_file():
-            there = "has no meta/info.json" if self.root.is_dir() else "does not exist"
+            there = "has no meta/info.json" if self.root.exists() else "does not exist"
             raise SourceError(uri, there, "give the folder of a LeRobotDataset, or its name on the Hub")
 
     def path(self, relative: str) -> Path:

@@ -95,6 +95,19 @@ def test_what_the_yaml_states_is_held_against_the_episodes(
     }
 
 
+def test_without_a_yaml_black_pictures_are_a_warning_only_where_no_other_camera_is_left(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "toy.hdf5"
+    with h5py.File(path, "w") as file:
+        sound(file)
+        set_all("obs/image", np.zeros_like)(file)
+    assert {one.severity for one in examine(str(path)) if one.check == "blank"} == {"info"}
+    with h5py.File(path, "a") as file:
+        set_all("obs/side", np.zeros_like)(file)
+    assert {one.severity for one in examine(str(path)) if one.check == "blank"} == {"warn"}
+
+
 def test_degrees_stated_as_radians_are_noticed(tmp_path: Path) -> None:
     in_degrees = set_all("actions", lambda actions: actions * 90)
     found = examined(tmp_path, in_degrees, ARM_YAML.replace("dims: 3", "dims: 3, unit: rad"))

@@ -323,7 +323,20 @@ def test_the_verdict_says_whether_the_model_follows_its_actions() -> None:
     assert verdict({"psnr_action_gain_last": 0.1}).startswith("does not follow its actions yet (+0.1 dB")
     heard = {"psnr_action_gain_last": 0.1, "loss": 2.0, "shuffled_loss": 4.0}
     assert verdict(heard).startswith("hears its actions (2.00 nats a token, 4.00 with shuffled ones), but")
+    assert "(2.00 nats a square of 2×2 tokens, 4.00" in verdict(heard | {"merge": 2})
     assert verdict(heard | {"shuffled_loss": 2.1}).startswith("does not follow its actions yet")
+
+
+def test_the_verdict_states_its_interval_and_doubts_a_gain_of_too_few_episodes() -> None:
+    found = {"psnr_action_gain_last": 3.705, "psnr_action_gain_last_95": [1.2, 6.2], "episodes": 3}
+    said = "+3.7 dB on the last frame, true less shuffled actions"
+    assert verdict(found) == f"follows its actions: {said}, 95 %: +1.2 to +6.2 over 3 episodes"
+    wide = found | {"psnr_action_gain_last_95": [-2.59, 8.77]}
+    assert verdict(wide) == (
+        f"may follow its actions: {said}, 95 %: -2.6 to +8.8 over 3 episodes, too few to be sure"
+    )
+    one = found | {"psnr_action_gain_last_95": None, "episodes": 1}
+    assert verdict(one) == f"follows its actions: {said}, of one episode"
 
 
 # -- intervals, other commands, words
@@ -333,6 +346,7 @@ def test_a_single_episode_has_no_interval(data, model):
     found = evaluate(model, Blocks(), data, count=5, prompt=1)
     assert found["episodes"] == 1 and found["windows"] == 5
     assert found["true"]["psnr_95"] is None and found["loss_95"] is None and found["perplexity_95"] is None
+    assert any("all windows are of one episode, so no figure has an interval" in t for t in found["notes"])
     assert found["true"]["psnr_by_frame_95"][0] == [None, None]
 
 

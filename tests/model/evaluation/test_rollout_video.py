@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from hma_data.errors import UsageError
 from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.reader import ShardSet
 from hma_model.cli import main
@@ -57,6 +58,16 @@ def test_borders_tell_the_prompt_from_predictions_and_the_truth_has_none_of_thos
     panels = np.split(film.frames, 3, axis=2)
     picture = slice(46, 46 + module.SMALLEST)
     assert (panels[0][:PROMPT, picture] == panels[1][:PROMPT, picture]).all()
+
+
+def test_a_split_without_such_a_window_is_refused_with_what_to_do(shards: ShardSet, tmp_path: Path) -> None:
+    alone = ShardSet(make_shards(tmp_path / "alone", "arm", episodes=1, held_out=0))
+    for given, options, message in (
+        (alone, {}, "has no episode in val — give --split train"),
+        (shards, {"window": 900}, "none with number 900 — they are 0 to"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            rollout_video(make_model({"arm": 2}), Blocks(), given, **options)
 
 
 def test_the_verb_tells_of_actions_outside_the_range_seen_in_training(

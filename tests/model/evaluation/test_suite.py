@@ -16,6 +16,7 @@ from hma_data.lab.truth import episode
 from hma_data.registry.embodiment import find
 from hma_model.cli import main
 from hma_model.evaluation import showcase, suite
+from hma_model.evaluation.evaluate import verdict
 from hma_model.evaluation.report import difference, write_results
 from hma_model.evaluation.simulated import PERTURBATION, perturbed
 from hma_model.evaluation.suite import Settings, evaluate_all
@@ -35,6 +36,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         save(folder / name, {"arm": 2, "hand": 3}, seed)
     make_shards(folder / "arm", "arm", held_out=2)
     make_shards(folder / "hand", "hand", dims=3, seed=4, held_out=2)
+    make_shards(folder / "alone", "arm", episodes=1, held_out=0)
     return folder
 
 
@@ -70,9 +72,20 @@ def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_onc
     low, high = first["true.psnr_95"]
     assert low < first["true.psnr"] < high
     names, lines = rows(parts)
+    assert [line[names.index("episodes")] for line in lines] == [2, 2, 4] * 2
     assert [line[1] for line in lines] == ["arm", "hand", "mean over sets"] * 2 and len(lines[0]) == len(
         names
     )
+
+
+def test_what_holds_for_every_part_is_said_of_all_and_the_rest_of_its_own(made: Path) -> None:
+    parts = run(made, checkpoints=BOTH)
+    for part in parts:
+        part.found["notes"] = ["of each"]
+    parts[1].found["notes"] = ["of each", "of one"]
+    whose = {text: name for name, text in absences(parts)}
+    assert whose["of each"] == "all" and whose["of one"] == f"{made / 'one'} on hand"
+    assert {text: name for name, text in absences(parts[:1])}["of each"] == "arm"
 
 
 def test_a_model_of_squares_is_compared_by_the_loss_of_a_stored_token(
@@ -139,6 +152,8 @@ def test_the_page_is_one_file_that_shows_each_robot_and_checkpoint(made: Path, t
     assert "recorded pictures are not shown" in page and "--lpips FILE" in page
     table = (tmp_path / "results.md").read_text()
     assert table.count("mean over sets") == 2 and "ΔPSNR" in table
+    said = verdict(run(made)[0].found)
+    assert said in page and f"- {made / 'one'} on arm {said}" in table
 
 
 def test_the_difference_is_black_where_pictures_are_equal() -> None:
@@ -153,6 +168,10 @@ def test_the_difference_is_black_where_pictures_are_equal() -> None:
     ("words", "message"),
     [
         (["{made}/one", "{made}/arm", "--frames", "40"], "arm: has no window of 40 frames in val"),
+        (
+            ["{made}/one", "{made}/alone"],
+            "alone: has no episode in val — give --split train, or convert more",
+        ),
         (["{made}/one", "{made}/arm", "--prompt", "4"], "--prompt: 4 true frames leave none to predict"),
         (["{made}/one", "{made}/arm", "{made}/arm"], "arm: is the embodiment of two arguments"),
         (["{made}/one", "{made}/arm", "--beside", "{made}/one"], "is the checkpoint of two arguments"),

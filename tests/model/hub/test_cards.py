@@ -42,7 +42,9 @@ def test_the_hubs_filters_find_a_model_by_its_data_and_its_base(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("tokenizer", "views"), [("fsq-lab", 1), ("fsq-lab", 2), pytest.param("vae-8", 1, marks=pytest.mark.slow)]
 )
-def test_the_cards_code_runs_as_pasted(tokenizer: str, views: int, tmp_path: Path) -> None:
+def test_the_cards_code_runs_as_pasted(
+    tokenizer: str, views: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     spec = get_tokenizer(tokenizer).spec
     numbers = {"factored": spec.factored} if spec.kind == "discrete" else {"channels": spec.channels}
     config = HMAConfig(
@@ -55,7 +57,8 @@ def test_the_cards_code_runs_as_pasted(tokenizer: str, views: int, tmp_path: Pat
     found = re.search(r"```python\n(.*?)```", card.text, re.DOTALL)
     assert found
     made: dict[str, Any] = {}
-    exec(found[1].replace('"PATH"', repr(str(tmp_path / "hub"))), made)
+    monkeypatch.chdir(tmp_path / "hub")  # the card says: in this folder
+    exec(found[1], made)
     assert made["film"].shape == (6, spec.image_size, spec.image_size, 3) and made["film"].dtype == np.uint8
 
 
@@ -67,6 +70,18 @@ def test_a_shard_sets_card_tells_the_viewer_its_tables(tmp_path: Path) -> None:
         for files in config["data_files"]:
             assert list((tmp_path / "hub").glob(files["path"]))
     assert data.license == "apache-2.0" and data.task_categories == ["robotics"]
+
+
+def test_a_shard_sets_code_runs_as_pasted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = get_tokenizer("fsq-lab").spec
+    push_data(make_shards(tmp_path / "shards", "arm", spec=spec), tmp_path / "hub")
+    found = re.search(r"```python\n(.*?)```", (tmp_path / "hub" / "README.md").read_text(), re.DOTALL)
+    assert found
+    monkeypatch.chdir(tmp_path / "hub")
+    monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path / "cache")
+    made: dict[str, Any] = {}
+    exec(found[1], made)
+    assert made["pictures"].shape == (8, 128, 128, 3) and made["pictures"].dtype == np.uint8
 
 
 def test_a_token_is_in_no_file_log_or_error(

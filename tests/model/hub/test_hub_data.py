@@ -152,7 +152,7 @@ def test_the_viewer_is_told_which_files_are_which_split(server, shards):
     assert episodes["data_files"] == [{"split": "train", "path": "episodes.parquet"}]
     assert front["size_categories"] == ["n<1K"] and front["license"] == "apache-2.0"
     assert {"robotics", "embodiment:arm", "tokenizer:raw"} <= set(front["tags"])
-    assert f'load_dataset("{REPO}", "frames")' in page
+    assert f'load_dataset("{REPO}", "frames", split="train")' in page
 
 
 def test_a_set_made_anew_replaces_the_old_one_whole(server, shards, tmp_path):

@@ -391,7 +391,11 @@ def test_a_snapshot_in_the_hubs_cache_is_read_where_it_lies(
 
 
 def test_a_folder_that_is_none_says_so(tmp_path: Path) -> None:
-    for uri, said in ((tmp_path, "has no meta/info.json"), (tmp_path / "no", "does not exist")):
+    (tmp_path / "toy.hdf5").touch()
+    missing = "has no meta/info.json"
+    for uri, said in (
+        (tmp_path, missing), (tmp_path / "toy.hdf5", missing), (tmp_path / "no", "does not exist"),
+    ):  # fmt: skip
         with pytest.raises(SourceError, match=said):
             open_source("lerobot").index(str(uri))
 
