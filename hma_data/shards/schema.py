@@ -32,6 +32,7 @@ MALFORMED = (KeyError, TypeError, ValueError, AttributeError, RecursionError)  #
 _FOOTER = b"hma"
 # a footer as `to_metadata` writes it; in a text of JSON, quotes have a backslash before them
 _EPISODES_OF_TEXT = re.compile(rb'(.*?), "episodes": (\[.*\])(, "quarantine": .*)')
+MEASURES = {"millinats"}  # flags that measure an episode and count no frames: a sum of them means nothing
 PAUSES = "pauses="  # begins the word of an episode's flags that states its pauses
 PLAN_HASH = b"hma.plan_hash"  # states the plan beside the footer's JSON, for those who need no more
 
@@ -226,12 +227,12 @@ def flag_words(name: str) -> str:
 
 
 def flag_totals(flags: pa.ChunkedArray) -> dict[str, int]:
-    """Return name -> count over all episodes, from the column `flags`."""
+    """Return name -> count over all episodes, from the column `flags`; without MEASURES."""
     totals: Counter[str] = Counter()
     for item in flags.value_counts().to_pylist():
         for name, count in flag_counts(item["values"] or "").items():
-            totals[name] += count * item["counts"]
-    return dict(sorted(totals.items()))
+            totals[name] += 0 if name in MEASURES else count * item["counts"]
+    return dict(sorted((name, count) for name, count in totals.items() if count))
 
 
 def token_column(spec: TokenizerSpec) -> tuple[str, int]:

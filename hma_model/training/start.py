@@ -40,6 +40,7 @@ ADDED = {
     "digit_order": "readout.chain.", "copy_previous": "readout.copy.",
 }  # fmt: skip
 WAVES = "action_waves"
+OF_THE_TRUNK = {WAVES, "copy_previous"}  # what recipes turn on; a frozen trunk stays as it is
 
 
 @dataclass(frozen=True)
@@ -108,9 +109,9 @@ class Start:
         config = self.checkpoint.config
         changes: dict[str, Any] = {"objectives": recipe.objectives}
         for key, value in recipe.model.items():
-            if key == WAVES:  # `waves` looks after them: each stem may have its own
-                changes.update({} if self.frozen else {key: value})
-            elif key in TRAINED_BY or (key in self._off() and not self.frozen):
+            if key in OF_THE_TRUNK and self.frozen:
+                continue  # for waves, `waves` looks after them: each stem may have its own
+            if key == WAVES or key in TRAINED_BY or (key in self._off() and not self.frozen):
                 changes[key] = value
             elif getattr(config.replace(**{key: value}), key) != getattr(config, key):
                 fault = f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}"

@@ -16,7 +16,7 @@ from hma_data.inspection.inspect import inspect_recording
 from hma_data.loading.dataset import MixtureDataset, WindowDataset
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.schema import flag_counts, flag_pauses, flags_text, mask_columns
+from hma_data.shards.schema import flag_counts, flag_pauses, flag_totals, flags_text, mask_columns
 from hma_data.shards.verify import check_shard, verify
 from hma_data.storage.files import file_sha256
 from tests.conftest import BlockTokenizer
@@ -175,3 +175,8 @@ def test_marks_that_are_not_those_of_the_values_are_found(
     listed = replace(shard, bytes=path.stat().st_size, sha256=file_sha256(path))
     (problem,) = check_shard(tmp_path, listed, manifest, quick=False).problems
     assert fault in problem
+
+
+def test_totals_count_frames_and_add_up_no_measures():
+    flags = pa.chunked_array([["masked_actions=2,millinats=900", "millinats=1100", "masked_actions=3", None]])
+    assert flag_totals(flags) == {"masked_actions": 5}

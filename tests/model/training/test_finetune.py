@@ -106,6 +106,10 @@ def test_what_begins_at_nothing_can_be_turned_on_for_a_tuned_trunk(base, tmp_pat
     again = tune(b.out, arm, tmp_path / "again", *still, freeze=False)
     for result in (b, again):
         assert getattr(Checkpoint.open(result.checkpoint).config, key) == value
+    if key == "copy_previous":  # recipes turn it on, and a frozen trunk stays as it is
+        kept = tune(base.out, arm, tmp_path / "frozen", *more)
+        assert not Checkpoint.open(kept.checkpoint).config.copy_previous
+        return
     with pytest.raises(RecipeError, match=f"model.{key}: is {value!r}, the checkpoint .* has "):
         tune(base.out, arm, tmp_path / "frozen", *more)
 
