@@ -48,6 +48,7 @@ class CopyGain(nn.Module):
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         self.digits = len(config.digits)
+        self.multiplier = SCALE * (config.base_width / config.width if config.mup else 1.0)
         self.token_digits = self.digits // config.merge**2
         self.linear = Linear(config.width, self.digits * STATES)
         nn.init.zeros_(self.linear.weight)
@@ -57,7 +58,7 @@ class CopyGain(nn.Module):
 
     def gains(self, features: Tensor, before: Tensor) -> Tensor:
         """Return the gains (..., F, STATES) of features (..., D); 0 where `before` (..., F) is -1."""
-        gains = self.linear(features * SCALE).float().unflatten(-1, (self.digits, STATES))
+        gains = self.linear(features * self.multiplier).float().unflatten(-1, (self.digits, STATES))
         return gains * (before >= 0).unsqueeze(-1)
 
     def forward(self, scores: Tensor, features: Tensor, digits: Tensor | None, before: Tensor) -> Tensor:

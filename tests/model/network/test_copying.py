@@ -7,7 +7,7 @@ import torch
 
 from hma_data.loading.rows import Batch
 from hma_model.evaluation.metrics import teacher_forced
-from hma_model.network.copying import SCALE, frames_before, known_digits
+from hma_model.network.copying import frames_before, known_digits
 from hma_model.network.head import TokenReadout
 from hma_model.network.stem import from_digits, merge_tokens, split_tokens, to_digits
 from tests.model.network_parts import small_batch, small_config, small_model
@@ -60,7 +60,7 @@ def test_the_loss_is_that_of_gains_written_out(changes):
     digits = torch.stack([torch.randint(0, v, (rows,), generator=_seed(v)) for v in config.digits], dim=1)
     before, chained = _near(digits, config), config.digit_order == "chain"
     alone = [part.double() for part in readout(features, digits).split(list(config.digits), dim=-1)]
-    gains = readout.copy.linear(features * SCALE).double().view(rows, count, 3)
+    gains = readout.copy.linear(features * readout.copy.multiplier).double().view(rows, count, 3)
     per_token = count // config.merge**2
     for row in range(rows):
         expected = 0.0
