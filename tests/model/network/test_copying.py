@@ -72,7 +72,8 @@ def test_the_loss_is_that_of_gains_written_out(changes):
             if before[row, place] >= 0:
                 scores[before[row, place]] += gains[row, place, state]
             expected -= float(scores.log_softmax(-1)[digits[row, place]].detach())
-        assert math.isclose(readout.loss(features, digits, before)[row], expected, abs_tol=1e-4)
+        found = float(readout.loss(features, digits, before)[row].detach())
+        assert math.isclose(found, expected, abs_tol=1e-4)
 
 
 @pytest.mark.parametrize("changes", CHANGES[:4], ids=str)
