@@ -24,6 +24,8 @@ from hma_data.errors import RecipeError
 if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
 
+MOST_IDS = 2**62  # of the trunk's tokens: ids are int64
+
 
 @dataclass(frozen=True)
 class Readout:
@@ -343,7 +345,7 @@ def _check_shapes(config: HMAConfig) -> None:
         )
     if config.kind == "discrete" and any(side % config.merge for side in config.grid):
         raise _refuse("merge", config.merge, f"a divisor of both sides of the grid, {config.grid}")
-    if config.kind == "discrete" and config.mask_id >= 2**62:
+    if config.kind == "discrete" and config.mask_id >= MOST_IDS:
         raise _refuse("merge", config.merge, "fewer tokens: their ids together must fit 62 bits")
     if config.kind == "continuous" and any(side % config.patch for side in config.grid):
         raise _refuse("patch", config.patch, f"a divisor of both sides of the grid, {config.grid}")

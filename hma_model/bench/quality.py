@@ -59,8 +59,8 @@ class Case:
 
 
 CASES = {
-    "discrete": Case("rails_03", "fsq-lab", "discrete_tiny", 400, ("model.merge=2",)),
-    "continuous": Case("rails_03", "vae-8", "continuous_tiny", 600, ("model.patch=4",)),
+    "discrete": Case("rails_03", "fsq-lab", "discrete_tiny", 400),
+    "continuous": Case("rails_03", "vae-8", "continuous_tiny", 400),
     "finetuned": Case("arm3_55", "fsq-lab", "demo", 300, ("start=embedded",)),
 }
 

@@ -9,6 +9,7 @@ A recipe refuses unknown keys. The values that the shards state (kind, grid, voc
 from them and cannot be given. All faults are reported at once, before any shard is opened.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -30,7 +31,7 @@ from hma_data.loading.views import view_count
 from hma_data.storage.paths import StrPath, as_text, shipped
 from hma_data.storage.yaml_io import parse_yaml, read_yaml
 from hma_model.checkpoint.folder import EMBEDDED_NAME
-from hma_model.config import HMAConfig
+from hma_model.config import MOST_IDS, HMAConfig
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import TokenizerSpec
@@ -144,6 +145,8 @@ class Recipe(_Settings):
     )
     # a token's digits: the tokenizer's, or split into this many values (FSQ's levels) or joined up to them
     digits: Count = Field(0, ge=0, description="0: the tokenizer's; 8 splits 512 into 8 · 8 · 8; 512 joins")
+    # model.merge or model.patch, unless the recipe gives it, is the least that leaves so few
+    places: Count = Field(0, ge=0, description="of the trunk in a camera's frame, at most; 0 has no limit")
     # what the bias of the token readout starts with: the log frequencies of the training tokens
     readout_bias: Literal["frequencies", "zero"] = "frequencies"
 
@@ -241,8 +244,22 @@ class Recipe(_Settings):
             derived["factored"] = self.factored(spec)
         else:
             derived.update(channels=spec.channels, latent_scale=spec.latent_scale)
+        derived |= self._side(spec)
         derived.update(frames=self.frames, objectives=self.objectives, views=view_count(self.cameras))
         return HMAConfig(**{**self.model, **derived})
+
+    def _side(self, spec: "TokenizerSpec") -> dict[str, int]:
+        """Return the side of the squares or patches for `places`; nothing if the recipe gives it."""
+        name = "merge" if spec.kind == "discrete" else "patch"
+        if not self.places or name in self.model:
+            return {}
+        values = math.prod(self.factored(spec)) if spec.kind == "discrete" else 1
+        sides = [
+            side for side in range(1, min(spec.grid) + 1) if not any(length % side for length in spec.grid)
+        ]
+        allowed = [side for side in sides if values**side**2 < MOST_IDS]
+        enough = [side for side in allowed if math.prod(spec.grid) // side**2 <= self.places]
+        return {name: (enough or allowed[-1:] or [1])[0]}
 
 
 def network_values(config: HMAConfig) -> dict[str, Any]:

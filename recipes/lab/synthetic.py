@@ -70,7 +70,7 @@ def trained(given: argparse.Namespace, data: Path, row: str, seed: int) -> World
     out = given.out / f"policy-{row.replace(' ', '')}-{seed}"
     words = [
         "objectives={policy: 1.0}", f"cpu_seconds={given.policy_cpu_seconds}", "steps=1000000",
-        "eval_every=0", "checkpoint_every=0", "report=false", "pictures=0", "model.merge=2", "batch_size=8",
+        "eval_every=0", "checkpoint_every=0", "report=false", "pictures=0", "batch_size=8",
         f"seed={seed}", f"data=[{data}]", "short=pad",
     ]  # fmt: skip
     if not (out / "checkpoints").is_dir():

@@ -5,11 +5,13 @@
     python recipes/lab/what_pays.py build/lab/shards/mover_10 build/pays.csv --rows "told noise"
     python recipes/lab/what_pays.py --table build/pays.csv
 
-A row is a set of overrides of recipes/lab/what_pays.yaml. Every run appends a line to the CSV; runs that are
-there are not repeated. For each seed the base is trained first, then the other rows, so that a busy machine
-slows all of them alike. Times are CPU seconds of one thread.
+A row is a set of overrides of recipes/lab/what_pays.yaml, or on shards of latents (`--tokenizer vae-8` of
+record.py) of recipes/lab/what_pays_latents.yaml. Every run appends a line to the CSV; runs that are there are
+not repeated. For each seed the base is trained first, then the other rows, so that a busy machine slows all
+of them alike. Times are CPU seconds of one thread.
 
-The loss is nats a square of 2×2 stored tokens, so that rows with other tokens of the trunk can be compared.
+The loss is nats a square of 2×2 stored tokens, so that rows with other tokens of the trunk can be compared;
+of latents it is the diffusion head's.
 """
 
 import argparse
@@ -23,11 +25,14 @@ from hma_data.console import run_script
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import get_tokenizer
 
-RECIPE = Path(__file__).with_suffix(".yaml")
+RECIPES = {
+    "discrete": Path(__file__).with_suffix(".yaml"),
+    "continuous": Path(__file__).with_name("what_pays_latents.yaml"),
+}
 FRAMES, PROMPT, WINDOWS, DRAWS = 8, 2, 24, 2  # of the rollouts; the same for every row
 
 BASE = "base"
-ROWS: dict[str, list[str]] = {
+TOKENS: dict[str, list[str]] = {
     BASE: [],
     "the paper's form: masked windows": ["model.training_pass=window"],
     "a masked token begins as a learned vector": ["model.masked_input=learned"],
@@ -58,6 +63,26 @@ ROWS: dict[str, list[str]] = {
     "16×16 tokens": ["model.merge=1"],
     "a tenth of the windows without commands": ["model.drop_commands=0.1"],
 }
+LATENTS: dict[str, list[str]] = {
+    BASE: [],
+    "the paper's form: masked windows": ["model.training_pass=window"],
+    "a masked patch begins as a learned vector": ["model.masked_input=learned"],
+    "places begin at random": ["model.position_init=random"],
+    "AdamW alone": ["optimizer=adamw"],
+    "without waves of the commands": ["model.action_waves=0"],
+    "clean past": ["model.latent_noise=0"],
+    "past with half the noise": ["model.latent_noise=0.25"],
+    "batch of 8": ["batch_size=8"],
+    "rates × 2": ["lr=3e-3", "muon_lr=0.04"],
+    "patches of 2×2": ["model.patch=2"],
+    "four noise levels a patch": ["model.diffusion_repeats=4"],
+    "the noise as the target": ["model.diffusion_target=noise"],
+    "all as the paper": [
+        *("model.training_pass=window", "model.masked_input=learned", "model.position_init=random"),
+        *("model.action_waves=0", "optimizer=adamw", "lr=1e-3", "batch_size=8"),
+    ],
+}
+ROWS = {"discrete": TOKENS, "continuous": LATENTS}
 # Rollouts of the same trained model by other means: a row, and the options of the rollouts.
 ROLLOUTS: dict[str, dict[str, dict[str, Any]]] = {
     "told noise": {"told noise, and of its own frames 0.1": {"noise_level": 0.1}},
@@ -76,8 +101,9 @@ def measure(data: Path, row: str, changes: list[str], seed: int) -> list[dict[st
     from hma_model.training.loop import train
     from hma_model.training.recipe import load_recipe
 
-    recipe = load_recipe(RECIPE, [*changes, f"data=[{data}]", f"seed={seed}", "device=cpu"])
     shards = ShardSet(data)
+    own = [f"data=[{data}]", f"seed={seed}", "device=cpu"]
+    recipe = load_recipe(RECIPES[shards.spec.kind], [*changes, *own])
     tokenizer = get_tokenizer(shards.spec.name)
     given: dict[str, Any] = {"count": WINDOWS, "frames": FRAMES, "prompt": PROMPT, "draws": DRAWS}
     ways: dict[str, dict[str, Any]] = {row: {}, **ROLLOUTS.get(row, {})}
@@ -87,7 +113,7 @@ def measure(data: Path, row: str, changes: list[str], seed: int) -> list[dict[st
             raise SystemExit(f"{row}, seed {seed}: stopped by a signal; the run does not count")
         model = HMA.from_pretrained(result.checkpoint)
         found = {way: evaluate(model, tokenizer, shards, **given, **how) for way, how in ways.items()}
-    square = (2 / model.config.merge) ** 2
+    square = (2 / model.config.merge) ** 2 if model.config.kind == "discrete" else 1.0
     return [
         {
             "row": way,
@@ -151,7 +177,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Measure what pays in training, in equal CPU seconds")
     parser.add_argument("data", type=Path, nargs="?", help="a shard set")
     parser.add_argument("csv", type=Path)
-    parser.add_argument("--rows", nargs="+", default=list(ROWS), help="names; the base is always there")
+    parser.add_argument("--rows", nargs="+", help="names, by default all; the base is always there")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--set", nargs="+", default=[], help="key=value overrides of every row")
     parser.add_argument("--table", action="store_true", help="only print the table of the CSV")
@@ -160,11 +186,12 @@ def main() -> None:
         import torch
 
         torch.set_num_threads(1)
-        names = dict.fromkeys([BASE, *given.rows])
+        rows = ROWS[ShardSet(given.data).spec.kind]
+        names = dict.fromkeys([BASE, *(given.rows or rows)])
         for seed in range(given.seeds):
             for row in names:
                 if not any(line["row"] == row and int(line["seed"]) == seed for line in read(given.csv)):
-                    for line in measure(given.data, row, [*ROWS[row], *given.set], seed):
+                    for line in measure(given.data, row, [*rows[row], *given.set], seed):
                         append(given.csv, line)
                         print(line, flush=True)
     print(table(read(given.csv)))

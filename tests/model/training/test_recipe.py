@@ -196,6 +196,32 @@ def test_digits_are_split_and_joined_without_changing_the_ids(stated, digits, ex
     assert load_recipe("discrete_tiny", [f"digits={digits}"]).factored(spec) == expected
 
 
+@pytest.mark.parametrize(
+    ("grid", "digits", "places", "side"),
+    [
+        ((16, 16), (8,) * 5, 64, 2),  # fsq-lab
+        ((8, 8), (512, 512), 64, 1),  # fsq-8
+        ((16, 16), (512, 512), 64, 1),  # fsq-16: the ids of squares would not fit
+        ((12, 20), (8, 8), 64, 2),
+        ((16, 16), (2, 2), 16, 4),
+        ((16, 16), (8, 8), 256, 1),
+        ((16, 16), (8, 8), 0, 1),
+    ],
+)
+def test_places_choose_the_smallest_squares_that_are_few_enough(grid, digits, places, side):
+    spec = TokenizerSpec("x", 1, "discrete", 128, grid, vocab_size=math.prod(digits), factored=digits)
+    recipe = load_recipe("discrete_tiny", ["digits=0", f"places={places}"])
+    assert recipe.network(spec).merge == side
+    assert load_recipe("discrete_tiny", [f"places={places}", "model.merge=1"]).network(spec).merge == 1
+
+
+def test_places_choose_patches_of_latents():
+    spec = get_tokenizer("vae-8").spec
+    assert load_recipe("continuous_tiny").network(spec).token_grid == (8, 8)
+    assert load_recipe("continuous_tiny", ["places=0"]).network(spec).patch == 2
+    assert load_recipe("continuous_base").network(spec).patch == 2
+
+
 def test_what_only_says_where_and_how_often_may_change_in_a_run():
     old = make_recipe({"out": "a", "device": "cpu", "keep_last": 1, "workers": 0, "data": ["a"]})
     new = make_recipe({"out": "b", "device": "cuda:1", "keep_last": 9, "workers": 4, "data": ["b"]})

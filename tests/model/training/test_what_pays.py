@@ -10,9 +10,11 @@ from hma_model.training.recipe import load_recipe
 SCRIPT = runpy.run_path(str(shipped("recipes") / "lab" / "what_pays.py"))
 
 
-@pytest.mark.parametrize("row", SCRIPT["ROWS"])
-def test_every_row_is_a_recipe_that_differs_from_the_base(row):
-    base, own = (load_recipe(SCRIPT["RECIPE"], changes) for changes in ([], SCRIPT["ROWS"][row]))
+@pytest.mark.parametrize(
+    ("kind", "row"), [(kind, row) for kind, rows in SCRIPT["ROWS"].items() for row in rows]
+)
+def test_every_row_is_a_recipe_that_differs_from_the_base(kind, row):
+    base, own = (load_recipe(SCRIPT["RECIPES"][kind], changes) for changes in ([], SCRIPT["ROWS"][kind][row]))
     assert own.cpu_seconds == base.cpu_seconds
     assert (own.values() == base.values()) == (row == SCRIPT["BASE"])
 
