@@ -11,11 +11,12 @@ not repeated. For each seed the base is trained first, then the other rows, so t
 of them alike. Times are CPU seconds of one thread.
 
 The loss is nats a square of 2×2 stored tokens, so that rows with other tokens of the trunk can be compared;
-of latents it is the diffusion head's.
+of latents it is the diffusion head's, and that with shuffled commands is not measured.
 """
 
 import argparse
 import csv
+import math
 import statistics
 import tempfile
 from pathlib import Path
@@ -120,7 +121,7 @@ def measure(data: Path, row: str, changes: list[str], seed: int) -> list[dict[st
             "seed": seed,
             "steps": result.step,
             "loss": figures["loss"] * square,
-            "shuffled_loss": figures["shuffled_loss"] * square,
+            "shuffled_loss": figures.get("shuffled_loss", math.nan) * square,
             "psnr_last": figures["true"]["psnr_last"],
             "copy": figures["copy"]["psnr_last"],
             "shuffled": figures["shuffled"]["psnr_last"],
@@ -167,7 +168,9 @@ def table(lines: list[dict[str, Any]]) -> str:
 
 
 def spread(values: list[float], digits: int) -> str:
-    """Return the mean of values ± their standard deviation."""
+    """Return the mean of values ± their standard deviation; nothing of what was not measured."""
+    if any(math.isnan(value) for value in values):
+        return ""
     deviation = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
     return f"{statistics.mean(values):.{digits}f}{deviation}"
 
