@@ -24,6 +24,7 @@ from hma_data.lab.simulator import simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
+from hma_data.shards.windows import episode_pieces
 from hma_data.storage.files import atomic_path, kept_arrays
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.evaluate import cameras_for
@@ -243,18 +244,23 @@ class _Maker:
         return Replay(share, std)
 
     def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:
-        """Return the rows of episodes that are long enough, with the first frames that leave room."""
+        """Return the pieces of episodes that are long enough: rows, where they begin, and the room to start.
+
+        `begin` and `room` are recorded frames. No episode starts before a pause and goes on after it.
+        """
         if shards.embodiment.id != self.settings.embodiment:
             fault = f"is of {shards.embodiment.id}, not of {self.settings.embodiment}"
             raise UsageError(shards.folder, fault, "name shards of the robot")
+        every = shards.manifest.frame_stride
         span = (self.prompt_frames + self.settings.frames - 1) * shards.embodiment.stride
-        rows = [
-            row | {"room": row["length"] * shards.manifest.frame_stride - span}
+        found = [
+            row | {"begin": part.start * every, "room": len(part) * every - span}
             for row in shards.episodes.to_pylist()
+            for part in episode_pieces(shards, row)
+            if len(part) * every > span
         ]
-        found = [row for row in rows if row["room"] > 0]
         if not found:
-            fault = f"has no episode of {self.prompt_frames} + {self.settings.frames} frames"
+            fault = f"has no episode of {self.prompt_frames} + {self.settings.frames} frames without a pause"
             raise UsageError(shards.folder, fault, "give fewer --frames")
         return found
 
@@ -360,7 +366,7 @@ class _Maker:
         needed = None if self.settings.recorded else self.prompt_frames
         for draw in range(DRAWS):
             row = self._long[(number + draw) % len(self._long)]
-            start = int(rng.integers(row["room"])) // every * every
+            start = row["begin"] + int(rng.integers(row["room"])) // every * every
             given = {"shards": shards.folder, "episode": row["episode_index"], "start": start}
             frames, chunks = read_prompt(self.world.model, self.scenes.name, given | {"frames": length})
             assert chunks is not None

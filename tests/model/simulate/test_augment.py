@@ -27,6 +27,7 @@ from hma_model.simulate.policies import Still
 from hma_model.simulate.synthetic import Made, write_shards
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
+from tests.model.shards import state_pauses
 from tests.model.simulate.worlds import trained_on
 
 ROBOT, FRAMES, KNOWN = "rails_03", 4, 2
@@ -157,6 +158,27 @@ def test_first_frames_and_commands_come_from_shards(world: World, tmp_path: Path
         assert any(np.array_equal(one, columns["action"].ravel()) for one in rows)
     with pytest.raises(UsageError, match="has no episode of 2 \\+ 900 frames"):
         augment(tmp_path / "no", asked(frames=900), world=world, shards=tmp_path / "real")
+
+
+@pytest.mark.slow
+def test_no_episode_continues_one_that_pauses(world: World, real: Path, tmp_path: Path) -> None:
+    stride = world.model.embodiments[ROBOT].stride
+    frames, (row,) = episodes(real)[0]["tokens"], ShardSet(real).episodes.to_pylist()
+    needed = (KNOWN + FRAMES - 1) * stride
+    last = row["length"] - needed - 4
+    state_pauses(real, {needed - 1: stride, last: stride})  # the first part is too short
+    augment(tmp_path / "out", asked(source="real", episodes=6), world=world, shards=real)
+    for columns in episodes(tmp_path / "out"):
+        prompt = columns["tokens"][:KNOWN]
+        starts = [
+            at
+            for at in range(len(frames) - stride)
+            if np.array_equal(frames[at], prompt[0]) and np.array_equal(frames[at + stride], prompt[1])
+        ]
+        assert any(needed <= at <= last - needed or last < at for at in starts)
+    state_pauses(real, dict.fromkeys(range(0, row["length"], needed), stride))
+    with pytest.raises(UsageError, match="has no episode of 2 \\+ 4 frames without a pause"):
+        augment(tmp_path / "no", asked(source="real"), world=world, shards=real)
 
 
 @pytest.fixture

@@ -25,6 +25,7 @@ from hma_model.simulate.session import Frame, Sampling, Session, jpeg
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
 from tests.model.robots import save
+from tests.model.shards import state_pauses
 from tests.model.simulate.worlds import TrueWorld, lab_robots
 
 RIGHT_DOWN, UP = (False, False), (False, True)
@@ -159,6 +160,22 @@ def test_a_recordings_truth_is_known_for_its_own_commands(
     assert other.advance(np.zeros(6, np.float32)) is not None
     followed = other.advance(None)
     assert followed is not None and followed[1] is None  # it was left
+
+
+def test_no_scene_of_a_recording_crosses_a_pause(shards: ShardSet, block_tokenizer: BlockTokenizer) -> None:
+    rows = shards.episodes.to_pylist()
+    state_pauses(shards.folder, *[{row["length"] // 3: 50, row["length"] // 3 + 1: 50} for row in rows])
+    robot = RecordedRobot(ShardSet(shards.folder), lambda: block_tokenizer, shards.manifest.stats, "first")
+    scene, frames = robot.scene(0), PROMPT
+    while (step := scene.advance(None)) is not None:
+        assert step[1] is not None
+        frames += 1
+    longest = max(row["length"] - row["length"] // 3 - 2 for row in rows)
+    assert PROMPT < frames <= longest // shards.row_stride
+    state_pauses(shards.folder, *[dict.fromkeys(range(row["length"]), 50) for row in rows])
+    robot = RecordedRobot(ShardSet(shards.folder), lambda: block_tokenizer, shards.manifest.stats, "first")
+    with pytest.raises(UsageError, match="has no episode longer than 4 frames without a pause"):
+        robot.scene(0)
 
 
 def test_new_scenes_come_to_every_window_once_before_any_comes_again() -> None:
