@@ -41,7 +41,8 @@ from hma_model.simulate.synthetic import (
     begun,
     digests,
     finished,
-    require_new,
+    holds_dataset,
+    require_dataset,
     write_as_lerobot,
     write_shards,
 )
@@ -169,7 +170,7 @@ def augment(
         settings: what to make.
         checkpoint: as `load_world` takes it.
         shards: shard set whose episodes give first frames and commands; by default the simulator does.
-        lerobot: folder for the same episodes as a LeRobotDataset v3.0.
+        lerobot: folder for the same episodes as a LeRobotDataset v3.0; one that is finished is kept.
         world: a world instead of a checkpoint.
         device: of the world made from the checkpoint, and of policies that are networks.
         on_progress: called with the frames done, and what is done.
@@ -180,7 +181,7 @@ def augment(
     """
     folder = as_path(out)
     if lerobot is not None:
-        require_new(as_path(lerobot))
+        require_dataset(as_path(lerobot))
     drawn: dict[str, Any] = {"unmask_steps": settings.unmask_steps, "temperature": settings.temperature}
     world = world or load_world(checkpoint, device=device, **drawn)
     if world.model.config.kind != "discrete":
@@ -195,7 +196,9 @@ def augment(
     begins = None if shards is None else ShardSet(shards)
     if begins is not None:
         made_by |= {"source_sha256": hashlib.sha256(begins.manifest.to_text().encode()).hexdigest()}
+    dataset = None if lerobot is None else as_path(lerobot)
     with locked(folder):
+        done = dataset is None or holds_dataset(dataset, made_by)  # before anything is made
         found = finished(folder, made_by)
         if found is None:
             maker = _Maker(world, settings, begins)
@@ -203,8 +206,13 @@ def augment(
             chosen, spec = _chosen(batches, settings), world.tokenizer.spec
             found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
             shutil.rmtree(folder / WORK)
-    if lerobot is not None:
-        write_as_lerobot(as_path(lerobot), folder, world.tokenizer)
+        if dataset is not None and not done:
+            frames = settings.episodes * settings.frames
+
+            def tell(at: int, words: str) -> None:
+                on_progress(frames, f"LeRobot: {words}" + (f", {at} so far" if at else ""))
+
+            write_as_lerobot(dataset, folder, world.tokenizer, tell)
     return found
 
 
