@@ -8,7 +8,7 @@ T frames of an episode, A action dims, S state dims.
 import json
 import struct
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, reduce
@@ -214,7 +214,12 @@ class LeRobotEpisode:
     further: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # other features -> (T, values)
 
 
-def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRobotEpisode]) -> None:
+def write_lerobot(
+    folder: Path,
+    embodiment: Embodiment,
+    episodes: Iterable[LeRobotEpisode],
+    on_progress: Callable[[int, str], None] = lambda done, words: None,
+) -> None:
     """Write a LeRobotDataset v3.0 with lerobot's own writer; videos are H.264.
 
     The features are those that `hma registry export --to lerobot-features` prints for the embodiment, and
@@ -224,11 +229,13 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
         folder: folder to make.
         embodiment: one with a whole number of frames a second.
         episodes: at least one; each has the embodiment's cameras and widths, and the same further features.
+        on_progress: called with the frames written so far, and what is done.
 
     Raises:
         MissingDependencyError: lerobot cannot be imported.
     """
     assert embodiment.frequency_hz
+    on_progress(0, "loading lerobot")  # its imports take seconds
     with imported("lerobot"):
         from lerobot.configs.video import RGBEncoderConfig
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -249,6 +256,7 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
         rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=18),
         encoder_threads=1,  # the output bytes depend on the number of threads
     )
+    done = 0
     with _quiet():
         try:
             for episode in chain([first], rest):
@@ -258,6 +266,9 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
                     if episode.state is not None:
                         values["observation.state"] = episode.state[row]
                     writer.add_frame({**values, "task": episode.task})
+                    done += 1
+                    on_progress(done, "writing frames")
+                on_progress(done, "encoding videos")
                 writer.save_episode(parallel_encoding=False)  # otherwise it forks this process, once a camera
         finally:
             writer.finalize()  # after a failure too; else it would write to a removed folder when collected

@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 from hma_data.errors import OutputError, UsageError
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import token_column
-from hma_data.shards.windows import piece_lengths
+from hma_data.shards.windows import episode_pieces
 from hma_data.storage.files import new_folder, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
@@ -98,21 +98,19 @@ def _write_rows(shards: ShardSet, split: str, part: Path, camera: int) -> Iterat
     dtypes = {tokens: video_dtype(spec), "action": "<f4", **EXTRA_DTYPES}
     paths = {tokens: VIDEO, "action": ACTIONS} | {name: f"{EXTRA}/{name}.bin" for name in EXTRA_DTYPES}
     segments: list[int] = []  # rows of each piece, see `hma_data.shards.windows`
-    stride, frame_stride = shards.embodiment.stride, shards.manifest.frame_stride
     (part / "actions").mkdir()
     (part / EXTRA).mkdir()
     with ExitStack() as opened:
         files = {column: opened.enter_context((part / paths[column]).open("wb")) for column in written}
         for row in table.to_pylist():
-            length = row["length"]
             values = reader.episode(row, name)
             values[tokens] = shards.tokens(values[tokens])
             if spec.dtype == "uint8":
                 values[tokens] = values[tokens].transpose(0, 2, 3, 1)  # pixels are (N, H, W, 3) there
             for column, file in files.items():
                 file.write(np.ascontiguousarray(values[column], dtypes[column]).tobytes())
-            segments += piece_lengths(row["flags"] or "", length, stride, frame_stride)
-            yield length
+            segments += map(len, episode_pieces(shards, row))
+            yield row["length"]
     ids = np.repeat(np.arange(len(segments)), segments).astype("<i4")
     (part / SEGMENTS).write_bytes(ids.tobytes())
     pq.write_table(table, part / EXTRA / "episodes.parquet")

@@ -11,11 +11,11 @@ the missing frames repeat its last row and are masked. Attention is causal in ti
 real frame change no prediction before them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,16 +159,31 @@ class WindowIndex:
         return int(np.searchsorted(self.edges, row, side="right")) - 1
 
 
-def piece_lengths(flags: str, length: int, stride: int, frame_stride: int) -> list[int]:
-    """Return the rows of each piece of an episode of `length` rows with these flags.
+def episode_pieces(shards: ShardSet, row: Mapping[str, Any], row_stride: int | None = None) -> list[range]:
+    """Return the rows of each piece of an episode.
 
     Args:
+        shards: the set.
+        row: of the episode in episodes.parquet.
+        row_stride: rows between frames; None takes the embodiment's.
+    """
+    every = shards.manifest.frame_stride
+    stride = (row_stride or shards.row_stride) * every
+    return pieces(flag_pauses(row["flags"] or ""), row["length"], stride, every)
+
+
+def pieces(pauses: Mapping[int, int], length: int, stride: int, frame_stride: int = 1) -> list[range]:
+    """Return the rows of each piece of one episode, as `WindowIndex` divides all of a split.
+
+    Args:
+        pauses: recorded frame -> recorded steps to the next one.
+        length: rows of the episode.
         stride: least recorded steps of a pause that divides an episode.
         frame_stride: recorded steps a row.
     """
-    after = {frame // frame_stride + 1 for frame, steps in flag_pauses(flags).items() if steps >= stride}
+    after = {frame // frame_stride + 1 for frame, steps in pauses.items() if steps >= stride}
     edges = [0, *sorted(row for row in after if row < length), length]
-    return [end - begin for begin, end in pairwise(edges)]
+    return [range(begin, end) for begin, end in pairwise(edges)]
 
 
 def _row_groups(per_shard: list[tuple[int, ...]]) -> tuple[Ints, Ints]:

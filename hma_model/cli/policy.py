@@ -107,13 +107,16 @@ def augment(
 
     Example: hma augment rails_03 synthetic/rails_03 --episodes 64 --commands perturb=0.3
     """
+    from hma_data.shards.manifest import MANIFEST
     from hma_model.simulate.augment import Augmentation
     from hma_model.simulate.augment import augment as run
+    from hma_model.simulate.synthetic import FACTS
 
     there, name = device_name(device), source.resolve().name if source else ""
     settings = Augmentation(
         embodiment, name, episodes, frames, commands, keep, judge, seed, unmask_steps, temperature
     )
+    finished = (out / MANIFEST).is_file() and (lerobot is None or (lerobot / FACTS).is_file())
     words = f"finished batches are kept in {out}; run the same command again to continue"
     with interruptible(lambda: words), progress("episodes", episodes * frames) as update:
         made = run(
@@ -129,7 +132,9 @@ def augment(
     if json:
         print_json({"out": str(out), "made": episodes, "kept": kept, "plan": made.plan})
         return
-    print(f"kept {human_count(kept, 'episode')} of {episodes} in {out}; synthetic: true in every file")
+    before = "finished already: " if finished else ""
+    said = f"kept {human_count(kept, 'episode')} of {episodes} in {out}"
+    print(f"{before}{said}; synthetic: true in every file")
     if lerobot:
         print(f"the same as a LeRobotDataset: {lerobot}")
 

@@ -24,6 +24,7 @@ from hma_data.lab.simulator import simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
+from hma_data.shards.windows import episode_pieces
 from hma_data.storage.files import atomic_path, kept_arrays
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.evaluate import cameras_for
@@ -40,7 +41,8 @@ from hma_model.simulate.synthetic import (
     begun,
     digests,
     finished,
-    require_new,
+    holds_dataset,
+    require_dataset,
     write_as_lerobot,
     write_shards,
 )
@@ -168,7 +170,7 @@ def augment(
         settings: what to make.
         checkpoint: as `load_world` takes it.
         shards: shard set whose episodes give first frames and commands; by default the simulator does.
-        lerobot: folder for the same episodes as a LeRobotDataset v3.0.
+        lerobot: folder for the same episodes as a LeRobotDataset v3.0; one that is finished is kept.
         world: a world instead of a checkpoint.
         device: of the world made from the checkpoint, and of policies that are networks.
         on_progress: called with the frames done, and what is done.
@@ -179,7 +181,7 @@ def augment(
     """
     folder = as_path(out)
     if lerobot is not None:
-        require_new(as_path(lerobot))
+        require_dataset(as_path(lerobot))
     drawn: dict[str, Any] = {"unmask_steps": settings.unmask_steps, "temperature": settings.temperature}
     world = world or load_world(checkpoint, device=device, **drawn)
     if world.model.config.kind != "discrete":
@@ -194,7 +196,9 @@ def augment(
     begins = None if shards is None else ShardSet(shards)
     if begins is not None:
         made_by |= {"source_sha256": hashlib.sha256(begins.manifest.to_text().encode()).hexdigest()}
+    dataset = None if lerobot is None else as_path(lerobot)
     with locked(folder):
+        done = dataset is None or holds_dataset(dataset, made_by)  # before anything is made
         found = finished(folder, made_by)
         if found is None:
             maker = _Maker(world, settings, begins)
@@ -202,8 +206,13 @@ def augment(
             chosen, spec = _chosen(batches, settings), world.tokenizer.spec
             found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
             shutil.rmtree(folder / WORK)
-    if lerobot is not None:
-        write_as_lerobot(as_path(lerobot), folder, world.tokenizer)
+        if dataset is not None and not done:
+            frames = settings.episodes * settings.frames
+
+            def tell(at: int, words: str) -> None:
+                on_progress(frames, f"LeRobot: {words}" + (f", {at} so far" if at else ""))
+
+            write_as_lerobot(dataset, folder, world.tokenizer, tell)
     return found
 
 
@@ -243,18 +252,23 @@ class _Maker:
         return Replay(share, std)
 
     def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:
-        """Return the rows of episodes that are long enough, with the first frames that leave room."""
+        """Return the pieces of episodes that are long enough: rows, where they begin, and the room to start.
+
+        `begin` and `room` are recorded frames. No episode starts before a pause and goes on after it.
+        """
         if shards.embodiment.id != self.settings.embodiment:
             fault = f"is of {shards.embodiment.id}, not of {self.settings.embodiment}"
             raise UsageError(shards.folder, fault, "name shards of the robot")
+        every = shards.manifest.frame_stride
         span = (self.prompt_frames + self.settings.frames - 1) * shards.embodiment.stride
-        rows = [
-            row | {"room": row["length"] * shards.manifest.frame_stride - span}
+        found = [
+            row | {"begin": part.start * every, "room": len(part) * every - span}
             for row in shards.episodes.to_pylist()
+            for part in episode_pieces(shards, row)
+            if len(part) * every > span
         ]
-        found = [row for row in rows if row["room"] > 0]
         if not found:
-            fault = f"has no episode of {self.prompt_frames} + {self.settings.frames} frames"
+            fault = f"has no episode of {self.prompt_frames} + {self.settings.frames} frames without a pause"
             raise UsageError(shards.folder, fault, "give fewer --frames")
         return found
 
@@ -360,7 +374,7 @@ class _Maker:
         needed = None if self.settings.recorded else self.prompt_frames
         for draw in range(DRAWS):
             row = self._long[(number + draw) % len(self._long)]
-            start = int(rng.integers(row["room"])) // every * every
+            start = row["begin"] + int(rng.integers(row["room"])) // every * every
             given = {"shards": shards.folder, "episode": row["episode_index"], "start": start}
             frames, chunks = read_prompt(self.world.model, self.scenes.name, given | {"frames": length})
             assert chunks is not None

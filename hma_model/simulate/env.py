@@ -1,7 +1,7 @@
 """Offer a world model as gymnasium environments: one session, or several that step in one pass.
 
     import gymnasium, hma_model.simulate
-    env = gymnasium.make("hma/WorldModel-v0", checkpoint="embedded", embodiment="pusht_fast")
+    env = gymnasium.make("hma/WorldModel-v0", embodiment="pusht_fast", clip=True)
     picture, _ = env.reset(seed=0)
     picture, reward, terminated, truncated, _ = env.step(env.action_space.sample())
 

@@ -1,8 +1,9 @@
 """Save what was driven: as a film, or as a LeRobotDataset of one episode that converts like any recording."""
 
 import io
+import time
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,7 +16,7 @@ from hma_data.episodes.sheets import gif_bytes, write_mp4, write_text
 from hma_data.lab.writers import LeRobotEpisode, write_lerobot
 from hma_data.registry.embodiment import Embodiment
 from hma_model.simulate.scenes import Drivable, Picture
-from hma_model.simulate.session import Frame
+from hma_model.simulate.session import Frame, Session
 
 KINDS = {  # name -> media type and ending
     "mp4": ("video/mp4", ".mp4"),
@@ -24,30 +25,66 @@ KINDS = {  # name -> media type and ending
 }
 DRIVEN = "driven in a world model by hma play; the pictures are the model's"
 SIDE, HEAD, GAP = 320, 26, 8  # pixels of a panel, of its title, between panels
+TELL_S = 0.2  # between two messages on how far a file is
 GIF_SIDE, GIF_FRAMES = 192, 600  # smaller and shorter: a GIF is large
 
 
-def film(kind: str, robot: Drivable, frames: Sequence[Frame]) -> bytes:
+Told = Callable[[str, int, int], None]  # is told what is done, and how many frames of how many are
+
+
+def film(
+    kind: str,
+    robot: Drivable,
+    frames: Sequence[Frame],
+    on_progress: Told = lambda words, done, total: None,
+) -> bytes:
     """Return a file of frames.
 
     Args:
         kind: a key of KINDS.
+        robot: that was driven.
+        frames: in their order.
+        on_progress: called with what is done, and how many frames of how many are.
     """
     hz = robot.embodiment.effective_hz
     if all(frame.true is None for frame in frames[1:]):
         frames = [replace(frames[0], true=None), *frames[1:]]
     if kind == "gif":
-        return gif_bytes(panels(frames[-GIF_FRAMES:], GIF_SIDE), hz)
+        return gif_bytes(_counted(frames[-GIF_FRAMES:], GIF_SIDE, on_progress), hz)
     with TemporaryDirectory(prefix="hma-play-") as folder:
         if kind == "mp4":
             path = Path(folder) / "film.mp4"
-            write_mp4(path, panels(frames, SIDE), hz)
+            write_mp4(path, _counted(frames, SIDE, on_progress), hz)
             return path.read_bytes()
         home = Path(folder) / robot.embodiment.id
         episode, embodiment = lerobot_episode(robot, frames)
-        write_lerobot(home, embodiment, [episode])
+        total = len(episode.action)
+        write_lerobot(home, embodiment, [episode], lambda done, words: on_progress(words, done, total))
         (home / "embodiment.yaml").write_text(embodiment.to_yaml(), encoding="utf-8")
+        on_progress("packing the files", total, total)
         return _zipped(home)
+
+
+def told_by(session: Session, kind: str) -> Told:
+    """Return what tells a session's viewer how far a file is: new words at once, frames now and then."""
+    before, words_before = 0.0, ""
+
+    def tell(words: str, done: int, total: int) -> None:
+        nonlocal before, words_before
+        now = time.monotonic()
+        if words == words_before and now - before < TELL_S:
+            return
+        before, words_before = now, words
+        if viewer := session.viewer:
+            viewer.tell({"kind": "saving", "file": kind, "text": words, "done": done, "total": total})
+
+    return tell
+
+
+def _counted(frames: Sequence[Frame], side: int, on_progress: Told) -> Iterator[Picture]:
+    for done, panel in enumerate(panels(frames, side), 1):
+        yield panel
+        on_progress("writing frames" if done < len(frames) else "encoding the film", done, len(frames))
 
 
 def panels(frames: Sequence[Frame], side: int) -> Iterator[Picture]:

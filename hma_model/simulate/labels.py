@@ -4,8 +4,9 @@
     print(found.error.explained)      # on held-out film whose commands are known
 
 Film is a shard set, of any robot or of people, or a folder of video files. Its frames are taken at the rate
-of the robot's model; an episode that cannot be read goes to quarantine. Labelled episodes lie in a folder of
-the output until all are written, by the content of their film, so the same call continues.
+of the robot's model. What lies between two pauses of a set's episode is an episode of its own. An episode
+that cannot be read goes to quarantine. Labelled episodes lie in a folder of the output until all are
+written, by the content of their film, so the same call continues.
 
 T frames, A action dims, K = stride · A.
 """
@@ -30,6 +31,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST, Manifest
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import Refused
+from hma_data.shards.windows import episode_pieces
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.storage.files import atomic_path, file_sha256, kept_arrays
 from hma_data.storage.paths import StrPath, as_path
@@ -134,14 +136,16 @@ def label_actions(
         HMAError: the model does not infer commands, film or output do not fit, or on labelled film the
             inferred commands are no better than their mean.
     """
-    folder, world = as_path(out), world or load_world(checkpoint, device=device)
+    folder = as_path(out)
+    find_film(film)
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(folder, "is a file", "name a folder")
+    world = world or load_world(checkpoint, device=device)
     model = world.model
     trained = [OBJECTIVES[name].readout for name, weight in model.config.objectives.items() if weight]
     if INVERSE not in trained:
         fault = f"was not trained to infer commands, but for {', '.join(model.config.objectives)}"
         raise HMAError(checkpoint, fault, "train one with objectives={inverse: 1.0}")
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(folder, "is a file", "name a folder")
     commands = world.commands(embodiment)
     robot = described(model, embodiment)
     if robot is None:
@@ -204,9 +208,9 @@ def measure(
         HMAError: of no value of the command it is better than the mean.
     """
     film = ShardFilm(world, shards, shards.row_stride, commands.embodiment)
-    rows = shards.episodes.to_pylist()
-    split = "val" if any(row["split"] == "val" for row in rows) else "train"
-    chosen = [number for number, row in enumerate(rows) if row["split"] == split][:CHECKED]
+    splits = film.splits()
+    split = "val" if "val" in splits else "train"
+    chosen = [number for number, name in enumerate(splits) if name == split][:CHECKED]
     width, misses, true = len(commands.names), [], []
     for done, number in enumerate(chosen):
         on_progress(done, "checking on labelled film", len(chosen))
@@ -317,15 +321,34 @@ class _Kept(Sequence[Made]):
 # -- film
 
 
+def find_film(place: StrPath) -> ShardSet | list[Path]:
+    """Return the shard set at a place, or the video files of a folder.
+
+    Raises:
+        UsageError: it is neither.
+        ShardError: the set is damaged.
+    """
+    path = as_path(place)
+    if (path / MANIFEST).is_file():
+        return ShardSet(path)
+    videos = (
+        sorted(file for file in path.rglob("*") if file.suffix.lower() in VIDEOS) if path.is_dir() else []
+    )
+    if not videos:
+        fault = "is no shard set and no folder with video files" if path.exists() else "does not exist"
+        raise UsageError(path, fault, f"give a folder of {', '.join(VIDEOS)}, or a shard set")
+    return videos
+
+
 def film_of(world: World, place: StrPath, embodiment: str, hz: float) -> Film:
     """Return the film of a shard set or of a folder of video files, at a rate in Hz.
 
     Raises:
         UsageError: it is neither, or its rate is no multiple of that.
     """
-    path = as_path(place)
-    if (path / MANIFEST).is_file():
-        shards = ShardSet(path)
+    path, found = as_path(place), find_film(place)
+    if isinstance(found, ShardSet):
+        shards = found
         require_tokenizer(world.model.config, shards.spec, shards.folder)
         rows_hz = shards.embodiment.rate_hz / shards.manifest.frame_stride
         step = max(1, round(rows_hz / hz))
@@ -334,23 +357,14 @@ def film_of(world: World, place: StrPath, embodiment: str, hz: float) -> Film:
             remedy = "convert the film with --frames all, or at a multiple of the model's rate"
             raise UsageError(path, fault, remedy)
         return ShardFilm(world, shards, step, embodiment)
-    videos = (
-        sorted(file for file in path.rglob("*") if file.suffix.lower() in VIDEOS) if path.is_dir() else []
-    )
-    if not videos:
-        raise UsageError(
-            path,
-            "is no shard set and no folder with video files",
-            f"give a folder of {', '.join(VIDEOS)}, or a shard set",
-        )
     if world.model.config.views > 1:
         fault = f"has films of one camera, and the model sees {world.model.config.views} at once"
         raise UsageError(path, fault, "convert the recordings with --cameras, and give the shards")
-    return VideoFilm(world, path, videos, embodiment, hz)
+    return VideoFilm(world, path, found, embodiment, hz)
 
 
 class ShardFilm:
-    """The episodes of a shard set: every `step`-th row, of the cameras that the model sees of a robot.
+    """The episodes of a shard set, divided where they pause: every `step`-th row, of the model's cameras.
 
     Film of another robot, which lacks them, is taken from its first camera.
 
@@ -366,7 +380,8 @@ class ShardFilm:
 
     def __init__(self, world: World, shards: ShardSet, step: int, embodiment: str | None = None) -> None:
         self.name, self._shards, self._step = shards.folder.name, shards, step
-        self._rows = shards.episodes.to_pylist()
+        rows = shards.episodes.to_pylist()
+        self._parts = [(row, part) for row in rows for part in episode_pieces(shards, row, step)]
         cameras = trained_cameras(card(world.model, embodiment or shards.embodiment.id))
         if embodiment in (None, shards.embodiment.id) or view_count(cameras) > 1:
             Views.of(shards, cameras)
@@ -374,7 +389,18 @@ class ShardFilm:
         self._reader = EpisodeReader(shards, shards.columns(self.cameras))
 
     def heads(self) -> list[tuple[str, str, str]]:
-        return [(row["id"], row["group"] or "", row["instruction"] or "") for row in self._rows]
+        return [
+            (
+                row["id"] if len(part) == row["length"] else f"{row['id']}_from_{part.start}",
+                row["group"] or (row["id"] if len(part) < row["length"] else ""),
+                row["instruction"] or "",
+            )
+            for row, part in self._parts
+        ]
+
+    def splits(self) -> list[str]:
+        """Return the split of each episode."""
+        return [row["split"] for row, _ in self._parts]
 
     def content(self, number: int) -> str:
         return f"{self._manifest_sha256} {self.cameras} {self._step}"
@@ -388,12 +414,13 @@ class ShardFilm:
 
     def labelled(self, number: int) -> tuple[NDArray[Any], Floats, NDArray[np.bool_]]:
         """Return the frames (T, …), the chunks (T, K) that follow them, and which are known (T,)."""
-        stored, columns = seen_frames(self._shards, self._reader, self._rows[number], self.cameras)
-        at = np.arange(0, len(stored), self._step)
+        row, part = self._parts[number]
+        stored, columns = seen_frames(self._shards, self._reader, row, self.cameras)
+        at = np.array(part[:: self._step])
         actions = columns["action"]
         spans = at[:, None] + np.arange(self._step)
-        whole = spans[:, -1] < len(stored)
-        spans = np.minimum(spans, len(stored) - 1)
+        whole = spans[:, -1] < part.stop
+        spans = np.minimum(spans, part.stop - 1)
         known = columns.get("action_known", np.ones(len(stored), np.bool_))[spans].all(axis=1) & whole
         return stored[at], actions[spans].reshape(len(at), -1).astype(np.float32), known
 

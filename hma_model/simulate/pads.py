@@ -6,7 +6,7 @@ something up and down in the picture has keys for up and down.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -117,23 +117,41 @@ def hint(robot: Drivable) -> str:
         return "Drag on the picture to move the target" + "s" * (len(found) > 1)
     if all(pad.x is None or pad.y is None for pad in found) and len(found) > 1:
         return f"Drag on the picture, along {'each' if len(found) > 2 else 'either'} rail"
-    names = [dim.name for dim in dims]
+    names, shown = [dim.name for dim in dims], labels(robot)
     if len(found) == 1 and {"vx", "speed", "bridge"} & set(names):
         return "Drag on the picture to steer"
     if len(found) > 1:
-        said = [" and ".join(_named(dims, i) for i in (pad.x, pad.y) if i is not None) for pad in found]
+        said = [" and ".join(shown[i] for i in (pad.x, pad.y) if i is not None) for pad in found]
         return f"Drag on the picture: on its left half {said[0]}, on its right half {said[1]}"
     ways = (("sideways", first.x), ("up or down", first.y))
-    return f"Drag on the picture: {', '.join(f'{way} {_named(dims, i)}' for way, i in ways if i is not None)}"
+    return f"Drag on the picture: {', '.join(f'{way} {shown[i]}' for way, i in ways if i is not None)}"
 
 
-def _named(dims: Sequence[Dimension], number: int) -> str:
-    return dims[number].name.replace("_", " ")
+def labels(robot: Drivable) -> list[str]:
+    """Return a readable label of each value: its name in the YAML, else the end of its key and a number."""
+    parts, found = robot.embodiment.action.components, []
+    for part in parts:
+        names = part.names
+        if names is None:
+            end = _end(part.key, {other.key for other in parts if other.key != part.key})
+            first = part.slice[0] if part.slice else 0
+            alone = part.dims == 1 and not part.slice
+            names = (end,) if alone else tuple(f"{end} {first + i}" for i in range(part.dims))
+        found += [re.sub(r"[_.\s]+", " ", name).strip() or name for name in names]
+    return found
+
+
+def _end(key: str, others: Collection[str]) -> str:
+    """Return the end of a key: as many words of its path as tell it from the other keys."""
+    paths = [other.strip("/").split("/") for other in others]
+    words = key.strip("/").split("/")
+    counts = (n for n in range(1, len(words)) if all(path[-n:] != words[-n:] for path in paths))
+    return " ".join(words[-next(counts, len(words)) :])
 
 
 def describe(robot: Drivable) -> dict[str, Any]:
     """Return what the page shows of a robot, as plain values."""
-    text = re.sub(r"^A made-up ", "", robot.embodiment.description) or robot.embodiment.id
+    text = re.sub(r"^A made-up ", "", robot.embodiment.description)
     return {
         "key": robot.key,
         "id": robot.embodiment.id,
@@ -141,7 +159,9 @@ def describe(robot: Drivable) -> dict[str, Any]:
         "source": robot.source,
         "hz": robot.embodiment.rate_hz,
         "stride": robot.embodiment.stride,
-        "dimensions": [vars(dim) for dim in robot.dimensions],
+        "dimensions": [
+            vars(dim) | {"label": label} for dim, label in zip(robot.dimensions, labels(robot), strict=True)
+        ],
         "pads": [asdict(pad) for pad in pads(robot)],
         "hint": hint(robot),
     }

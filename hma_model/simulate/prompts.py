@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hma_data.episodes.align import to_clip
+from hma_data.episodes.align import pauses, to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepared
 from hma_data.errors import HMAError, UsageError
@@ -22,6 +22,7 @@ from hma_data.lab import FAMILY, RECORDERS, record
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.windows import episode_pieces, pieces
 from hma_data.sources.base import open_source
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
@@ -47,12 +48,12 @@ class Part:
 
     Attributes:
         episode: number or id; None for the first.
-        start: its first frame as recorded.
+        start: its first frame as recorded; None for the first from which on the frames cross no pause.
         frames: P; None for half the model's window.
     """
 
     episode: int | str | None = None
-    start: int = 0
+    start: int | None = None
     frames: int | None = None
 
     def number(self, ids: Sequence[str], where: StrPath) -> int:
@@ -63,15 +64,28 @@ class Part:
             raise UsageError(where, f"has no episode {self.episode!r}", remedy)
         return found
 
-    def rows(self, model: "HMA", length: int, stride: int, start: int) -> NDArray[np.int64]:
-        """Return the rows (P,) of the frames in an episode of that length, from row `start` on."""
+    def rows(
+        self, model: "HMA", parts: Sequence[range], stride: int, frame_stride: int = 1
+    ) -> NDArray[np.int64]:
+        """Return the rows (P,) of the frames, `stride` apart, in one of the pieces of an episode.
+
+        Raises:
+            UsageError: they do not fit the episode, or cross a pause.
+        """
         count = default_frames(model) if self.frames is None else self.frames
-        last = start + (count - 1) * stride
-        if count < 1 or start < 0 or last >= length:
-            apart = "" if stride == 1 else f", {stride} rows apart"
-            fault = f"{count} frames{apart}, from row {start} on do not fit an episode of {length} rows"
-            raise UsageError("prompt", fault, "choose another start or fewer frames")
-        return np.arange(start, last + 1, stride)
+        span, length = (count - 1) * stride, parts[-1].stop
+        if self.start is None:
+            start = next((part.start for part in parts if span < len(part)), 0)
+        else:
+            start = self.start // frame_stride
+        fault = f"from row {start} on do not fit an episode of {length} rows"
+        if start >= 0 and start + span < length:
+            part = next(part for part in parts if start in part)
+            fault = f"from row {start} on cross the pause after row {part.stop - 1}"
+            if 0 <= span < part.stop - start:
+                return np.arange(start, start + span + 1, stride)
+        apart = "" if stride == 1 else f", {stride} rows apart"
+        raise UsageError("prompt", f"{count} frames{apart}, {fault}", "choose another start or fewer frames")
 
 
 def default_frames(model: "HMA") -> int:
@@ -90,7 +104,7 @@ def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int 
             pictures (H, W, 3) or (P, H, W, 3) uint8, or the str or path of a picture's file, or several;
             the str or path of a shard set, or of a LeRobotDataset: the first frames of its first episode;
             a mapping: "shards" or "lerobot": that folder, and if wanted "episode": number or id, "start": its
-            first frame as recorded, "frames": P;
+            first frame as recorded, "frames": P; they may cross no pause;
             a mapping: "frames": pictures at the model's rate, and "chunks": (P - 1, K);
             a mapping: "frames": pictures at the control rate, T of them, and "actions": (T - 1, A);
             an environment whose render() returns a picture.
@@ -176,7 +190,8 @@ def _of_shards(model: "HMA", embodiment: str, folder: StrPath, part: Part) -> Pr
     chosen = rows[part.number([row["id"] for row in rows], shards.folder)]
     names = seen_cameras(cameras_for(model, shards), shards.manifest.cameras)
     frames, columns = seen_frames(shards, EpisodeReader(shards, shards.columns(names)), chosen, names)
-    at = part.rows(model, len(frames), shards.row_stride, part.start // shards.manifest.frame_stride)
+    every = shards.manifest.frame_stride
+    at = part.rows(model, episode_pieces(shards, chosen), shards.row_stride, every)
     chunks = _chunks(columns["action"], columns.get("action_known"), at, shards.row_stride)
     return frames[at], chunks
 
@@ -232,7 +247,7 @@ def _of_recording(model: "HMA", robot: Embodiment, recording: Path, part: Part) 
     source = open_source(robot.source.format)
     ids = source.episode_ids(recording)
     clip = to_clip(source.read(recording, ids[part.number(ids, recording)], robot), robot)
-    at = part.rows(model, len(clip), robot.stride, part.start)
+    at = part.rows(model, pieces(pauses(clip.timestamps), len(clip), robot.stride), robot.stride)
     return _pictures(model, robot, clip, at), _chunks(clip.actions, clip.action_known, at, robot.stride)
 
 

@@ -23,6 +23,7 @@ from hma_data.loading.views import FIRST, Cameras
 from hma_data.registry.components import Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
+from hma_data.shards.windows import episode_pieces
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.simulate.pictures import (
     Picture,
@@ -191,13 +192,17 @@ class RecordedRobot:
 
         splits = self._shards.manifest.splits
         split = "val" if splits.get("val", {}).get("episodes") else "train"
-        rows = [row for row in self._shards.episodes.to_pylist() if row["split"] == split]
-        lengths = sorted(row["length"] // self._shards.row_stride for row in rows)
-        length = min(LONGEST, lengths[len(lengths) // 2]) if lengths else 0
-        if length <= PROMPT:
-            raise UsageError(
-                self._shards.folder, f"its episodes are not longer than {PROMPT} frames", "give other shards"
-            )
+        parts = [
+            len(part) // self._shards.row_stride
+            for row in self._shards.episodes.to_pylist()
+            if row["split"] == split
+            for part in episode_pieces(self._shards, row)
+        ]
+        lengths = sorted(length for length in parts if length > PROMPT)
+        if not lengths:
+            fault = f"has no episode longer than {PROMPT} frames without a pause"
+            raise UsageError(self._shards.folder, fault, "give other shards")
+        length = min(LONGEST, lengths[len(lengths) // 2])
         return WindowDataset(self._shards, split, length, cameras=self._cameras)
 
     def scene(self, number: int) -> "RecordedScene":

@@ -31,8 +31,8 @@ from hma_data.errors import HMAError, UsageError
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.simulate import messages
 from hma_model.simulate.engine import Engine
-from hma_model.simulate.films import KINDS, film
-from hma_model.simulate.pads import describe
+from hma_model.simulate.films import KINDS, film, told_by
+from hma_model.simulate.pads import describe, labels
 from hma_model.simulate.scenes import Drivable
 from hma_model.simulate.session import Frame, Sampling, Session
 
@@ -206,9 +206,12 @@ class Server:
         frames = await self._in_engine(session.film)
         if len(frames) < 2:
             return PlainTextResponse("nothing was driven yet\n", 409)
+        tell = told_by(session, kind)
+        if self._saving.locked():
+            tell("waiting for another file", 0, len(frames))
         async with self._saving:
             try:
-                data = await asyncio.to_thread(film, kind, session.robot, frames)
+                data = await asyncio.to_thread(film, kind, session.robot, frames, tell)
             except HMAError as fault:
                 return PlainTextResponse(f"{fault}\n", 500)
         media, suffix = KINDS[kind]
@@ -367,11 +370,15 @@ class Connection:
             return
         session.held, session.input = np.array(message.command, np.float32), message.input
         if not session.warned:
-            pairs = zip(session.robot.dimensions, message.command)
-            beyond = [d for d, value in pairs if abs(2 * value - d.low - d.high) > 1.05 * (d.high - d.low)]
-            said = ", ".join(f"{dim.name} {dim.low:g} to {dim.high:g}" for dim in beyond)
+            ends = [(dim.low, dim.high) for dim in session.robot.dimensions]
+            rows = enumerate(zip(ends, message.command, strict=True))
+            beyond = [
+                i for i, ((low, high), value) in rows if abs(2 * value - low - high) > 1.05 * (high - low)
+            ]
             session.warned = bool(beyond)
             if beyond:
+                names = labels(session.robot)
+                said = ", ".join(f"{names[i]} {ends[i][0]:g} to {ends[i][1]:g}" for i in beyond)
                 text = f"the model knows only {said}; what it shows beyond is a guess. This is said once"
                 self.page.tell({"kind": "error", "text": f"command: {text}"})
 

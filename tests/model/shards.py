@@ -3,10 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import finish
-from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema
+from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema, flags_text
 from hma_data.shards.stats import Stats
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.tokenizers.base import TokenizerSpec
@@ -25,6 +27,17 @@ def episode(
     tokens[np.arange(length), place.astype(int) % cells] = 50
     actions = np.concatenate([signs[:, None], rng.normal(size=(length, dims - 1))], axis=1)
     return tokens.reshape(length, *grid), actions.astype(np.float32)
+
+
+def state_pauses(folder: Path, *pauses: dict[int, int]) -> None:
+    """Let episodes.parquet state pauses of the first episodes: recorded frame -> steps to the next one."""
+    path = folder / "episodes.parquet"
+    table = pq.read_table(path)
+    flags = [flags_text(0, {}, one) for one in pauses] + [""] * (len(table) - len(pauses))
+    at = table.schema.get_field_index("flags")
+    pq.write_table(
+        table.set_column(at, table.schema.field(at), pa.array(flags, table.schema.types[at])), path
+    )
 
 
 def make_shards(

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hma_data.shards.reader import EpisodeIndex
-from hma_data.shards.windows import WindowIndex
+from hma_data.shards.windows import WindowIndex, pieces
 
 
 def fake(lengths: list[int], stride: int = 1, cameras: int = 1, group: int = 7, shards: int = 1) -> Any:
@@ -55,18 +55,41 @@ def test_a_pause_as_long_as_a_step_divides_an_episode_into_pieces() -> None:
     pauses = np.array([[2, 9, 3], [0, 4, 2], [2, 12, 40], [2, 29, 9]])  # entry, row before, recorded steps
     index = replace(made.index("train"), pauses=pauses)
     made.index = lambda split: index
-    for stride, pieces in ((2, [5, 15, 6, 10, 3, 17]), (3, [20, 6, 10, 3, 17]), (9, [20, 6, 13, 17])):
-        starts = np.cumsum([0, *pieces])
+    for stride, parts in ((2, [5, 15, 6, 10, 3, 17]), (3, [20, 6, 10, 3, 17]), (9, [20, 6, 13, 17])):
+        starts = np.cumsum([0, *parts])
         for frames in (1, 2, 3):
             span, first, last = frames * stride, [], []
-            for begin, length in zip(starts, pieces):
+            for begin, length in zip(starts, parts):
                 found = [*range(begin, begin + max(0, length - span + 1))]
                 found += [begin] if not found and length > stride else []
                 first, last = first + found, last + [begin + length - 1] * len(found)
             windows = WindowIndex.of(made, "train", frames, stride, "pad")
             every = np.arange(windows.count)
             assert windows.first_rows(every).tolist() == first and windows.last_rows(every).tolist() == last
-            assert windows.divided_episodes == len(pieces) - 3 - (stride < 9)
+            assert windows.divided_episodes == len(parts) - 3 - (stride < 9)
+
+
+@given(LENGTHS, st.integers(1, 4), st.integers(1, 3), st.data())
+@settings(max_examples=60, deadline=None)
+def test_the_pieces_of_one_episode_are_those_of_the_window_index(
+    lengths: list[int], stride: int, frame_stride: int, data: st.DataObject
+) -> None:
+    rates = st.dictionaries(st.integers(0, 95), st.integers(1, 9), max_size=4)
+    paused = [data.draw(rates) for _ in lengths]
+    made = fake(lengths)
+    made.manifest.frame_stride = frame_stride
+    found = [
+        (entry, frame // frame_stride, steps)
+        for entry, pauses in enumerate(paused)
+        for frame, steps in pauses.items()
+    ]
+    index = replace(made.index("train"), pauses=np.array(found, np.int64).reshape(-1, 3))
+    made.index = lambda split: index
+    windows, first = WindowIndex.of(made, "train", 1, stride), []
+    for begin, length, pauses in zip(np.cumsum([0, *lengths]), lengths, paused, strict=False):
+        for part in pieces(pauses, length, stride * frame_stride, frame_stride):
+            first += [begin + at for at in part[: len(part) - stride + 1]] if len(part) >= stride else []
+    assert windows.first_rows(np.arange(windows.count)).tolist() == first
 
 
 def check_index(index: WindowIndex, lengths: list[int], cameras: int, wanted: range) -> None:

@@ -18,7 +18,7 @@ from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
-from hma_model.simulate import World
+from hma_model.simulate import World, synthetic
 from hma_model.simulate import augment as augment_module
 from hma_model.simulate.acting import Acting
 from hma_model.simulate.arenas import Scenes, TrueArena
@@ -27,6 +27,7 @@ from hma_model.simulate.policies import Still
 from hma_model.simulate.synthetic import Made, write_shards
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
+from tests.model.shards import state_pauses
 from tests.model.simulate.worlds import trained_on
 
 ROBOT, FRAMES, KNOWN = "rails_03", 4, 2
@@ -157,6 +158,27 @@ def test_first_frames_and_commands_come_from_shards(world: World, tmp_path: Path
         assert any(np.array_equal(one, columns["action"].ravel()) for one in rows)
     with pytest.raises(UsageError, match="has no episode of 2 \\+ 900 frames"):
         augment(tmp_path / "no", asked(frames=900), world=world, shards=tmp_path / "real")
+
+
+@pytest.mark.slow
+def test_no_episode_continues_one_that_pauses(world: World, real: Path, tmp_path: Path) -> None:
+    stride = world.model.embodiments[ROBOT].stride
+    frames, (row,) = episodes(real)[0]["tokens"], ShardSet(real).episodes.to_pylist()
+    needed = (KNOWN + FRAMES - 1) * stride
+    last = row["length"] - needed - 4
+    state_pauses(real, {needed - 1: stride, last: stride})  # the first part is too short
+    augment(tmp_path / "out", asked(source="real", episodes=6), world=world, shards=real)
+    for columns in episodes(tmp_path / "out"):
+        prompt = columns["tokens"][:KNOWN]
+        starts = [
+            at
+            for at in range(len(frames) - stride)
+            if np.array_equal(frames[at], prompt[0]) and np.array_equal(frames[at + stride], prompt[1])
+        ]
+        assert any(needed <= at <= last - needed or last < at for at in starts)
+    state_pauses(real, dict.fromkeys(range(0, row["length"], needed), stride))
+    with pytest.raises(UsageError, match="has no episode of 2 \\+ 4 frames without a pause"):
+        augment(tmp_path / "no", asked(source="real"), world=world, shards=real)
 
 
 @pytest.fixture
@@ -290,8 +312,37 @@ def test_lerobot_loads_the_dataset(world: World, tmp_path: Path) -> None:
     np.testing.assert_allclose(row["action"], columns[0]["action"][1][: len(row["action"])])
     assert "synthetic" in row["task"]
     assert json.loads((tmp_path / "rails/synthetic.json").read_text())["synthetic"] is True
-    with pytest.raises(OutputError, match="exists already"):
+    with pytest.raises(OutputError, match="rails: holds another dataset"):
         augment(tmp_path / "more", asked(), world=world, lerobot=tmp_path / "rails")
+    assert not list((tmp_path / "more").glob("*/*.parquet"))
+
+
+def test_the_same_call_keeps_a_finished_dataset_and_finishes_one_that_was_cut_off(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped, written, dataset = [True], list[Path](), tmp_path / "rails"
+    (tmp_path / ".rails.part").mkdir()  # of a process that was killed
+
+    def write(folder: Path, *_: Any) -> None:
+        folder.mkdir()
+        (folder / "meta").mkdir()
+        if stopped.pop():
+            raise KeyboardInterrupt
+        written.append(folder)
+
+    monkeypatch.setattr(synthetic, "write_lerobot", write)
+    given: Any = {"world": world, "lerobot": dataset}
+    with pytest.raises(KeyboardInterrupt):
+        augment(tmp_path / "out", asked(episodes=2), **given)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+    stopped.append(False)
+    made = augment(tmp_path / "out", asked(episodes=2), **given)
+    before = {path: path.stat().st_mtime_ns for path in dataset.rglob("*")}
+    assert augment(tmp_path / "out", asked(episodes=2), **given) == made and len(written) == 1
+    assert before == {path: path.stat().st_mtime_ns for path in dataset.rglob("*")}
+    (dataset / "synthetic.json").unlink()
+    with pytest.raises(OutputError, match="rails: holds something else — remove it or choose another"):
+        augment(tmp_path / "out", asked(episodes=2), **given)
 
 
 def test_a_robot_without_simulator_needs_shards(tmp_path: Path) -> None:

@@ -7,12 +7,20 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import h5py
 import pytest
 
+from hma_data.conversion.job import convert
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.reader import ShardSet
+from hma_model.simulate import server
 from hma_model.simulate.engine import Engine
+from hma_model.simulate.scenes import RecordedRobot
 from hma_model.simulate.server import Server, run
+from tests.conftest import BlockTokenizer
 from tests.model.simulate.worlds import TrueWorld, lab_robots
 
 if TYPE_CHECKING:
@@ -33,6 +41,45 @@ def engine() -> Iterator[Engine]:
 def address(engine: Engine) -> Iterator[str]:
     with serving(engine) as port:
         yield f"http://127.0.0.1:{port}/"
+
+
+class StillWorld(TrueWorld):
+    """A model in which nothing moves."""
+
+    def open(self, embodiment: str, frames: Any, chunks: Any = None, *, seed: int = 0) -> int:
+        self._count += 1
+        self.rows[self._count] = frames[-1]
+        return self._count
+
+    def reset(self, session: int, frames: Any, chunks: Any = None, *, seed: int | None = None) -> None:
+        self.rows[session] = frames[-1]
+
+    def step(self, commands: Any) -> Any:
+        return {row: self.rows[row] for row in commands}
+
+    def picture(self, session: int) -> Any:
+        return self.rows[session]
+
+
+@pytest.fixture
+def recorded(
+    toy_arm: Embodiment, toy_recording: Path, block_tokenizer: BlockTokenizer, tmp_path: Path
+) -> Iterator[Engine]:
+    """A robot of recordings whose YAML names no value of the command."""
+    values = toy_arm.to_dict()
+    (part,) = values["action"]["components"]
+    with h5py.File(toy_recording, "a") as file:
+        for episode in file["data"].values():
+            episode["cmd/joint target"] = episode[part["key"]][:]
+    values["action"]["components"] = [{"key": "cmd/joint target", "dims": part["dims"]}]
+    own = Embodiment.from_values(values, "toy_arm")
+    convert(own, toy_recording, block_tokenizer, tmp_path / "shards")
+    shards = ShardSet(tmp_path / "shards")
+    robot = RecordedRobot(shards, lambda: block_tokenizer, shards.manifest.stats, "first")
+    made = Engine(StillWorld(), {robot.key: robot})
+    made.start()
+    yield made
+    made.stop()
 
 
 @contextmanager
@@ -290,6 +337,47 @@ def test_a_drive_is_downloaded(page: "Page") -> None:
     assert download.value.suggested_filename == "mover_04-scene-0.mp4"
 
 
+def test_a_file_that_is_prepared_says_how_far_it_is_and_the_page_goes_on(
+    page: "Page", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = threading.Event()
+
+    def write(kind: str, robot: Any, shown: Any, tell: Any) -> bytes:
+        tell("loading lerobot", 0, 40)
+        assert go_on.wait(20)
+        tell("writing frames", 20, 40)
+        return b"a zip"
+
+    monkeypatch.setattr(server, "film", write)
+    page.click("#run")
+    frames(page, 3)
+    with page.expect_download() as download:
+        page.click("[data-save=lerobot]")
+        page.wait_for_selector("#saving:has-text('LeRobot: loading lerobot, some seconds the first time …')")
+        frames(page, int(page.get_attribute("body", "data-frame") or 0) + 3)
+        go_on.set()
+    assert download.value.suggested_filename == "mover_04-scene-0.zip"
+    page.wait_for_selector("#saving", state="hidden")
+    page.wait_for_selector("#note:has-text('Saved mover_04-scene-0.zip')")
+
+
+def test_a_recording_has_readable_names_and_its_end_offers_no_pause(
+    browser: "Browser", recorded: Engine
+) -> None:
+    with serving(recorded) as port:
+        context = browser.new_context(viewport={"width": 1280, "height": 800})
+        page = opened(context.new_page(), f"http://127.0.0.1:{port}/", "toy_arm:recordings")
+        assert page.locator("#dims label").all_text_contents() == [f"joint target {i}" for i in range(3)]
+        page.locator("input[value=fast]").check(force=True)
+        page.click("#replay")
+        page.wait_for_selector("#start:has-text('End of the recording')")
+        assert (page.text_content("#run") or "").split()[0] == "Run" and page.is_disabled("#run")
+        assert page.text_content("#fps") == "–" and page.text_content("#robot option") == "toy_arm"
+        page.click("#reset")
+        page.wait_for_selector("#run:not([disabled])")
+        context.close()
+
+
 def test_a_closed_session_offers_to_start_again(page: "Page", engine: Engine) -> None:
     name = session_of(engine, page).name
     engine.call(lambda: engine.close(name, "Closed, because nothing was done for 5 minutes.")).result(10)
@@ -349,7 +437,7 @@ def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", en
     engine.call(lambda: engine._world.blind.clear()).result(10)  # type: ignore[attr-defined]
     page.keyboard.press("y")
     page.wait_for_selector("#parted:has-text('parted')", state="hidden")
-    assert page.get_attribute("#sync", "class") == ""
+    page.wait_for_selector("#sync:not(.call)")
 
 
 def test_a_page_whose_server_stopped_says_so_and_goes_on_when_it_is_back(

@@ -17,6 +17,7 @@ from gymnasium.wrappers import RecordVideo
 
 from hma_data.errors import HMAError
 from hma_data.tokenizers.base import get_tokenizer
+from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.network.model import HMA
 from hma_model.simulate import World, WorldModelEnv, WorldModelVectorEnv, starting_window
 
@@ -269,6 +270,19 @@ def test_bad_actions_are_refused_and_the_episode_goes_on(
 def test_bad_settings_are_refused(world: World, change: dict[str, Any], message: str) -> None:
     with pytest.raises(HMAError, match=message):
         WorldModelEnv(**{"embodiment": PUSH, "world": world, **change})
+
+
+@pytest.mark.slow
+def test_the_examples_of_the_page_run_without_a_warning() -> None:
+    page = (Path(__file__).parents[3] / "docs/environment.md").read_text()
+    first, by_hand = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        exec(first, {})
+        exec(by_hand, {})
+    assert [str(one.message) for one in warned] == []
+    with pytest.warns(OutsideRangeWarning, match="x 15 to 497, y 15 to 497"):
+        exec(first.replace(", clip=True", "").replace("env.action_space.sample()", "[0, 512]"), {})
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Film gets commands: shards that verify and say that they are inferred, with their true error."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from hma_model.simulate import World, labels, read_prompt
 from hma_model.simulate.labels import ShardFilm, VideoFilm, infer, label_actions
 from tests.conftest import BlockTokenizer
 from tests.data import cameras
+from tests.model.shards import state_pauses
 from tests.model.simulate.worlds import tiny_model, trained_on
 
 ROBOT = "rails_03"
@@ -124,6 +126,25 @@ def test_labels_no_better_than_the_mean_are_refused(world: World, real: Path, tm
     assert not (tmp_path / "out").exists()
 
 
+def test_film_that_pauses_is_labelled_in_parts(world: World, real: Path, tmp_path: Path) -> None:
+    paused = shutil.copytree(real, tmp_path / "paused")
+    shards, (row, *_) = ShardSet(paused), ShardSet(paused).episodes.to_pylist()
+    whole = ShardFilm(world, shards, shards.row_stride)
+    state_pauses(paused, {10: 90})
+    film = ShardFilm(world, ShardSet(paused), shards.row_stride)
+    name = row["id"]
+    assert [head[:2] for head in film.heads()][:2] == [
+        (f"{name}_from_0", row["group"] or name),
+        (f"{name}_from_11", row["group"] or name),
+    ]
+    assert len(film.heads()) == len(whole.heads()) + 1 == len(film.splits())
+    stored, actions, known = film.labelled(0)
+    steps = -(-11 // shards.row_stride)
+    np.testing.assert_array_equal(stored, whole.labelled(0)[0][:steps])
+    assert len(actions) == steps and known.all() == (11 % shards.row_stride == 0)
+    assert len(film.read(1)) == -(-(row["length"] - 11) // shards.row_stride)
+
+
 def film(folder: Path) -> np.ndarray:
     """Write a video of thirty grey pictures at 30 Hz, and return their levels."""
     levels = np.linspace(20, 230, 30).astype(np.uint8)
@@ -144,6 +165,8 @@ def test_what_cannot_be_labelled_is_refused(world: World, tmp_path: Path) -> Non
     (tmp_path / "empty").mkdir()
     with pytest.raises(UsageError, match="empty: is no shard set and no folder with video files"):
         run(tmp_path / "empty")
+    with pytest.raises(UsageError, match="nothing: does not exist — give a folder of .mp4"):
+        run(tmp_path / "nothing", world=None, checkpoint="no such checkpoint")  # the film is looked at first
     (tmp_path / "out").write_text("")
     with pytest.raises(OutputError, match="out: is a file"):
         run()

@@ -1,5 +1,6 @@
 """Prompts from everything that an episode may start from."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from hma_model.cli import main
 from hma_model.network.model import HMA
 from hma_model.simulate import read_prompt, starting_window
 from tests.model.network_parts import small_model
+from tests.model.shards import state_pauses
 
 MOVER, ARM = "mover_10", "planar_arm"
 
@@ -120,6 +122,20 @@ def test_windows_that_are_not_there_are_refused(model: HMA, shards: Path) -> Non
         read_prompt(model, MOVER, {"shards": shards, "start": 900})
     with pytest.raises(HMAError, match="5 actions of 2 values in a chunk — planar_arm takes 3 of 2"):
         read_prompt(model, ARM, shards)
+
+
+@pytest.mark.slow
+def test_a_prompt_crosses_no_pause(model: HMA, shards: Path, tmp_path: Path) -> None:
+    paused = shutil.copytree(shards, tmp_path / "paused")
+    state_pauses(paused, {7: 90, 40: 4})  # the second is shorter than a step of the model, 5
+    first, _ = read_prompt(model, MOVER, paused)
+    assert np.array_equal(first, read_prompt(model, MOVER, {"shards": shards, "start": 8})[0])
+    with pytest.raises(HMAError, match="4 frames, 5 rows apart, from row 3 on cross the pause after row 7"):
+        read_prompt(model, MOVER, {"shards": paused, "start": 3})
+    for start, frames in ((0, 2), (8, 4), (30, 4)):
+        given = {"start": start, "frames": frames}
+        whole, pausing = (read_prompt(model, MOVER, {"shards": s} | given) for s in (shards, paused))
+        assert np.array_equal(whole[0], pausing[0]) and np.array_equal(whole[1], pausing[1])
 
 
 def test_another_robot_needs_a_prompt() -> None:

@@ -2,7 +2,11 @@
 
 import io
 import zipfile
+from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,12 +23,13 @@ from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.simulate.films import film, lerobot_episode
-from hma_model.simulate.pads import Pad, hint, pads
+from hma_model.simulate.pads import Pad, describe, hint, labels, pads
 from hma_model.simulate.scenes import PROMPT, LabRobot, RecordedRobot, apart, drivable
 from hma_model.simulate.session import Frame, Sampling, Session, jpeg
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
 from tests.model.robots import save
+from tests.model.shards import state_pauses
 from tests.model.simulate.worlds import TrueWorld, lab_robots
 
 RIGHT_DOWN, UP = (False, False), (False, True)
@@ -85,6 +90,28 @@ def test_a_robot_says_what_a_drag_on_its_picture_does() -> None:
     assert said["arm4_04"].endswith(
         "on its left half joint 1 and joint 2, on its right half joint 3 and joint 4"
     )
+
+
+def test_values_without_names_are_labelled_by_the_end_of_their_key() -> None:
+    (robot,) = lab_robots("mover_04").values()
+    given: list[tuple[list[dict[str, Any]], list[str]]] = [
+        ([{"key": "cmd/joint target", "dims": 2}], ["joint target 0", "joint target 1"]),
+        ([{"key": "left/q", "dims": 1}, {"key": "right/q", "dims": 1}], ["left q", "right q"]),
+        ([{"key": "/arm/cmd.position", "dims": 1, "names": ["elbow_joint"]}], ["elbow joint"]),
+        ([{"key": "/arm/cmd.position", "dims": 1}, {"key": "grip", "dims": 1}], ["cmd position", "grip"]),
+        (
+            [{"key": "action", "dims": 2, "slice": [0, 2]}, {"key": "action", "dims": 1, "slice": [2, 3]}],
+            ["action 0", "action 1", "action 2"],
+        ),
+    ]
+    for components, wanted in given:
+        values = robot.embodiment.to_dict()
+        values["action"] = {"space": "joint_position", "components": components}
+        own = Embodiment.from_values(values, "a robot")
+        dims = tuple(replace(robot.dimensions[0], name=name) for name in own.action.names())
+        shown: Any = SimpleNamespace(key="a", source="recordings", embodiment=own, dimensions=dims)
+        assert labels(shown) == [one["label"] for one in describe(shown)["dimensions"]] == wanted
+        assert hint(shown).endswith(wanted[1] if len(wanted) == 2 else wanted[0]) or len(wanted) == 3
 
 
 def test_all_robots_of_the_embedded_model_can_be_driven() -> None:
@@ -161,6 +188,22 @@ def test_a_recordings_truth_is_known_for_its_own_commands(
     assert followed is not None and followed[1] is None  # it was left
 
 
+def test_no_scene_of_a_recording_crosses_a_pause(shards: ShardSet, block_tokenizer: BlockTokenizer) -> None:
+    rows = shards.episodes.to_pylist()
+    state_pauses(shards.folder, *[{row["length"] // 3: 50, row["length"] // 3 + 1: 50} for row in rows])
+    robot = RecordedRobot(ShardSet(shards.folder), lambda: block_tokenizer, shards.manifest.stats, "first")
+    scene, frames = robot.scene(0), PROMPT
+    while (step := scene.advance(None)) is not None:
+        assert step[1] is not None
+        frames += 1
+    longest = max(row["length"] - row["length"] // 3 - 2 for row in rows)
+    assert PROMPT < frames <= longest // shards.row_stride
+    state_pauses(shards.folder, *[dict.fromkeys(range(row["length"]), 50) for row in rows])
+    robot = RecordedRobot(ShardSet(shards.folder), lambda: block_tokenizer, shards.manifest.stats, "first")
+    with pytest.raises(UsageError, match="has no episode longer than 4 frames without a pause"):
+        robot.scene(0)
+
+
 def test_new_scenes_come_to_every_window_once_before_any_comes_again() -> None:
     for count in range(1, 201):
         assert {number * apart(count) % count for number in range(count)} == {*range(count)}
@@ -233,7 +276,15 @@ def test_a_saved_dataset_reads_as_what_was_driven(name: str, tmp_path: Path) -> 
         chunk = session.next_chunk()
         assert chunk is not None
         session.take(world.step({session.row: chunk})[session.row], float(now), 0.0)
-    with zipfile.ZipFile(io.BytesIO(film("lerobot", robot, session.film()))) as archive:
+    told: list[tuple[str, int, int]] = []
+    data = film("lerobot", robot, session.film(), lambda *words: told.append(words))
+    rows = 6 * robot.embodiment.stride
+    assert [words for words, _ in groupby(words for words, *_ in told)] == [
+        "loading lerobot", "writing frames", "encoding videos", "packing the files",
+    ]  # fmt: skip
+    assert [done for words, done, _ in told if words == "writing frames"] == [*range(1, rows + 1)]
+    assert {total for *_, total in told} == {rows}
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
         archive.extractall(tmp_path)
     own = Embodiment.load(tmp_path / name / "embodiment.yaml")
     source = open_source("lerobot")

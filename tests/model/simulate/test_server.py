@@ -256,6 +256,12 @@ def test_what_was_driven_is_saved(client: TestClient) -> None:
         assert 'filename="mover_04-scene-0.mp4"' in answer.headers["content-disposition"]
         with av.open(BytesIO(answer.content)) as film:
             assert sum(1 for _ in film.decode(video=0)) == 4  # and the prompt's last frame
+        said = [page.message("saving") for _ in range(2)]
+        assert [(one["file"], one["text"]) for one in said] == [
+            ("mp4", "writing frames"),
+            ("mp4", "encoding the film"),
+        ]
+        assert said[0]["done"] == 1 and said[1]["done"] == said[1]["total"] == 4
         assert client.get(f"/save?kind=gif&session={name}").content[:6] == b"GIF89a"
     for query in ("kind=mp4&session=../../etc/passwd", f"kind=../page&session={name}", ""):
         assert client.get(f"/save?{query}").status_code == 404
