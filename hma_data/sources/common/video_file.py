@@ -288,7 +288,7 @@ def _quarters(frame: Any) -> int:
 
 
 def decoded_size(container: Any, stream: Any) -> tuple[int, int]:
-    """Return width and height of the decoded pictures, by the first one; those of the header if it is damaged.
+    """Return width and height of the decoded pictures, by the first; of the header where it is damaged.
 
     The container is read beyond that picture then.
     """
