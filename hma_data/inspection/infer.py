@@ -119,6 +119,17 @@ def commands(found: Inspection) -> dict[str, Offset]:
         return {}
 
 
+def lacking(found: Inspection) -> str:
+    """Return what a recording lacks for `infer`, as "has no colour camera"; empty where it lacks nothing."""
+    if found.format == "hands":
+        return ""
+    try:
+        _Draft(found)
+    except SourceError as fault:
+        return fault.fault.partition(";")[0]
+    return ""
+
+
 def _in_registry(found: Inspection, values: dict[str, Any]) -> str:
     """Return one line that names the embodiments which may be this robot; empty where there are none.
 

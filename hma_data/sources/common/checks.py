@@ -411,7 +411,7 @@ def picture_findings(looks: dict[str, Look]) -> Iterator[Finding]:
         share = look.same / max(look.neighbours, 1)
         if share > STILL and look.blank < look.episodes:
             said = f"{key}: {share:.0%} of neighbouring pictures are equal"
-            remedy = "the camera may be slower than its rate"
+            remedy = f"the camera may be {'frozen' if share == 1 else 'slower than its rate'}"
             yield Finding("still", "warn", said, remedy, key, {"share": share, "pairs": look.neighbours})
         sureness, reason = look.swapped()
         if sureness == "sure":
