@@ -51,28 +51,72 @@ def print_json(values: Any) -> None:
 
 
 MAX_TITLE = 40  # letters in the column of titles; a longer title pushes its text to the right
+GAP = 3  # letters between columns
 MANY_ROWS = 500  # laying out more than this with rich takes seconds
 
 
-def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: str = "") -> None:
-    """Print a table to standard output: numbers aligned right, full width when it is not a terminal."""
+def print_table(
+    columns: Sequence[str], rows: Sequence[Sequence[Any]], title: str = "", repeated: int = 1
+) -> None:
+    """Print a table to standard output: numbers aligned right, full width when it is not a terminal.
+
+    Args:
+        columns: headings.
+        rows: a cell for each column.
+        title: printed above.
+        repeated: where a terminal is too narrow for numbers, the table is cut into several below each other;
+            each begins with so many of the first columns.
+    """
     if len(rows) > MANY_ROWS:
         _print_columns(columns, rows)
         return
+    cells = [[_cell(value) for value in row] for row in rows]
+    numeric = [_is_numeric([row[i] for row in rows]) for i in range(len(columns))]
+    widths = [max(map(len, [name, *(row[i] for row in cells)])) for i, name in enumerate(columns)]
+    console = stdout()
+    parts = [[*range(len(columns))]]
+    if sys.stdout.isatty() and all(numeric[repeated:]):
+        parts = _parts(widths, repeated, console.width)
+    for part in parts:
+        console.print(_table(columns, cells, numeric, part, title if part is parts[0] else ""))
+
+
+def _table(
+    columns: Sequence[str], cells: list[list[str]], numeric: list[bool], part: list[int], title: str
+) -> Any:
+    """Return the columns of those indices as a table of rich."""
     from rich.box import SIMPLE
     from rich.markup import escape
     from rich.table import Table
 
-    heads = [escape(column) for column in columns]
+    heads = [escape(columns[i]) for i in part]
     table = Table(*heads, title=escape(title) or None, title_justify="left", box=SIMPLE, pad_edge=False)
     table.columns[0].overflow = "fold"  # users type it into the next command, so it is never cut short
-    for i, column in enumerate(table.columns):
-        values = [row[i] for row in rows]
-        if any(isinstance(value, int | float) for value in values) and not any(map(_is_word, values)):
+    for column, i in zip(table.columns, part, strict=True):
+        if numeric[i]:
             column.justify, column.no_wrap = "right", True
-    for row in rows:
-        table.add_row(*(escape(_cell(value)) for value in row))
-    stdout().print(table)
+    for row in cells:
+        table.add_row(*(escape(row[i]) for i in part))
+    return table
+
+
+def _parts(widths: Sequence[int], repeated: int, room: int) -> list[list[int]]:
+    """Divide the columns into parts that fit a terminal, each with the first ones again."""
+    first = list(range(repeated))
+    names = min(sum(widths[:repeated]) + GAP * repeated, room // 2)  # longer names are folded
+    parts: list[list[int]] = []
+    left = -1
+    for i in range(repeated, len(widths)):
+        left -= widths[i] + GAP
+        if left < 0 or not parts:
+            parts.append([*first])
+            left = room - names - widths[i] - GAP
+        parts[-1].append(i)
+    return parts or [first]
+
+
+def _is_numeric(values: Sequence[Any]) -> bool:
+    return any(isinstance(value, int | float) for value in values) and not any(map(_is_word, values))
 
 
 def stdout() -> Any:

@@ -4,6 +4,7 @@ import ast
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from typing import Any
 
 import pytest
 import typer
+from playwright.sync_api import sync_playwright
 
 from hma_model.cli import app
 from tests.command import ROOT
@@ -42,6 +44,23 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_
         assert not re.search(r"(@import|url\()\s*[\"']?(https?:)?//", sheet.read_text()), sheet
     assert "def generate" not in (tmp_path / "reference/python.html").read_text()  # signatures, not source
     assert 'id="hma_model.network.model.HMA.generate"' in (tmp_path / "reference/python.html").read_text()
+    require_search_from_a_folder(tmp_path)
+
+
+def require_search_from_a_folder(site: Path) -> None:
+    """Search in the site as it is opened from the disk, where there is a browser."""
+    assert (site / "search/search_index.js").is_file() and (site / "iframe-worker.js").is_file()
+    if not (chromium := shutil.which("chromium")):
+        return
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.goto((site / "index.html").as_uri())
+        page.locator(".md-search__input").press_sequentially("quarantine.jsonl")
+        found = page.locator(".md-search-result__item a").first
+        found.wait_for(state="attached")
+        assert "format.html" in (found.get_attribute("href") or "")
+        browser.close()
 
 
 def reference() -> Any:

@@ -123,6 +123,7 @@ def _print_checks(report: dict[str, Any]) -> None:
         said = f"{finding['severity']}: {finding['message']}{remedy}"
         findings.setdefault(finding["check"], []).append(said)
     titles = {**CHECKS, "fits": "the embodiment fits", "usable": "episodes the embodiment can use"}
+    titles["robot"] = "pictures and commands of a robot"
     done = {check: result for check, result in report["checks"].items() if result != NOT_LOOKED}
     print_lines(
         (titles.get(check, check), line)

@@ -235,10 +235,12 @@ def registry_infer(
     for line in text.splitlines()[1:2]:
         if line.startswith("# "):
             print(line[2:])
-    for said in ("sync", "segments"):
-        if measured := values.get("provenance", {}).get(said):
+    asked = todos(values)
+    for said in ("cameras", "sync", "segments"):
+        measured = values.get("provenance", {}).get(said)
+        if measured and f"provenance.{said}" not in dict(asked):
             print(measured)
-    for path, question in todos(values):
+    for path, question in asked:
         print(f"answer {path}: {question}")
     print(f"then: hma registry validate {shlex.quote(str(out))}")
 

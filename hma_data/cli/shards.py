@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
-from hma_data.console import Update, human_bytes, human_count, print_json, print_table, progress
+from hma_data.console import (
+    Update,
+    human_bytes,
+    human_count,
+    human_seconds,
+    print_json,
+    print_table,
+    progress,
+)
 from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
@@ -59,9 +67,10 @@ def _print_info(facts: dict[str, Any]) -> None:
 
     robot, totals, episodes = facts["embodiment"], facts["totals"], facts["episodes"]
     print(f"{facts['folder']}: {robot['id']} × {facts['tokenizer']['name']}, from {facts['source']}")
+    lasting = human_seconds(totals["hours"] * 3600)
     print(
         f"{human_count(totals['episodes'], 'episode')}, {totals['frames']:,} frames at "
-        f"{robot['rows_hz']:g} Hz ({totals['hours']:.2f} h), {human_bytes(totals['bytes'])} in "
+        f"{robot['rows_hz']:g} Hz ({lasting}), {human_bytes(totals['bytes'])} in "
         f"{human_count(facts['shards'], 'shard')} ({facts['bytes_per_frame']:.0f} bytes a frame)"
     )
     print(f"cameras: {robot['cameras_line']}")
@@ -71,9 +80,8 @@ def _print_info(facts: dict[str, Any]) -> None:
     )
     print(
         f"episodes of {episodes['shortest']:,} to {episodes['longest']:,} frames, median "
-        f"{episodes['median']:,.0f}; {episodes['instructions']:,} instructions; "
-        f"{episodes['success']:,} successes, {episodes['failure']:,} failures, "
-        f"{episodes['not_told']:,} not told; skew up to {episodes['worst_skew_ms']:.1f} ms"
+        f"{episodes['median']:,.0f}; {_with_instruction(episodes['instructions'])}; "
+        f"{_successes(episodes)}; skew up to {episodes['worst_skew_ms']:.1f} ms"
     )
     for label in ("flags", "quarantine"):
         for name, count in episodes[label].items():
@@ -93,6 +101,18 @@ def _print_info(facts: dict[str, Any]) -> None:
             [vector, "mean", "std", "min", "max", "q01", "q50", "q99"],
             [[name, *(column[i] for column in columns)] for i, name in enumerate(names)],
         )
+
+
+def _with_instruction(count: int) -> str:
+    return f"{count:,} with an instruction" if count else "no instructions"
+
+
+def _successes(episodes: dict[str, Any]) -> str:
+    """Return how many episodes succeed, in words."""
+    if not episodes["success"] and not episodes["failure"]:
+        return "success not recorded"
+    parts = [f"{episodes['success']:,} succeed, {episodes['failure']:,} fail"]
+    return ", ".join(parts + ([f"{episodes['not_told']:,} not told"] if episodes["not_told"] else []))
 
 
 @shards_app.command("verify")

@@ -47,7 +47,9 @@ def explain(where: str, fault: BaseException) -> HubError:
         case errors.HfHubHTTPError():
             return _answered(where, fault)
         case errors.LocalEntryNotFoundError() if not isinstance(cause, errors.HfHubHTTPError):
-            return HubError(where, "is out of reach, and not in the cache", "go online and pull again")
+            return HubError(
+                where, "is out of reach, and not in the cache", "check the name, go online, run it again"
+            )
         case errors.LocalEntryNotFoundError() | RuntimeError() | ValueError() if isinstance(
             cause, httpx.HTTPError | errors.OfflineModeIsEnabled
         ):

@@ -20,6 +20,7 @@ from hma_data.episodes.offset import Offset
 from hma_data.errors import SourceError, UsageError
 from hma_data.inspection import infer_topics
 from hma_data.inspection.infer_choices import (
+    Choice,
     actions,
     camera_names,
     cameras,
@@ -118,6 +119,17 @@ def commands(found: Inspection) -> dict[str, Offset]:
         return {}
 
 
+def lacking(found: Inspection) -> str:
+    """Return what a recording lacks for `infer`, as "has no colour camera"; empty where it lacks nothing."""
+    if found.format == "hands":
+        return ""
+    try:
+        _Draft(found)
+    except SourceError as fault:
+        return fault.fault.partition(";")[0]
+    return ""
+
+
 def _in_registry(found: Inspection, values: dict[str, Any]) -> str:
     """Return one line that names the embodiments which may be this robot; empty where there are none.
 
@@ -171,7 +183,7 @@ class _Draft:
         self.found = found
         self.bag = found.format == "rosbag"
         self.timed = found.format not in ONE_INDEX  # each key has its own times
-        self.seen = cameras(found.keys)
+        self.seen, self.looks = _showing(cameras(found.keys), found.findings)
         if not self.seen.keys:
             raise _lacks(found, "has no colour camera", [key for key in found.keys if key.kind == "camera"])
         numbers = vectors(found.keys)
@@ -318,8 +330,9 @@ class _Draft:
             )
         if self.action.question:
             said["action"] = f"{TODO}: {self.action.question}"
-        if self.seen.question:
-            said["cameras"] = f"{TODO}: {self.seen.question}"
+        if self.seen.question or self.looks:
+            asked = [f"{TODO}: {self.seen.question}"] if self.seen.question else []
+            said["cameras"] = "; ".join([*asked, *self.looks])
         if levels := [key.key for key in self.seen.keys if key.encoding == "mono16"]:
             said["levels"] = f"from 0 to the largest value of as many bits as {shown(levels)} uses"
         if self.bag:
@@ -353,6 +366,21 @@ class _Draft:
         rates = dict.fromkeys(f"{key.topic.name if key.topic else key.key} {_hz(key)}" for key in moved)
         beside = f"; beside it {shown(rates)}" if rates else ""
         return f"measured: {camera.key} {_hz(camera)}{beside}"
+
+
+def _showing(seen: Choice, findings: Iterable[Finding]) -> tuple[Choice, list[str]]:
+    """Return the cameras without those that show one colour in every episode, and notes on what they show.
+
+    Where all of them do, all are kept: the recording may be all that there is.
+    """
+    keys = {key.key for key in seen.keys}
+    found = [one for one in findings if one.check in ("blank", "still") and one.key in keys]
+    never = {
+        one.key for one in found if one.check == "blank" and one.numbers["blank"] == one.numbers["episodes"]
+    }
+    out = never if never < keys else set()
+    notes = [one.message + (", and is left out" if one.key in out else "") for one in found]
+    return replace(seen, keys=tuple(key for key in seen.keys if key.key not in out)), notes
 
 
 def _levels(key: KeyInfo) -> dict[str, Any]:

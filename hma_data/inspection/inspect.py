@@ -27,9 +27,9 @@ from hma_data.episodes.episode import Clip, Floats
 from hma_data.episodes.images import describe_resize
 from hma_data.episodes.offset import Offset, measure
 from hma_data.errors import HMAError, SourceError
-from hma_data.inspection.infer import commands
+from hma_data.inspection.infer import commands, lacking
 from hma_data.registry.components import Sync
-from hma_data.registry.embodiment import Embodiment, find
+from hma_data.registry.embodiment import ONE_INDEX, Embodiment, find
 from hma_data.sources.base import SAMPLE, Inspection, LaidOut, Source, detect, of_another_format, open_source
 from hma_data.sources.common.checks import SEVERITIES, Finding, Severity
 from hma_data.sources.common.choice import ids_for_robot
@@ -83,7 +83,7 @@ def inspect_recording(
     else:
         offsets = commands(inspection)
         report["facts"] |= {f"commands {name}": offset.measured for name, offset in offsets.items()}
-        found += proposed(offsets)
+        found += [*unanswered(inspection), *proposed(offsets)]
     report["findings"] = [finding.to_json() for finding in found]
     report["problems"] = [str(finding) for finding in found if finding.severity != "info"]
     report["checks"] = _results(inspection.checks, found)
@@ -163,6 +163,19 @@ def _constant(deviations: NDArray[Any], robot: Embodiment) -> list[str]:
     if len(keys) == len(names):  # two keys may have values of one name
         names = [f"{key}'s {name}" if names.count(name) > 1 else name for key, name in zip(keys, names)]
     return list(dict.fromkeys(names[i % len(names)] for i in np.flatnonzero(deviations == 0)))
+
+
+def unanswered(inspection: Inspection) -> Iterator[Finding]:
+    """Yield what the YAML of a robot needs and the recording does not have."""
+    if lack := lacking(inspection):
+        said = f"the recording {lack}"
+        yield Finding(
+            "robot", "warn", said, "record cameras and the robot's commands or joint states together"
+        )
+    if inspection.format in ONE_INDEX and not inspection.hz:
+        yield Finding(
+            "rate", "info", "the recording states no rate", "state frequency_hz in the robot's YAML"
+        )
 
 
 # -- commands beside pictures
@@ -264,6 +277,7 @@ def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Find
         yield EMPTY
     elif robot is None:
         yield from _without_robot(inspection)
+        yield from unanswered(inspection)
         yield from proposed(commands(inspection))
     else:
         yield from _for_robot(inspection, robot)

@@ -63,10 +63,11 @@ def window_finding(shards: ShardSet) -> Finding | None:
 
     if not shards.manifest.splits["train"]["episodes"] or WindowIndex.of(shards, "train", WINDOW).count:
         return None
-    rows, longest = WINDOW * shards.row_stride, int(shards.index("train").length.max())
+    lengths = np.sort(shards.index("train").length)
+    rows, longest, usual = WINDOW * shards.row_stride, int(lengths[-1]), int(lengths[len(lengths) // 10])
     said = f"no window to train on: {WINDOW} frames need {rows} rows, the longest episode has {longest}"
-    fits, frames, remedies = longest // WINDOW, longest // shards.row_stride, []
-    if 0 < fits < shards.row_stride:
+    fits, frames, remedies = max(usual // WINDOW, 1), longest // shards.row_stride, []  # as `hma doctor -e`
+    if longest >= WINDOW and fits < shards.row_stride:
         hz = shards.embodiment.rate_hz / shards.manifest.frame_stride / fits
         remedies.append(f"set target_hz: {hz:.3g} in its YAML and convert again with --overwrite")
     if frames > 1:

@@ -267,6 +267,9 @@ class Embodiment(SpecModel):
     def from_values(cls, values: Any, where: str, *, stored: bool = False) -> "Embodiment":
         """Return the embodiment of a YAML's plain values; see `load`."""
         found = problems(values, stored)
+        if found and all(": still TODO" in problem for problem in found):
+            said = f"still to be answered: {', '.join(path for path, _ in todos(values))}"
+            raise RegistryError(where, said, "write answers in place of the TODOs in the file")
         if found:
             raise RegistryError(where, "; ".join(found), "hma registry schema prints what is allowed")
         return cls.model_validate(values, context={"stored": stored})

@@ -173,6 +173,7 @@ def open_device(name: str, device: str) -> torch.device:
         place = torch.device(device)
         torch.empty(1, device=place)
     except (RuntimeError, AssertionError) as fault:
-        reason = str(fault).splitlines()[0]
-        raise TokenizerError(name, f"cannot run on device {device!r}: {reason}", "use cpu") from fault
+        reason = str(fault).splitlines()[0].split(". ")[0]  # what follows is where drivers are had
+        remedy = "use --device cpu" + (", or install the driver" if "driver" in reason else "")
+        raise TokenizerError(name, f"cannot run on device {device!r}: {reason}", remedy) from fault
     return place

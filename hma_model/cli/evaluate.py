@@ -206,7 +206,7 @@ def _print_table(parts: "Sequence[Part]") -> None:
     from hma_model.evaluation.tables import rows, verdicts
 
     names, lines = rows(parts, intervals=False)
-    print_table(names, [[_number(cell) for cell in line] for line in lines])
+    print_table(names, [[_number(cell) for cell in line] for line in lines], repeated=2)
     _print_absences(parts)
     for whose, said in verdicts(parts):
         print(f"{whose} {said}")

@@ -1,12 +1,13 @@
 """Define the verbs of `hma hub`: publish and fetch checkpoints and shard sets; convert released ones."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from hma_data.console import print_json, print_table
+from hma_data.console import human_bytes, human_count, print_json, print_lines, print_table
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Embodiments = Annotated[
@@ -39,7 +40,32 @@ def push(
 
     if film or sample:
         _add_films(checkpoint, sample, embodiment)
-    print(f"published to {hub.push(checkpoint, target, embodiment, private)}")
+    address = hub.push(checkpoint, target, embodiment, private, _print_files)
+    print(f"published to {address}")
+    robots = "".join(f" -e {shlex.quote(name)}" for name in embodiment or ())
+    print(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {_folder_for(target)}")
+
+
+def _print_files(sizes: dict[str, int]) -> None:
+    """Print what will be sent: a line for each file, of robots one for all of their files."""
+    if not sizes:
+        print("nothing to send: all files are there already")
+        return
+    groups: dict[str, list[int]] = {}
+    for name, size in sizes.items():
+        groups.setdefault("/".join(name.split("/")[:2]), []).append(size)
+    lines = [
+        (name, human_bytes(sum(own)) + (f" in {len(own)} files" if len(own) > 1 else ""))
+        for name, own in groups.items()
+    ]
+    print(f"sending {human_count(len(sizes), 'file')}, {human_bytes(sum(sizes.values()))}")
+    print_lines((f"  {name}", text) for name, text in lines)
+    sys.stdout.flush()  # the transfer's own progress follows on standard error
+
+
+def _folder_for(target: str) -> str:
+    """Return a folder to pull to, named as the published checkpoint."""
+    return shlex.quote(f"{target.rstrip('/').rsplit('/', 1)[-1]}-pulled")
 
 
 def _add_films(checkpoint: Path, sample: list[Path] | None, embodiments: list[str] | None) -> None:

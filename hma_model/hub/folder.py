@@ -79,9 +79,11 @@ class FolderStore:
 
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
         """Check whether a file has this content already; return False in a store, where reading is slow."""
-        if isinstance(self._root, RemotePath) or not isinstance(content, Path):
+        if isinstance(self._root, RemotePath):
             return False
         path = self._root / name
+        if isinstance(content, bytes):
+            return path.is_file() and path.read_bytes() == content
         return path.is_file() and file_sha256(path) == (sha256 or file_sha256(content))
 
     # -- pulling

@@ -7,7 +7,7 @@ folder.
 
 import hashlib
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -86,6 +86,7 @@ def push(
     target: StrPath,
     embodiments: Iterable[str] | None = None,
     private: bool | None = None,
+    told: Callable[[dict[str, int]], None] | None = None,
 ) -> str:
     """Publish embodiments of a checkpoint, and its trunk if the hub has none yet.
 
@@ -94,6 +95,7 @@ def push(
         target: str or path of a folder, a URI, or a repository; it is made if it does not exist.
         embodiments: ids; None for all.
         private: make a new repository a private one.
+        told: called once before anything is sent, with the files to send and their sizes in bytes.
 
     Returns:
         The address of the published checkpoint: a path, URI or web address.
@@ -108,8 +110,16 @@ def push(
     _require_publishable(source, ids)
     store = open_store(target, write=True, private=private)
 
+    tell = [told] if told else []
+
+    def changes() -> dict[str, Content | None]:
+        files = _changes(source, ids, store)
+        while tell:  # once: a store may ask again
+            tell.pop()(_sizes(files, store))
+        return files
+
     message = f"Add {', '.join(ids)}" if ids else "Add the trunk"
-    return store.publish(lambda: _changes(source, ids, store), message)
+    return store.publish(changes, message)
 
 
 def pull(
@@ -308,6 +318,15 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
     config = checkpoints.config_json(source.config, source.trunk_sha256)
     present[README] = render(config, cards, repo=store.repo, samples=samples)
     return present
+
+
+def _sizes(files: dict[str, Content | None], store: Store) -> dict[str, int]:
+    """Return the sizes in bytes of the files that the store has not yet."""
+    return {
+        name: content.stat().st_size if isinstance(content, Path) else len(content)
+        for name, content in files.items()
+        if content is not None and not store.has(name, content)
+    }
 
 
 def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> None:

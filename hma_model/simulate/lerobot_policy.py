@@ -5,12 +5,15 @@ N scenes, S pixels a side, S' values of a state.
 
 import sys
 from contextlib import redirect_stdout
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hma_data.errors import HMAError
+from hma_data.hub.repository import Repository
 from hma_data.lab import imported
+from hma_data.storage.paths import REPOSITORY
 from hma_model.simulate.arenas import Arena, Floats, Scenes
 
 STATE, TASK = "observation.state", "task"
@@ -29,6 +32,7 @@ class LeRobotPolicy:
 
     def __init__(self, source: str, scenes: Scenes, device: str = "cpu") -> None:
         self.name = f"policy lerobot:{source}"
+        _require_there(source, self.name)
         with imported("lerobot"):
             from lerobot.configs.policies import PreTrainedConfig
             from lerobot.policies.factory import get_policy_class, make_pre_post_processors
@@ -96,3 +100,15 @@ class LeRobotPolicy:
             )
             raise HMAError(self.name, fault, "give a policy that acts from pictures alone")
         return state
+
+
+def _require_there(source: str, where: str) -> None:
+    """Raise HMAError if there is no such folder or repository; the loader asks the Hub even for a path."""
+    if Path(source).is_dir():
+        return
+    if not REPOSITORY.fullmatch(source):
+        raise HMAError(
+            where, "no such folder", "give the folder of a policy, or ORGANISATION/NAME on the Hub"
+        )
+    if "config.json" not in Repository(source, name=where).files():
+        raise HMAError(where, "has no config.json", "give a policy that lerobot has saved")

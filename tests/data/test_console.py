@@ -1,5 +1,7 @@
 """Progress off a terminal: amounts in their unit, elapsed and remaining time; tables as they are."""
 
+import re
+
 import pytest
 
 from hma_data import console
@@ -52,6 +54,22 @@ def test_brackets_in_tables_are_text(capsys: pytest.CaptureFixture[str]) -> None
     console.print_table(["key [unit]", "n"], [["pose[rad]", 1]], title="in [a]")
     out = capsys.readouterr().out
     assert all(words in out for words in ("key [unit]", "pose[rad]", "in [a]"))
+
+
+@pytest.mark.parametrize("width", [80, 100])
+def test_a_table_too_wide_for_a_terminal_is_cut_into_several(
+    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    figures = [f"figure {i}" for i in range(14)]
+    row = ["runs/first/checkpoints/step-00000620", "arm", *(1000.5 + i for i in range(14))]
+    console.print_table(["checkpoint", "robot", *figures], [row], repeated=2)
+    out = re.sub(r"\x1b\[\d*m", "", capsys.readouterr().out)  # bold headings
+    assert max(map(len, out.splitlines())) <= width and out.count("checkpoint  ") > 1
+    assert all(f"figure {i}" in out for i in range(14)) and all(
+        f"{1000.5 + i:,.4g}" in out for i in range(14)
+    )
 
 
 def test_a_ctrl_c_becomes_an_error_with_the_words() -> None:

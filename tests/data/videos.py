@@ -54,6 +54,17 @@ def encode(
     return path
 
 
+def turn(path: Path) -> Path:
+    """Make an MP4 say that its camera was held upright: decoders turn its pictures clockwise."""
+    whole = path.read_bytes()
+    unit = (1 << 16).to_bytes(4, "big")
+    level = unit + bytes(12) + unit  # of the display matrix
+    quarter = bytes(4) + unit + bytes(4) + (-(1 << 16)).to_bytes(4, "big", signed=True) + bytes(4)
+    at = whole.index(level, whole.index(b"tkhd"))
+    path.write_bytes(whole[:at] + quarter + whole[at + 20 :])
+    return path
+
+
 CAMERA = "observation.images.cam"
 STILL = "observation.images.still"
 TASKS = ("push the block", "lift the block")

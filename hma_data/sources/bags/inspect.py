@@ -176,12 +176,14 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
         if budget.spent:
             break
     if first is None:
-        faults = [str(one) for one in survey.findings(()) if one.severity != "info"]
-        raise SourceError(uri, f"nothing to inspect: {faults[0] if faults else 'no bag holds a message'}")
+        faults = [one for one in survey.findings(()) if one.severity != "info"]
+        told, remedy = (faults[0].message, faults[0].remedy) if faults else ("no bag holds a message", "")
+        own = told.removeprefix(f"{uri}: ")
+        raise SourceError(uri, own if own != told else f"nothing to inspect: {told}", remedy)
     keys = tuple(survey.key(key) for key in _with_offsets(first.keys, clocks, survey))
     camera = next((key for key in keys if key.kind == "camera"), None)
     frames = [counts[camera.key] for counts in lengths] if camera else []
-    facts = {"keys and rates of": str(first.bag.path)}
+    facts = {} if str(first.bag.path) == uri else {"keys and rates of": str(first.bag.path)}
     if budget.spent:
         facts["measured up to"] = f"{MAX_MESSAGES:,} messages or {MAX_BYTES >> 20:,} MiB; counts are whole"
     return Inspection(

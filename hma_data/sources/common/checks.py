@@ -406,11 +406,12 @@ def picture_findings(looks: dict[str, Look]) -> Iterator[Finding]:
             said = f"{key}: shows only one colour in {look.blank} of {look.episodes} episodes looked at"
             # Where every episode is blank, the camera was never plugged in.
             severity: Severity = "info" if look.blank == look.episodes else "warn"
-            yield Finding("blank", severity, said, "check the camera's key in the YAML", key)
+            numbers = {"blank": look.blank, "episodes": look.episodes}
+            yield Finding("blank", severity, said, "check the camera's key in the YAML", key, numbers)
         share = look.same / max(look.neighbours, 1)
         if share > STILL and look.blank < look.episodes:
             said = f"{key}: {share:.0%} of neighbouring pictures are equal"
-            remedy = "the camera may be slower than its rate"
+            remedy = f"the camera may be {'frozen' if share == 1 else 'slower than its rate'}"
             yield Finding("still", "warn", said, remedy, key, {"share": share, "pairs": look.neighbours})
         sureness, reason = look.swapped()
         if sureness == "sure":

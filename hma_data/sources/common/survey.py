@@ -305,7 +305,9 @@ class Survey:
                 whole.append(key)
                 continue
             stated = names.get(key)
-            said = "" if len(held.low) == 1 else f" in dims {', '.join(map(str, still))}"
+            said = (
+                "" if len(held.low) == 1 else f" in dim{'s' * (len(still) > 1)} {', '.join(map(str, still))}"
+            )
             if stated and len(stated) == len(held.low):
                 said = f" in {listed([stated[i] for i in still])}"
             severity: Severity = "warn" if command and not self.by_field else "info"

@@ -45,7 +45,7 @@ class FrameTable:
         stamps: (N,) the same in ticks of the stream.
         keys: (N,) for each frame the index of the keyframe its decoding starts from.
         seek_stamps: (N,) ticks to seek to for that keyframe; may differ from when it is shown.
-        width, height: pixels, as stored.
+        width, height: pixels of the decoded pictures.
         codec: h264, av1, hevc, vp9, …
         hz: stated rate; None where the file states none.
         counted: whether the container's times are those of packets, not of frames (B-frames in AVI);
@@ -67,7 +67,7 @@ class FrameTable:
 
 
 def frame_table(path: Path) -> FrameTable:
-    """Return the frames of a video file, without decoding any.
+    """Return the frames of a video file; only the first is decoded, for its size.
 
     Raises:
         EpisodeError: there is no such file, no video in it, or it is damaged.
@@ -81,6 +81,8 @@ def frame_table(path: Path) -> FrameTable:
 
 @lru_cache(maxsize=64)  # LeRobotDataset v3 keeps hundreds of episodes in one file
 def _cached_table(path: str, size: int, changed: int) -> FrameTable:
+    with opened(path) as (container, stream):
+        size_px = decoded_size(container, stream)
     with opened(path) as (container, stream):
         shown: list[int] = []
         keyframes: list[tuple[int, int]] = []
@@ -100,11 +102,16 @@ def _cached_table(path: str, size: int, changed: int) -> FrameTable:
                 shown.append(stamp)
         timeless = "avi" in container.format.name or delays <= {0, None}
         counted = bool(stream.codec_context.has_b_frames) and timeless and len(delays) == 1
-        return _table(path, stream, shown, keyframes, counted)
+        return _table(path, stream, shown, keyframes, counted, size_px)
 
 
 def _table(
-    path: str, stream: Any, shown: list[int], keyframes: list[tuple[int, int]], counted: bool
+    path: str,
+    stream: Any,
+    shown: list[int],
+    keyframes: list[tuple[int, int]],
+    counted: bool,
+    size_px: tuple[int, int],
 ) -> FrameTable:
     stamps = np.sort(np.array(shown, np.int64))
     if not len(stamps) or not keyframes:
@@ -119,8 +126,8 @@ def _table(
         stamps=stamps,
         keys=np.searchsorted(stamps, starts[order, 0]),
         seek_stamps=starts[order, 1],
-        width=stream.width,
-        height=stream.height,
+        width=size_px[0],
+        height=size_px[1],
         codec=stream.codec.canonical_name,
         hz=float(rate) if rate else None,
         counted=counted,
@@ -272,8 +279,29 @@ class VideoFile:
         rgb = self._converter(frame)
         plane = rgb.planes[0]  # its bytes are copied once, into the array that `frames` returns
         lines = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: rgb.height, : rgb.width * 3]
-        quarters = round(frame.rotation / 90) % 4  # phones state here that they were held upright
-        return np.rot90(lines.reshape(rgb.height, rgb.width, 3), quarters)
+        return np.rot90(lines.reshape(rgb.height, rgb.width, 3), _quarters(frame))
+
+
+def _quarters(frame: Any) -> int:
+    """Return the quarter turns to the left that a frame asks for: phones state here how they were held."""
+    return round(frame.rotation / 90) % 4
+
+
+def decoded_size(container: Any, stream: Any) -> tuple[int, int]:
+    """Return width and height of the decoded pictures, by the first; of the header where it is damaged.
+
+    The container is read beyond that picture then.
+    """
+    from av.error import FFmpegError
+
+    stream.codec_context.thread_count = THREADS
+    try:
+        frame = next(container.decode(stream), None)
+    except FFmpegError:
+        frame = None
+    if frame is None:
+        return stream.width, stream.height
+    return (frame.height, frame.width) if _quarters(frame) % 2 else (frame.width, frame.height)
 
 
 def is_spoilt(frame: Any, before: bool) -> bool:

@@ -23,7 +23,7 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import HandsLayout
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import local_path, nothing_there
-from hma_data.sources.common.video_file import opened
+from hma_data.sources.common.video_file import decoded_size, opened
 from hma_data.sources.hands import VIDEO_SUFFIXES
 
 Floats = NDArray[np.float64]
@@ -83,11 +83,11 @@ def _natural_order(name: str) -> list[tuple[int, int, str]]:
 
 @dataclass(frozen=True)
 class Header:
-    """The facts of a video file's header, known without reading its packets."""
+    """The facts of a video file's header and first picture, known without reading its packets."""
 
     frames: int  # how many; 0 where the header does not state it
     hz: float  # stated rate; 0 where none is stated
-    width: int  # pixels, as stored
+    width: int  # pixels of the decoded pictures
     height: int
     codec: str  # h264, av1, …
 
@@ -104,7 +104,7 @@ def header_of(path: Path) -> Header:
         if not seconds and container.duration:
             seconds = container.duration / 1e6
         frames = stream.frames or round(seconds * hz)
-        return Header(frames, hz, stream.width, stream.height, stream.codec.canonical_name)
+        return Header(frames, hz, *decoded_size(container, stream), stream.codec.canonical_name)
 
 
 # -- labels and runs

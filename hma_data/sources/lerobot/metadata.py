@@ -179,12 +179,14 @@ class Folder:
     def _reached(self) -> Iterator[None]:
         from huggingface_hub.errors import HfHubHTTPError, HTTPError
 
+        from hma_data.hub.errors import explain
+
         try:
             yield
         except (HfHubHTTPError, HTTPError, OSError, ValueError) as fault:
-            lines = [line for line in str(fault).splitlines() if line.strip()] or [type(fault).__name__]
-            remedy = "check its name, the network, and access with hf auth login"
-            raise SourceError(self.uri, f"cannot be fetched from the Hub: {lines[0]}", remedy) from fault
+            known = explain(self.uri, fault)
+            said = f"cannot be fetched from the Hub ({known.fault})"
+            raise SourceError(self.uri, said, known.remedy) from fault
 
 
 def _hub_name(uri: str) -> tuple[str | None, str | None]:

@@ -136,6 +136,15 @@ def test_a_set_without_a_window_is_told(tmp_path: Path) -> None:
     )
 
 
+def test_the_rate_that_is_named_gives_nine_of_ten_episodes_a_window(tmp_path: Path) -> None:
+    path = tmp_path / "toy.hdf5"
+    write_toy(path, [59] * 2 + [25] * 18)
+    (note,) = made(
+        path, tmp_path / "out", yaml=ARM_YAML.replace("frequency_hz: 10", "frequency_hz: 10\nstride: 5")
+    ).notes
+    assert "the longest episode has 59 — set target_hz: 5 " in note
+
+
 def test_a_set_without_a_window_at_any_rate_is_told_to_take_fewer_frames(tmp_path: Path) -> None:
     path = tmp_path / "toy.hdf5"
     write_toy(path, [8] * 2)

@@ -138,7 +138,8 @@ def test_a_camera_that_the_robot_does_not_use_is_left_alone(tmp_path: Path) -> N
 def test_the_exit_code_follows_fail_on(tmp_path: Path, limit: str, code: int) -> None:
     examined(tmp_path, set_all("actions", lambda actions: actions * [1, 0, 1]))
     done = CliRunner().invoke(app, ["doctor", str(tmp_path / "toy.hdf5"), "--fail-on", limit, "--json"])
-    (finding,) = json.loads(done.stdout)["findings"]
+    finding, unstated = json.loads(done.stdout)["findings"]
+    assert (unstated["check"], unstated["message"]) == ("rate", "the recording states no rate")
     assert (done.exit_code, finding["check"], finding["numbers"]["dims"]) == (code, "constant", [1])
 
 
@@ -174,3 +175,9 @@ def test_episodes_that_are_refused_come_with_what_to_do(tmp_path: Path) -> None:
     (first, *_) = examined(tmp_path, lambda file: None, yaml)
     assert (first.check, first.severity) == ("usable", "error")
     assert "dims" in first.remedy or "slice" in first.remedy
+
+
+def test_a_recording_without_a_camera_is_no_robots(tmp_path: Path) -> None:
+    examined(tmp_path, lambda file: [file[f"data/{name}"].pop("obs") for name in file["data"]])
+    found = [one for one in examine(tmp_path / "toy.hdf5") if one.check == "robot"]
+    assert [(one.severity, one.message) for one in found] == [("warn", "the recording has no colour camera")]

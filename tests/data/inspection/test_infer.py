@@ -45,6 +45,28 @@ def picture_feature(seed: int = 0) -> tuple[Any, list[bytes]]:
     return image((H, W, 3)), [png(picture) for picture in pictures(seed)]
 
 
+def three_cameras(folder: Path, black: tuple[str, ...]) -> Path:
+    """A dataset of the cameras front, side and top, some black, side frozen."""
+    feature, seen = picture_feature()
+    shown = {"front": seen, "side": seen[:1] * T, "top": seen}
+    dark = [png(np.zeros((H, W, 3), np.uint8))] * T
+    cameras = {name: (feature, dark if name in black else shown[name]) for name in shown}
+    return rlds(folder / "toy" / "0.1.0", {"move": (tensor((2,)), numbers(T, 2).astype(np.float32))}, cameras)
+
+
+def test_a_camera_that_is_always_black_is_left_out_and_a_frozen_one_noted(tmp_path: Path) -> None:
+    values = inferred(three_cameras(tmp_path, black=("front",)))
+    assert keys(values, "cameras") == ["observation/top", "observation/side"]
+    said = values["provenance"]["cameras"]
+    assert "observation/front: shows only one colour in 1 of 1 episodes looked at, and is left out" in said
+    assert "observation/side: 100% of neighbouring pictures are equal" in said and "top" not in said
+
+
+def test_cameras_that_are_all_black_are_kept_and_noted(tmp_path: Path) -> None:
+    values = inferred(three_cameras(tmp_path, black=("front", "side", "top")))
+    assert len(keys(values, "cameras")) == 3 and "left out" not in values["provenance"]["cameras"]
+
+
 def oxe(folder: Path) -> Path:
     """A dataset with actions in parts, as those of Open X-Embodiment have them."""
     grey = [png(picture[..., 0]) for picture in pictures()]
@@ -400,7 +422,8 @@ def test_lerobot_depth_and_grey_features_are_left_out(tmp_path: Path) -> None:
 def test_real_bridge(real_data: Path) -> None:
     path = real_data / "rlds/bridge_dataset/1.0.0"
     values = inferred(path)
-    assert keys(values, "cameras") == [f"observation/image_{i}" for i in range(4)]
+    assert keys(values, "cameras") == [f"observation/image_{i}" for i in range(3)]
+    assert "image_3: shows only one colour" in values["provenance"]["cameras"]  # black in all episodes
     assert (keys(values, "action"), keys(values, "state")) == (["action"], ["observation/state"])
     assert values["source"]["episodes"] == 50 and values["source"]["instruction"] == "language_instruction"
     assert first_clip(path, values).episode.instruction

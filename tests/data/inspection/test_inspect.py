@@ -110,7 +110,7 @@ def test_a_dimension_that_never_changes_in_any_episode_is_told(tmp_path: Path) -
         for demo in file["data"].values():
             demo["actions"][:, 1] = 3
 
-    assert damaged(tmp_path, freeze)["constant"] == ["actions never changes in dims 1"]
+    assert damaged(tmp_path, freeze)["constant"] == ["actions never changes in dim 1"]
 
 
 def test_a_dimension_that_is_constant_in_one_episode_only_is_not(tmp_path: Path) -> None:

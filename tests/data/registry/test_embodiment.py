@@ -342,6 +342,10 @@ def test_open_questions_are_the_problem_not_what_pydantic_says_of_them() -> None
     values = changed("frequency_hz", "TODO: how many commands a second?")
     assert problems(values) == ["frequency_hz: still TODO: how many commands a second?"]
     assert todos({"a": [{"b": "TODO: c?"}]}) == [("a[0].b", "c?")]
+    with pytest.raises(RegistryError) as fault:
+        Embodiment.from_values(values, "arm.yaml")
+    said = "arm.yaml: still to be answered: frequency_hz — write answers in place of the TODOs in the file"
+    assert str(fault.value) == said
 
 
 @settings(max_examples=120, deadline=None)

@@ -386,3 +386,10 @@ def test_real_robot_frames_come_back_as_promised(real_data, fsq16):
 
 
 PROMISED_PSNR_DB, PROMISED_SSIM = 26.0, 0.83
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_gpu_that_is_not_there_is_one_line_without_an_address() -> None:
+    with pytest.raises(TokenizerError, match="cannot run on device 'cuda': .* — use --device cpu") as fault:
+        get_tokenizer("fsq-8", device="cuda")
+    assert "http" not in str(fault.value) and "\n" not in str(fault.value)

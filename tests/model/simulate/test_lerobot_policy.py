@@ -12,8 +12,10 @@ from hma_data.lab import family
 from hma_model.simulate.arenas import Scenes, TrueArena
 from hma_model.simulate.policies import begin, checked, read_policy
 from hma_model.simulate.scenes import LabRobot
+from tests.hub_server import Hub
 
 pytestmark = pytest.mark.slow
+pytest_plugins = ["tests.hub_fixtures"]
 ROBOT, CAMERA, STATE = "rails_03", "observation.images.top", "observation.state"
 
 
@@ -90,3 +92,24 @@ def test_a_state_that_pictures_do_not_tell_is_refused(tmp_path: Path) -> None:
 def test_a_folder_without_a_policy_is_refused(tmp_path: Path) -> None:
     with pytest.raises(HMAError, match="cannot be loaded"):
         read_policy(f"lerobot:{tmp_path}", scenes())
+
+
+@pytest.mark.parametrize("source", ["/nope", "./nope", "nope"])
+def test_a_folder_that_is_not_there_is_not_asked_of_the_hub(source: str) -> None:
+    with pytest.raises(HMAError, match=f"policy lerobot:{source}: no such folder — give the folder"):
+        read_policy(f"lerobot:{source}", scenes())
+
+
+def test_a_repository_out_of_reach_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    with pytest.raises(HMAError, match="is out of reach, and not in the cache — check the name") as fault:
+        read_policy("lerobot:someone/nope", scenes())
+    assert str(fault.value).startswith("policy lerobot:someone/nope: ") and "\n" not in str(fault.value)
+
+
+def test_a_repository_that_is_not_there_is_one_line(server: Hub) -> None:
+    with pytest.raises(HMAError, match="policy lerobot:someone/nope: no such repository, or no access"):
+        read_policy("lerobot:someone/nope", scenes())

@@ -20,7 +20,7 @@ from hma_data.errors import EpisodeError
 from hma_data.registry.components import Camera
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from tests.data.fresh import run_fresh
-from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
+from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture, turn
 
 LENGTH = 40
 
@@ -113,13 +113,9 @@ def test_an_index_outside_is_an_index_error(video: Path) -> None:
 
 
 def test_a_file_filmed_upright_is_turned(tmp_path: Path) -> None:
-    path = encode(tmp_path / "v.mp4", [20, 21])
-    whole = path.read_bytes()
-    unit = (1 << 16).to_bytes(4, "big")
-    upright = unit + bytes(12) + unit
-    quarter = bytes(4) + unit + bytes(4) + (-(1 << 16)).to_bytes(4, "big", signed=True) + bytes(4)
-    at = whole.index(upright, whole.index(b"tkhd"))
-    path.write_bytes(whole[:at] + quarter + whole[at + 20 :])
+    path = turn(encode(tmp_path / "v.mp4", [20, 21]))
+    table = frame_table(path)
+    assert (table.width, table.height) == (HEIGHT, WIDTH)  # as decoded, not as stored
     frame = VideoFile(path).frames([0])[0]
     assert frame.shape == (WIDTH, HEIGHT, 3)  # turned clockwise: the mark goes from top left to top right
     assert frame[:12, -12:].mean() > 200 > frame[-12:].mean()

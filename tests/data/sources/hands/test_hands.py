@@ -15,6 +15,7 @@ from hma_data.errors import EpisodeError
 from hma_data.registry.components import HandsLayout
 from hma_data.registry.embodiment import find
 from hma_data.sources.base import detect, open_source
+from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.runs import (
     KEYS,
     POINTS,
@@ -27,7 +28,7 @@ from hma_data.sources.hands.runs import (
 )
 from tests.data import hands_files as made
 from tests.data.sources.common.test_video_kinds import make
-from tests.data.videos import HEIGHT, WIDTH, encode, number_of
+from tests.data.videos import HEIGHT, WIDTH, encode, number_of, turn
 
 LENGTH = 30
 VIDEO = Header(1_000, 10.0, 100, 50, "h264")
@@ -351,6 +352,12 @@ def test_the_human_embodiments_that_come_along_have_known_keys_and_layouts() -> 
         assert set(keys) <= set(KEYS) and [key.split("/")[0] for key in keys] == ["left", "right"] * 2
         assert robot.cameras[0].key == "video"
         assert layout_of(robot).labels == robot.source.layout["labels"]
+
+
+def test_the_size_of_a_video_filmed_upright_is_that_of_its_pictures(tmp_path: Path) -> None:
+    path = turn(encode(tmp_path / "v.mp4", range(LENGTH)))
+    camera = open_source("hands").inspect(str(path)).keys[0]
+    assert camera.shape == VideoFile(path).frames([0])[0].shape == (WIDTH, HEIGHT, 3)
 
 
 def test_a_folder_of_videos_is_recognised_and_inspected(folder: Path, monkeypatch) -> None:

@@ -468,7 +468,7 @@ def test_inspect_tells_what_looks_wrong(demos: Path) -> None:
         del file["data/demo_3/rewards"]
         file["data/demo_3/rewards"] = np.zeros(2)
     said = " | ".join(open_source("hdf5").inspect(str(demos)).problems)
-    assert "actions never changes in dims 1" in said
+    assert "actions never changes in dim 1" in said
     assert "demo_0: rewards is not finite at step 3" in said
     assert "demo_1: has no actions" in said
     assert "demo_3: of 12 frames, rewards has 2" in said

@@ -98,6 +98,7 @@ def test_what_the_hub_does_not_have_is_one_line(hub: Hub, uri: str) -> None:
     with pytest.raises(SourceError, match="cannot be fetched from the Hub") as found:
         open_source("lerobot").index(uri)
     assert "\n" not in str(found.value) and uri in str(found.value)
+    assert ("no such revision" if "@" in uri else "no such repository, or no access") in str(found.value)
 
 
 def test_a_file_the_hub_lacks_is_one_refused_episode(
