@@ -189,7 +189,8 @@ class HMAConfig:
     # discrete: how a token's digits are predicted. "together": independently of one another (paper).
     # "chain": one after the other, the low one first, each given those before it.
     digit_order: str = "together"
-    # discrete: how likely each digit stays as in the frame before is predicted, beside its value.
+    # How likely each digit stays as in the frame before is predicted beside its value; of latents, the share
+    # of each value that stays.
     copy_previous: bool = False
 
     diffusion_target: str = "velocity"  # what the head predicts: defined at full noise too; "noise" (paper)

@@ -27,7 +27,7 @@ from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import OBJECTIVES, token_words
 from hma_model.evaluation.commands import gaussian, shuffled, shuffled_actions, without_commands
-from hma_model.evaluation.intervals import ends_of, interval, rounded, summary
+from hma_model.evaluation.intervals import NATURAL, SHARE, ends_of, interval, rounded, summary
 from hma_model.evaluation.losses import (
     Means,
     digit_frequencies,
@@ -283,7 +283,7 @@ def _losses(
     """Return the losses, and by the name of each the values (N,) of the windows."""
     if model.config.kind == "continuous":
         loss = np.array(validation_losses(model, batches)[0].samples)
-        return summary("loss", loss, digits=6, episodes=episodes), {"loss": loss}
+        return summary("loss", loss, digits=6, episodes=episodes, within=NATURAL), {"loss": loss}
     forced = [teacher_forced(model, batch.to(model.device)) for batch in batches]
     nats, hits = (torch.cat(part).double().cpu().numpy() for part in zip(*forced, strict=True))
     other = (shuffled(batch, seed=seed, draw=draw) for draw in range(draws) for batch in batches)
@@ -292,7 +292,7 @@ def _losses(
     masked_nats, masked_hits = (torch.cat(part).double().cpu().numpy() for part in zip(*masked, strict=True))
     by_window = {"loss": nats.mean(axis=1), "accuracy": hits.mean(axis=1)}
     by_window |= {"masked_loss": masked_nats, "masked_accuracy": masked_hits}
-    table: dict[str, Any] = summary("loss", by_window["loss"], seed, digits=6, episodes=episodes) | {
+    table: dict[str, Any] = summary("loss", by_window["loss"], seed, 6, episodes, NATURAL) | {
         "shuffled_loss": masked_val_loss(model, other),
         "baseline_loss": unconditional_baseline(
             [shards], batches, cameras, model.config.factored, model.config.merge
@@ -301,10 +301,10 @@ def _losses(
     if table["loss"] is not None:  # a model that takes squares of tokens as one has a loss of squares
         table["stored_loss"] = round(table["loss"] / model.config.merge**2, 6)
     table |= _perplexity("perplexity", by_window["loss"], seed, episodes)
-    table |= summary("accuracy", by_window["accuracy"], seed, digits=6, episodes=episodes)
+    table |= summary("accuracy", by_window["accuracy"], seed, 6, episodes, SHARE)
     table |= _perplexity("masked_perplexity", masked_nats, seed, episodes)
     finite = np.isfinite(masked_hits)
-    table |= summary("masked_accuracy", masked_hits[finite], seed, digits=6, episodes=episodes[finite])
+    table |= summary("masked_accuracy", masked_hits[finite], seed, 6, episodes[finite], SHARE)
     table |= {"loss_by_frame": rounded(nats.mean(axis=0)), "accuracy_by_frame": rounded(hits.mean(axis=0))}
     return table, by_window
 
@@ -314,7 +314,7 @@ def _perplexity(name: str, nats: Floats, seed: int, episodes: NDArray[np.int64])
     nats, episodes = nats[np.isfinite(nats)], episodes[np.isfinite(nats)]
     if not len(nats):
         return {name: None, f"{name}_95": None}
-    ends = np.array([perplexity(float(end)) for end in interval(nats, seed, episodes)])
+    ends = np.array([perplexity(float(end)) for end in interval(nats, seed, episodes, NATURAL)])
     return {name: perplexity(float(nats.mean())), f"{name}_95": ends_of(ends)}
 
 

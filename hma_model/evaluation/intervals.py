@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Episodes = Sequence[int] | NDArray[Any] | None  # (N,) which windows belong together; None: none do
 RESAMPLES, LEVELS = 1000, (2.5, 97.5)
+ANY, NATURAL, SHARE = (-math.inf, math.inf), (0.0, math.inf), (0.0, 1.0)  # what values may be
 Z95 = 1.959964  # the 97.5 % quantile of the normal distribution, and of Student's t from 1 degree of freedom
 T95 = (12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
@@ -64,9 +65,14 @@ def _shares(count: int, seed: int) -> Floats:
     return np.bincount(cells.ravel(), minlength=RESAMPLES * count).reshape(RESAMPLES, count) / count
 
 
-def interval(values: NDArray[Any], seed: int = 0, episodes: Episodes = None) -> Floats:
-    """Return the ends (2, …) of the 95 % interval of the mean of values (N, …); NaN of a single one."""
-    return np.percentile(resampled_means(values, seed, episodes), LEVELS, axis=0)
+def interval(
+    values: NDArray[Any], seed: int = 0, episodes: Episodes = None, within: tuple[float, float] = ANY
+) -> Floats:
+    """Return the ends (2, …) of the 95 % interval of the mean of values (N, …); NaN of a single one.
+
+    `within` are the least and the largest value that is possible, which few episodes would pass.
+    """
+    return np.percentile(resampled_means(values, seed, episodes), LEVELS, axis=0).clip(*within)
 
 
 def rounded(values: Any, digits: int = 4) -> Any:
@@ -77,14 +83,19 @@ def rounded(values: Any, digits: int = 4) -> Any:
 
 
 def summary(
-    name: str, values: NDArray[Any], seed: int = 0, digits: int = 4, episodes: Episodes = None
+    name: str,
+    values: NDArray[Any],
+    seed: int = 0,
+    digits: int = 4,
+    episodes: Episodes = None,
+    within: tuple[float, float] = ANY,
 ) -> dict[str, Any]:
-    """Return the mean of values (N,) as `name`, and its interval as `name_95`.
+    """Return the mean of values (N,) as `name`, and its interval, as of `interval`, as `name_95`.
 
     Both are None if a value is not finite; the interval also of one window or episode.
     """
     mean = rounded(values.mean(), digits) if np.isfinite(values).all() else None
-    ends = None if mean is None else ends_of(interval(values, seed, episodes), digits)
+    ends = None if mean is None else ends_of(interval(values, seed, episodes, within), digits)
     return {name: mean, f"{name}_95": ends}
 
 

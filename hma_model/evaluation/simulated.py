@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hma_data.lab import truth
 from hma_data.loading.dataset import Batch
 from hma_model.evaluation.commands import shuffled, without_commands
-from hma_model.evaluation.intervals import interval, rounded, summary
+from hma_model.evaluation.intervals import NATURAL, interval, rounded, summary
 from hma_model.evaluation.metrics import perplexity, psnr, teacher_forced
 from hma_model.evaluation.probe import Probe, as_seen, state_errors, train_probe
 from hma_model.evaluation.rollouts import Pictures, Sampling, rollout
@@ -124,10 +124,10 @@ def _controllability(probe: Probe, ways: dict[str, Images], parts: Floats, seed:
     }
     for name, pictures in ways.items():
         errors = state_errors(probe, pictures, parts)[..., own].mean(axis=-1)
-        found[name] = summary("error_px", errors.mean(axis=1), seed) | {
-            **summary("error_px_last", errors[:, -1], seed),
+        found[name] = summary("error_px", errors.mean(axis=1), seed, within=NATURAL) | {
+            **summary("error_px_last", errors[:, -1], seed, within=NATURAL),
             "error_px_by_frame": rounded(errors.mean(axis=0)),
-            "error_px_by_frame_95": rounded(interval(errors, seed).T),
+            "error_px_by_frame_95": rounded(interval(errors, seed, within=NATURAL).T),
         }
     return found
 
@@ -145,7 +145,7 @@ def _perturbed(
         found |= summary(f"psnr{mark}_last", signal[:, -1], seed)
         if model.config.kind == "discrete":
             nats = teacher_forced(model, windows.to(model.device))[0].double().cpu().numpy().mean(axis=1)
-            ends = [perplexity(float(end)) for end in interval(nats, seed)]
+            ends = [perplexity(float(end)) for end in interval(nats, seed, within=NATURAL)]
             found[f"perplexity{mark}"] = rounded(perplexity(float(nats.mean())))
             found[f"perplexity{mark}_95"] = rounded(np.array(ends))
     return found

@@ -372,11 +372,12 @@ class Rollout:
         """Return new frames (n, S) of rows, with all their twins last, wholly masked."""
         values = self.state.blank(len(rows))
         generators = self.state.drawing(rows[: len(rows) // (1 + self.twins)])
+        newest = self.state.newest(rows) if self.config.copy_previous else None
         if self.config.kind == "discrete":
-            before = known_digits(self.state.newest(rows), self.config) if self.config.copy_previous else None
+            before = None if newest is None else known_digits(newest, self.config)
             mask, copies = self.config.mask_id, 1 + self.twins
             return TokenFrame(values, mask, self.decoding, generators, copies, before=before)
-        return PatchFrame(values, self.decoding, generators)
+        return PatchFrame(values, self.decoding, generators, newest)
 
     def _show(self, values: Tensor) -> Tensor:
         config = self.config

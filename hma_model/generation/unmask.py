@@ -166,10 +166,17 @@ class PatchFrame:
     Attributes:
         values: (B, S, C) scaled patches.
         masked: (B, S) bool, True for masked patches.
+        before: (B, S, C) those of the frame before; None for models that do not copy it.
     """
 
-    def __init__(self, values: Tensor, decoding: Decoding, generators: Sequence[torch.Generator]) -> None:
-        self.values, self.decoding, self.generators = values, decoding, generators
+    def __init__(
+        self,
+        values: Tensor,
+        decoding: Decoding,
+        generators: Sequence[torch.Generator],
+        before: Tensor | None = None,
+    ) -> None:
+        self.values, self.decoding, self.generators, self.before = values, decoding, generators, before
         self.copies = len(values) // len(generators)
         self.masked = torch.ones(values.shape[:2], dtype=torch.bool, device=values.device)
         self.rank = _ranks(values, generators, self.copies)
@@ -177,12 +184,12 @@ class PatchFrame:
     def unmask(self, readout: LatentReadout, features: Tensor, position: Tensor, count: int) -> None:
         """Draw `count` more patches from features (B, S, D) of frames at times (1 or B, 1)."""
         chosen = _top(self.rank, self.masked, count)
-        conditions = _gather(readout(features.unsqueeze(1), position).squeeze(1), chosen).flatten(0, 1)
+        before = None if self.before is None else self.before.unsqueeze(1)
+        conditions = readout(features.unsqueeze(1), position, before).squeeze(1)
+        conditions = _gather(conditions, chosen).flatten(0, 1)
         way = self.decoding
         guidance = None if self.copies == 1 else way.guidance
-        patches = readout.diffusion.sample(
-            conditions, way.sample_steps, way.temperature, self.generators, guidance
-        )
+        patches = readout.sample(conditions, way.sample_steps, way.temperature, self.generators, guidance)
         patches = patches.view(len(self.generators), chosen.shape[1], -1).repeat(self.copies, 1, 1)
         self.values = self.values.scatter(1, chosen.unsqueeze(-1).expand_as(patches), patches)
         self.masked = self.masked.scatter(1, chosen, False)

@@ -1,11 +1,12 @@
-"""Let the token readout copy the frame before (a copy mechanism as in arXiv 1603.06393).
+"""Let a readout copy the frame before (a copy mechanism as in arXiv 1603.06393).
 
 Most of a picture stays from one frame to the next. To keep a token, a readout must spell out all its digits
 from the features; here the features only say how likely it stays. The score of each digit that the frame
 before has at the same place gains a number that depends on the features, and on whether an earlier digit of
-the place already differs from the frame before.
+the place already differs from the frame before. Of latents, the features say the share of each value that
+stays.
 
-B batch, k places, S places of a frame, F digits of a place, V values of a digit, D width.
+B batch, k places, S places of a frame, F digits of a place, V values of one, C values of a patch, D width.
 """
 
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from hma_model.network.stem import to_digits
 
 # Nothing before a digit differs; only other tokens of its square do; its own token does.
 STATES = 3
+MOST = 2.0  # a patch's shares begin at the sigmoid of this, 0.88; begun at 0 they learn less
 SCALE = 4.0  # of the features: gains grow as fast as scores at a learning rate of small steps
 
 
@@ -114,3 +116,18 @@ class Copying:
         differs = (digits != before).any(1).long()
         self.in_square, self.in_token = self.in_square | differs, self.in_token | differs
         return digits
+
+
+class PatchCopy(nn.Module):
+    """What a patch of latents keeps of the frame before: of each value a share that the features say."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        self.multiplier = SCALE * (config.base_width / config.width if config.mup else 1.0)
+        self.linear = Linear(config.width, config.patch_dim)
+        nn.init.zeros_(self.linear.weight)
+        nn.init.constant_(self.linear.bias, MOST)
+
+    def forward(self, features: Tensor, before: Tensor) -> Tensor:
+        """Return what is kept (..., C) float32 of patches (..., C), from features (..., D)."""
+        return self.linear(features * self.multiplier).float().sigmoid() * before

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hma_model.config import ActionSpace, HMAConfig, Readout
-from hma_model.network.copying import CopyGain, Copying
+from hma_model.network.copying import CopyGain, Copying, PatchCopy
 from hma_model.network.linear import Linear
 from hma_model.network.trunk import rows_at
 
@@ -195,7 +195,10 @@ class TokenReadout(nn.Module):
 
 
 class LatentReadout(nn.Module):
-    """The readout of the continuous model: conditions for the diffusion head, and the head itself."""
+    """The readout of the continuous model: conditions for the diffusion head, and the head itself.
+
+    With `copy_previous` the head draws only what a patch has more than it keeps of the frame before.
+    """
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
@@ -206,10 +209,50 @@ class LatentReadout(nn.Module):
         self.diffusion = DiffusionHead(config, config.patch_dim)
         nn.init.normal_(self.proj.weight, std=config.width**-0.5)
         nn.init.zeros_(self.proj.bias)
+        self.copy = PatchCopy(config) if config.copy_previous else None
 
-    def forward(self, features: Tensor, positions: Tensor) -> Tensor:
-        """Map features (B, T, S, D) of frames at the times (T,) to conditions (B, T, S, D)."""
-        return self.norm(self.proj(features)) + rows_at(self.position, positions)
+    def forward(self, features: Tensor, positions: Tensor, before: Tensor | None = None) -> Tensor:
+        """Map features (B, T, S, D) of frames at the times (T,) to conditions (B, T, S, D).
+
+        With `copy_previous`, what is kept of the patches `before` (B, T, S, C) follows: (B, T, S, D + C). By
+        default nothing is.
+        """
+        conditions = self.norm(self.proj(features)) + rows_at(self.position, positions)
+        if self.copy is None:
+            return conditions
+        if before is None:
+            before = features.new_zeros(*features.shape[:-1], self.diffusion.values)
+        return torch.cat([conditions, self.copy(features, before)], dim=-1)
+
+    def loss(self, patches: Tensor, conditions: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Return the diffusion head's loss (M,) float32 of patches (M, C) under conditions (M, …)."""
+        conditions, kept = self._parts(conditions)
+        return self.diffusion.loss(patches if kept is None else patches - kept, conditions, generator)
+
+    def sample(
+        self,
+        conditions: Tensor,
+        steps: int | None = None,
+        temperature: float = 0.0,
+        generator: Generators = None,
+        guidance: float | None = None,
+    ) -> Tensor:
+        """Draw patches (M, C) float32 under conditions (M, …), as `DiffusionHead.sample`."""
+        conditions, kept = self._parts(conditions)
+        drawn = self.diffusion.sample(conditions, steps, temperature, generator, guidance)
+        if kept is None:
+            return drawn
+        if guidance is not None:
+            commanded, free = kept.chunk(2)
+            kept = torch.lerp(free, commanded, guidance)
+        return drawn + kept
+
+    def _parts(self, conditions: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return the conditions (M, D) of the head, and what is kept (M, C)."""
+        if self.copy is None:
+            return conditions, None
+        own, kept = conditions.split([self.diffusion.condition.in_features, self.diffusion.values], dim=-1)
+        return own.to(self.position.dtype), kept.float()
 
 
 class ActionHead(nn.Module):

@@ -26,6 +26,7 @@ from hma_model.network.stem import (
     Stem,
     TokenEmbedding,
     merge_tokens,
+    patches_before,
     patchify,
     space_of_stem,
     to_digits,
@@ -238,7 +239,7 @@ class HMA(nn.Module):
         action_mask: Tensor | None = None,
         first: Tensor | None = None,
     ) -> Tensor:
-        """Compute the conditions of the diffusion head.
+        """Compute the conditions under which `LatentReadout.sample` draws.
 
         Args:
             latents: (B, T, c, H, W), already multiplied by the configuration's `latent_scale`.
@@ -248,15 +249,19 @@ class HMA(nn.Module):
                 frame.
 
         Returns:
-            (B, T, H/p, W/p, D).
+            (B, T, H/p, W/p, D); with `copy_previous` (B, T, H/p, W/p, D + c*p*p).
         """
         self._require("continuous", "video_conditions")
         groups, times = Groups.of(embodiment, len(latents)), self.time_positions(latents.shape[1])
         conditioning = self._condition(actions, action_mask, groups, times)
         patches, pixels = patchify(latents, self.config.patch), patchify(mask.unsqueeze(2), self.config.patch)
         x = self.embed_patches(groups.sort(patches), groups.sort(pixels), first=self._first(first, groups))
+        before = None
+        if self.config.copy_previous:
+            order = range(-1, patches.shape[1] - 1)
+            before = patches_before(groups.sort(patches), groups.sort(pixels), order, self.config.patch)
         conditions = self.latent_readout(
-            self.video_features(self.trunk(x, conditioning, times)), times.positions
+            self.video_features(self.trunk(x, conditioning, times)), times.positions, before
         )
         return groups.unsort(conditions).unflatten(2, self.config.token_grid)
 

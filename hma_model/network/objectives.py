@@ -18,7 +18,7 @@ from hma_model.config import OBJECTIVES, HMAConfig, Objective, Readout
 from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
 from hma_model.network.copying import frames_before
 from hma_model.network.head import device_of, randn, uniform
-from hma_model.network.stem import from_digits, to_digits
+from hma_model.network.stem import from_digits, patches_before, to_digits
 from hma_model.network.trunk import TimePositions, paired_times
 
 if TYPE_CHECKING:
@@ -136,11 +136,16 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
         own, masked = model.video_features(features)[:, layout.predicted], masked[:, layout.predicted]
         targets = frames[:, 1:] if layout.paired else frames
         predictors = own
-        if config.kind == "continuous":
-            predictors = model.latent_readout(own, layout.times.positions[layout.predicted])
         before = None
-        if config.copy_previous:
-            before = frames_before(shown, layout.previous[layout.predicted], config)
+        previous = layout.previous[layout.predicted]
+        if config.kind == "continuous":
+            kept = None
+            if config.copy_previous:
+                hidden = groups.sort(video.masked.to(shown.device)).unsqueeze(-1)
+                kept = patches_before(shown, hidden, previous, config.patch)
+            predictors = model.latent_readout(own, layout.times.positions[layout.predicted], kept)
+        elif config.copy_previous:
+            before = frames_before(shown, previous, config)
         video_loss, per_sample = _video_loss(model, predictors, targets, before, masked, groups, generator)
         if layout.paired:  # no copy is of the first frame
             own = torch.cat([model.video_features(features)[:, :1], own], dim=1)
@@ -276,7 +281,7 @@ def _video_loss(
         near = None if before is None else before.flatten(0, 2)[rows]
         losses = model.token_readout.loss(chosen, to_digits(targets, model.config.digits), near)
     else:
-        losses = model.latent_readout.diffusion.loss(targets, chosen, generator)
+        losses = model.latent_readout.loss(targets, chosen, generator)
     return losses.sum() / max(len(rows), 1), groups.unsort(_means(losses, sample, len(frames)))
 
 

@@ -125,6 +125,15 @@ def carried(values: Tensor, previous: Sequence[int]) -> Tensor:
     return before * (index >= 0).to(values.dtype).view(-1, 1, 1)
 
 
+def patches_before(patches: Tensor, masked: Tensor, previous: Sequence[int], patch: int) -> Tensor:
+    """Return what is seen of the frames numbered `previous`: (B, len(previous), S, c*p*p), zeros elsewhere.
+
+    `patches` (B, T, S, c*p*p) and `masked` (B, T, S, p*p or 1) are those of `LatentEmbedding`.
+    """
+    pixels = patches.unflatten(-1, (-1, patch**2)).masked_fill(masked.unsqueeze(-2), 0)
+    return carried(pixels.flatten(-2), previous)
+
+
 class LatentEmbedding(nn.Module):
     """A linear embedding of patches of latents; a learned pixel first replaces the masked latent pixels.
 
@@ -150,8 +159,7 @@ class LatentEmbedding(nn.Module):
         pixels, hidden = patches.unflatten(-1, (-1, self.patch**2)), masked.unsqueeze(-2)
         mask = self.mask.to(patches.dtype).unsqueeze(-1)
         if self.carries:
-            before = carried(pixels.masked_fill(hidden, 0).flatten(-2), previous)
-            mask = mask + before.view_as(pixels)
+            mask = mask + patches_before(patches, masked, previous, self.patch).view_as(pixels)
         filled = torch.where(hidden, mask, pixels).flatten(-2)
         return self.linear(filled.to(self.linear.weight.dtype))
 

@@ -159,8 +159,7 @@ def _predicted(
     mask = torch.zeros(context.shape[:2] + context.shape[3:], dtype=torch.bool, device=context.device)
     mask[rows, at] = True
     conditions = model.video_conditions(scaled, mask, actions, names, known, batch.earlier)[rows, at]
-    diffusion = model.latent_readout.diffusion
-    patches = diffusion.sample(conditions.flatten(0, 2), steps=SAMPLE_STEPS, generator=generator)
+    patches = model.latent_readout.sample(conditions.flatten(0, 2), SAMPLE_STEPS, generator=generator)
     whole = patches.view(len(at), 1, -1, config.patch_dim)
     latents = unpatchify(whole, config.patch, config.token_grid)
     return (latents[:, 0] / config.latent_scale).to(context.dtype)

@@ -30,7 +30,7 @@ from hma_model.evaluation.evaluate import (
     verdict,
     windows,
 )
-from hma_model.evaluation.intervals import interval, over_datasets, students_t
+from hma_model.evaluation.intervals import NATURAL, SHARE, interval, over_datasets, students_t
 from hma_model.evaluation.metrics import masked_scores, teacher_forced, token_hits, token_nats
 from hma_model.network.model import HMA
 from tests.model.robots import CONFIG, SPEC, make_model
@@ -373,6 +373,14 @@ def test_a_model_that_was_trained_without_actions_is_given_none(data, model):
     assert found["loss"] == pytest.approx(found["shuffled_loss"], abs=1e-5)
     assert found["loss"] != seeing["loss"]
     assert found["true"] == found["none"] == seeing["none"] and found["psnr_action_gain_last"] == 0
+
+
+def test_intervals_of_few_episodes_stay_within_what_is_possible():
+    values, episodes = np.array([0.9, 0.5]), [0, 1]
+    low, high = interval(values, episodes=episodes)
+    assert low < 0 and high > 1
+    assert interval(values, episodes=episodes, within=SHARE).tolist() == [0, 1]
+    assert interval(values, episodes=episodes, within=NATURAL).tolist() == [0, high]
 
 
 def test_intervals_are_the_middle_of_resampled_means(tmp_path, model):

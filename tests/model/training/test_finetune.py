@@ -114,6 +114,17 @@ def test_what_begins_at_nothing_can_be_turned_on_for_a_tuned_trunk(base, tmp_pat
         tune(base.out, arm, tmp_path / "frozen", *more)
 
 
+@pytest.mark.parametrize("copies", [False, True])
+def test_latents_are_copied_only_if_the_trunk_was_trained_so(tmp_path, copies):
+    spec = TokenizerSpec("raw", 1, "continuous", 16, (4, 4), channels=2, dtype="float16")
+    arm, leg = (make_shards(tmp_path / name, name, spec=spec) for name in ("arm", "leg"))
+    small = {"patch": 2, "diffusion_width": 16, "diffusion_depth": 1, "copy_previous": copies}
+    recipe = make_recipe({**TINY, "data": [str(arm)], "model": {**TINY["model"], **small}})
+    trained = train(recipe, out=tmp_path / "base", show=False)
+    result = tune(trained.out, leg, tmp_path / "run", "model.copy_previous=true", freeze=False)
+    assert Checkpoint.open(result.checkpoint).config.copy_previous == copies
+
+
 def test_waves_of_the_commands_belong_to_a_stem(base, leg, tmp_path):
     arm, still = make_shards(tmp_path / "arm", "arm"), ["steps=1", "lr=1e-12"]
     more = [*still, "model.action_waves=3"]
