@@ -31,6 +31,8 @@ def test_the_device_reaches_the_world(
         raise Asked(given["device"])
 
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "film").mkdir()
+    (tmp_path / "film" / "a.mp4").touch()  # film is looked for before the world is loaded
     monkeypatch.setattr("hma_model.training.runtime.choose_device", lambda name: f"chosen {name}")
     monkeypatch.setattr(module, "load_world", load)
     with pytest.raises(Asked, match="chosen cuda:1"):
