@@ -18,7 +18,7 @@ import json
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +42,7 @@ STEM, HEAD, YAML, STATS, CARD = (
 PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card is last: its presence means that the others are there
 SAMPLE, FILM = "sample.png", "sample.gif"  # optional, shown in the model card
 SHOWN = (SAMPLE, FILM)
+COPIES = "readout.copy."  # the beginning of the names of a readout's weights of copies
 EMBEDDED, EMBEDDED_NAME = Path(__file__).parents[1] / "embedded", "embedded"  # comes along with the package
 _APART = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was cut short: do it again"
@@ -93,7 +94,7 @@ class Checkpoint:
         """
         folder = resolve(folder)
         values = read_json(inside(folder, CONFIG))
-        config = parse_config(values, folder / CONFIG)
+        config = _of_trunk(parse_config(values, folder / CONFIG), folder / TRUNK)
         home = folder / "embodiments"
         found = sorted(path.name for path in home.iterdir()) if home.is_dir() else []
         present = tuple(name for name in found if (home / name / CARD).is_file())
@@ -247,17 +248,32 @@ def training_checkpoints(run: StrPath) -> list[Path]:
     return sorted(path for path in (as_path(run) / "checkpoints").glob("step-*") if (path / CONFIG).is_file())
 
 
+def _of_trunk(config: HMAConfig, trunk: Path) -> HMAConfig:
+    """Return the config without `copy_previous` if a trunk of latents has no weights for it.
+
+    Until 2026-11-25 it was stated for latents and had no effect.
+    """
+    if config.kind != "continuous" or not config.copy_previous or not trunk.is_file():
+        return config
+    return replace(config, copy_previous=any(name.startswith(COPIES) for name in _read_header(trunk)[1]))
+
+
 def read_metadata(path: Path) -> dict[str, str]:
     """Read the metadata in the header of a safetensors file.
 
     Raises:
         CheckpointError: the file is damaged, truncated or of another format.
     """
+    return _read_header(path)[0]
+
+
+def _read_header(path: Path) -> tuple[dict[str, str], list[str]]:
+    """Return the metadata of a safetensors file and the names of its tensors; raise as `read_metadata`."""
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(path, framework="np") as file:  # the header alone needs no torch
-            return file.metadata() or {}
+            return file.metadata() or {}, list(file.keys())
     except (SafetensorError, OSError) as fault:
         reason = unreadable(path, f"is not whole safetensors: {fault}", "pull or save it again")
         raise CheckpointError(path, *reason) from fault
