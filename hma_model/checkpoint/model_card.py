@@ -110,8 +110,8 @@ def _words(config: Mapping[str, Any], cards: Mapping[str, Mapping[str, Any]]) ->
     merge = config["model"].get("merge", 1)
     unit = token_words(merge if isinstance(merge, int) else 1)
     return (
-        f"\n\nVal loss: nats a {unit}, in held-out episodes. Baseline loss: that of knowing only how often each "
-        "token occurs, which a model must beat. Accuracy: the share predicted right."
+        f"\n\nVal loss: nats a {unit}, in held-out episodes. Baseline loss: that of knowing only how often "
+        "each token occurs, which a model must beat. Accuracy: the share predicted right."
     )
 
 
