@@ -279,7 +279,7 @@ class Run:
     # -- evaluation and checkpoints
 
     def saved_model(self) -> HMA:
-        """Return the model to evaluate and save, averaged with `ema`; whole on rank 0, but every rank calls it."""
+        """Return the model to evaluate and save, or with `ema` its average; every rank must call it."""
         if not self.average and not self.parallel_model.sharded:
             return self.model
         state = self.average.state() if self.average else gathered(self.model.state_dict().items())
