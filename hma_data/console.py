@@ -60,12 +60,14 @@ def print_table(
 ) -> None:
     """Print a table to standard output: numbers aligned right, full width when it is not a terminal.
 
+    Where a terminal is too narrow for numbers, the table is cut into several below each other; where it is
+    too narrow for words, each row becomes a paragraph.
+
     Args:
         columns: headings.
         rows: a cell for each column.
         title: printed above.
-        repeated: where a terminal is too narrow for numbers, the table is cut into several below each other;
-            each begins with so many of the first columns.
+        repeated: so many of the first columns begin each part of a table that is cut.
     """
     if len(rows) > MANY_ROWS:
         _print_columns(columns, rows)
@@ -75,7 +77,10 @@ def print_table(
     widths = [max(map(len, [name, *(row[i] for row in cells)])) for i, name in enumerate(columns)]
     console = stdout()
     parts = [[*range(len(columns))]]
-    if sys.stdout.isatty() and all(numeric[repeated:]):
+    if sys.stdout.isatty() and sum(widths) + GAP * len(columns) > console.width:
+        if not all(numeric[repeated:]):
+            _print_paragraphs(console, columns, cells, title)
+            return
         parts = _parts(widths, repeated, console.width)
     for part in parts:
         console.print(_table(columns, cells, numeric, part, title if part is parts[0] else ""))
@@ -98,6 +103,24 @@ def _table(
     for row in cells:
         table.add_row(*(escape(row[i]) for i in part))
     return table
+
+
+def _print_paragraphs(console: Any, columns: Sequence[str], cells: list[list[str]], title: str) -> None:
+    """Print each row as its first cell, which is never broken, with the others named below it."""
+    from rich.padding import Padding
+    from rich.text import Text
+
+    if title:
+        console.print(Text(title))
+    for first, *others in cells:
+        console.print(Text(first, "bold"), soft_wrap=True)
+        named = [
+            (name, cell) for name, cell in zip(columns[1:], others, strict=True) if cell not in ("", "-")
+        ]
+        pieces: list[Any] = []
+        for name, cell in named:
+            pieces += [(f"{'; ' if pieces else ''}{name}: ", "dim"), cell]
+        console.print(Padding(Text.assemble(*pieces), (0, 0, 0, 2)))
 
 
 def _parts(widths: Sequence[int], repeated: int, room: int) -> list[list[int]]:
@@ -161,6 +184,24 @@ def print_lines(lines: Iterable[tuple[str, str]]) -> None:
             shown = title if i == 0 and title != last else ""
             print(f"{shown:{width}}  {part}")
         last = title
+
+
+MAX_NAME = 20  # letters of a path, beyond which `short_paths` shortens it
+
+
+def short_paths(paths: Sequence[str]) -> dict[str, str]:
+    """Return a short name for each path: without the folders that all have in common, before or after.
+
+    A single path, and paths that are short, stay as they are.
+    """
+    if len(paths) < 2 or max(map(len, paths)) <= MAX_NAME:
+        return {path: path for path in paths}
+    parts = [path.rstrip("/").split("/") for path in paths]
+    for _ in range(2):  # from the front, then from the back
+        while min(map(len, parts)) > 1 and len({part[0] for part in parts}) == 1:
+            parts = [part[1:] for part in parts]
+        parts = [part[::-1] for part in parts]
+    return {path: "/".join(part) for path, part in zip(paths, parts, strict=True)}
 
 
 def human_number(value: float | None) -> str | None:
@@ -234,6 +275,7 @@ def progress(description: str, total: float = 0, unit: str = "frames") -> Iterat
 def _bar(description: str, total: float, unit: str) -> Iterator[Update]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+    from rich.table import Column
     from rich.text import Text
 
     class Times(ProgressColumn):
@@ -245,7 +287,9 @@ def _bar(description: str, total: float, unit: str) -> Iterator[Update]:
         BarColumn(bar_width=24),
         TextColumn("{task.fields[amount]}"),
         Times(),
-        TextColumn("{task.fields[extra]}", markup=False),
+        # The last column alone is shortened in a narrow terminal.
+        TextColumn("{task.fields[extra]}", markup=False, table_column=Column(ratio=1, no_wrap=True)),
+        expand=True,
         console=Console(stderr=True),
         refresh_per_second=5,
     )

@@ -127,6 +127,7 @@ def make_shard(
 
     with ExitStack() as committing:
         writer = committing.enter_context(ShardWriter(job.out / unit.name, layout.schema, tokenizer.spec))
+        report(Tick())  # the worker's start, which may take seconds, is no part of the rate
         decoded = _decoded(job, unit, report, attempt)
         ahead = prefetch(decoded) if not attempt.number else decoded  # one at a time: shows whose fault it is
         for item in _tokenized(ahead, tokenizer, report):

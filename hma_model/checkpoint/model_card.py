@@ -11,6 +11,7 @@ from typing import Any
 from hma_data.storage.paths import REPOSITORY
 from hma_data.storage.yaml_io import write_yaml
 from hma_data.tokenizers.catalog import other_weights
+from hma_model.config import token_words
 
 _TAGS = ("robotics", "world-model", "video-prediction", "hma")
 _DATASET = re.compile(rf"hf://datasets/({REPOSITORY.pattern})")
@@ -55,7 +56,7 @@ def render(
         f"---\n{write_yaml(front)}---",
         f"# {line((repo or 'HMA world model').rsplit('/', 1)[-1])}",
         _about(config),
-        "## Embodiments\n\n" + _table(cards),
+        "## Embodiments\n\n" + _table(cards) + _words(config, cards),
         *pictures,
         "## How to use\n\n" + _usage(repo or ".", config, cards),
         f"Format version {line(config.get('format_version'))}. Each `card.json` names its trunk by SHA-256: "
@@ -99,6 +100,19 @@ def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
             line(card.get("license")) or "not stated",
         ])  # fmt: skip
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _words(config: Mapping[str, Any], cards: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return what the metrics mean, where an embodiment states a loss beside its baseline."""
+    stated = _parts(cards, "metrics")
+    if config["model"].get("kind") != "discrete" or not any("baseline_loss" in metrics for metrics in stated):
+        return ""
+    merge = config["model"].get("merge", 1)
+    unit = token_words(merge if isinstance(merge, int) else 1)
+    return (
+        f"\n\nVal loss: nats a {unit}, in held-out episodes. Baseline loss: that of knowing only how often "
+        "each token occurs, which a model must beat. Accuracy: the share predicted right."
+    )
 
 
 def _origins(cards: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -147,7 +161,8 @@ def _usage(name: str, config: Mapping[str, Any], cards: Mapping[str, Any]) -> st
         views="" if views == 1 else f".repeat({line(views)}, axis=-2)  # one picture a camera, stacked",
         first="" if views == 1 else f"[..., :{line(height)}, :]",
     )  # fmt: skip
-    where = "In this folder:\n\n" if name == "." else ""
+    where = "In this folder, with" if name == "." else "With"
+    where += " HMA Toolkit (the Python package `hma-toolkit`) installed:\n\n"
     return (
         f"{where}```python\n{code}\n```\n\n"
         "```sh\n"

@@ -203,10 +203,16 @@ def _ends(ends: Sequence[float] | None) -> str | None:
 
 
 def _print_table(parts: "Sequence[Part]") -> None:
-    from hma_model.evaluation.tables import rows, verdicts
+    from hma_model.evaluation.tables import renamed, rows, verdicts
 
+    parts, legend = renamed(parts)
+    print_lines(legend)
     names, lines = rows(parts, intervals=False)
-    print_table(names, [[_number(cell) for cell in line] for line in lines], repeated=2)
+    if len({part.checkpoint for part in parts}) == 1:  # the same in every row, and perhaps long
+        print(parts[0].checkpoint)
+        names, lines = names[1:], [line[1:] for line in lines]
+    repeated = names.index("robot") + 1
+    print_table(names, [[_number(cell) for cell in line] for line in lines], repeated=repeated)
     _print_absences(parts)
     for whose, said in verdicts(parts):
         print(f"{whose} {said}")

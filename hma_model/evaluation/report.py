@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from hma_data.console import human_count
 from hma_data.storage.files import to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
+from hma_model.evaluation.evaluate import verdict
 from hma_model.evaluation.pages import Page, over_horizon
 from hma_model.evaluation.showcase import Showcase, choose
 from hma_model.evaluation.suite import RESULTS, Part
-from hma_model.evaluation.tables import WORDS, absences, markdown, results, rows, value, verdicts
+from hma_model.evaluation.tables import WORDS, absences, markdown, renamed, results, rows, value
 
 Images = NDArray[np.uint8]
 GIVEN, PREDICTED, GAP = (150, 150, 150), (0, 158, 115), (128, 128, 128)
@@ -46,6 +47,7 @@ def write_results(parts: Sequence[Part], out: StrPath, command: str) -> Path:
 
 def page(parts: Sequence[Part], command: str) -> str:
     """Return the page."""
+    parts, legend = renamed(parts)
     labels = list(dict.fromkeys(part.checkpoint for part in parts))
     robots = list(dict.fromkeys(part.found["embodiment"] for part in parts))
     first = parts[0].found
@@ -55,9 +57,10 @@ def page(parts: Sequence[Part], command: str) -> str:
         f"first {first['prompt']}. Pictures are compared with those decoded from the true tokens."
     )
     made = Page(f"Evaluation of {', '.join(labels)}", lead)
+    made.definitions(legend)
     _headline(made, parts)
     made.section("Does it follow its commands?")
-    made.definitions(verdicts(parts))
+    made.definitions([(_whose(part, parts), verdict(part.found)) for part in parts])
     made.section("Figures", "Below a figure: the 95 % interval of its mean, by bootstrap of whole episodes.")
     names, lines = rows(parts)
     made.table(names, [[_below(cell) for cell in line] for line in lines])
@@ -78,6 +81,12 @@ def page(parts: Sequence[Part], command: str) -> str:
     return made.html()
 
 
+def _whose(part: Part, parts: Sequence[Part]) -> str:
+    """Return the robot of a part, and its checkpoint where there are several."""
+    robot: str = part.found["embodiment"]
+    return robot if len({each.checkpoint for each in parts}) == 1 else f"{part.checkpoint}, {robot}"
+
+
 def _below(cell: Any) -> Any:
     """Put the interval of a figure below it."""
     return cell.replace(" [", "\n", 1).rstrip("]").replace(", ", " to ") if isinstance(cell, str) else cell
@@ -91,10 +100,10 @@ def _units(found: dict[str, Any]) -> str:
 def _headline(made: Page, parts: Sequence[Part]) -> None:
     tiles = []
     for part in parts[:6]:
-        found, who = part.found, f"{part.checkpoint}, {part.found['embodiment']}"
-        gain = found["psnr_action_gain_last"]
+        gain = part.found["psnr_action_gain_last"]
         if gain is not None:
-            tiles.append((f"{gain:+.1f} dB", f"{who}: last frame, true less shuffled commands"))
+            words = "nearer to the truth with its own commands than with others, last frame"
+            tiles.append((f"{gain:+.1f} dB", f"{_whose(part, parts)}: {words}"))
     if len(parts) == 1:
         found = parts[0].found
         for path, digits, unit, about in (

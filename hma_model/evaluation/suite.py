@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hma_data.console import Update, progress
+from hma_data.console import Update, progress, short_paths
 from hma_data.errors import OutputError, UsageError
 from hma_data.lab.simulator import simulated
 from hma_data.loading.dataset import WindowDataset
@@ -104,11 +104,12 @@ def evaluate_all(
     parts, done = [], 0
     work = [(label, model, shards) for label, model in models.items() for shards in sets]
     total = sum(_frames(model, shards, settings) for _, model, shards in work)
+    shown = short_paths(list(models))
     with progress("evaluate", total) as update:
         for label, model, shards in work:
             mark = fingerprint(model, shards, settings, networks)
             part = _kept(folder, mark, label, shards) if folder else None
-            about = f"{label}, {shards.embodiment.id}"
+            about = f"{shown[label]}, {shards.embodiment.id}"
             if part is None:
                 counter = _Counter(update, done, about)
                 counter.begins("losses first")

@@ -6,8 +6,10 @@ mean loss.
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+from hma_data.console import short_paths
 from hma_data.storage.files import finite
 from hma_model.evaluation.evaluate import verdict
 from hma_model.evaluation.intervals import over_datasets
@@ -51,6 +53,13 @@ WORDS = {
     "PSNR none": "dB, last frame, without commands",
     "PSNR copy": "dB, last frame, the prompt's last frame repeated",
 }
+
+
+def renamed(parts: Sequence[Part]) -> tuple[list[Part], list[tuple[str, str]]]:
+    """Return the parts under short names of their checkpoints, and the pairs (short, full) that differ."""
+    names = short_paths(list(dict.fromkeys(part.checkpoint for part in parts)))
+    legend = [(short, name) for name, short in names.items() if short != name]
+    return [replace(part, checkpoint=names[part.checkpoint]) for part in parts], legend
 
 
 def value(found: Mapping[str, Any], path: str) -> Any:

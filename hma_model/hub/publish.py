@@ -151,8 +151,7 @@ def _pull(
     source: str | Path, embodiments: Iterable[str] | None, out: Path | None, revision: str | None
 ) -> tuple[Path, list[str]]:
     """Return the checkpoint's folder and the requested ids; the folder may hold older ones too."""
-    store = open_store(source, revision)
-    files = store.files()
+    store, files = open_published(source, revision)
     values = _config(store, files)
     there = embodiment_ids(files)
     wanted = list(dict.fromkeys(there if embodiments is None else embodiments))
@@ -191,6 +190,19 @@ def _pull(
     if out:
         checkpoints.write_readme(out)
     return place, wanted
+
+
+def open_published(source: str | Path, revision: str | None) -> tuple[Store, dict[str, int]]:
+    """Return a hub and its files; a name that may also be a mistyped path is told to be neither."""
+    try:
+        store = open_store(source, revision)
+        return store, store.files()
+    except HubError as fault:
+        if revision or not is_repository(source) or "://" in str(source):
+            raise
+        both = f"is no folder here; as a repository of the hub: {fault.fault}"
+        remedy = f"give the path of a checkpoint or run, or: {fault.remedy}"
+        raise HubError(str(source), both, remedy) from fault
 
 
 def list_embodiments(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:

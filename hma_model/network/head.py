@@ -298,7 +298,7 @@ class ActionHead(nn.Module):
 
 
 def cosine_levels(steps: int) -> Tensor:
-    """Return (steps,) float64, the signal's share of variance at each noise level (arXiv 2102.09672)."""
+    """Return (steps,) float64, the signal's share of variance at each noise level, alpha-bar (2102.09672)."""
     time = torch.arange(steps + 1, dtype=torch.float64, device="cpu") / steps
     share = ((time + 0.008) / 1.008 * math.pi / 2).cos() ** 2
     noise = (1 - share[1:] / share[:-1]).clamp(max=0.999)
@@ -346,8 +346,8 @@ class DiffusionHead(nn.Module):
         self.modulation = Linear(width, 2 * width)
         self.output = Linear(width, values * (2 if config.diffusion_variance else 1))
         # as a list too, so that sampling does not wait for a GPU
-        self.shares: list[float] = cosine_levels(config.diffusion_train_steps).float().tolist()
-        self.register_buffer("levels", torch.tensor(self.shares), persistent=False)
+        self.alpha_bars: list[float] = cosine_levels(config.diffusion_train_steps).float().tolist()
+        self.register_buffer("levels", torch.tensor(self.alpha_bars), persistent=False)
         for name, module in self.named_modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
@@ -366,8 +366,8 @@ class DiffusionHead(nn.Module):
         draw = uniform((len(target),), generator, target.device)
         level = (draw * len(self.levels)).long().clamp(max=len(self.levels) - 1)
         noise = randn(target.shape, generator, target.device)
-        share = self.levels.float()[level].unsqueeze(-1)
-        signal, spread = share.sqrt(), (1 - share).sqrt()
+        alpha_bar = self.levels.float()[level].unsqueeze(-1)
+        signal, spread = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
         predicted = self(signal * target + spread * noise, level, condition)
         goal = signal * noise - spread * target if self.velocity else noise
         return F.mse_loss(predicted, goal, reduction="none").mean(-1).view(self.repeats, rows).mean(0)
@@ -393,10 +393,10 @@ class DiffusionHead(nn.Module):
         Returns:
             (M, C) float32.
         """
-        total = len(self.shares)
+        total = len(self.alpha_bars)
         count = min(steps or self.sample_steps, total)
         levels = torch.linspace(total - 1, 0, count).round().long()
-        shares = [*(self.shares[level] for level in levels.tolist()), 1.0]
+        alpha_bars = [*(self.alpha_bars[level] for level in levels.tolist()), 1.0]
         embedded, embedded_levels = self.condition(condition), self._level(levels.to(condition.device))
         copies = 1 if guidance is None else 2
         x = randn((len(condition) // copies, self.values), generator, condition.device)
@@ -405,26 +405,26 @@ class DiffusionHead(nn.Module):
             if guidance is not None:
                 commanded, free = predicted.chunk(2)
                 predicted = torch.lerp(free, commanded, guidance)
-            x = self._step(x, predicted, shares[index], shares[index + 1], temperature, generator)
+            x = self._step(x, predicted, alpha_bars[index], alpha_bars[index + 1], temperature, generator)
         return x
 
     def _step(
         self,
         x: Tensor,
         predicted: Tensor,
-        share: float,
+        alpha_bar: float,
         after: float,
         eta: float,
         generator: Generators,
     ) -> Tensor:
-        """Make one DDIM step from a level whose signal share is `share` to one where it is `after`."""
-        signal, spread = math.sqrt(share), math.sqrt(1 - share)
+        """Make one DDIM step from a level of signal share `alpha_bar` to one where it is `after`."""
+        signal, spread = math.sqrt(alpha_bar), math.sqrt(1 - alpha_bar)
         clean = signal * x - spread * predicted if self.velocity else (x - spread * predicted) / signal
         clean = clean.clamp(-self.clip, self.clip)
         if after == 1.0:
             return clean
         noise = (x - signal * clean) / spread  # consistent with the clipped estimate
-        fresh = eta * math.sqrt((1 - after) / (1 - share) * (1 - share / after))
+        fresh = eta * math.sqrt((1 - after) / (1 - alpha_bar) * (1 - alpha_bar / after))
         x = math.sqrt(after) * clean + math.sqrt(1 - after - fresh**2) * noise
         return x + fresh * randn(x.shape, generator, x.device) if fresh else x
 

@@ -21,6 +21,7 @@ from hma_model.config import POLICY, READOUTS, ActionSpace, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition, unknown
 from hma_model.network.copying import frames_before
 from hma_model.network.head import ActionHead, Generators, LatentReadout, TokenReadout
+from hma_model.network.states import check_fit, module_key
 from hma_model.network.stem import (
     LatentEmbedding,
     Stem,
@@ -37,8 +38,6 @@ from hma_model.network.trunk import Conditioning, TimePositions, Trunk, window_t
 if TYPE_CHECKING:
     from hma_data.loading.rows import Batch
     from hma_model.network.objectives import Output
-
-MOST_NAMED = 3  # keys in an error
 
 
 class HMA(nn.Module):
@@ -483,27 +482,3 @@ class HMA(nn.Module):
     def _require(self, kind: str, name: str) -> None:
         if self.config.kind != kind:
             raise HMAError(name, f"is of {kind} models; this one is {self.config.kind}")
-
-
-def module_key(embodiment: str) -> str:
-    """Return a module name for an id, without dots and without a clash with a module's attributes."""
-    return "id_" + embodiment.replace("%", "%25").replace(".", "%2E")
-
-
-def check_fit(where: object, state: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
-    """Check that a state has the names and shapes of the one that it replaces.
-
-    Raises:
-        CheckpointError: the states differ; it names the first keys that do not fit.
-    """
-    faults = [f"missing {name}" for name in sorted(own.keys() - state.keys())]
-    faults += [f"unknown {name}" for name in sorted(state.keys() - own.keys())]
-    faults += [
-        f"{name} is {tuple(state[name].shape)}, not {tuple(tensor.shape)}"
-        for name, tensor in sorted(own.items())
-        if name in state and state[name].shape != tensor.shape
-    ]
-    if faults:
-        if len(faults) > MOST_NAMED:
-            faults[MOST_NAMED:] = [f"and {len(faults) - MOST_NAMED} more"]
-        raise CheckpointError(where, "; ".join(faults), "load it into the configuration it was saved from")

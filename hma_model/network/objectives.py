@@ -1,11 +1,10 @@
-"""Hide tokens and chunks, and compute the losses of the training objectives (paper section 3).
+"""Compute the losses of the training objectives (paper section 3).
 
-`hma_model.config.OBJECTIVES` states what each objective predicts, sees and hides.
+`hma_model.config.OBJECTIVES` states what each objective predicts, sees and hides; `network.masking` draws it.
 
 B batch, T frames, h,w token grid, S = h*w, M hidden tokens or chunks, K = stride * action dim.
 """
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
@@ -17,8 +16,15 @@ from hma_data.errors import HMAError
 from hma_model.config import OBJECTIVES, HMAConfig, Objective, Readout
 from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
 from hma_model.network.copying import frames_before
-from hma_model.network.head import device_of, randn, uniform
-from hma_model.network.stem import from_digits, patches_before, to_digits
+from hma_model.network.head import randn, uniform
+from hma_model.network.masking import (
+    VideoMask,
+    corrupt_tokens,
+    draw_pairs_mask,
+    draw_video_mask,
+    drop_chunks,
+)
+from hma_model.network.stem import patches_before, to_digits
 from hma_model.network.trunk import TimePositions, paired_times
 
 if TYPE_CHECKING:
@@ -48,19 +54,6 @@ class Output:
     masked: Tensor
     objective: str
     video_logits: Tensor | None = None
-
-
-@dataclass
-class VideoMask:
-    """The masked and corrupted tokens of the frames of a pass, which are T, or more with pairs.
-
-    Attributes:
-        masked: (B, T, S) bool, the tokens of the video loss; never those of frame 0.
-        corruption: (B, T) float32, the probability that a digit of a visible token is replaced.
-    """
-
-    masked: Tensor
-    corruption: Tensor
 
 
 @dataclass(frozen=True)
@@ -133,33 +126,55 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
             model, features[:, : layout.past], batch, dropped, chosen.readout, groups, generator
         )
     if chosen.predicts_video:
-        own, masked = model.video_features(features)[:, layout.predicted], masked[:, layout.predicted]
+        masked = masked[:, layout.predicted]
+        own, before = _readout_inputs(model, features, shown, video, layout, groups)
         targets = frames[:, 1:] if layout.paired else frames
-        predictors = own
-        before = None
-        previous = layout.previous[layout.predicted]
-        if config.kind == "continuous":
-            kept = None
-            if config.copy_previous:
-                hidden = groups.sort(video.masked.to(shown.device)).unsqueeze(-1)
-                kept = patches_before(shown, hidden, previous, config.patch)
-            predictors = model.latent_readout(own, layout.times.positions[layout.predicted], kept)
-        elif config.copy_previous:
-            before = frames_before(shown, previous, config)
-        video_loss, per_sample = _video_loss(model, predictors, targets, before, masked, groups, generator)
+        video_loss, per_sample = _video_loss(model, own, targets, before, masked, groups, generator)
         if layout.paired:  # no copy is of the first frame
-            own = torch.cat([model.video_features(features)[:, :1], own], dim=1)
             masked = F.pad(masked, (0, 0, 1, 0))
-            before = None if before is None else F.pad(before, (0, 0, 0, 0, 1, 0), value=-1)
         if config.kind == "discrete" and not model.training:
-            true = to_digits(groups.sort(frames), config.digits)
-            scores = model.token_readout.split(model.token_readout(own.detach(), true, before))
-            logits = groups.unsort(scores).unflatten(2, config.token_grid)
+            logits = _video_logits(model, features, own, before, frames, layout, groups)
     loss = torch.zeros((), device=features.device)
     loss = loss if video_loss is None else loss + video_loss
     loss = loss if action_loss is None else loss + config.action_loss_weight * action_loss
     masked = masked.to(features.device).unflatten(2, config.token_grid)
     return Output(loss, video_loss, action_loss, per_sample.detach(), masked, name, logits)
+
+
+def _readout_inputs(
+    model: "HMA", features: Tensor, shown: Tensor, video: VideoMask, layout: Layout, groups: Groups
+) -> tuple[Tensor, Tensor | None]:
+    """Return what the readout takes of frames that predict video: features or conditions, and digits before.
+
+    The digits before (B, T, S, F) are those of a discrete model that may copy them, else None.
+    """
+    config, previous = model.config, layout.previous[layout.predicted]
+    own = model.video_features(features)[:, layout.predicted]
+    if config.kind == "discrete":
+        return own, frames_before(shown, previous, config) if config.copy_previous else None
+    kept = None
+    if config.copy_previous:
+        hidden = groups.sort(video.masked.to(shown.device)).unsqueeze(-1)
+        kept = patches_before(shown, hidden, previous, config.patch)
+    return model.latent_readout(own, layout.times.positions[layout.predicted], kept), None
+
+
+def _video_logits(
+    model: "HMA",
+    features: Tensor,
+    own: Tensor,
+    before: Tensor | None,
+    frames: Tensor,
+    layout: Layout,
+    groups: Groups,
+) -> Tensor:
+    """Return the scores (B, T, h, w, F, V) of the window's frames; the first of pairs is scored as it is."""
+    if layout.paired:
+        own = torch.cat([model.video_features(features)[:, :1], own], dim=1)
+        before = None if before is None else F.pad(before, (0, 0, 0, 0, 1, 0), value=-1)
+    true = to_digits(groups.sort(frames), model.config.digits)
+    scores = model.token_readout.split(model.token_readout(own.detach(), true, before))
+    return groups.unsort(scores).unflatten(2, model.config.token_grid)
 
 
 def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
@@ -319,77 +334,3 @@ def _means(losses: Tensor, sample: Tensor, batch: int) -> Tensor:
     zeros = losses.new_zeros(batch)
     count = zeros.index_add(0, sample, torch.ones_like(losses))
     return zeros.index_add(0, sample, losses.detach()) / count.clamp(min=1)
-
-
-# -- what is hidden
-
-
-def draw_pairs_mask(
-    config: HMAConfig, batch: int, frames: int, past: int, generator: torch.Generator | None
-) -> VideoMask:
-    """Mask the copies of the frames from the second on, and corrupt the `past` frames before them.
-
-    A copy is wholly masked with probability `whole_share`, else its tokens are masked with probability
-    cos(u pi/2). The past is corrupted as by `draw_video_mask`, the copies' visible tokens never.
-    """
-    where = device_of(generator)
-    corruption = draw_video_mask(config, batch, frames, generator).corruption[:, :past]
-    whole = uniform((batch, frames - 1), generator, where) < config.whole_share
-    ratio = torch.cos(uniform((batch, frames - 1), generator, where) * (math.pi / 2))
-    ratio = torch.where(whole, 1.0, ratio.clamp(min=config.mask_ratio_min)).unsqueeze(-1)
-    copies = uniform((batch, frames - 1, config.tokens_per_frame), generator, where) < ratio
-    masked = torch.cat([copies.new_zeros(batch, past, copies.shape[2]), copies], dim=1)
-    return VideoMask(masked, F.pad(corruption, (0, frames - 1)))
-
-
-def draw_video_mask(
-    config: HMAConfig, batch: int, frames: int, generator: torch.Generator | None, drift: bool = True
-) -> VideoMask:
-    """Mask the tokens of each frame with probability cos(u pi/2), and corrupt a share of all tokens.
-
-    With `history_probability` a sample keeps a history of at least `history_frames` frames unmasked. With
-    `drift`, each frame after it is corrupted more than the one before, as in a rollout of the model's own
-    predictions. Each sample has its own draws.
-    """
-    tokens = config.tokens_per_frame
-    where = device_of(generator)
-    index = torch.arange(frames, device=where)
-    draw = uniform((2, batch), generator, where)
-    start = min(config.history_frames, frames - 1)
-    long = (draw[0] < config.history_probability) & (frames > 2)
-    first = torch.where(long, start + (draw[1] * (frames - start)).long(), 1).unsqueeze(1)
-    ratio = torch.cos(uniform((batch, frames), generator, where) * (math.pi / 2))
-    ratio = ratio.clamp(min=config.mask_ratio_min)
-    masked = uniform((batch, frames, tokens), generator, where) < ratio.unsqueeze(-1)
-    masked &= (index >= first).unsqueeze(-1)
-
-    kept = 0.2 + 0.8 * uniform((batch, 1), generator, where)
-    shrink = 0.9 + 0.1 * uniform((batch, frames), generator, where)
-    after = (index >= first) & long.unsqueeze(1) & drift
-    more = 1 - kept * torch.where(after, shrink, 1.0).cumprod(1)
-    base = config.corrupt_max * uniform((batch, 1), generator, where)
-    corruption = torch.where(after, torch.maximum(more, base), base)
-    return VideoMask(masked, corruption if config.corrupt_max else torch.zeros_like(corruption))
-
-
-def corrupt_tokens(
-    config: HMAConfig, tokens: Tensor, mask: VideoMask, generator: torch.Generator | None
-) -> Tensor:
-    """Replace digits of token ids (B, T, S) at random, and set masked ids to `mask_id`."""
-    digits = to_digits(tokens, config.digits)
-    if config.corrupt_max:
-        values = torch.tensor(config.digits, device=tokens.device)
-        random = (uniform(digits.shape, generator, tokens.device) * values).long()
-        draw = uniform(digits.shape, generator, tokens.device)
-        hit = draw < mask.corruption.to(tokens.device)[..., None, None]
-        digits = torch.where(hit, torch.minimum(random, values - 1), digits)
-    corrupted = from_digits(digits, config.digits)
-    return corrupted.masked_fill(mask.masked.to(tokens.device), config.mask_id)
-
-
-def drop_chunks(present: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Draw chunks to hide, (B, T) bool: each sample draws a rate U(0, 1) and hides at least one present."""
-    draw = uniform(present.shape, generator, present.device)
-    rate = uniform((present.shape[0], 1), generator, present.device)
-    lowest = torch.where(present, draw, 2.0).argmin(1, keepdim=True)
-    return (draw < rate).scatter(1, lowest, True)

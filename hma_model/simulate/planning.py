@@ -216,7 +216,7 @@ def solver_of(kind: str) -> tuple[Any, Any]:
         raise UsageError(f"policy plan:{kind}", "is no solver", f"choose from {', '.join(SOLVERS)}")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of environments that are not installed
+            warnings.filterwarnings("ignore", "ale-py not found")  # solvers need no Atari games
             from stable_worldmodel import policy, solver
     except ImportError as fault:
         remedy = install_command("planning")

@@ -352,6 +352,7 @@ class Connection:
                     return
                 case messages.Sync():
                     session.sync()
+                    self.page.show(session.last(), {})  # in the place of an older one that still waits
                 case messages.Clock():
                     session.fast, session.due = message.fast, session.touched
                 case messages.Replay():

@@ -9,7 +9,7 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -144,7 +144,7 @@ class Session:
         true, shown = self._true[-1], self._world.picture(self.row)
         self._best, self._still = psnr(shown, true), true
         none = np.zeros((0, 0), np.float32)
-        self.start = Frame(0, jpeg(shown), jpeg(true), none, self._state, self._best, 60.0)
+        self.start = self._last = Frame(0, jpeg(shown), jpeg(true), none, self._state, self._best, 60.0)
 
     def sync(self) -> None:
         """Restart the model from the true last frames.
@@ -155,9 +155,10 @@ class Session:
         if not self._true:
             raise UsageError("sync", "the true frames are unknown here", "reset first, or drive a simulator")
         self._world.reset(self.row, *self._history())
-        self._still = self._true[-1]
-        self._best = psnr(self._world.picture(self.row), self._still)
+        shown, true = self._world.picture(self.row), self._true[-1]
+        self._best, self._still = psnr(shown, true), true
         self.parted, self._bad = None, 0
+        self._last = replace(self._last, model=jpeg(shown), true=jpeg(true), psnr=self._best, still=60.0)
 
     def _history(self) -> tuple[Picture, Floats]:
         """Return the true last frames, and the chunks between them."""
@@ -207,6 +208,7 @@ class Session:
         true = None if self._truth is None else jpeg(self._truth)
         frame = Frame(self.count, jpeg(picture), true, commands, self._state, score, still)
         self.frames.append(frame)
+        self._last = frame
         if self.replays:
             self.touched, self.held = now, commands[-1].copy()
         if self.viewer:
@@ -262,8 +264,8 @@ class Session:
         return self.status() | about | {"kind": "opened", "scores": scores}
 
     def last(self) -> Frame:
-        """Return the newest frame; before the first, the prompt's last one."""
-        return self.frames[-1] if self.frames else self.start
+        """Return what is to be seen now: the newest frame, or that from which the model was restarted."""
+        return self._last
 
     def film(self) -> list[Frame]:
         """Return the frames that are kept, after the prompt's last one if they begin there."""

@@ -25,7 +25,8 @@ from hma_data.storage.files import file_sha256, finite, read_json, to_json
 from hma_model.checkpoint.folder import CONFIG, FORMAT_VERSION, HEAD, STEM, TRAINING, Checkpoint, inside
 from hma_model.checkpoint.weights import read_tensors, write_tensors
 from hma_model.config import HMAConfig
-from hma_model.network.model import HMA, check_fit, module_key
+from hma_model.network.model import HMA
+from hma_model.network.states import check_fit, module_key
 from hma_model.training.recipe import Recipe, differences
 
 if TYPE_CHECKING:

@@ -278,8 +278,8 @@ class Run:
 
     # -- evaluation and checkpoints
 
-    def shown(self) -> HMA:
-        """Return the model to evaluate and save, unsharded on rank 0; every rank must call it."""
+    def saved_model(self) -> HMA:
+        """Return the model to evaluate and save, or with `ema` its average; every rank must call it."""
         if not self.average and not self.parallel_model.sharded:
             return self.model
         state = self.average.state() if self.average else gathered(self.model.state_dict().items())
@@ -295,7 +295,7 @@ class Run:
         with the loss of the training tokens' frequencies as a baseline. For passive, policy and inverse it is
         the training loss on held-out windows, under masks that are the same at every evaluation.
         """
-        model = self.shown()
+        model = self.saved_model()
         self.evaluation = self.world.once(lambda: self._evaluated(model))
         return self.evaluation
 
@@ -349,7 +349,7 @@ class Run:
 
     def save(self) -> Path:
         """Write checkpoints/step-N, and delete all but the last few; every rank must call it."""
-        model, sampler = self.shown(), self.train_data.state(self.world)
+        model, sampler = self.saved_model(), self.train_data.state(self.world)
         moments = optim.optimizer_state(self.optimizer)
         weights = gathered(self.model.state_dict().items()) if self.average else {}
         state = State(

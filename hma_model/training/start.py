@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.errors import CheckpointError, HubError, RecipeError
+from hma_data.errors import CheckpointError, RecipeError
 from hma_data.loading.views import view_count
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
@@ -73,21 +73,14 @@ class Start:
             require_tokenizer(found.config, _spec(sets), found.folder)
             found.trunk()
             source = str(found.folder)
+        wanted, likes = _robots(recipe, sets, source, revision, local)
         try:
-            wanted, likes = _robots(recipe, sets, source, revision, local)
-            try:
-                hub.pull(source, sorted(wanted | likes), place, revision)
-            except CheckpointError as fault:
-                if not likes - wanted:
-                    raise
-                remedy = f"{fault.remedy}, or with new_stem=fresh go without the robots like yours"
-                raise CheckpointError(fault.where, fault.fault, remedy) from fault
-        except HubError as fault:
-            if local or "://" in source:
+            hub.pull(source, sorted(wanted | likes), place, revision)
+        except CheckpointError as fault:
+            if not likes - wanted:
                 raise
-            both = f"is no folder here; as a repository of the hub: {fault.fault}"
-            remedy = f"give the path of a checkpoint or run, or: {fault.remedy}"
-            raise HubError(recipe.start, both, remedy) from fault
+            remedy = f"{fault.remedy}, or with new_stem=fresh go without the robots like yours"
+            raise CheckpointError(fault.where, fault.fault, remedy) from fault
 
     @classmethod
     def open(cls, recipe: Recipe, sets: Mapping[str, ShardSet], out: Path) -> "Start":
@@ -200,7 +193,7 @@ def _robots(
     """Return the robots of a checkpoint that the run takes, and those with whose stem a new one may begin."""
     from hma_model.hub import publish as hub
 
-    known = hub.embodiment_ids(hub.open_store(source, revision).files())
+    known = hub.embodiment_ids(hub.open_published(source, revision)[1])
     wanted = {name for name in known if name in sets or (recipe.freeze == "trunk" and local)}
     fresh, likes = set(sets) - set(known), set[str]()
     if fresh and recipe.new_stem == "like":

@@ -114,3 +114,32 @@ def test_a_script_tells_an_error_in_one_line(fault, said, code, capsys, monkeypa
 )
 def test_a_duration_never_has_sixty_seconds(seconds: float, text: str) -> None:
     assert console.human_seconds(seconds) == text
+
+
+def test_a_row_of_words_too_wide_for_a_terminal_becomes_a_paragraph(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    name = "a_robot_with_a_name_that_alone_is_wider_than_the_terminal_is"
+    console.print_table(["id", "robot", "Hz", "licence"], [[name, "an arm [left]", 30.0, None]])
+    out = re.sub(r"\x1b\[\d*m", "", capsys.readouterr().out)
+    assert [line.rstrip() for line in out.splitlines()] == [name, "  robot: an arm [left]; Hz: 30"]
+
+
+@pytest.mark.parametrize(
+    ("paths", "short"),
+    [
+        (["runs/first", "runs/second"], ["runs/first", "runs/second"]),
+        (["runs/an_arm_of_ours/checkpoints/step-10"], ["runs/an_arm_of_ours/checkpoints/step-10"]),
+        (["runs/ablations/w64/seed_1/", "runs/ablations/w64/seed_2"], ["seed_1", "seed_2"]),
+        (
+            ["runs/width_64/checkpoints/step-10", "runs/width_32/checkpoints/step-10"],
+            ["width_64", "width_32"],
+        ),
+        (["runs/ablations/width_64", "runs/ablations/width_64/ema"], ["width_64", "width_64/ema"]),
+        (["embedded", "/somewhere/else/runs/first"], ["embedded", "/somewhere/else/runs/first"]),
+    ],
+)
+def test_short_paths_leave_out_what_all_have_in_common(paths: list[str], short: list[str]) -> None:
+    assert console.short_paths(paths) == dict(zip(paths, short, strict=True))

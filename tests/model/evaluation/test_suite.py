@@ -154,6 +154,10 @@ def test_the_page_is_one_file_that_shows_each_robot_and_checkpoint(made: Path, t
     assert table.count("mean over sets") == 2 and "ΔPSNR" in table
     said = verdict(run(made)[0].found)
     assert said in page and f"- {made / 'one'} on arm {said}" in table
+    shown = re.sub(r"<h2>The command.*", "", page, flags=re.DOTALL)
+    assert shown.count(str(made / "one")) == 1 and "<td>one</td>" in shown  # a legend, then short names
+    results = json.loads((tmp_path / "results.json").read_bytes())
+    assert {row["checkpoint"] for row in results["means"]} == {str(made / name) for name in BOTH}
 
 
 def test_the_difference_is_black_where_pictures_are_equal() -> None:

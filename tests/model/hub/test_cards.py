@@ -10,7 +10,7 @@ from huggingface_hub import DatasetCard, ModelCard
 
 from hma_data.errors import HubError
 from hma_data.tokenizers.base import get_tokenizer
-from hma_model.checkpoint.model_card import licence
+from hma_model.checkpoint.model_card import licence, render
 from hma_model.config import HMAConfig
 from hma_model.hub import publish as hub
 from hma_model.hub.datasets import push_data
@@ -60,6 +60,14 @@ def test_the_cards_code_runs_as_pasted(
     monkeypatch.chdir(tmp_path / "hub")  # the card says: in this folder
     exec(found[1], made)
     assert made["film"].shape == (6, spec.image_size, spec.image_size, 3) and made["film"].dtype == np.uint8
+
+
+def test_a_card_says_what_its_losses_are_of() -> None:
+    config: dict[str, Any] = {"model": {"kind": "discrete", "merge": 2}, "tokenizer": {}}
+    cards = {"arm": {"metrics": {"val_loss": 7.1, "baseline_loss": 12.5}}}
+    text = render(config, cards).decode()
+    assert "Val loss: nats a square of 2×2 tokens" in text
+    assert "Baseline loss" not in render(config, {"arm": {"metrics": {"val_loss": 7.1}}}).decode()
 
 
 def test_a_shard_sets_card_tells_the_viewer_its_tables(tmp_path: Path) -> None:

@@ -359,7 +359,7 @@ def test_a_token_without_write_access_is_called_so(published, source):
 
 
 def test_a_repository_or_revision_that_is_not_there_is_called_so(published):
-    with pytest.raises(HubError, match=r"hf://team/none: no such repository.*check the name"):
+    with pytest.raises(HubError, match=r"^team/none: is no folder here; .* no such repository.*check"):
         hub.pull("team/none")
     with pytest.raises(HubError, match=r"no such revision.*branch, tag or commit"):
         hub.pull(REPO, revision="v9")

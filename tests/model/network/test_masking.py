@@ -5,7 +5,7 @@ import math
 import torch
 
 from hma_model.generation.unmask import masked_after
-from hma_model.network.objectives import VideoMask, corrupt_tokens, draw_video_mask, drop_chunks
+from hma_model.network.masking import VideoMask, corrupt_tokens, draw_video_mask, drop_chunks
 from hma_model.network.stem import to_digits
 from tests.model.network_parts import small_config
 

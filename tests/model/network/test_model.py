@@ -9,8 +9,8 @@ import torch
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_model.config import CONDITIONINGS, OBJECTIVES, ActionSpace
+from hma_model.network.masking import draw_video_mask, drop_chunks
 from hma_model.network.model import HMA
-from hma_model.network.objectives import draw_video_mask, drop_chunks
 from hma_model.network.stem import from_digits, patchify, to_digits, unpatchify
 from tests.model.network_parts import ARM, HAND, small_batch, small_config, small_model
 

@@ -8,8 +8,9 @@ import torch
 
 from hma_data.loading.rows import Batch
 from hma_model.evaluation.metrics import teacher_forced
+from hma_model.network.masking import draw_pairs_mask
 from hma_model.network.model import HMA
-from hma_model.network.objectives import Layout, draw_pairs_mask
+from hma_model.network.objectives import Layout
 from hma_model.network.stem import merge_tokens, split_tokens, to_digits
 from hma_model.network.trunk import sinusoids
 from tests.model.network_parts import small_batch, small_config, small_model

@@ -440,6 +440,37 @@ def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", en
     page.wait_for_selector("#sync:not(.call)")
 
 
+def test_a_picture_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(
+    page: "Page", engine: Engine
+) -> None:
+    session = session_of(engine, page)
+    engine.call(lambda: engine._world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
+    page.locator("input[value=fast]").check(force=True)
+    page.click("#run")
+    page.wait_for_selector("#parted:has-text('parted at 0.1 s')")
+    page.keyboard.press("p")
+    page.wait_for_selector("#run:has-text('Run')")
+    page.evaluate("""() => {
+        const decode = createImageBitmap;
+        window.createImageBitmap = async (...given) => {
+            const map = await decode(...given);
+            await new Promise((done) => setTimeout(done, 300));
+            return map;
+        };
+        window.seen = [];
+        const note = () => seen.push($("parted").textContent);
+        new MutationObserver(note).observe($("parted"), { childList: true });
+    }""")
+    page.keyboard.press("n")
+    page.keyboard.press("y")
+    page.wait_for_selector("#sync:not(.call)")
+    page.wait_for_timeout(1000)
+    shown = page.evaluate("() => seen")
+    assert shown[-1] == "" and "parted at 0.1 s" not in shown[shown.index("") :]
+    middle = page.evaluate("() => [...$('model-view').getContext('2d').getImageData(5, 5, 1, 1).data]")
+    assert max(middle[:3]) > 50  # the true picture, where the model of before was black
+
+
 def test_a_page_whose_server_stopped_says_so_and_goes_on_when_it_is_back(
     browser: "Browser", engine: Engine
 ) -> None:

@@ -1,5 +1,7 @@
 """Plans: what candidates lead to is what a session sees, and solvers move a dot to its goal."""
 
+import subprocess
+import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -137,3 +139,11 @@ def test_words_that_are_no_plan_are_refused() -> None:
         read_policy("plan:cem,samples=many", scenes, world)
     with pytest.raises(UsageError, match="receding up to horizon"):
         Planning(world, scenes, horizon=2, receding=3)
+
+
+@pytest.mark.slow
+def test_solvers_are_imported_without_a_warning_of_games() -> None:
+    pytest.importorskip("stable_worldmodel")
+    code = "from hma_model.simulate.planning import solver_of; solver_of('cem')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "ale-py" not in done.stderr
