@@ -148,7 +148,7 @@ def converted(made: Made, given: Given, out: Path) -> Any:
     convert(made.arm, source, BlockTokenizer(), given(out / "set"), settings=settings)
     share = Share(0, 1)
     convert_share(made.arm, source, BlockTokenizer(), given(out / "shared"), share, settings=settings)
-    plan, uri = plan_conversion(made.arm, source, BlockTokenizer(), settings)
+    plan, uri = plan_conversion(made.arm, source, BlockTokenizer().spec, settings)
     estimated = estimate(plan, given(made.hdf5), made.arm, BlockTokenizer(), 1)
     return content(out), plan.facts, uri, estimated.bytes
 

@@ -253,7 +253,7 @@ def _plan(job: _Job, json: bool, share: "Share | None") -> bool:
     from hma_data.tokenizers.base import get_tokenizer
 
     opened = get_tokenizer(job.tokenizer, weights=job.weights, device=job.device)
-    plan, uri = plan_conversion(robot, job.source, opened, job.settings)
+    plan, uri = plan_conversion(robot, job.source, opened.spec, job.settings)
     tasks = share.count if share else 1
     cost = estimate(plan, uri, robot, opened, job.workers, tasks)
     units = [{"shard": unit.name, "episodes": len(unit), "frames": unit.frames} for unit in plan.units]

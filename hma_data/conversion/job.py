@@ -49,7 +49,7 @@ from hma_data.storage.files import remove_parts
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.records import Records
 from hma_data.storage.remote import parquet_file, place
-from hma_data.tokenizers.base import Tokenizer, get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_spec, get_tokenizer
 
 
 @dataclass
@@ -123,7 +123,7 @@ class Shared:
 
 
 def plan_conversion(
-    embodiment: Embodiment, source: StrPath | None, tokenizer: Tokenizer, settings: Settings
+    embodiment: Embodiment, source: StrPath | None, tokenizer: TokenizerSpec, settings: Settings
 ) -> tuple[Plan, str]:
     """Return the plan of a conversion and the URI it reads; see `convert`."""
     uri = embodiment.source.uri if source is None else as_text(source)
@@ -147,7 +147,7 @@ def plan_conversion(
         ids = ids_for_robot(refs.column("id").to_pylist(), embodiment)
         kept = pa.array(chosen_ids(ids, settings.only, settings.exclude), pa.string())
         chosen = refs.take(to_numpy(pc.is_in(refs.column("id"), kept)))
-    plan = make_plan(chosen, embodiment, tokenizer.spec, settings, uri)
+    plan = make_plan(chosen, embodiment, tokenizer, settings, uri)
     return replace(plan, left_out=len(refs) - len(chosen)), uri
 
 
@@ -295,13 +295,16 @@ class _Conversion:
     def __post_init__(self) -> None:
         if not isinstance(self.tokenizer, str) or str(self.out).startswith("memory:"):
             self.workers = 0  # no other process sees them
-        if isinstance(self.tokenizer, str):
-            # Workers open it on the device; this process needs what it is, and may have no such device.
-            device = "cpu" if self.workers or self.engine == "ray" else self.device
-            self._opened = get_tokenizer(self.tokenizer, weights=self.weights, device=device)
-        else:
+        self._opened: Tokenizer | None = None
+        if not isinstance(self.tokenizer, str):
             self._opened = self.tokenizer
-        self._whole, self.uri = plan_conversion(self.embodiment, self.source, self._opened, self.settings)
+        elif not self.workers and self.engine == "local":
+            self._opened = get_tokenizer(self.tokenizer, weights=self.weights, device=self.device)
+        else:  # workers open it; this process stays light, and may have no such device
+            self._spec = get_spec(self.tokenizer, weights=self.weights)
+        if self._opened is not None:
+            self._spec = self._opened.spec
+        self._whole, self.uri = plan_conversion(self.embodiment, self.source, self._spec, self.settings)
         self.pictures: dict[str, tuple[int, int]] = {}
         self.changed = ""
 
@@ -379,7 +382,7 @@ class _Conversion:
         job = Job(
             self.uri,
             self.embodiment,
-            self._opened.spec.name,
+            self._spec.name,
             None if self.weights is None else as_text(self.weights),
             self.device,
             self.out.absolute(),
@@ -392,7 +395,7 @@ class _Conversion:
             if gpus is None:
                 gpus = 1.0 if self.device.startswith("cuda") else 0.0
             return run_ray(todo, MakeWork(job), self.workers, on_event, self.limits, cpus, gpus)
-        make_work = MakeWork(job, None if self.workers else self._opened)
+        make_work = MakeWork(job, self._opened)
         return run_local(todo, make_work, self.workers, on_event, self.limits)
 
     def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Manifest:
@@ -418,7 +421,7 @@ class _Conversion:
             out,
             names,
             self.embodiment,
-            self._opened.spec,
+            self._spec,
             plan.facts,
             self.uri,
             hashes={**{shard.path: shard.sha256 for shard in kept}, **known_hashes(out)},

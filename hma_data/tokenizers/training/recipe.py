@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationErr
 from hma_data.errors import RecipeError
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.storage.yaml_io import read_yaml
-from hma_data.tokenizers.embedded import PATCH, FsqConfig, VaeConfig
+from hma_data.tokenizers.shapes import PATCH, FsqConfig, VaeConfig
 
 LOCAL: dict[str, Any] = {"corpus": True, "network": {"latent_scale"}}  # a place, and a measured value
 Share = Annotated[float, Field(ge=0, le=1)]
