@@ -69,7 +69,7 @@ class Embodiment(SpecModel):
     robot: str | None = Field(None, description="which robot it is, in words")
     kind: Literal["real", "simulation", "human"] = Field(description="who or what was recorded")
     frequency_hz: Number | Literal["unknown"] | None = Field(
-        description="control rate of the recording in Hz; null only where every recording has timestamps"
+        description="control rate of the recording in Hz; unknown; null only where recordings have times"
     )
     target_hz: Number = Field(
         2.0, ge=0.001, le=100_000, description="frames a second that the model sees; the stride follows"
@@ -173,7 +173,8 @@ class Embodiment(SpecModel):
         """
         where = f"embodiment {self.id}: frequency_hz"
         if self.frequency_hz not in ("unknown", hz):
-            fault = f"is {self.frequency_hz}, not {hz:g}"
+            stated = "null" if self.frequency_hz is None else f"{self.frequency_hz:g}"
+            fault = f"is {stated}, not {hz:g}"
             raise RegistryError(where, fault, "correct it in a copy of the YAML")
         provenance = self.provenance | {"frequency_hz": "given at the conversion"}
         return Embodiment.from_values(self.to_dict() | {"frequency_hz": hz, "provenance": provenance}, where)
@@ -303,7 +304,9 @@ def find_problems(values: Any, stored: bool = False) -> list[Problem]:
     questions = todos(values)
     found = [Problem(path, f"still {TODO}: {text}") for path, text in questions]
     try:
-        Embodiment.model_validate(values, context={"stored": stored})
+        robot = Embodiment.model_validate(values, context={"stored": stored})
+        if not stored:
+            found += _rate_problem(robot)
     except ValidationError as fault:
         asked = {path for path, _ in questions}
         for item in fault.errors(include_url=False):
@@ -312,6 +315,22 @@ def find_problems(values: Any, stored: bool = False) -> list[Problem]:
             if path not in asked and not follows:
                 found.append(_problem(path, item, values))
     return list(dict.fromkeys(found))
+
+
+def _rate_problem(robot: Embodiment) -> list[Problem]:
+    """Return what is wrong with a rate that is null: nothing where times and stride are known without it."""
+    if robot.frequency_hz is not None or robot.sync.rate_hz:
+        return []
+    form, layout = robot.source.format, robot.source.layout or {}
+    allowed = "the rate in Hz, or unknown"
+    if form == "rlds" or (form == "hdf5" and "timestamps" not in layout):
+        if form == "hdf5":
+            allowed += ", or null with source.layout.timestamps and a stride"
+        return [Problem("frequency_hz", f"is null, but {form} recordings keep no times", allowed=allowed)]
+    if robot.stride_override:
+        return []
+    allowed += ", or null with a stride" + ("" if form in ONE_INDEX else " or sync.rate_hz")
+    return [Problem("frequency_hz", "is null, so that no stride follows from it", allowed=allowed)]
 
 
 def todos(values: Any, path: str = "") -> list[tuple[str, str]]:

@@ -239,14 +239,8 @@ def _check_length(
 def _times(group: h5py.Group, embodiment: Embodiment, layout: Hdf5Layout, length: int, where: str) -> Floats:
     """Return the seconds of the frames: the episode's own where the YAML names their key."""
     key, hz = layout.timestamps, embodiment.frequency_hz
-    if key is None and hz is None:
-        raise SourceError(
-            f"embodiment {embodiment.id}",
-            "frequency_hz is null, and HDF5 stores no times by itself",
-            "set frequency_hz, or source.layout.timestamps to the key of the seconds",
-        )
     if key is None:  # With an unknown rate a recording can be looked at; converting it is refused before.
-        return rate_times(length, hz if isinstance(hz, float) else 1.0)
+        return rate_times(length, 1.0 if hz == "unknown" else embodiment.rate_hz)
     values = numbers(group, key, where)
     if values.dtype.kind not in "fiu" or values.size != len(values):
         raise EpisodeError(where, f"{key!r} holds {values.shape} {values.dtype}, not a time a frame")

@@ -175,18 +175,13 @@ def test_a_layout_names_groups_and_times(tmp_path: Path) -> None:
                 fill(file.create_group(f"{day}/runs/{run}"), seed=run)
                 file[f"{day}/runs/{run}/clock"] = np.arange(T) * 0.3 + 100
     layout = {"episodes": "*/runs/*", "timestamps": "clock"}
-    arm = embodiment(source__layout=layout, frequency_hz=None)
+    arm = embodiment(source__layout=layout, frequency_hz=None, stride=2)
     source = open_source("hdf5")
     ids = [ref.id for ref in source.index(str(path), arm)]
     assert ids == ["mon/runs/9", "mon/runs/10", "tue/runs/9", "tue/runs/10"]
     np.testing.assert_allclose(
         source.read(str(path), ids[1], arm).streams["front"].timestamps, 100 + np.arange(T) * 0.3
     )
-
-
-def test_without_rate_and_times_reading_says_what_to_set(demos: Path) -> None:
-    with pytest.raises(SourceError, match=r"layout\.timestamps"):
-        open_source("hdf5").read(str(demos), "demo_0", embodiment(frequency_hz=None))
 
 
 def test_an_unknown_rate_can_still_be_looked_at(demos: Path) -> None:
