@@ -21,7 +21,7 @@ from hma_data.console import (
 from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
-    from hma_data.conversion.job import Progress, Shared, Summary
+    from hma_data.conversion.report import Progress, Shared, Summary
     from hma_data.conversion.output import Share
     from hma_data.conversion.plan import Settings
 
