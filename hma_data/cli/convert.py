@@ -21,9 +21,9 @@ from hma_data.console import (
 from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
-    from hma_data.conversion.report import Progress, Shared, Summary
     from hma_data.conversion.output import Share
     from hma_data.conversion.plan import Settings
+    from hma_data.conversion.report import Progress, Shared, Summary
 
 SHOWN = 20  # reasons of quarantine that are printed
 DATA, BAD, OLD = "What is kept, and the split", "Episodes that cannot be used", "If --out holds a shard set"

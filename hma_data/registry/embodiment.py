@@ -37,7 +37,7 @@ from hma_data.registry.components import (
 )
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path, as_text
-from hma_data.storage.yaml_io import parse_yaml, read_yaml, write_yaml
+from hma_data.storage.yaml_io import parse_yaml, plain_fault, read_yaml, write_yaml
 
 if TYPE_CHECKING:
     import numpy as np
@@ -95,6 +95,16 @@ class Embodiment(SpecModel):
     def _id_is_a_name(cls, value: str) -> str:
         if not ID_PATTERN.fullmatch(value) or ".." in value:
             raise ValueError("must be 1 to 100 of a-z 0-9 _ - . and begin with a letter or digit")
+        return value
+
+    @field_validator("frequency_hz", mode="before")
+    @classmethod
+    def _rate_is_a_number(cls, value: Any) -> Any:
+        if isinstance(value, str) and value != "unknown":  # else one fault for each kind of value
+            try:
+                return float(value)
+            except ValueError:
+                raise ValueError("must be a number of Hz without a unit, or unknown") from None
         return value
 
     @field_validator("frequency_hz")
@@ -300,7 +310,10 @@ def problems(values: Any, stored: bool = False) -> list[str]:
 def find_problems(values: Any, stored: bool = False) -> list[Problem]:
     """Return all problems of a YAML's plain values; for `stored`, see `Embodiment.load`."""
     if not isinstance(values, dict):
-        return [Problem("", f"must be a mapping, is {type(values).__name__}")]
+        said = {"NoneType": "is empty", "list": "is a list"}.get(type(values).__name__, "is a single value")
+        return [
+            Problem("", f"must be a mapping of keys to values, {said}", allowed=", ".join(_keys(Embodiment)))
+        ]
     questions = todos(values)
     found = [Problem(path, f"still {TODO}: {text}") for path, text in questions]
     try:
@@ -363,12 +376,15 @@ def _problem(path: str, item: Any, values: dict[str, Any]) -> Problem:
         return Problem(path, "is missing")
     if item["type"] == "extra_forbidden":
         return _unknown_key(path, values)
-    shown = None if isinstance(item["input"], dict) else repr(item["input"])
+    shown: str | None = repr(item["input"])
+    if isinstance(item["input"], dict):
+        shown = None if item["type"] == "value_error" else "a mapping"
     if shown and len(shown) > 60:
         shown = shown[:57] + "..."
     if item["type"] == "literal_error":
         return Problem(path, "is not one of the words that are allowed", shown, item["ctx"]["expected"])
-    return Problem(path, item["msg"].removeprefix("Value error, "), shown)
+    inside = _KEYS_AT.get(re.sub(r"\[\d+\]", "", path)) if item["type"] == "model_type" else None
+    return Problem(path, plain_fault(item), shown, ", ".join(_keys(inside)) if inside else None)
 
 
 def _unknown_key(path: str, values: dict[str, Any]) -> Problem:
@@ -380,7 +396,8 @@ def _unknown_key(path: str, values: dict[str, Any]) -> Problem:
         known, of = LAYOUTS[values["source"]["format"]], f" of format {values['source']['format']}"
     keys, key = _keys(known), path.rpartition(".")[2]
     places = [place for place, model in _KEYS_AT.items() if key in _keys(model)]
-    near = get_close_matches(key, keys, n=1) or [f"{place}.{key}" for place in places]
+    other = [name for name in [_OTHER_WORDS.get(key.lower())] if name in keys]
+    near = other or get_close_matches(key, keys, n=1) or [f"{place}.{key}" for place in places]
     hint = f", did you mean {near[0]!r}?" if near else ""
     return Problem(path, f"unknown key{of}{hint}", allowed=", ".join(keys) or "none")
 
@@ -389,6 +406,10 @@ def _keys(model: type[BaseModel]) -> list[str]:
     return [field.alias or name for name, field in model.model_fields.items()]
 
 
+_OTHER_WORDS = {  # keys as other projects name them -> ours
+    "path": "uri", "url": "uri", "file": "uri", "folder": "uri", "type": "kind",
+    "fps": "frequency_hz", "hz": "frequency_hz", "rate": "frequency_hz",
+}  # fmt: skip
 _KEYS_AT: dict[str, type[SpecModel]] = {
     "action": Action,
     "action.components": Component,

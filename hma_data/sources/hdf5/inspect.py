@@ -129,12 +129,12 @@ def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: EpisodeGrou
 
 def _end_to_end(name: str, group: h5py.Group, place: EpisodeGroup, survey: Survey) -> None:
     """Warn where a whole file is taken for one episode, but states that it holds several."""
-    for key in _ENDS if place.group == WHOLE_FILE else ():
-        item = group.get(key)
-        if not isinstance(item, h5py.Dataset) or len(item.shape or ()) != 1 or item.size > MAX_VALUES:
+    for key, item in walk(group) if place.group == WHOLE_FILE else ():
+        last = key.rsplit("/", 1)[-1]
+        if last not in _ENDS or len(item.shape or ()) != 1 or item.size > MAX_VALUES:
             continue
         ends = item[()].astype(bool)  # a run of True counts once
-        count = len(item) if key.startswith("episode") else int(np.diff(ends, prepend=False)[ends].sum())
+        count = len(item) if last.startswith("episode") else int(np.diff(ends, prepend=False)[ends].sum())
         if count > 1:
             said = f"{name} is read as one episode, but {key} tells of {count:,}"
             remedy = (
@@ -180,7 +180,7 @@ def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: in
 
 def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, first: _First) -> None:
     survey.numbers(name, key, values)
-    seconds = seconds_of(values) if is_times(key, info.shape) else None
+    seconds = seconds_of(values, key) if is_times(key, info.shape) else None
     if seconds is not None:
         clock = survey.times(name, key, seconds)
         survey.made.add("rate")
@@ -248,7 +248,7 @@ def _facts(group: h5py.Group, said: dict[str, Any], place: EpisodeGroup) -> dict
 def _rate(
     group: h5py.Group, said: dict[str, Any], keys: dict[str, KeyInfo], where: str
 ) -> tuple[float | None, str, str]:
-    """Return Hz, what states it, and the key of times in seconds; empty where there is no such key."""
+    """Return Hz, what states it, and the key of times whose unit is clear; empty where there is no such key."""
     stated, holder = _stated_rate(group, said)
     key = next(
         (key for key, info in keys.items() if info.kind == "vector" and is_times(key, info.shape)), None
@@ -256,12 +256,11 @@ def _rate(
     if key is None:
         return stated, holder, ""
     values = numbers(group, key, where).reshape(-1)
-    unit = seconds_a_unit(values) if values.dtype.kind in "fiu" else None
+    unit = seconds_a_unit(values, key) if values.dtype.kind in "fiu" else None
     if unit is None:
         return stated, holder, ""
     measured = 1 / (float(np.median(np.diff(values.astype(np.float64)))) * unit)
-    seconds = key if unit == 1.0 else ""
-    return (stated, holder, seconds) if stated else (measured, f"{_MEASURED} {key}", seconds)
+    return (stated, holder, key) if stated else (measured, f"{_MEASURED} {key}", key)
 
 
 def _stated_rate(group: h5py.Group, said: dict[str, Any]) -> tuple[float | None, str]:

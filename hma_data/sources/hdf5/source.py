@@ -8,7 +8,7 @@ An episode is a group (`data/demo_0`) or a whole file. The file itself shows whi
       layout: {episodes: "data/*", timestamps: obs/time}   # "/" means one file an episode
 
 A uri is a file or a folder of files. Keys are paths inside the episode's group. HDF5 stores no rate: the rate
-is the embodiment's `frequency_hz`, unless `layout.timestamps` names a key of seconds. Where pictures and
+is the embodiment's `frequency_hz`, unless `layout.timestamps` names a key of times. Where pictures and
 states have one row more than the actions (ManiSkill), `last_observation: drop` leaves out the row after the
 last action.
 
@@ -37,6 +37,7 @@ from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.components import Hdf5Layout, Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
+from hma_data.sources.common.checks import seconds_a_unit, seconds_of
 from hma_data.sources.hdf5.file import (
     WHOLE_FILE,
     EpisodeFinder,
@@ -244,7 +245,10 @@ def _times(group: h5py.Group, embodiment: Embodiment, layout: Hdf5Layout, length
     values = numbers(group, key, where)
     if values.dtype.kind not in "fiu" or values.size != len(values):
         raise EpisodeError(where, f"{key!r} holds {values.shape} {values.dtype}, not a time a frame")
-    return values.reshape(-1).astype(np.float64)
+    times = values.reshape(-1)
+    unit = seconds_a_unit(np.unique(times), key)
+    seconds = seconds_of(times, key) if unit not in (None, 1.0) else None
+    return times.astype(np.float64) if seconds is None else seconds
 
 
 def _vector(group: h5py.Group, vector: Vector, where: str) -> NDArray[np.float32]:

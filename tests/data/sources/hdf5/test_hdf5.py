@@ -184,6 +184,25 @@ def test_a_layout_names_groups_and_times(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("key", "origin", "unit"),
+    [
+        ("clock", 1_700_000_000_000_000_000, 1e-9),
+        ("time_us", 1_700_000_000_000_000, 1e-6),
+        ("t_ms", 0, 1e-3),
+        ("stamp_ns", 0, 1e-9),
+    ],
+)
+def test_times_of_any_unit_are_read_as_seconds(tmp_path: Path, key: str, origin: int, unit: float) -> None:
+    uneven = np.cumsum([0.0, *([0.1, 0.3] * T)])[:T]
+    with h5py.File(tmp_path / "lab.h5", "w") as file:
+        fill(file.create_group("data/demo_0"))
+        file[f"data/demo_0/{key}"] = origin + np.round(uneven / unit).astype(np.int64)
+    arm = embodiment(source__layout={"timestamps": key}, frequency_hz=5)
+    times = open_source("hdf5").read(str(tmp_path / "lab.h5"), "demo_0", arm).streams["front"].timestamps
+    np.testing.assert_allclose(times - times[0], uneven, atol=1e-3)
+
+
 def test_an_unknown_rate_can_still_be_looked_at(demos: Path) -> None:
     episode = open_source("hdf5").read(str(demos), "demo_0", embodiment(frequency_hz="unknown"))
     assert len(episode.streams["front"].timestamps) == T
