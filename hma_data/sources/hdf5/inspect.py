@@ -248,7 +248,7 @@ def _facts(group: h5py.Group, said: dict[str, Any], place: EpisodeGroup) -> dict
 def _rate(
     group: h5py.Group, said: dict[str, Any], keys: dict[str, KeyInfo], where: str
 ) -> tuple[float | None, str, str]:
-    """Return Hz, what states it, and the key of times whose unit is clear; empty where there is no such key."""
+    """Return Hz, what states it, and the key of times whose unit is clear; empty where there is none."""
     stated, holder = _stated_rate(group, said)
     key = next(
         (key for key, info in keys.items() if info.kind == "vector" and is_times(key, info.shape)), None
