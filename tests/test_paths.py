@@ -410,8 +410,9 @@ INNER = {  # take what a public function has made of a path already
         "Derived",
     },
     "hma_data.shards.verify": {"check_rows", "check_shard"},
-    "hma_data.sources.base": {
-        "of_another_format",
+    "hma_data.sources.base": {"of_another_format", "by_files"},
+    "hma_data.sources.common.places": {
+        "is_away",
         "existing_path",
         "local_path",
         "leaves",
@@ -419,7 +420,6 @@ INNER = {  # take what a public function has made of a path already
         "file_fingerprint",
         "unfollowed",
         "nothing_there",
-        "by_files",
     },
     "hma_data.tokenizers.training.frames": {"read_pictures", "load_pools"},
     "hma_data.tokenizers.training.train": {"Run"},

@@ -36,8 +36,9 @@ from hma_data.episodes.images import Images, decode_image
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.components import Hdf5Layout, Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
 from hma_data.sources.common.checks import seconds_a_unit, seconds_of
+from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.hdf5.file import (
     WHOLE_FILE,
     EpisodeFinder,
