@@ -4,8 +4,6 @@ import math
 from collections import Counter
 from collections.abc import Container, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -33,9 +31,8 @@ from hma_data.sources.hdf5.file import (
 )
 from hma_data.sources.hdf5.pictures import as_bytes, as_rgb, encoded, picture_kind, pixels_of
 from hma_data.sources.hdf5.source import TEXT_KEYS, json_of
-from hma_data.sources.hdf5.videos import SUFFIXES
+from hma_data.sources.hdf5.videos import is_video, video_keys, videos_beside
 
-MAX_LISTED = 1_000  # files beside an HDF5 file among which videos are looked for
 LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
 _ENDS = ("episode_ends", "episode_lengths", "terminals", "timeouts", "dones")  # of episodes end to end
@@ -87,7 +84,8 @@ def inspect(
                     _tell(first, group, files, place)
                     _end_to_end(name, group, place, survey)
                 held.update(sizes)
-                series = [key for key, info in first.keys.items() if info.kind in ("camera", "vector")]
+                inside = (key for key, info in first.keys.items() if info.kind in ("camera", "vector"))
+                series = [key for key in inside if not is_video(key)]
                 survey.lengths(name, lengths[name], sizes, series)
                 if name in chosen:
                     survey.episode(name)
@@ -124,7 +122,9 @@ def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: EpisodeGrou
     first.keys = {info.key: info for info in _keys(group, place, first.pixels)}
     first.facts = _facts(group, said, place)
     first.facts["pixels"] = next(iter(first.pixels.values()), "")
-    first.facts["videos beside it"] = _videos(place.file)
+    first.facts["videos beside it"] = listed(videos_beside(place.file))
+    if place.group == WHOLE_FILE and all(info.kind != "camera" for info in first.keys.values()):
+        first.keys |= {info.key: info for info in video_keys(place.file)}
     first.rate, first.facts["rate"], first.facts["timestamps"] = _rate(group, said, first.keys, str(place))
 
 
@@ -143,13 +143,6 @@ def _end_to_end(name: str, group: h5py.Group, place: EpisodeGroup, survey: Surve
             )
             survey.note(Finding("rows", "warn", said, remedy, key, {"episodes": count}))
             return
-
-
-def _videos(file: Path) -> str:
-    """Return the video files below the file's folder, as a camera's key would name them."""
-    inside = islice(file.parent.rglob("*"), MAX_LISTED)
-    found = [item.relative_to(file.parent).as_posix() for item in inside if item.suffix.lower() in SUFFIXES]
-    return listed(sorted(found))
 
 
 def _environment(handle: h5py.File) -> dict[str, Any]:

@@ -151,11 +151,11 @@ class Hdf5Source:
                 check(embodiment.state.components[0].key, len(observed))
             cameras: dict[str, PictureRows | VideoRows] = {}
             for camera in embodiment.cameras:
-                if is_video(camera):
+                if is_video(camera.key):
                     cameras[camera.name] = VideoRows(video_path(place.file, camera, layout), times)
                 else:
                     cameras[camera.name] = self._pictures(place, group, camera.key, layout, times)
-                check(camera.key, cameras[camera.name].rows, layout.frames_missing * is_video(camera))
+                check(camera.key, cameras[camera.name].rows, layout.frames_missing * is_video(camera.key))
             length = min(len(actions), *(pictures.rows for pictures in cameras.values()))
             times = times[:length]
             for pictures in cameras.values():
