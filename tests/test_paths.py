@@ -148,7 +148,7 @@ def converted(made: Made, given: Given, out: Path) -> Any:
     convert(made.arm, source, BlockTokenizer(), given(out / "set"), settings=settings)
     share = Share(0, 1)
     convert_share(made.arm, source, BlockTokenizer(), given(out / "shared"), share, settings=settings)
-    plan, uri = plan_conversion(made.arm, source, BlockTokenizer(), settings)
+    plan, uri = plan_conversion(made.arm, source, BlockTokenizer().spec, settings)
     estimated = estimate(plan, given(made.hdf5), made.arm, BlockTokenizer(), 1)
     return content(out), plan.facts, uri, estimated.bytes
 
@@ -410,8 +410,9 @@ INNER = {  # take what a public function has made of a path already
         "Derived",
     },
     "hma_data.shards.verify": {"check_rows", "check_shard"},
-    "hma_data.sources.base": {
-        "of_another_format",
+    "hma_data.sources.base": {"of_another_format", "by_files"},
+    "hma_data.sources.common.places": {
+        "is_away",
         "existing_path",
         "local_path",
         "leaves",
@@ -419,7 +420,6 @@ INNER = {  # take what a public function has made of a path already
         "file_fingerprint",
         "unfollowed",
         "nothing_there",
-        "by_files",
     },
     "hma_data.tokenizers.training.frames": {"read_pictures", "load_pools"},
     "hma_data.tokenizers.training.train": {"Run"},

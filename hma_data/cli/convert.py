@@ -21,9 +21,9 @@ from hma_data.console import (
 from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
-    from hma_data.conversion.job import Progress, Shared, Summary
     from hma_data.conversion.output import Share
     from hma_data.conversion.plan import Settings
+    from hma_data.conversion.report import Progress, Shared, Summary
 
 SHOWN = 20  # reasons of quarantine that are printed
 DATA, BAD, OLD = "What is kept, and the split", "Episodes that cannot be used", "If --out holds a shard set"
@@ -253,7 +253,7 @@ def _plan(job: _Job, json: bool, share: "Share | None") -> bool:
     from hma_data.tokenizers.base import get_tokenizer
 
     opened = get_tokenizer(job.tokenizer, weights=job.weights, device=job.device)
-    plan, uri = plan_conversion(robot, job.source, opened, job.settings)
+    plan, uri = plan_conversion(robot, job.source, opened.spec, job.settings)
     tasks = share.count if share else 1
     cost = estimate(plan, uri, robot, opened, job.workers, tasks)
     units = [{"shard": unit.name, "episodes": len(unit), "frames": unit.frames} for unit in plan.units]

@@ -139,6 +139,8 @@ def registry_validate(
         for path, note in _notes(judged):
             print(f"{path}: note: {note}")
         print(f"{human_count(len(judged), 'file')}, {human_count(len(found), 'problem')}")
+        if len(judged) == 1 and paths and (uri := (judged[0].facts or {}).get("uri")):
+            print(f"then: hma inspect {shlex.quote(uri)} -e {shlex.quote(str(judged[0].path))}")
     raise typer.Exit(1 if found else 0)
 
 

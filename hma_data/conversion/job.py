@@ -6,18 +6,17 @@ manifest from the footers at the end. An episode that cannot be used goes to qua
 the job goes on.
 """
 
-import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hma_data.conversion.engines import LIMITS, RESOURCES, Limits, Resources, Retry
+from hma_data.conversion.engines import LIMITS, RESOURCES, Limits, Resources
 from hma_data.conversion.engines.local import end_worker_that_starts_workers
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.extend import content_of, extended
@@ -35,13 +34,21 @@ from hma_data.conversion.output import (
 )
 from hma_data.conversion.plan import Plan, Settings, ShardUnit, idle_workers, make_plan
 from hma_data.conversion.publish import HubOutput
-from hma_data.conversion.worker import Job, MakeWork, Seen, Tick
+from hma_data.conversion.report import (
+    Counter,
+    Progress,
+    Shared,
+    Summary,
+    rate_warning,
+    refusal_reasons,
+    training_notes,
+    yaml_change,
+)
+from hma_data.conversion.worker import Job, MakeWork
 from hma_data.episodes.align import OFF_RATE
 from hma_data.errors import OutputError, RegistryError, SourceError, StorageAwayError, UsageError
-from hma_data.inspection.shard_rate import pause_finding, rate_finding, window_finding
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, finish, shard_sizes
-from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import RowLayout, flag_totals, to_numpy
 from hma_data.sources.base import EpisodeRef, of_another_format, open_source, require_utf8
 from hma_data.sources.common.choice import chosen_ids, ids_for_robot
@@ -49,81 +56,11 @@ from hma_data.storage.files import remove_parts
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.records import Records
 from hma_data.storage.remote import parquet_file, place
-from hma_data.tokenizers.base import Tokenizer, get_tokenizer
-
-
-@dataclass
-class Progress:
-    """The progress of a conversion, as the console shows it.
-
-    Attributes:
-        idle: a line for the user where workers have no shard to make, see `idle_workers`; else empty.
-    """
-
-    episodes: int = 0
-    frames: int = 0
-    bytes: int = 0
-    quarantined: int = 0
-    kept_shards: int = 0
-    total_episodes: int = 0
-    total_frames: int = 0
-    retries: list[str] = field(default_factory=list)
-    pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
-    idle: str = ""
-    started: float = field(default_factory=time.monotonic)
-
-
-@dataclass(frozen=True)
-class Summary:
-    """The result of a conversion.
-
-    Attributes:
-        reasons: error type and message (without the ids where there are several) -> number of episodes
-            refused for it.
-        flags: name -> count over all episodes, such as masked_actions; see docs/format.md.
-        pictures: camera -> (height, width) of its recorded pictures; empty if no shard was made.
-        left_out: number of the recording's episodes that `only` and `exclude` leave out.
-        too_many: True where more than `max_quarantine` was refused; the command ends with exit code 1.
-        changed: what the YAML says now that a finished set did not say yet; empty if nothing.
-        warning: the fault of a rate that the recordings do not have; empty if there is none.
-        notes: what else to mend before training, as `hma doctor` says it: no window, pauses.
-    """
-
-    out: Path
-    manifest: Manifest
-    kept_shards: int
-    made_shards: int
-    seconds: float
-    reasons: dict[str, int]
-    flags: dict[str, int]
-    too_many: bool
-    pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
-    left_out: int = 0
-    changed: str = ""
-    warning: str = ""
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Shared:
-    """The result of one share of a conversion; the last share to end finishes the shard set.
-
-    Attributes:
-        missing: number of shards that other shares have still to make.
-        changed, warning: see `Summary`; empty for a share that does not finish the set.
-    """
-
-    out: Path
-    kept_shards: int
-    made_shards: int
-    missing: int
-    seconds: float
-    changed: str = ""
-    warning: str = ""
+from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_spec, get_tokenizer
 
 
 def plan_conversion(
-    embodiment: Embodiment, source: StrPath | None, tokenizer: Tokenizer, settings: Settings
+    embodiment: Embodiment, source: StrPath | None, tokenizer: TokenizerSpec, settings: Settings
 ) -> tuple[Plan, str]:
     """Return the plan of a conversion and the URI it reads; see `convert`."""
     uri = embodiment.source.uri if source is None else as_text(source)
@@ -147,7 +84,7 @@ def plan_conversion(
         ids = ids_for_robot(refs.column("id").to_pylist(), embodiment)
         kept = pa.array(chosen_ids(ids, settings.only, settings.exclude), pa.string())
         chosen = refs.take(to_numpy(pc.is_in(refs.column("id"), kept)))
-    plan = make_plan(chosen, embodiment, tokenizer.spec, settings, uri)
+    plan = make_plan(chosen, embodiment, tokenizer, settings, uri)
     return replace(plan, left_out=len(refs) - len(chosen)), uri
 
 
@@ -219,16 +156,14 @@ def convert(
         done, made = conversion.make(plan, base, None, on_progress)
         manifest = conversion.finish(plan, base, bool(made))
         flags = flag_totals(parquet_file(folder / EPISODES).read(columns=["flags"])["flags"])
-        reasons = _reasons(folder)
+        reasons = refusal_reasons(folder)
         if not any(split["episodes"] for split in manifest.splits.values()):
             clear(folder)
             worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
             told = "; ".join(f"{count} × {reason}" for reason, count in worst)
             raise SourceError(conversion.uri, f"gave no usable episode, so nothing was written: {told}")
-        warning = _rate_warning(folder, out) if OFF_RATE in flags else ""
-        made_set = ShardSet(folder)
-        found = (window_finding(made_set), pause_finding(made_set))
-        notes = tuple(f"{out}: {one}" for one in found if one and one.severity != "info")
+        warning = rate_warning(folder, out) if OFF_RATE in flags else ""
+        notes = training_notes(folder, out, plan)
         if hub:
             hub.upload()
     episodes = sum(split["episodes"] for split in manifest.splits.values())
@@ -272,7 +207,7 @@ def convert_share(
             if not missing:
                 # A journal shows that some share has made shards since the manifest was written.
                 conversion.finish(plan, base, bool(made or known_hashes(out)))
-                warning = _rate_warning(out, out)
+                warning = rate_warning(out, out)
     return Shared(out, done, made, missing, time.monotonic() - begun, conversion.changed, warning)
 
 
@@ -295,13 +230,16 @@ class _Conversion:
     def __post_init__(self) -> None:
         if not isinstance(self.tokenizer, str) or str(self.out).startswith("memory:"):
             self.workers = 0  # no other process sees them
-        if isinstance(self.tokenizer, str):
-            # Workers open it on the device; this process needs what it is, and may have no such device.
-            device = "cpu" if self.workers or self.engine == "ray" else self.device
-            self._opened = get_tokenizer(self.tokenizer, weights=self.weights, device=device)
-        else:
+        self._opened: Tokenizer | None = None
+        if not isinstance(self.tokenizer, str):
             self._opened = self.tokenizer
-        self._whole, self.uri = plan_conversion(self.embodiment, self.source, self._opened, self.settings)
+        elif not self.workers and self.engine == "local":
+            self._opened = get_tokenizer(self.tokenizer, weights=self.weights, device=self.device)
+        else:  # workers open it; this process stays light, and may have no such device
+            self._spec = get_spec(self.tokenizer, weights=self.weights)
+        if self._opened is not None:
+            self._spec = self._opened.spec
+        self._whole, self.uri = plan_conversion(self.embodiment, self.source, self._spec, self.settings)
         self.pictures: dict[str, tuple[int, int]] = {}
         self.changed = ""
 
@@ -370,16 +308,16 @@ class _Conversion:
         on_progress(progress)
         if todo:
             with Journal(self.out, share) as journal:
-                for made in self._run(todo, plan, _Counter(progress, on_progress)):
+                for made in self._run(todo, plan, Counter(progress, on_progress)):
                     journal.add(made)
                     on_progress(progress)
         return progress.kept_shards, len(todo)
 
-    def _run(self, todo: list[ShardUnit], plan: Plan, on_event: "_Counter") -> Iterator[Made]:
+    def _run(self, todo: list[ShardUnit], plan: Plan, on_event: Counter) -> Iterator[Made]:
         job = Job(
             self.uri,
             self.embodiment,
-            self._opened.spec.name,
+            self._spec.name,
             None if self.weights is None else as_text(self.weights),
             self.device,
             self.out.absolute(),
@@ -392,7 +330,7 @@ class _Conversion:
             if gpus is None:
                 gpus = 1.0 if self.device.startswith("cuda") else 0.0
             return run_ray(todo, MakeWork(job), self.workers, on_event, self.limits, cpus, gpus)
-        make_work = MakeWork(job, None if self.workers else self._opened)
+        make_work = MakeWork(job, self._opened)
         return run_local(todo, make_work, self.workers, on_event, self.limits)
 
     def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Manifest:
@@ -407,7 +345,7 @@ class _Conversion:
         before = Manifest.load(out) if (out / MANIFEST).is_file() else None
         kept = base.shards if base else ()
         if before is not None:
-            self.changed = _change(before.embodiment, self.embodiment)
+            self.changed = yaml_change(before.embodiment, self.embodiment)
             if not changed and not damaged_files(out, before):
                 if not self.changed and before.plan["hash"] == plan.facts["hash"]:
                     remove_notes(out)
@@ -418,7 +356,7 @@ class _Conversion:
             out,
             names,
             self.embodiment,
-            self._opened.spec,
+            self._spec,
             plan.facts,
             self.uri,
             hashes={**{shard.path: shard.sha256 for shard in kept}, **known_hashes(out)},
@@ -431,57 +369,3 @@ def _encoded(units: Sequence[ShardUnit], layout: RowLayout) -> int:
     """Return the number of frames to encode: of every camera, and with --frames strided only the grid's."""
     rows = sum(int((to_numpy(unit.refs.column("frames")) // layout.frame_stride).sum()) for unit in units)
     return rows * len(layout.cameras)
-
-
-def _change(before: Embodiment, now: Embodiment) -> str:
-    """Return what of the YAML has changed, in words; empty if it is the same."""
-    old, new = before.to_dict(), now.to_dict()
-    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-    if not keys:
-        return ""
-    with suppress(RegistryError):  # nobody states the rate
-        if before.stride != now.stride:
-            said = f"stride {before.stride} → {now.stride}: the model now sees {now.effective_hz:g} Hz"
-            others = [key for key in keys if key not in ("target_hz", "stride", "provenance")]
-            return said + (f"; also new from the YAML: {', '.join(others)}" if others else "")
-    return f"new from the YAML: {', '.join(keys)}"
-
-
-def _rate_warning(folder: Path, out: Path) -> str:
-    """Return the fault and the remedy where episodes have another rate than the YAML states; else empty."""
-    finding = rate_finding(ShardSet(folder))
-    return f"{out}: {finding}" if finding else ""
-
-
-def _reasons(out: Path) -> dict[str, int]:
-    """Return reason -> number of refused episodes; reasons that differ in the episode's id alone are one."""
-    told: dict[str, list[str]] = {}
-    for item in ShardSet(out).refused():
-        text = plain = f"{item['type']}: {item['message']}"
-        if any(letter.isdigit() for letter in item["id"]):  # a numbered id would keep equal reasons apart
-            text = re.sub(rf"(?<!\w){re.escape(item['id'])}(?!\w)", "<episode>", text)
-        told.setdefault(text, []).append(plain)
-    return {text if len(plain) > 1 else plain[0]: len(plain) for text, plain in told.items()}
-
-
-class _Counter:
-    """A counter of what units report; when a unit is retried, its earlier counts are taken back."""
-
-    def __init__(self, progress: Progress, on_progress: Callable[[Progress], None]) -> None:
-        self._progress, self._on_progress = progress, on_progress
-        self._by_unit: dict[int, dict[str, int]] = {}
-
-    def __call__(self, unit: int, event: Tick | Seen | Retry) -> None:
-        if isinstance(event, Seen):
-            self._progress.pictures.setdefault(event.camera, (event.height, event.width))
-            return
-        counts = self._by_unit.setdefault(unit, dict.fromkeys(vars(Tick()), 0))
-        if isinstance(event, Retry):
-            self._progress.retries.append(event.reason)
-            change = {name: -count for name, count in counts.items()}
-        else:
-            change = vars(event)
-        for name, count in change.items():
-            counts[name] += count
-            setattr(self._progress, name, getattr(self._progress, name) + count)
-        self._on_progress(self._progress)

@@ -38,6 +38,7 @@ from hma_data.registry.components import Space
 from hma_data.registry.embodiment import ID_PATTERN, ONE_INDEX, TODO, Embodiment, find
 from hma_data.sources.base import Inspection, KeyInfo, detect, open_source, require_utf8
 from hma_data.sources.common.checks import Finding
+from hma_data.sources.hdf5.videos import is_video
 from hma_data.storage.paths import StrPath
 
 LINE = 110
@@ -104,7 +105,8 @@ def from_inspection(found: Inspection, embodiment_id: str) -> str:
     if found.format == "hands":  # videos hold nothing that could be an action
         values = find("hand_video").to_dict() | {"id": embodiment_id}
         head = "A copy of hand_video, which reads any video of two hands: use it as it is, or change this one"
-        return f"# {head}\n{_yaml_text(values)}"
+        beside = [f"# {one}\n" for one in found.findings if "beside them are" in one.message]
+        return f"# {head}\n{''.join(beside)}{_yaml_text(values)}"
     values = _Draft(found).values(embodiment_id)
     head = f"# Inferred from source.uri; answer every {TODO}, then: hma registry validate FILE\n"
     known = _in_registry(found, values)
@@ -292,7 +294,7 @@ class _Draft:
                 "key": key.key,
                 "size": list(map(int, key.shape[:2])),
                 **_levels(key),
-                **(asked if doubtful else {}),
+                **(asked if doubtful and not is_video(key.key) else {}),
             }
             for name, key in zip(camera_names(self.seen.keys), self.seen.keys, strict=True)
         ]

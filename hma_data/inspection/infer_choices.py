@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from hma_data.sources.base import KeyInfo
+from hma_data.sources.hdf5.videos import FILE, is_video
 
 MAX_DIMS = 4096  # of a component
 
@@ -211,6 +212,8 @@ def camera_names(found: Iterable[KeyInfo]) -> list[str]:
 
 
 def _short_name(key: str) -> str:
+    if is_video(key):
+        key = key.rpartition(".")[0].replace(FILE, "")
     telling = [part for part in re.split(r"[/.]", key) if _is_telling(part)]
     if not telling:
         number = re.search(r"\d", _last(key))

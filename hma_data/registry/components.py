@@ -276,7 +276,9 @@ class Hdf5Layout(SourceLayout):
     episodes: str | None = Field(
         None, description="pattern of the groups that are episodes; / for one file an episode"
     )
-    timestamps: str | None = Field(None, description="key of the seconds, where the rate is not even")
+    timestamps: str | None = Field(
+        None, description="key of the times (s, ms, µs or ns), where the rate is not even"
+    )
     axes: Literal["THWC", "TCHW"] | None = Field(
         None, description="of pictures, where the shape leaves it open"
     )

@@ -37,7 +37,7 @@ from hma_data.registry.components import (
 )
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path, as_text
-from hma_data.storage.yaml_io import parse_yaml, read_yaml, write_yaml
+from hma_data.storage.yaml_io import parse_yaml, plain_fault, read_yaml, write_yaml
 
 if TYPE_CHECKING:
     import numpy as np
@@ -69,7 +69,7 @@ class Embodiment(SpecModel):
     robot: str | None = Field(None, description="which robot it is, in words")
     kind: Literal["real", "simulation", "human"] = Field(description="who or what was recorded")
     frequency_hz: Number | Literal["unknown"] | None = Field(
-        description="control rate of the recording in Hz; null only where every recording has timestamps"
+        description="control rate of the recording in Hz; unknown; null only where recordings have times"
     )
     target_hz: Number = Field(
         2.0, ge=0.001, le=100_000, description="frames a second that the model sees; the stride follows"
@@ -95,6 +95,16 @@ class Embodiment(SpecModel):
     def _id_is_a_name(cls, value: str) -> str:
         if not ID_PATTERN.fullmatch(value) or ".." in value:
             raise ValueError("must be 1 to 100 of a-z 0-9 _ - . and begin with a letter or digit")
+        return value
+
+    @field_validator("frequency_hz", mode="before")
+    @classmethod
+    def _rate_is_a_number(cls, value: Any) -> Any:
+        if isinstance(value, str) and value != "unknown":  # else one fault for each kind of value
+            try:
+                return float(value)
+            except ValueError:
+                raise ValueError("must be a number of Hz without a unit, or unknown") from None
         return value
 
     @field_validator("frequency_hz")
@@ -173,7 +183,8 @@ class Embodiment(SpecModel):
         """
         where = f"embodiment {self.id}: frequency_hz"
         if self.frequency_hz not in ("unknown", hz):
-            fault = f"is {self.frequency_hz}, not {hz:g}"
+            stated = "null" if self.frequency_hz is None else f"{self.frequency_hz:g}"
+            fault = f"is {stated}, not {hz:g}"
             raise RegistryError(where, fault, "correct it in a copy of the YAML")
         provenance = self.provenance | {"frequency_hz": "given at the conversion"}
         return Embodiment.from_values(self.to_dict() | {"frequency_hz": hz, "provenance": provenance}, where)
@@ -299,11 +310,16 @@ def problems(values: Any, stored: bool = False) -> list[str]:
 def find_problems(values: Any, stored: bool = False) -> list[Problem]:
     """Return all problems of a YAML's plain values; for `stored`, see `Embodiment.load`."""
     if not isinstance(values, dict):
-        return [Problem("", f"must be a mapping, is {type(values).__name__}")]
+        said = {"NoneType": "is empty", "list": "is a list"}.get(type(values).__name__, "is a single value")
+        return [
+            Problem("", f"must be a mapping of keys to values, {said}", allowed=", ".join(_keys(Embodiment)))
+        ]
     questions = todos(values)
     found = [Problem(path, f"still {TODO}: {text}") for path, text in questions]
     try:
-        Embodiment.model_validate(values, context={"stored": stored})
+        robot = Embodiment.model_validate(values, context={"stored": stored})
+        if not stored:
+            found += _rate_problem(robot)
     except ValidationError as fault:
         asked = {path for path, _ in questions}
         for item in fault.errors(include_url=False):
@@ -312,6 +328,22 @@ def find_problems(values: Any, stored: bool = False) -> list[Problem]:
             if path not in asked and not follows:
                 found.append(_problem(path, item, values))
     return list(dict.fromkeys(found))
+
+
+def _rate_problem(robot: Embodiment) -> list[Problem]:
+    """Return what is wrong with a rate that is null: nothing where times and stride are known without it."""
+    if robot.frequency_hz is not None or robot.sync.rate_hz:
+        return []
+    form, layout = robot.source.format, robot.source.layout or {}
+    allowed = "the rate in Hz, or unknown"
+    if form == "rlds" or (form == "hdf5" and "timestamps" not in layout):
+        if form == "hdf5":
+            allowed += ", or null with source.layout.timestamps and a stride"
+        return [Problem("frequency_hz", f"is null, but {form} recordings keep no times", allowed=allowed)]
+    if robot.stride_override:
+        return []
+    allowed += ", or null with a stride" + ("" if form in ONE_INDEX else " or sync.rate_hz")
+    return [Problem("frequency_hz", "is null, so that no stride follows from it", allowed=allowed)]
 
 
 def todos(values: Any, path: str = "") -> list[tuple[str, str]]:
@@ -344,12 +376,15 @@ def _problem(path: str, item: Any, values: dict[str, Any]) -> Problem:
         return Problem(path, "is missing")
     if item["type"] == "extra_forbidden":
         return _unknown_key(path, values)
-    shown = None if isinstance(item["input"], dict) else repr(item["input"])
+    shown: str | None = repr(item["input"])
+    if isinstance(item["input"], dict):
+        shown = None if item["type"] == "value_error" else "a mapping"
     if shown and len(shown) > 60:
         shown = shown[:57] + "..."
     if item["type"] == "literal_error":
         return Problem(path, "is not one of the words that are allowed", shown, item["ctx"]["expected"])
-    return Problem(path, item["msg"].removeprefix("Value error, "), shown)
+    inside = _KEYS_AT.get(re.sub(r"\[\d+\]", "", path)) if item["type"] == "model_type" else None
+    return Problem(path, plain_fault(item), shown, ", ".join(_keys(inside)) if inside else None)
 
 
 def _unknown_key(path: str, values: dict[str, Any]) -> Problem:
@@ -361,7 +396,8 @@ def _unknown_key(path: str, values: dict[str, Any]) -> Problem:
         known, of = LAYOUTS[values["source"]["format"]], f" of format {values['source']['format']}"
     keys, key = _keys(known), path.rpartition(".")[2]
     places = [place for place, model in _KEYS_AT.items() if key in _keys(model)]
-    near = get_close_matches(key, keys, n=1) or [f"{place}.{key}" for place in places]
+    other = [name for name in [_OTHER_WORDS.get(key.lower())] if name in keys]
+    near = other or get_close_matches(key, keys, n=1) or [f"{place}.{key}" for place in places]
     hint = f", did you mean {near[0]!r}?" if near else ""
     return Problem(path, f"unknown key{of}{hint}", allowed=", ".join(keys) or "none")
 
@@ -370,6 +406,10 @@ def _keys(model: type[BaseModel]) -> list[str]:
     return [field.alias or name for name, field in model.model_fields.items()]
 
 
+_OTHER_WORDS = {  # keys as other projects name them -> ours
+    "path": "uri", "url": "uri", "file": "uri", "folder": "uri", "type": "kind",
+    "fps": "frequency_hz", "hz": "frequency_hz", "rate": "frequency_hz",
+}  # fmt: skip
 _KEYS_AT: dict[str, type[SpecModel]] = {
     "action": Action,
     "action.components": Component,

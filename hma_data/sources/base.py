@@ -8,14 +8,12 @@ add some.
 T frames of an episode, A values of a vector.
 """
 
-import hashlib
-import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatchcase
 from importlib import import_module
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +26,12 @@ from hma_data.registry import FORMATS, MORE, known_formats
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.common.checks import Finding
+from hma_data.sources.common.places import file_fingerprint as file_fingerprint  # sources of packages use it
+from hma_data.sources.common.places import first_bytes, is_away, nothing_there
+from hma_data.sources.common.places import local_path as local_path
 from hma_data.storage.kinds import misplaced, own_layout, unreadable
 from hma_data.storage.paths import StrPath, as_text
-from hma_data.storage.remote import RangeFile, RemotePath, is_remote, place
+from hma_data.storage.remote import place
 
 SAMPLE = 20  # episodes that inspect looks into
 RECIPE = "docs/adding-a-robot.md, Pictures and tables"
@@ -277,7 +278,7 @@ def detect(uri: StrPath) -> str:
     ours = _of_toolkit()
     if found := _by_uri(uri, ours):
         return found
-    if _is_away(uri):
+    if is_away(uri):
         return _by_uri(uri, _of_packages()[0]) or _by_listing(uri, ours) or "rlds"
     path = local_path(uri)
     files = [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file())[:2000]
@@ -309,7 +310,7 @@ def recognitions() -> Recognitions:
 def require_there(uri: StrPath) -> None:
     """Raise SourceError if a local recording does not exist; a URI or a name of the hub is not looked at."""
     uri = as_text(uri)
-    if uri and not _is_away(uri) and not _by_uri(uri, recognitions()):
+    if uri and not is_away(uri) and not _by_uri(uri, recognitions()):
         local_path(uri)
 
 
@@ -346,13 +347,9 @@ def _of_packages() -> tuple[Recognitions, list[PluginError]]:
     return found, broken
 
 
-def _is_away(uri: str) -> bool:
-    return "://" in uri and not uri.startswith("file://")
-
-
 def _by_uri(uri: str, known: Recognitions) -> str | None:
     """Return the format that a name or URI alone shows."""
-    suffix = PurePosixPath(uri).suffix if _is_away(uri) else ""
+    suffix = PurePosixPath(uri).suffix if is_away(uri) else ""
     by_name = (name for name, recognition in known.items() if recognition.uri(uri))
     by_ending = (name for name, recognition in known.items() if suffix in recognition.endings)
     return next(by_name, None) or next(by_ending, None)
@@ -418,79 +415,6 @@ def _unpack_first(files: Sequence[Path]) -> str:
     return ""
 
 
-def local_path(uri: str) -> Path:
-    """Return the local path of a plain path or file:// URI.
-
-    Raises:
-        SourceError: it does not exist, or it is a URI of remote storage.
-    """
-    plain = uri.removeprefix("file://")
-    path = Path(plain).expanduser()
-    try:
-        if path.exists():
-            return path
-    except PermissionError as fault:
-        raise SourceError(uri, *unreadable(path, str(fault), "")) from fault
-    if "://" in plain:
-        remedy = "copy it here: only RLDS, LeRobot and bags are read elsewhere"
-        raise SourceError(uri, "is not on this machine", remedy)
-    raise SourceError(uri, "does not exist", "check the path, or source.uri in the embodiment's YAML")
-
-
-def existing_path(uri: str) -> Path:
-    """Return the path of a recording on this machine or in a store.
-
-    Raises:
-        SourceError: it does not exist, or no store is known by that scheme.
-        StorageError: the store refuses it; StorageAwayError: it does not answer.
-    """
-    if not _is_away(uri):
-        return local_path(uri)
-    path = place(uri)
-    if not path.exists():
-        raise SourceError(uri, "does not exist", "check the URI, or source.uri in the embodiment's YAML")
-    return path
-
-
-def leaves(path: Path, folder: Path) -> bool:
-    """Check whether a path leads out of its folder by a link or `..`.
-
-    The Hugging Face Hub's cache keeps the files of a snapshot as links to its blobs, which may be followed.
-    """
-    inside, target = folder.resolve(), path.resolve()
-    hub = next((above.parent for above in inside.parents if above.name == "snapshots"), None)
-    homes = (inside, hub / "blobs") if hub else (inside,)
-    return not any(target.is_relative_to(home) for home in homes)
-
-
-def first_bytes(path: Path, count: int) -> bytes:
-    """Return the first bytes of a file; empty when it cannot be read."""
-    try:
-        with _opened(path) as file:
-            return file.read(count)
-    except OSError:
-        return b""
-
-
-def _opened(path: Path) -> BinaryIO:
-    """Open a file to read a few bytes at some places."""
-    return cast(BinaryIO, RangeFile(path)) if isinstance(path, RemotePath) else path.open("rb")
-
-
-def file_fingerprint(path: Path) -> str:
-    """Return 16 hex digits hashed from a file's size and its first, middle and last 64 KiB.
-
-    Time stamps do not change it.
-    """
-    size = path.stat().st_size
-    digest = hashlib.sha256(str(size).encode())
-    with _opened(path) as file:
-        for offset in (0, max(0, size // 2 - 32768), max(0, size - 65536)):
-            file.seek(offset)
-            digest.update(file.read(65536))
-    return digest.hexdigest()[:16]
-
-
 def compose(vector: Vector, pieces: Sequence[NDArray[Any]], where: str) -> NDArray[np.float32]:
     """Return a vector over time, joined from the recorded values of its components.
 
@@ -536,50 +460,3 @@ def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.f
     values = values.astype(np.float64) * np.asarray(part.sign) + np.asarray(part.offset)
     with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite, and align refuses it
         return values.astype(np.float32)
-
-
-# -- links
-
-
-def unfollowed(root: Path, told: Collection[Path] = ()) -> list[Finding]:
-    """Return findings on the links under a folder that lead to a folder outside of it, or to nothing.
-
-    A link to a folder may lead anywhere, even in a circle, so it is not followed. A recording behind a link
-    is read when the user names that recording.
-
-    Args:
-        root: folder of the recordings; a file has no links.
-        told: paths that are reported elsewhere.
-    """
-    if is_remote(root):  # stores have no links
-        return []
-    outside: list[Path] = []
-    gone: list[Path] = []
-    home = root.resolve()
-    for folder, folders, files in os.walk(root):
-        for path in (Path(folder, name) for name in sorted(folders + files)):
-            if not path.is_symlink() or path in told or path.name.startswith("."):  # editors lock with links
-                continue
-            if path.is_dir() and not path.resolve().is_relative_to(home):
-                outside.append(path)
-            elif not path.exists():
-                gone.append(path)
-    found = []
-    for links, remedy in ((outside, "give the path of that folder"), (gone, "copy the file in")):
-        if links:
-            target = f"a folder outside {root}, not followed"
-            if links is gone:
-                target = f"{gone[0].readlink()}, which is not there"
-            more = f" (and {len(links) - 1:,} more such links)" if len(links) > 1 else ""
-            said = f"{links[0]} is a link to {target}{more}"
-            found.append(Finding("files", "warn", said, remedy, numbers={"links": len(links)}))
-    return found
-
-
-def nothing_there(uri: str, root: Path, fault: str, remedy: str) -> SourceError:
-    """Return the error for a place without recordings; mention a link that was not followed, if any."""
-    fault, remedy = unreadable(root, fault, remedy)
-    links = unfollowed(root)
-    if links:
-        fault, remedy = f"{fault}; {links[0].message}", links[0].remedy
-    return SourceError(uri, fault, remedy)

@@ -5,6 +5,7 @@ the file and, for a fault in the text, the line. libyaml scans the text where Py
 times as fast); the rules for what is accepted are the same either way.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,21 @@ except ImportError:  # a PyYAML without libyaml
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32
+HINTS = {  # words of the parser's faults -> what to do
+    "mapping values are not allowed": "put a text with a colon in quotes",
+    "did not find expected": "check the indentation and the brackets above",
+    "could not find expected ':'": "write key: value, with a space after the colon",
+}
+_PLAIN = {  # pydantic's error types, or their first words, in plain English
+    "int": "must be a whole number (an integer)",
+    "float": "must be a number",
+    "bool": "must be true or false (a boolean)",
+    "string_type": "must be a text (a string), in quotes where YAML reads it as something else",
+    "tuple_type": "must be a list, as in [a, b]",
+    "dict": "must be a mapping of keys to values (a dictionary)",
+    "model": "must be a mapping of keys to values (a dictionary)",
+    "invalid_key": "keys must be words",
+}
 
 
 class _PlainLoader(yaml.composer.Composer, _Events, yaml.constructor.SafeConstructor, yaml.resolver.Resolver):
@@ -82,6 +98,8 @@ def parse_yaml(text: str, where: str, error: type[HMAError] = RegistryError) -> 
         problem = getattr(fault, "problem", None) or str(fault).splitlines()[0]
         if mark and "\t" in "".join(text.split("\n")[mark.line : mark.line + 1])[: mark.column + 1]:
             problem += " (a tab: indent with spaces)"
+        elif hint := next((hint for words, hint in HINTS.items() if words in problem), ""):
+            problem += f" ({hint})"
         raise error(where, f"not valid YAML{place}: {problem}") from fault
 
 
@@ -116,6 +134,13 @@ def decode_yaml(content: bytes, path: Path, error: type[HMAError] = RegistryErro
     except UnicodeDecodeError as fault:
         found = misplaced(path, "a YAML file")
         raise error(path, *(found or (f"is not UTF-8 text: {fault}",))) from fault
+
+
+def plain_fault(item: Mapping[str, Any]) -> str:
+    """Return the fault that one of pydantic's `errors()` describes, in plain words and without the value."""
+    kind, said = str(item["type"]), str(item["msg"]).removeprefix("Value error, ")
+    text = _PLAIN.get(kind) or _PLAIN.get(kind.partition("_")[0]) or said
+    return text.replace("Input should be", "must be")
 
 
 def write_yaml(values: Any) -> str:

@@ -30,6 +30,7 @@ from hma_data.storage.files import file_sha256, read_json, write_atomic
 from hma_data.storage.kinds import unreadable
 from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.catalog import Entry, find_entry
+from hma_data.tokenizers.shapes import read_shape
 
 FOLDER = "HMA_WEIGHTS"  # environment variable: a folder of weights, named after the tokenizers
 SUFFIXES = (".safetensors", ".ckpt", ".pt", ".pth")
@@ -158,7 +159,7 @@ def read_tensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
         with path.open("rb") as file:
             start = file.read(9)
         if start[8:] == b"{":
-            return _read_safetensors(path, error)[0]
+            return _read_safetensors(path, error)
         # Only a zip archive can be memory-mapped; torch wrote others before version 1.6.
         values = torch.load(path, map_location="cpu", weights_only=True, mmap=start.startswith(b"PK"))
     except pickle.UnpicklingError as fault:
@@ -180,11 +181,11 @@ def read_tensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
     return tensors
 
 
-def _read_safetensors(path: Path, error: type[HMAError]) -> tuple[Tensors, dict[str, str]]:
-    """Return the tensors and the metadata of a safetensors file."""
+def _read_safetensors(path: Path, error: type[HMAError]) -> Tensors:
+    """Return the tensors of a safetensors file."""
     try:
         with safe_open(path, "pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as fault:
         text = f"is not a complete safetensors file: {_one_line(fault)}"
         raise error(path, *unreadable(path, text, "name another file, or download it again")) from fault
@@ -270,14 +271,5 @@ def read_weights[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[
     Raises:
         TokenizerError: there is no such file, or it is not safetensors, truncated, or of another network.
     """
-    tensors, metadata = _read_safetensors(path, TokenizerError)
-    remedy = "take the file that `hma tokenizer train` writes, or leave --weights out"
-    if metadata.get("format") != form:
-        fault = f"does not hold {form} weights (format {metadata.get('format')!r})"
-        raise TokenizerError(path, fault, remedy)
-    try:
-        shape = config.model_validate_json(metadata.get("config", ""))
-    except ValueError as error:
-        fault = f"its metadata does not describe the network: {_one_line(error)}"
-        raise TokenizerError(path, fault, remedy) from error
-    return shape, tensors, metadata.get("tokens_sha256") or file_sha256(path)
+    shape, sha256 = read_shape(path, form, config)
+    return shape, _read_safetensors(path, TokenizerError), sha256

@@ -18,23 +18,16 @@ B pictures, S side, h·w grid, C latent channels. Pixels inside the networks are
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 from hma_data.tokenizers.checkpoints import fill, find_weights, read_weights
 from hma_data.tokenizers.network import NetworkTokenizer, open_device
-
-VERSION = 1
-PATCH = 8
-Width = Annotated[int, Field(ge=1, le=4096)]
-Blocks = Annotated[int, Field(ge=0, le=256)]
-
+from hma_data.tokenizers.shapes import PATCH, FsqConfig, VaeConfig
 
 # -- the layers of both networks
 
@@ -121,43 +114,6 @@ class Decoder(nn.Module):
 # -- discrete: finite scalar quantisation
 
 
-class FsqConfig(BaseModel):
-    """The network's shape, stored in the weights' file and stated by a recipe.
-
-    Attributes:
-        levels: number of levels of each digit's channels; `[[8, 8, 8], [8, 8, 8]]` is two digits of 512.
-        width: channels at 1/8 and, if there are two, at 1/16 of the picture's side; tokens lie at the last.
-        hidden: channels inside the residual blocks at 1/8 and 1/16.
-        encoder_blocks: residual blocks at each width.
-        decoder_blocks: residual blocks at each width in reverse order, then at 1/4.
-        fine_width: channels of the decoder at 1/4.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    levels: tuple[tuple[Annotated[int, Field(ge=2)], ...], ...] = ((8, 8, 8), (8, 8, 8))
-    width: tuple[Width] | tuple[Width, Width] = (128, 256)
-    hidden: Width = 128
-    encoder_blocks: tuple[Blocks, ...] = (3, 4)
-    decoder_blocks: tuple[Blocks, ...] = (5, 4, 1)
-    fine_width: Width = 48
-
-    @model_validator(mode="after")
-    def _fit(self) -> "FsqConfig":
-        count = len(self.width)
-        if (len(self.encoder_blocks), len(self.decoder_blocks)) != (count, count + 1):
-            raise ValueError(f"give {count} encoder_blocks and {count + 1} decoder_blocks for {count} widths")
-        return self
-
-    @field_validator("levels")
-    @classmethod
-    def _make_ids(cls, levels: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, ...], ...]:
-        count = math.prod(math.prod(digit) for digit in levels)
-        if not 2 <= count <= 2**31:
-            raise ValueError(f"levels make {count} ids; 2 to 2^31 are possible")
-        return levels
-
-
 class Quantizer(nn.Module):
     """A quantizer without parameters: latents (B, C, h, w) to levels, levels to ids, and back.
 
@@ -213,13 +169,13 @@ class Quantizer(nn.Module):
 class FsqAutoencoder(nn.Module):
     """An autoencoder of `encoder`, `quantizer` and `decoder`; `forward` is the training pass."""
 
-    format, shape = "hma-fsq-1", FsqConfig
+    shape = FsqConfig
     linear_gain = 1.7  # least-squares estimate of z as 1.7 u, from u = erf(z/√2), z standard normal
 
     def __init__(self, config: FsqConfig) -> None:
         super().__init__()
         self.config = config
-        self.stride = PATCH * len(config.width)
+        self.stride = config.stride
         widths, hidden, channels = config.width, config.hidden, sum(len(digit) for digit in config.levels)
         self.encoder = Encoder(channels, widths, hidden, config.encoder_blocks)
         self.quantizer = Quantizer(config)
@@ -242,45 +198,14 @@ class FsqAutoencoder(nn.Module):
         codes = self.quantizer.from_levels(self.quantizer.to_digits(ids))
         return self.decoder(codes.contiguous(memory_format=torch.channels_last))
 
-    def spec(self, name: str, image_size: int, sha256: str) -> TokenizerSpec:
-        """Return the spec of the tokenizer with these weights."""
-        factored = tuple(math.prod(digit) for digit in self.config.levels)
-        return TokenizerSpec.discrete(name, VERSION, image_size, self.stride, factored, weights_sha256=sha256)
-
 
 # -- continuous
-
-
-class VaeConfig(BaseModel):
-    """The network's shape, stored in the weights' file and stated by a recipe.
-
-    Attributes:
-        channels: number C of latent channels.
-        width: channels at 1/8 of the picture's side.
-        hidden: channels inside the residual blocks at 1/8.
-        encoder_blocks: residual blocks of the encoder.
-        decoder_blocks: residual blocks of the decoder at 1/8 and at 1/4.
-        fine_width: channels of the decoder at 1/4.
-        noise: standard deviation of the noise that training adds to the latents.
-        latent_scale: factor that brings the latents to unit variance; measured when training ends.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    channels: Width = 4
-    width: Width = 96
-    hidden: Width = 96
-    encoder_blocks: Blocks = 3
-    decoder_blocks: tuple[Blocks, Blocks] = (5, 2)
-    fine_width: Width = 48
-    noise: float = Field(ge=0, lt=10, default=0.05)
-    latent_scale: float = Field(gt=0, lt=1e4, default=1.0)
 
 
 class VaeAutoencoder(nn.Module):
     """An autoencoder of `encoder` and `decoder`; `forward` is the training pass."""
 
-    format, shape = "hma-vae-1", VaeConfig
+    shape = VaeConfig
     stride = PATCH
     linear_gain = 1.0  # the decoder takes the latents unchanged
 
@@ -305,11 +230,6 @@ class VaeAutoencoder(nn.Module):
         """Return the pixels of latents."""
         return self.decoder(latents.contiguous(memory_format=torch.channels_last))
 
-    def spec(self, name: str, image_size: int, sha256: str) -> TokenizerSpec:
-        """Return the spec of the tokenizer with these weights."""
-        facts = {"latent_scale": self.config.latent_scale, "weights_sha256": sha256}
-        return TokenizerSpec.continuous(name, VERSION, image_size, self.stride, self.config.channels, **facts)
-
 
 Autoencoder = FsqAutoencoder | VaeAutoencoder
 
@@ -319,9 +239,9 @@ def load(name: str, *, weights: str | None, device: str, image_size: int) -> Net
     place = open_device(name, device)
     path = find_weights(name, weights) if weights else EMBEDDED / CATALOG[name].file
     kind: Any = FsqAutoencoder if name.startswith("fsq") else VaeAutoencoder
-    config, tensors, sha256 = read_weights(path, kind.format, kind.shape)
+    config, tensors, sha256 = read_weights(path, kind.shape.format, kind.shape)
     with torch.device("meta"):
         network: Autoencoder = kind(config)
     fill(network, tensors, path)
-    spec = network.spec(name, image_size, sha256)
+    spec = config.spec(name, image_size, sha256)
     return NetworkTokenizer(spec, network, place, network.encode, network.decode, light=True)

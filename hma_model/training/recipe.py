@@ -29,7 +29,7 @@ from pydantic import (
 from hma_data.errors import RecipeError, UsageError
 from hma_data.loading.views import view_count
 from hma_data.storage.paths import StrPath, as_text, shipped
-from hma_data.storage.yaml_io import parse_yaml, read_yaml
+from hma_data.storage.yaml_io import parse_yaml, plain_fault, read_yaml
 from hma_model.checkpoint.folder import EMBEDDED_NAME
 from hma_model.config import MOST_IDS, HMAConfig
 
@@ -45,17 +45,7 @@ _FREE = {
 _DERIVED = {
     *("kind", "grid", "views", "factored", "channels", "latent_scale", "frames", "objectives", "tokenizer"),
 }
-_PLAIN = {  # pydantic's error types, or their first words, in plain English
-    "int": "must be a whole number (an integer)",
-    "float": "must be a number",
-    "bool": "must be true or false (a boolean)",
-    "string_type": "must be a text (a string)",
-    "string_pattern_mismatch": "must be auto, cpu, mps, cuda or cuda:N",  # only `device` has a pattern
-    "tuple_type": "must be a list",
-    "dict": "must be a mapping of keys to values (a dictionary)",
-    "model": "must be a mapping of keys to values (a dictionary)",
-    "invalid_key": "keys must be words",
-}
+_PATTERN = "must be auto, cpu, mps, cuda or cuda:N"  # only `device` has a pattern
 
 
 def _no_bool(value: Any) -> Any:
@@ -421,13 +411,13 @@ def _problem(item: Any, home: str) -> str:
     kind, near = item["type"], ""
     if kind == "extra_forbidden":
         return _unknown(path)
-    text = _PLAIN.get(kind) or _PLAIN.get(kind.partition("_")[0]) or item["msg"].removeprefix("Value error, ")
+    text = _PATTERN if kind == "string_pattern_mismatch" else plain_fault(item)
     if kind == "literal_error":
         allowed = item["ctx"]["expected"].replace(" or ", ", ").replace("'", "").split(", ")
         near = _meant(str(item["input"]), allowed)
     value = repr(item["input"])
     value = value if len(value) <= 80 else f"{value[:77]}…"
-    return f"{path}: {text.replace('Input should be', 'must be')}{near} (is {value})"
+    return f"{path}: {text}{near} (is {value})"
 
 
 def _unknown(path: str) -> str:

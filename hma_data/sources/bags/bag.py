@@ -28,7 +28,7 @@ from hma_data.sources.bags.container import (
 from hma_data.sources.bags.mcap import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.mcap import McapFile
 from hma_data.sources.bags.ros_files import SQLITE_MAGIC, Ros1File, SqliteFile
-from hma_data.sources.base import file_fingerprint, first_bytes, leaves
+from hma_data.sources.common.places import file_fingerprint, first_bytes, leaves
 from hma_data.storage.fetch import mark
 from hma_data.storage.remote import RemotePath, is_remote
 from hma_data.storage.yaml_io import read_yaml

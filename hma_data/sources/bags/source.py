@@ -25,14 +25,8 @@ from hma_data.sources.bags.inspect import report
 from hma_data.sources.bags.messages import decode
 from hma_data.sources.bags.segments import Rows, Table, heads, parted
 from hma_data.sources.bags.topic_track import Column, TopicTrack, camera_stream, missing_topic, parse_key
-from hma_data.sources.base import (
-    SAMPLE,
-    EpisodeRef,
-    Inspection,
-    component_values,
-    existing_path,
-    nothing_there,
-)
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values
+from hma_data.sources.common.places import existing_path, nothing_there
 from hma_data.storage.paths import StrPath, as_text
 
 PART = re.compile(r"(?P<bag>.+)/(?P<number>[0-9]{4,9})")

@@ -30,7 +30,11 @@ REGULAR = 0.8  # least share of intervals within a third of the median, for coun
 STREAM = 0.5  # least such share for reporting pauses; below it, the topic carries events
 LOST = 0.01  # share of lost frames above which they are reported
 UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # least time since 1970, seconds a unit
-TIMES = re.compile(r"(.*/)?(time_?stamps?|times?|stamps?|t)(_s|_sec|_ns)?")
+NAMED_UNITS = {  # endings of keys -> seconds a unit
+    "s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "usec": 1e-6,
+    "ns": 1e-9, "nsec": 1e-9,
+}  # fmt: skip
+TIMES = re.compile(rf"(.*/)?(time_?stamps?|times?|stamps?|t)(_({'|'.join(NAMED_UNITS)}))?")
 STEPS_S = (1e-4, 5.0)  # between samples of a recording
 DRIFT = 0.02  # share of the stated rate by which the measured rate may differ
 
@@ -215,13 +219,14 @@ def skew(times: Floats, primary: Floats) -> tuple[float, float, float] | None:
 # -- columns of times whose unit is not stated
 
 
-def seconds_a_unit(values: NDArray[Any]) -> float | None:
+def seconds_a_unit(values: NDArray[Any], key: str = "") -> float | None:
     """Return the length in seconds of one unit of a column of times; None where it is not clear.
 
-    The unit follows from the size of the times and from their steps.
+    The unit follows from the size of the times, from the ending of the key, or from their steps.
 
     Args:
         values: (T,) as recorded.
+        key: of the values, such as time_us.
     """
     times = np.asarray(values, np.float64).reshape(-1)
     steps = np.diff(times)
@@ -231,6 +236,9 @@ def seconds_a_unit(values: NDArray[Any]) -> float | None:
     for least, unit in UNITS:
         if times[0] >= least:
             return unit if STEPS_S[0] <= step * unit <= STEPS_S[1] else None
+    if (named := TIMES.fullmatch(key.lower())) and named[4]:
+        unit = NAMED_UNITS[named[4]]
+        return unit if STEPS_S[0] <= step * unit <= STEPS_S[1] else None
     counted = np.array_equal(times, np.round(times))  # frame numbers, or times in another unit
     return 1.0 if not counted and STEPS_S[0] <= step <= STEPS_S[1] else None
 
@@ -240,8 +248,8 @@ def is_times(key: str, shape: tuple[int, ...]) -> bool:
     return shape in ((), (1,)) and bool(TIMES.fullmatch(key.lower()))
 
 
-def seconds_of(values: NDArray[Any]) -> NDArray[np.float64] | None:
-    """Return a column of times (T,) in seconds; None where its unit is not clear.
+def seconds_of(values: NDArray[Any], key: str = "") -> NDArray[np.float64] | None:
+    """Return a column of times (T,) in seconds from the earliest; None where its unit is not clear.
 
     Stamps may repeat or go back. The unit is found from the sorted, distinct stamps.
     """
@@ -249,7 +257,7 @@ def seconds_of(values: NDArray[Any]) -> NDArray[np.float64] | None:
     if times.dtype.kind not in "fiu" or len(times) < 3:
         return None
     rising = np.unique(times[np.isfinite(times)] if times.dtype.kind == "f" else times)
-    unit = seconds_a_unit(rising)
+    unit = seconds_a_unit(rising, key)
     if unit is None:
         return None
     origin = rising[0]  # subtracted while they are integers: float64 cannot hold nanoseconds since 1970

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import HandsLayout
-from hma_data.sources.base import first_bytes, local_path
+from hma_data.sources.common.places import first_bytes, local_path
 from hma_data.sources.hands.runs import SIDES, HandLabels, Video, labels_from_rows
 
 PICKLES, TABLES = (".pkl", ".pickle"), (".parquet", ".csv")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import HandsLayout
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import local_path, nothing_there
+from hma_data.sources.common.places import local_path, nothing_there
 from hma_data.sources.common.video_file import decoded_size, opened
 from hma_data.sources.hands import VIDEO_SUFFIXES
 

@@ -35,7 +35,8 @@ from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import HandsLayout, Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
+from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.common.survey import listed
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.detect import HandModels, MediaPipeHands, load_models

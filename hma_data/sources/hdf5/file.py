@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.sources.base import local_path, nothing_there
+from hma_data.sources.common.places import local_path, nothing_there
 from hma_data.storage.kinds import unreadable
 
 SUFFIXES = (".h5", ".hdf5", ".hdf")

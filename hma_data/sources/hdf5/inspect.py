@@ -4,8 +4,6 @@ import math
 from collections import Counter
 from collections.abc import Container, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -14,9 +12,10 @@ import numpy as np
 from hma_data.episodes.images import decode_image
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import Hdf5Layout
-from hma_data.sources.base import Inspection, KeyInfo, local_path, unfollowed
+from hma_data.sources.base import Inspection, KeyInfo
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, is_times, seconds_a_unit, seconds_of
+from hma_data.sources.common.places import local_path, unfollowed
 from hma_data.sources.common.survey import MAX_VALUES, Survey, listed, sampled
 from hma_data.sources.hdf5.file import (
     WHOLE_FILE,
@@ -32,9 +31,8 @@ from hma_data.sources.hdf5.file import (
 )
 from hma_data.sources.hdf5.pictures import as_bytes, as_rgb, encoded, picture_kind, pixels_of
 from hma_data.sources.hdf5.source import TEXT_KEYS, json_of
-from hma_data.sources.hdf5.videos import SUFFIXES
+from hma_data.sources.hdf5.videos import is_video, video_keys, videos_beside
 
-MAX_LISTED = 1_000  # files beside an HDF5 file among which videos are looked for
 LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
 _ENDS = ("episode_ends", "episode_lengths", "terminals", "timeouts", "dones")  # of episodes end to end
@@ -86,7 +84,8 @@ def inspect(
                     _tell(first, group, files, place)
                     _end_to_end(name, group, place, survey)
                 held.update(sizes)
-                series = [key for key, info in first.keys.items() if info.kind in ("camera", "vector")]
+                inside = (key for key, info in first.keys.items() if info.kind in ("camera", "vector"))
+                series = [key for key in inside if not is_video(key)]
                 survey.lengths(name, lengths[name], sizes, series)
                 if name in chosen:
                     survey.episode(name)
@@ -123,18 +122,20 @@ def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: EpisodeGrou
     first.keys = {info.key: info for info in _keys(group, place, first.pixels)}
     first.facts = _facts(group, said, place)
     first.facts["pixels"] = next(iter(first.pixels.values()), "")
-    first.facts["videos beside it"] = _videos(place.file)
+    first.facts["videos beside it"] = listed(videos_beside(place.file))
+    if place.group == WHOLE_FILE and all(info.kind != "camera" for info in first.keys.values()):
+        first.keys |= {info.key: info for info in video_keys(place.file)}
     first.rate, first.facts["rate"], first.facts["timestamps"] = _rate(group, said, first.keys, str(place))
 
 
 def _end_to_end(name: str, group: h5py.Group, place: EpisodeGroup, survey: Survey) -> None:
     """Warn where a whole file is taken for one episode, but states that it holds several."""
-    for key in _ENDS if place.group == WHOLE_FILE else ():
-        item = group.get(key)
-        if not isinstance(item, h5py.Dataset) or len(item.shape or ()) != 1 or item.size > MAX_VALUES:
+    for key, item in walk(group) if place.group == WHOLE_FILE else ():
+        last = key.rsplit("/", 1)[-1]
+        if last not in _ENDS or len(item.shape or ()) != 1 or item.size > MAX_VALUES:
             continue
         ends = item[()].astype(bool)  # a run of True counts once
-        count = len(item) if key.startswith("episode") else int(np.diff(ends, prepend=False)[ends].sum())
+        count = len(item) if last.startswith("episode") else int(np.diff(ends, prepend=False)[ends].sum())
         if count > 1:
             said = f"{name} is read as one episode, but {key} tells of {count:,}"
             remedy = (
@@ -142,13 +143,6 @@ def _end_to_end(name: str, group: h5py.Group, place: EpisodeGroup, survey: Surve
             )
             survey.note(Finding("rows", "warn", said, remedy, key, {"episodes": count}))
             return
-
-
-def _videos(file: Path) -> str:
-    """Return the video files below the file's folder, as a camera's key would name them."""
-    inside = islice(file.parent.rglob("*"), MAX_LISTED)
-    found = [item.relative_to(file.parent).as_posix() for item in inside if item.suffix.lower() in SUFFIXES]
-    return listed(sorted(found))
 
 
 def _environment(handle: h5py.File) -> dict[str, Any]:
@@ -180,7 +174,7 @@ def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: in
 
 def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, first: _First) -> None:
     survey.numbers(name, key, values)
-    seconds = seconds_of(values) if is_times(key, info.shape) else None
+    seconds = seconds_of(values, key) if is_times(key, info.shape) else None
     if seconds is not None:
         clock = survey.times(name, key, seconds)
         survey.made.add("rate")
@@ -248,7 +242,7 @@ def _facts(group: h5py.Group, said: dict[str, Any], place: EpisodeGroup) -> dict
 def _rate(
     group: h5py.Group, said: dict[str, Any], keys: dict[str, KeyInfo], where: str
 ) -> tuple[float | None, str, str]:
-    """Return Hz, what states it, and the key of times in seconds; empty where there is no such key."""
+    """Return Hz, what states it, and the key of times whose unit is clear; empty where there is none."""
     stated, holder = _stated_rate(group, said)
     key = next(
         (key for key, info in keys.items() if info.kind == "vector" and is_times(key, info.shape)), None
@@ -256,12 +250,11 @@ def _rate(
     if key is None:
         return stated, holder, ""
     values = numbers(group, key, where).reshape(-1)
-    unit = seconds_a_unit(values) if values.dtype.kind in "fiu" else None
+    unit = seconds_a_unit(values, key) if values.dtype.kind in "fiu" else None
     if unit is None:
         return stated, holder, ""
     measured = 1 / (float(np.median(np.diff(values.astype(np.float64)))) * unit)
-    seconds = key if unit == 1.0 else ""
-    return (stated, holder, seconds) if stated else (measured, f"{_MEASURED} {key}", seconds)
+    return (stated, holder, key) if stated else (measured, f"{_MEASURED} {key}", key)
 
 
 def _stated_rate(group: h5py.Group, said: dict[str, Any]) -> tuple[float | None, str]:

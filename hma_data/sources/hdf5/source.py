@@ -8,7 +8,7 @@ An episode is a group (`data/demo_0`) or a whole file. The file itself shows whi
       layout: {episodes: "data/*", timestamps: obs/time}   # "/" means one file an episode
 
 A uri is a file or a folder of files. Keys are paths inside the episode's group. HDF5 stores no rate: the rate
-is the embodiment's `frequency_hz`, unless `layout.timestamps` names a key of seconds. Where pictures and
+is the embodiment's `frequency_hz`, unless `layout.timestamps` names a key of times. Where pictures and
 states have one row more than the actions (ManiSkill), `last_observation: drop` leaves out the row after the
 last action.
 
@@ -36,7 +36,9 @@ from hma_data.episodes.images import Images, decode_image
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.components import Hdf5Layout, Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
+from hma_data.sources.common.checks import seconds_a_unit, seconds_of
+from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.hdf5.file import (
     WHOLE_FILE,
     EpisodeFinder,
@@ -149,11 +151,11 @@ class Hdf5Source:
                 check(embodiment.state.components[0].key, len(observed))
             cameras: dict[str, PictureRows | VideoRows] = {}
             for camera in embodiment.cameras:
-                if is_video(camera):
+                if is_video(camera.key):
                     cameras[camera.name] = VideoRows(video_path(place.file, camera, layout), times)
                 else:
                     cameras[camera.name] = self._pictures(place, group, camera.key, layout, times)
-                check(camera.key, cameras[camera.name].rows, layout.frames_missing * is_video(camera))
+                check(camera.key, cameras[camera.name].rows, layout.frames_missing * is_video(camera.key))
             length = min(len(actions), *(pictures.rows for pictures in cameras.values()))
             times = times[:length]
             for pictures in cameras.values():
@@ -239,18 +241,15 @@ def _check_length(
 def _times(group: h5py.Group, embodiment: Embodiment, layout: Hdf5Layout, length: int, where: str) -> Floats:
     """Return the seconds of the frames: the episode's own where the YAML names their key."""
     key, hz = layout.timestamps, embodiment.frequency_hz
-    if key is None and hz is None:
-        raise SourceError(
-            f"embodiment {embodiment.id}",
-            "frequency_hz is null, and HDF5 stores no times by itself",
-            "set frequency_hz, or source.layout.timestamps to the key of the seconds",
-        )
     if key is None:  # With an unknown rate a recording can be looked at; converting it is refused before.
-        return rate_times(length, hz if isinstance(hz, float) else 1.0)
+        return rate_times(length, 1.0 if hz == "unknown" else embodiment.rate_hz)
     values = numbers(group, key, where)
     if values.dtype.kind not in "fiu" or values.size != len(values):
         raise EpisodeError(where, f"{key!r} holds {values.shape} {values.dtype}, not a time a frame")
-    return values.reshape(-1).astype(np.float64)
+    times = values.reshape(-1)
+    unit = seconds_a_unit(np.unique(times), key)
+    seconds = seconds_of(times, key) if unit not in (None, 1.0) else None
+    return times.astype(np.float64) if seconds is None else seconds
 
 
 def _vector(group: h5py.Group, vector: Vector, where: str) -> NDArray[np.float32]:

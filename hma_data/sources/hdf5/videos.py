@@ -2,15 +2,16 @@
 
 A camera whose key ends as a video file does is such a path, relative to the HDF5 file's folder:
 `videos/front.mp4`. A name in braces is replaced by its value in the JSON file that `layout.metadata` names, a
-pattern in the same folder: `recordings/MP4/{wrist_cam_serial}.mp4`. `*` stands for any characters; one file
-must match.
+pattern in the same folder: `recordings/MP4/{wrist_cam_serial}.mp4`. `{file}` is the name of the HDF5 file
+without its ending: `{file}_front.mp4`. `*` stands for any characters; one file must match.
 
 T rows of an episode, N frames of a video.
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,17 @@ from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import Camera, Hdf5Layout
-from hma_data.sources.base import file_fingerprint, leaves
+from hma_data.sources.base import KeyInfo
+from hma_data.sources.common.places import file_fingerprint, leaves
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.storage.files import parse_json
 
 SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 MAX_JSON = 16 << 20  # most bytes of the file of `layout.metadata`
 SHOWN = 12  # names in an error
+FILE = "{file}"  # in a key: the HDF5 file's name without its ending
+MAX_LISTED = 1_000  # files beside an HDF5 file among which videos are looked for
+MOST = 8  # videos of one episode
 _NAME = re.compile(r"\{(\w+)\}")
 
 
@@ -52,9 +57,9 @@ class VideoRows:
         return self._file.frames(indices)
 
 
-def is_video(camera: Camera) -> bool:
-    """Check whether a camera's pictures are in a video file beside the HDF5 file."""
-    return camera.key.lower().endswith(SUFFIXES)
+def is_video(key: str) -> bool:
+    """Check whether a camera's key is of a video file beside the HDF5 file."""
+    return key.lower().endswith(SUFFIXES)
 
 
 def video_path(file: Path, camera: Camera, layout: Hdf5Layout) -> Path:
@@ -67,7 +72,7 @@ def video_path(file: Path, camera: Camera, layout: Hdf5Layout) -> Path:
     Raises:
         EpisodeError: there is no such file, or several; or the JSON file lacks a name of the key.
     """
-    folder, key = file.parent, camera.key
+    folder, key = file.parent, camera.key.replace(FILE, file.stem)
     if names := _NAME.findall(key):
         values = _metadata(file, layout)
         for name in names:
@@ -78,10 +83,39 @@ def video_path(file: Path, camera: Camera, layout: Hdf5Layout) -> Path:
     return _one(file, folder, key, f"camera {camera.name}")
 
 
+def videos_beside(file: Path) -> list[str]:
+    """Return the video files below the folder of an HDF5 file, as a camera's key would name them."""
+    inside = islice(file.parent.rglob("*"), MAX_LISTED)
+    found = sorted(item.relative_to(file.parent) for item in inside if item.suffix.lower() in SUFFIXES)
+    if _is_alone(file):
+        return [path.as_posix() for path in found]
+    name = re.compile(rf"(?<![A-Za-z0-9]){re.escape(file.stem)}(?!\d)")  # run_1 is no part of run_10
+    return [name.sub(FILE, path.as_posix()) for path in found]
+
+
+def video_keys(file: Path) -> Iterator[KeyInfo]:
+    """Yield the videos of an HDF5 file that is one episode, as cameras.
+
+    Where other HDF5 files lie in the folder, a video must have the file's name in its own.
+    """
+    alone = _is_alone(file)
+    for key in [key for key in videos_beside(file) if alone or FILE in key][:MOST]:
+        with suppress(HMAError, OSError):
+            video = VideoFile(file.parent / key.replace(FILE, file.stem))
+            size = (video.table.height, video.table.width, 3)
+            yield KeyInfo(key, "camera", size, "uint8", codec=video.table.codec, count=len(video))
+
+
+def _is_alone(file: Path) -> bool:
+    return sum(item.suffix == file.suffix for item in file.parent.iterdir()) == 1
+
+
 def video_fingerprints(file: Path, cameras: Iterable[Camera], layout: Hdf5Layout) -> str:
     """Return a text that changes when a video does; empty without videos, and where one cannot be found."""
     found = ""
-    for camera in filter(is_video, cameras):
+    for camera in cameras:
+        if not is_video(camera.key):
+            continue
         with suppress(HMAError, OSError):
             found += f" {file_fingerprint(video_path(file, camera, layout))}"
     return found

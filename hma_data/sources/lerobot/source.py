@@ -32,7 +32,8 @@ from hma_data.episodes.images import Images, decode_image
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Camera, Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
+from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.sources.lerobot.metadata import Folder, Metadata, Span, episode_name, parquet_explained
 from hma_data.storage.paths import StrPath, as_text

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Floats
 from hma_data.errors import EpisodeError
-from hma_data.sources.base import leaves, local_path, nothing_there
+from hma_data.sources.common.places import leaves, local_path, nothing_there
 from hma_data.sources.rh20t import SCENE
 from hma_data.storage.files import read_json
 from hma_data.storage.npy_dict import read_dict

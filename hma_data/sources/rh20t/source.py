@@ -26,7 +26,8 @@ from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values, file_fingerprint
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values
+from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.rh20t.scenes import FILM, STAMPS, TABLES, Scene, scenes
 from hma_data.storage.paths import StrPath, as_text

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, NonNegativeInt, ValidationError
 from pydantic.alias_generators import to_camel
 
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources.base import local_path
+from hma_data.sources.common.places import local_path
 from hma_data.sources.rlds.features import Feature, read_features
 from hma_data.sources.rlds.records import Example, Framing, RecordFile, open_records
 from hma_data.storage.blocks import Blocks

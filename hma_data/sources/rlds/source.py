@@ -340,7 +340,7 @@ def _look(steps: Steps, survey: Survey, pairs: int) -> None:
             elif feature.kind == "number" and 0 < (feature.width or 0) <= MAX_VECTOR:
                 values = steps.numbers(key)
                 survey.numbers(steps.name, key, values)
-                seconds = seconds_of(values) if is_times(key, values.shape[1:]) else None
+                seconds = seconds_of(values, key) if is_times(key, values.shape[1:]) else None
                 if seconds is not None:
                     survey.times(steps.name, key, seconds)
         except EpisodeError as fault:

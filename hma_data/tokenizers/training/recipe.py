@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationErr
 
 from hma_data.errors import RecipeError
 from hma_data.storage.paths import StrPath, as_path
-from hma_data.storage.yaml_io import read_yaml
-from hma_data.tokenizers.embedded import PATCH, FsqConfig, VaeConfig
+from hma_data.storage.yaml_io import plain_fault, read_yaml
+from hma_data.tokenizers.shapes import PATCH, FsqConfig, VaeConfig
 
 LOCAL: dict[str, Any] = {"corpus": True, "network": {"latent_scale"}}  # a place, and a measured value
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -193,4 +193,4 @@ def load_recipe(path: StrPath, overrides: dict[str, Any] | None = None) -> Token
     except ValidationError as fault:
         first = fault.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise RecipeError(path, f"{place}: {first['msg']}, got {first['input']!r:.80}") from fault
+        raise RecipeError(path, f"{place}: {plain_fault(first)}, got {first['input']!r:.80}") from fault

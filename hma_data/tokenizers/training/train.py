@@ -33,8 +33,9 @@ from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.checkpoints import fill, read_weights, save_weights
-from hma_data.tokenizers.embedded import Autoencoder, FsqAutoencoder, FsqConfig, VaeAutoencoder, VaeConfig
+from hma_data.tokenizers.embedded import Autoencoder, FsqAutoencoder, VaeAutoencoder
 from hma_data.tokenizers.network import open_device
+from hma_data.tokenizers.shapes import FsqConfig, VaeConfig
 from hma_data.tokenizers.training.eval import GREY, ssim_map
 from hma_data.tokenizers.training.frames import Pool, draw_batch, load_pools
 from hma_data.tokenizers.training.muon import Muon
@@ -125,7 +126,7 @@ def start_from(network: Autoencoder, source: StrPath) -> str:
         TokenizerError: there is no such file, or its weights are of another network.
     """
     path = as_path(source).expanduser()
-    _, tensors, sha256 = read_weights(path, network.format, network.shape)
+    _, tensors, sha256 = read_weights(path, network.shape.format, network.shape)
     grown = {name: tensor.clone() for name, tensor in network.state_dict().items()}
     for name, old in tensors.items():
         new = grown.get(name)
@@ -192,7 +193,7 @@ class Run:
             network.load_state_dict(self.average)
             scale = round(1 / float(network.encoder(self.batch(END, 128)).std()), 4)
             config = config.model_copy(update={"latent_scale": scale})
-        save_weights(path, self.network.format, config, self.average, facts, self.tokens_sha256)
+        save_weights(path, config.format, config, self.average, facts, self.tokens_sha256)
 
     def save(self, path: Path) -> None:
         """Write what `resume` needs, atomically."""

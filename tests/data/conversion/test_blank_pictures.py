@@ -14,8 +14,9 @@ import pytest
 from skimage import data as skimage_data
 
 from hma_data.conversion import worker
-from hma_data.conversion.job import Summary, convert
+from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
+from hma_data.conversion.report import Summary
 from hma_data.episodes.images import PictureCheck, resize
 from hma_data.errors import SourceError
 from hma_data.inspection.inspect import examine

@@ -148,6 +148,19 @@ def test_another_embodiment_or_tokenizer_is_refused_and_nothing_touched(
     assert contents(tmp_path / "out") == before
 
 
+@pytest.mark.parametrize(("limit", "empty"), [(2, True), (3, False), (1, False)])
+def test_a_limit_that_leaves_val_empty_is_told(
+    limit: int, empty: bool, toy_arm, tmp_path, block_tokenizer
+) -> None:
+    path = tmp_path / "split.hdf5"
+    write_toy(path, [20, 20, 20])
+    with h5py.File(path, "a") as file:  # robomimic's masks are a split of the recording's own
+        file["mask/train"] = np.array(["demo_0", "demo_1"], "S")
+        file["mask/valid"] = np.array(["demo_2"], "S")
+    summary = run(toy_arm, path, tmp_path / "out", block_tokenizer, Settings(limit=limit))
+    assert any("val is empty" in note and "--limit" in note for note in summary.notes) == empty
+
+
 def test_overwrite_starts_anew_but_never_deletes_what_is_not_ours(
     toy_arm, toy_recording, tmp_path, block_tokenizer
 ) -> None:

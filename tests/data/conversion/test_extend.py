@@ -10,8 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from hma_data.conversion.extend import Content, content_of
-from hma_data.conversion.job import Summary, convert
+from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
+from hma_data.conversion.report import Summary
 from hma_data.conversion.rewrite import merge, restat
 from hma_data.errors import OutputError
 from hma_data.inspection.inspect import examine

@@ -50,22 +50,26 @@ def whole(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str,
 
 
 @pytest.mark.parametrize(
-    ("options", "device"),
-    [({"workers": 0}, "cuda:7"), ({"workers": 2}, "cpu"), ({"workers": 0, "engine": "ray"}, "cpu")],
+    ("options", "devices"),
+    [({"workers": 0}, ["cuda:7"]), ({"workers": 2}, []), ({"workers": 0, "engine": "ray"}, [])],
 )
-def test_only_who_tokenizes_opens_the_tokenizer_on_the_device(
-    options, device: str, toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, monkeypatch
+def test_only_who_tokenizes_opens_the_tokenizer(
+    options, devices: list[str], toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, monkeypatch
 ) -> None:
     opened = []
 
     def get(name: str, *, weights: str | None, device: str) -> BlockTokenizer:
         opened.append(device)
-        raise OutputError(name, "enough")
+        return BlockTokenizer()
+
+    def stop(*given: object) -> None:
+        raise OutputError("plan", "enough")
 
     monkeypatch.setattr("hma_data.conversion.job.get_tokenizer", get)
+    monkeypatch.setattr("hma_data.conversion.job.plan_conversion", stop)
     with pytest.raises(OutputError, match="enough"):
         convert(toy_arm, toy_recording, "fsq-8", tmp_path / "out", device="cuda:7", **options)
-    assert opened == [device]
+    assert opened == devices
 
 
 def test_a_device_that_workers_lack_is_one_error(

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from hma_data.conversion import job
-from hma_data.conversion.job import Shared, convert, convert_share
+from hma_data.conversion.job import convert, convert_share
 from hma_data.conversion.output import LOCK, Share
 from hma_data.conversion.plan import Settings
+from hma_data.conversion.report import Shared
 from hma_data.errors import OutputError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet

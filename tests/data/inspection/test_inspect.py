@@ -218,6 +218,7 @@ def test_a_rate_measured_in_one_episode_is_not_called_stated(tmp_path: Path) -> 
         ("terminals", [0] * 9 + [1] + [0] * 19 + [1], 2),
         ("dones", [False] * 20 + [True] * 10, None),
         ("episode_ends", [30], None),
+        ("meta/episode_ends", [10, 20, 30], 3),  # as diffusion policy's arrays
     ],
 )
 def test_episodes_end_to_end_in_one_file_are_told(

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from hma_data.conversion.job import Shared, convert, convert_share
+from hma_data.conversion.job import convert, convert_share
 from hma_data.conversion.output import PLAN, Share
 from hma_data.conversion.plan import Settings
+from hma_data.conversion.report import Shared
 from hma_data.conversion.rewrite import merge, restat
 from hma_data.errors import MissingDependencyError, OutputError, ShardError, StorageAwayError, StorageError
 from hma_data.registry.embodiment import Embodiment

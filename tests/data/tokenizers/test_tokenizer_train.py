@@ -15,7 +15,8 @@ from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import get_tokenizer
 from hma_data.tokenizers.catalog import EMBEDDED
 from hma_data.tokenizers.checkpoints import read_weights
-from hma_data.tokenizers.embedded import FsqAutoencoder, FsqConfig
+from hma_data.tokenizers.embedded import FsqAutoencoder
+from hma_data.tokenizers.shapes import FsqConfig
 from hma_data.tokenizers.training.eval import psnr_db
 from hma_data.tokenizers.training.frames import draw_batch, load_pools
 from hma_data.tokenizers.training.muon import Muon, orthogonal
@@ -141,7 +142,7 @@ GROWN = {"network.decoder_blocks": [1, 2, 3], "network.fine_width": 6, "network.
 
 def test_a_training_may_start_from_a_smaller_network_and_decodes_as_it_did(tmp_path):
     train(write_recipe(tmp_path), tmp_path / "small", report=lambda _: None)
-    small, _, _ = opened = read_weights(tmp_path / "small", FsqAutoencoder.format, FsqConfig)
+    small, _, _ = opened = read_weights(tmp_path / "small", FsqConfig.format, FsqConfig)
     grown = load_recipe(write_recipe(tmp_path), GROWN).network
     assert isinstance(grown, FsqConfig) and grown != small
     before, after = FsqAutoencoder(small), FsqAutoencoder(grown)
@@ -206,7 +207,7 @@ def test_crops_depend_on_seed_and_step_alone(tmp_path):
 
 
 def test_the_shipped_recipe_is_valid_and_makes_the_shipped_network():
-    config, _, _ = read_weights(EMBEDDED / "fsq.safetensors", FsqAutoencoder.format, FsqConfig)
+    config, _, _ = read_weights(EMBEDDED / "fsq.safetensors", FsqConfig.format, FsqConfig)
     assert load_recipe(RECIPE).network == config
 
 

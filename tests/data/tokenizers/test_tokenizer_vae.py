@@ -12,14 +12,15 @@ from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 from hma_data.tokenizers.catalog import EMBEDDED
 from hma_data.tokenizers.checkpoints import read_weights, save_weights
-from hma_data.tokenizers.embedded import VaeAutoencoder, VaeConfig
+from hma_data.tokenizers.embedded import VaeAutoencoder
+from hma_data.tokenizers.shapes import VaeConfig
 from hma_data.tokenizers.training.eval import evaluate, psnr_db
 from hma_data.tokenizers.training.recipe import load_recipe
 from hma_data.tokenizers.training.train import train
 from tests.data.tokenizer_files import draw_scene, drawn_corpus
 
 RECIPE = shipped("recipes") / "tokenizer" / "vae.yaml"
-FORMAT, WEIGHTS = VaeAutoencoder.format, EMBEDDED / "vae.safetensors"
+FORMAT, WEIGHTS = VaeConfig.format, EMBEDDED / "vae.safetensors"
 SMALL = VaeConfig(width=8, hidden=8, encoder_blocks=1, decoder_blocks=(1, 1), fine_width=4)
 
 

@@ -2,6 +2,7 @@
 
 import json
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,17 +11,19 @@ from safetensors.torch import load_file, save_file
 
 from hma_data.errors import TokenizerError
 from hma_data.storage.paths import shipped
-from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_spec, get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 from hma_data.tokenizers.checkpoints import read_weights, save_weights
-from hma_data.tokenizers.embedded import FsqAutoencoder, FsqConfig, Quantizer
+from hma_data.tokenizers.embedded import FsqAutoencoder, Quantizer
+from hma_data.tokenizers.shapes import FsqConfig
 from hma_data.tokenizers.training.eval import CodebookUse, evaluate, psnr_db, ssim, to_markdown
 from hma_data.tokenizers.training.frames import read_films
 from hma_data.tokenizers.training.recipe import load_recipe
+from tests.data.fresh import run_fresh
 from tests.data.tokenizer_files import draw_scene
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
-FORMAT, WEIGHTS = FsqAutoencoder.format, EMBEDDED / "fsq.safetensors"
+FORMAT, WEIGHTS = FsqConfig.format, EMBEDDED / "fsq.safetensors"
 SMALL = FsqConfig(width=(8, 8), hidden=8, encoder_blocks=(1, 1), decoder_blocks=(1, 1, 1), fine_width=4)
 
 
@@ -43,6 +46,23 @@ def scenes(count: int, size: int) -> np.ndarray:
 
 
 HERE = [name for name, entry in CATALOG.items() if entry.weights in ("embedded", "none")]
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_the_spec_is_that_of_the_opened_tokenizer(name: str) -> None:
+    assert get_spec(name) == get_tokenizer(name).spec
+
+
+def test_the_spec_of_embedded_weights_needs_no_torch() -> None:
+    run_fresh(
+        "import sys; from hma_data.conversion.job import get_spec\n"
+        "assert get_spec('fsq-16').grid == (16, 16) and 'torch' not in sys.modules"
+    )
+
+
+def test_the_spec_of_other_weights_is_theirs(tmp_path: Path) -> None:
+    save_weights(tmp_path / "w", FORMAT, SMALL, dict(FsqAutoencoder(SMALL).named_parameters()), {})
+    assert get_spec("fsq-8", weights=tmp_path / "w") != get_spec("fsq-8")
 
 
 @pytest.mark.parametrize("name", HERE)

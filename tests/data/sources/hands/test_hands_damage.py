@@ -36,7 +36,7 @@ def folder(tmp_path: Path, clip: Path) -> Path:
     ("layout", "fault"),
     [
         ({"missing": "skip"}, r"\(is 'skip'\); allowed: 'split', 'hold' or 'mask'"),
-        ({"min_frames": "few"}, "valid integer"),
+        ({"min_frames": "few"}, "a whole number"),
         ({"min_frames": "-1"}, "greater than or equal to 0"),
         ({"min_score": "nan"}, "finite number"),
         ({"label_size": "1920"}, "WIDTHxHEIGHT"),

@@ -175,7 +175,7 @@ def test_a_layout_names_groups_and_times(tmp_path: Path) -> None:
                 fill(file.create_group(f"{day}/runs/{run}"), seed=run)
                 file[f"{day}/runs/{run}/clock"] = np.arange(T) * 0.3 + 100
     layout = {"episodes": "*/runs/*", "timestamps": "clock"}
-    arm = embodiment(source__layout=layout, frequency_hz=None)
+    arm = embodiment(source__layout=layout, frequency_hz=None, stride=2)
     source = open_source("hdf5")
     ids = [ref.id for ref in source.index(str(path), arm)]
     assert ids == ["mon/runs/9", "mon/runs/10", "tue/runs/9", "tue/runs/10"]
@@ -184,9 +184,23 @@ def test_a_layout_names_groups_and_times(tmp_path: Path) -> None:
     )
 
 
-def test_without_rate_and_times_reading_says_what_to_set(demos: Path) -> None:
-    with pytest.raises(SourceError, match=r"layout\.timestamps"):
-        open_source("hdf5").read(str(demos), "demo_0", embodiment(frequency_hz=None))
+@pytest.mark.parametrize(
+    ("key", "origin", "unit"),
+    [
+        ("clock", 1_700_000_000_000_000_000, 1e-9),
+        ("time_us", 1_700_000_000_000_000, 1e-6),
+        ("t_ms", 0, 1e-3),
+        ("stamp_ns", 0, 1e-9),
+    ],
+)
+def test_times_of_any_unit_are_read_as_seconds(tmp_path: Path, key: str, origin: int, unit: float) -> None:
+    uneven = np.cumsum([0.0, *([0.1, 0.3] * T)])[:T]
+    with h5py.File(tmp_path / "lab.h5", "w") as file:
+        fill(file.create_group("data/demo_0"))
+        file[f"data/demo_0/{key}"] = origin + np.round(uneven / unit).astype(np.int64)
+    arm = embodiment(source__layout={"timestamps": key}, frequency_hz=5)
+    times = open_source("hdf5").read(str(tmp_path / "lab.h5"), "demo_0", arm).streams["front"].timestamps
+    np.testing.assert_allclose(times - times[0], uneven, atol=1e-3)
 
 
 def test_an_unknown_rate_can_still_be_looked_at(demos: Path) -> None:

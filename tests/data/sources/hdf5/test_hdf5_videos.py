@@ -16,6 +16,7 @@ from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import detect, open_source
 from tests.conftest import BlockTokenizer
+from tests.data.inferring import answered, inferred
 from tests.data.videos import encode, number_of
 
 T = 12
@@ -98,6 +99,23 @@ def test_another_video_is_another_recording(robot, tmp_path) -> None:
     before = HDF5.index(str(tmp_path), robot)[0].fingerprint
     encode(folder / "recordings" / "MP4" / "22.mp4", range(5, 5 + T), fps=60)
     assert HDF5.index(str(tmp_path), robot)[0].fingerprint != before
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_a_yaml_is_inferred_from_numbers_with_a_video_beside_them(tmp_path: Path, flat: bool) -> None:
+    for take in (1, 10):  # the name of the first is part of the other's
+        folder = tmp_path / "lab" if flat else tmp_path / "lab" / f"run_{take}"
+        folder.mkdir(parents=True, exist_ok=True)
+        with h5py.File(folder / (f"run_{take}.h5" if flat else "numbers.h5"), "w") as file:
+            file["actions"] = np.random.default_rng(take).normal(size=(T, 3))
+        encode(folder / (f"run_{take}_front.mp4" if flat else "front.mp4"), range(take, take + T), fps=60)
+    values = inferred(tmp_path / "lab")
+    key = "{file}_front.mp4" if flat else "front.mp4"
+    assert values["cameras"] == [{"name": "front", "key": key, "size": values["cameras"][0]["size"]}]
+    arm = Embodiment.from_values(answered(values), "inferred")
+    for name in HDF5.episode_ids(str(tmp_path / "lab")):
+        first = HDF5.read(str(tmp_path / "lab"), name, arm).streams["front"].frames([0])[0]
+        assert number_of(first) == (10 if "10" in name else 1)
 
 
 def spoil(folder: Path, how: str) -> None:

@@ -1,0 +1,164 @@
+"""Report how a conversion goes and how it ended."""
+
+import re
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hma_data.conversion.engines import Retry
+from hma_data.conversion.plan import Plan
+from hma_data.conversion.worker import Seen, Tick
+from hma_data.errors import RegistryError
+from hma_data.inspection.shard_rate import pause_finding, rate_finding, window_finding
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.manifest import Manifest
+from hma_data.shards.reader import ShardSet
+
+
+@dataclass
+class Progress:
+    """The progress of a conversion, as the console shows it.
+
+    Attributes:
+        idle: a line for the user where workers have no shard to make, see `idle_workers`; else empty.
+    """
+
+    episodes: int = 0
+    frames: int = 0
+    bytes: int = 0
+    quarantined: int = 0
+    kept_shards: int = 0
+    total_episodes: int = 0
+    total_frames: int = 0
+    retries: list[str] = field(default_factory=list)
+    pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
+    idle: str = ""
+    started: float = field(default_factory=time.monotonic)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The result of a conversion.
+
+    Attributes:
+        reasons: error type and message (without the ids where there are several) -> number of episodes
+            refused for it.
+        flags: name -> count over all episodes, such as masked_actions; see docs/format.md.
+        pictures: camera -> (height, width) of its recorded pictures; empty if no shard was made.
+        left_out: number of the recording's episodes that `only` and `exclude` leave out.
+        too_many: True where more than `max_quarantine` was refused; the command ends with exit code 1.
+        changed: what the YAML says now that a finished set did not say yet; empty if nothing.
+        warning: the fault of a rate that the recordings do not have; empty if there is none.
+        notes: what else to mend before training, as `hma doctor` says it: no window, pauses.
+    """
+
+    out: Path
+    manifest: Manifest
+    kept_shards: int
+    made_shards: int
+    seconds: float
+    reasons: dict[str, int]
+    flags: dict[str, int]
+    too_many: bool
+    pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
+    left_out: int = 0
+    changed: str = ""
+    warning: str = ""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Shared:
+    """The result of one share of a conversion; the last share to end finishes the shard set.
+
+    Attributes:
+        missing: number of shards that other shares have still to make.
+        changed, warning: see `Summary`; empty for a share that does not finish the set.
+    """
+
+    out: Path
+    kept_shards: int
+    made_shards: int
+    missing: int
+    seconds: float
+    changed: str = ""
+    warning: str = ""
+
+
+class Counter:
+    """A counter of what units report; when a unit is retried, its earlier counts are taken back."""
+
+    def __init__(self, progress: Progress, on_progress: Callable[[Progress], None]) -> None:
+        self._progress, self._on_progress = progress, on_progress
+        self._by_unit: dict[int, dict[str, int]] = {}
+
+    def __call__(self, unit: int, event: Tick | Seen | Retry) -> None:
+        if isinstance(event, Seen):
+            self._progress.pictures.setdefault(event.camera, (event.height, event.width))
+            return
+        counts = self._by_unit.setdefault(unit, dict.fromkeys(vars(Tick()), 0))
+        if isinstance(event, Retry):
+            self._progress.retries.append(event.reason)
+            change = {name: -count for name, count in counts.items()}
+        else:
+            change = vars(event)
+        for name, count in change.items():
+            counts[name] += count
+            setattr(self._progress, name, getattr(self._progress, name) + count)
+        self._on_progress(self._progress)
+
+
+def training_notes(folder: Path, out: Path, plan: Plan) -> tuple[str, ...]:
+    """Return what to mend before training: no window, pauses, no episode for validation."""
+    made = ShardSet(folder)
+    found = (window_finding(made), pause_finding(made))
+    notes = [f"{out}: {one}" for one in found if one and one.severity != "info"]
+    if fault := _empty_val(made.manifest, plan):
+        notes.append(f"{out}: val is empty: {fault}")
+    return tuple(notes)
+
+
+def _empty_val(manifest: Manifest, plan: Plan) -> str:
+    """Return why a set of several episodes has none for validation; empty where it has one or wants none."""
+    settings = plan.facts["settings"]
+    if manifest.splits["val"]["episodes"] or plan.episodes < 2 or not settings["val_fraction"]:
+        return ""
+    if any(unit.split == "val" for unit in plan.units):
+        return "its episodes were refused, see quarantine.jsonl"
+    if settings["limit"]:
+        fault = f"the first {plan.episodes:,} episodes are train, by a split of the recording's own"
+        return f"{fault} — a larger --limit reaches its others"
+    return "the episodes are of one group, or all train by a split of the recording's own"
+
+
+def yaml_change(before: Embodiment, now: Embodiment) -> str:
+    """Return what of the YAML has changed, in words; empty if it is the same."""
+    old, new = before.to_dict(), now.to_dict()
+    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+    if not keys:
+        return ""
+    with suppress(RegistryError):  # nobody states the rate
+        if before.stride != now.stride:
+            said = f"stride {before.stride} → {now.stride}: the model now sees {now.effective_hz:g} Hz"
+            others = [key for key in keys if key not in ("target_hz", "stride", "provenance")]
+            return said + (f"; also new from the YAML: {', '.join(others)}" if others else "")
+    return f"new from the YAML: {', '.join(keys)}"
+
+
+def rate_warning(folder: Path, out: Path) -> str:
+    """Return the fault and the remedy where episodes have another rate than the YAML states; else empty."""
+    finding = rate_finding(ShardSet(folder))
+    return f"{out}: {finding}" if finding else ""
+
+
+def refusal_reasons(out: Path) -> dict[str, int]:
+    """Return reason -> number of refused episodes; reasons that differ in the episode's id alone are one."""
+    told: dict[str, list[str]] = {}
+    for item in ShardSet(out).refused():
+        text = plain = f"{item['type']}: {item['message']}"
+        if any(letter.isdigit() for letter in item["id"]):  # a numbered id would keep equal reasons apart
+            text = re.sub(rf"(?<!\w){re.escape(item['id'])}(?!\w)", "<episode>", text)
+        told.setdefault(text, []).append(plain)
+    return {text if len(plain) > 1 else plain[0]: len(plain) for text, plain in told.items()}

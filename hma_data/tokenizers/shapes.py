@@ -1,0 +1,138 @@
+"""State the shapes of the embedded networks, and read them from the files of weights.
+
+The command that plans a conversion needs what a tokenizer is, not its network: nothing here imports torch.
+"""
+
+import math
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from safetensors import SafetensorError, safe_open
+
+from hma_data.errors import TokenizerError
+from hma_data.storage.files import file_sha256
+from hma_data.storage.kinds import unreadable
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_data.tokenizers.catalog import EMBEDDED, Entry
+
+VERSION = 1
+PATCH = 8
+Width = Annotated[int, Field(ge=1, le=4096)]
+Blocks = Annotated[int, Field(ge=0, le=256)]
+
+
+class FsqConfig(BaseModel):
+    """The network's shape, stored in the weights' file and stated by a recipe.
+
+    Attributes:
+        levels: number of levels of each digit's channels; `[[8, 8, 8], [8, 8, 8]]` is two digits of 512.
+        width: channels at 1/8 and, if there are two, at 1/16 of the picture's side; tokens lie at the last.
+        hidden: channels inside the residual blocks at 1/8 and 1/16.
+        encoder_blocks: residual blocks at each width.
+        decoder_blocks: residual blocks at each width in reverse order, then at 1/4.
+        fine_width: channels of the decoder at 1/4.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    format: ClassVar = "hma-fsq-1"
+
+    levels: tuple[tuple[Annotated[int, Field(ge=2)], ...], ...] = ((8, 8, 8), (8, 8, 8))
+    width: tuple[Width] | tuple[Width, Width] = (128, 256)
+    hidden: Width = 128
+    encoder_blocks: tuple[Blocks, ...] = (3, 4)
+    decoder_blocks: tuple[Blocks, ...] = (5, 4, 1)
+    fine_width: Width = 48
+
+    @model_validator(mode="after")
+    def _fit(self) -> "FsqConfig":
+        count = len(self.width)
+        if (len(self.encoder_blocks), len(self.decoder_blocks)) != (count, count + 1):
+            raise ValueError(f"give {count} encoder_blocks and {count + 1} decoder_blocks for {count} widths")
+        return self
+
+    @field_validator("levels")
+    @classmethod
+    def _make_ids(cls, levels: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, ...], ...]:
+        count = math.prod(math.prod(digit) for digit in levels)
+        if not 2 <= count <= 2**31:
+            raise ValueError(f"levels make {count} ids; 2 to 2^31 are possible")
+        return levels
+
+    @property
+    def stride(self) -> int:
+        """Return the side of a token in pixels."""
+        return PATCH * len(self.width)
+
+    def spec(self, name: str, image_size: int, sha256: str) -> TokenizerSpec:
+        """Return the spec of the tokenizer with these weights."""
+        factored = tuple(math.prod(digit) for digit in self.levels)
+        return TokenizerSpec.discrete(name, VERSION, image_size, self.stride, factored, weights_sha256=sha256)
+
+
+class VaeConfig(BaseModel):
+    """The network's shape, stored in the weights' file and stated by a recipe.
+
+    Attributes:
+        channels: number C of latent channels.
+        width: channels at 1/8 of the picture's side.
+        hidden: channels inside the residual blocks at 1/8.
+        encoder_blocks: residual blocks of the encoder.
+        decoder_blocks: residual blocks of the decoder at 1/8 and at 1/4.
+        fine_width: channels of the decoder at 1/4.
+        noise: standard deviation of the noise that training adds to the latents.
+        latent_scale: factor that brings the latents to unit variance; measured when training ends.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    format: ClassVar = "hma-vae-1"
+
+    channels: Width = 4
+    width: Width = 96
+    hidden: Width = 96
+    encoder_blocks: Blocks = 3
+    decoder_blocks: tuple[Blocks, Blocks] = (5, 2)
+    fine_width: Width = 48
+    noise: float = Field(ge=0, lt=10, default=0.05)
+    latent_scale: float = Field(gt=0, lt=1e4, default=1.0)
+
+    def spec(self, name: str, image_size: int, sha256: str) -> TokenizerSpec:
+        """Return the spec of the tokenizer with these weights."""
+        facts = {"latent_scale": self.latent_scale, "weights_sha256": sha256}
+        return TokenizerSpec.continuous(name, VERSION, image_size, PATCH, self.channels, **facts)
+
+
+def read_shape[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[C, str]:
+    """Read the network's shape from a weights' file; return it and its tokens' digest.
+
+    The digest is the file's SHA-256, or that of the file whose encoder it kept.
+
+    Raises:
+        TokenizerError: there is no such file, or it is not safetensors, truncated, or of another network.
+    """
+    try:
+        with safe_open(path, "np") as file:
+            metadata = file.metadata() or {}
+    except (SafetensorError, OSError) as fault:
+        text = f"is not a complete safetensors file: {' '.join(str(fault).split())[:160]}"
+        raise TokenizerError(
+            path, *unreadable(path, text, "name another file, or download it again")
+        ) from fault
+    remedy = "take the file that `hma tokenizer train` writes, or leave --weights out"
+    if metadata.get("format") != form:
+        raise TokenizerError(
+            path, f"does not hold {form} weights (format {metadata.get('format')!r})", remedy
+        )
+    try:
+        shape = config.model_validate_json(metadata.get("config", ""))
+    except ValueError as fault:
+        text = f"its metadata does not describe the network: {' '.join(str(fault).split())[:160]}"
+        raise TokenizerError(path, text, remedy) from fault
+    return shape, metadata.get("tokens_sha256") or file_sha256(path)
+
+
+def embedded_spec(entry: Entry) -> TokenizerSpec:
+    """Return the spec of a tokenizer whose weights are inside the package."""
+    kind: type[FsqConfig | VaeConfig] = FsqConfig if entry.name.startswith("fsq") else VaeConfig
+    shape, sha256 = read_shape(EMBEDDED / entry.file, kind.format, kind)
+    return shape.spec(entry.name, entry.image_size, sha256)
