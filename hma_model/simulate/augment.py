@@ -50,6 +50,7 @@ from hma_model.simulate.world import World, load_world
 
 WORK = ".augment"
 BATCH = 16  # episodes that step in one pass
+MEASURES = {"discrete": "millinats", "continuous": "millilatents"}  # flags: thousandths of `uncertainty`
 DRAWS = 100  # of a beginning, until one is found whose commands are all known
 
 
@@ -105,14 +106,14 @@ class Batch:
     Of a policy's episodes P is one: what was commanded before is none of its own.
 
     Attributes:
-        nats: (n,) mean entropy of the generated tokens' predictions, in nats a token.
+        uncertainty: (n,) how unsure the model was of the generated frames, their mean; see `Rollout`.
         success: (n,) as judged; all True without a judge.
         groups: (n,) ids of the real episodes that they begin with.
     """
 
     stored: NDArray[Any]
     chunks: Floats
-    nats: NDArray[np.float64]
+    uncertainty: NDArray[np.float64]
     success: NDArray[np.bool_]
     groups: NDArray[np.str_]
 
@@ -184,8 +185,6 @@ def augment(
         require_dataset(as_path(lerobot))
     drawn: dict[str, Any] = {"unmask_steps": settings.unmask_steps, "temperature": settings.temperature}
     world = world or load_world(checkpoint, device=device, **drawn)
-    if world.model.config.kind != "discrete":
-        raise HMAError("augment", "takes models of discrete tokens", "choose another checkpoint")
     if (views := world.model.config.views) > 1 and (shards is None or settings.looked_at):
         fault = f"the laboratory's simulator shows one camera, and the model sees {views}"
         remedy = "name shards with --from, and leave out --judge and policies that read the robot's state"
@@ -203,7 +202,8 @@ def augment(
         if found is None:
             maker = _Maker(world, settings, begins)
             batches = maker.run(begun(folder, WORK, made_by, world.model), on_progress)
-            chosen, spec = _chosen(batches, settings), world.tokenizer.spec
+            spec = world.tokenizer.spec
+            chosen = _chosen(batches, settings, MEASURES[spec.kind])
             found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
             shutil.rmtree(folder / WORK)
         if dataset is not None and not done:
@@ -310,11 +310,11 @@ class _Maker:
     def _make(self, numbers: range, tell: Callable[[float], None]) -> Batch:
         begun = self._simulated(numbers) if self.shards is None else self._recorded(self.shards, numbers)
         arena = ModelArena(self.world, begun, self.probe)
-        kept, nats = [], []
+        kept, uncertainty = [], []
 
         def look(done: float) -> None:
             kept.append(arena.stored())
-            nats.append(arena.entropies())
+            uncertainty.append(arena.uncertainty())
             tell(done)
 
         self.world.measure = True
@@ -328,13 +328,14 @@ class _Maker:
         success: NDArray[np.bool_] = np.ones(count, np.bool_)
         if self.judge is not None:
             success = self.judge.success(self.judge.score(np.stack(pictures, axis=1)))
-        first, before = _prompt_tokens(self.world, begun.prompts), [prompt.chunks for prompt in begun.prompts]
+        first = np.stack([self.world.encoded(self.robot.id, prompt.frames) for prompt in begun.prompts])
+        first, before = first.astype(kept[0].dtype), [prompt.chunks for prompt in begun.prompts]
         if not self.settings.recorded:  # what was commanded before is none of the policy's
             first, before = first[:, -1:], [chunks[:0] for chunks in before]
         return Batch(
             np.concatenate([first, np.stack(kept, axis=1)], axis=1),
             np.concatenate([np.stack(before), own], axis=1),
-            np.stack(nats).mean(axis=0),
+            np.stack(uncertainty).mean(axis=0),
             success,
             np.array(begun.groups),
         )
@@ -384,41 +385,36 @@ class _Maker:
         raise UsageError(shards.folder, fault, "give fewer --frames, or shards with more of the commands")
 
 
-def _prompt_tokens(world: World, prompts: Sequence[Prompt]) -> NDArray[Any]:
-    """Return the frames of prompts as shards store them (N, P, h, w)."""
-    frames = [prompt.frames for prompt in prompts]
-    if frames[0].ndim == 4:
-        frames = [world.tokenizer.encode(pictures) for pictures in frames]
-    return np.stack(frames).astype(world.tokenizer.spec.dtype)
-
-
 # -- what is kept
 
 
-def _chosen(batches: Sequence[Batch], settings: Augmentation) -> list[Made]:
-    """Return the episodes of which the model was least unsure, without those that are judged failures."""
-    nats = np.concatenate([batch.nats for batch in batches])
+def _chosen(batches: Sequence[Batch], settings: Augmentation, measure: str) -> list[Made]:
+    """Return the episodes of which the model was least unsure, without those that are judged failures.
+
+    `measure` is the name of the flag that says how unsure it was.
+    """
+    unsure = np.concatenate([batch.uncertainty for batch in batches])
     success = np.concatenate([batch.success for batch in batches])
-    kept = np.zeros(len(nats), np.bool_)
-    kept[np.argsort(nats, kind="stable")[: max(1, round(settings.keep * len(nats)))]] = True
+    kept = np.zeros(len(unsure), np.bool_)
+    kept[np.argsort(unsure, kind="stable")[: max(1, round(settings.keep * len(unsure)))]] = True
     if not (kept & success).any():
-        fault = f"none of the {kept.sum()} surest of {len(nats)} episodes is judged a success"
+        fault = f"none of the {kept.sum()} surest of {len(unsure)} episodes is judged a success"
         raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")
-    every = zip(_each(batches, settings), kept & success, strict=True)
+    every = zip(_each(batches, settings, measure), kept & success, strict=True)
     return [one for one, chosen in every if chosen]
 
 
-def _each(batches: Sequence[Batch], settings: Augmentation) -> Iterator[Made]:
+def _each(batches: Sequence[Batch], settings: Augmentation, measure: str) -> Iterator[Made]:
     """Yield all episodes, numbered through."""
     number = 0
     for batch in batches:
-        for stored, chunks, group, nats in zip(
-            batch.stored, batch.chunks, batch.groups, batch.nats, strict=True
+        for stored, chunks, group, unsure in zip(
+            batch.stored, batch.chunks, batch.groups, batch.uncertainty, strict=True
         ):
             counts = {
                 "prompt_frames": len(stored) - settings.frames,
                 "generated_frames": settings.frames - 1,  # the last one has no commands after it
-                "millinats": round(1000 * float(nats)),
+                measure: round(1000 * float(unsure)),
             }
             judged = True if settings.judge else None
             yield Made(f"synthetic_{number:06d}", stored, chunks, counts, str(group), judged)
