@@ -12,12 +12,14 @@ import hashlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.console import Update
 from hma_data.conversion.output import locked
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab.simulator import simulated
@@ -162,7 +164,7 @@ def augment(
     lerobot: StrPath | None = None,
     world: World | None = None,
     device: str = "cpu",
-    on_progress: Callable[[float, str], None] = lambda done, words: None,
+    on_progress: Update = lambda done, extra="", total=None: None,
 ) -> Manifest:
     """Make synthetic episodes, and write those that are kept as a shard set.
 
@@ -174,7 +176,7 @@ def augment(
         lerobot: folder for the same episodes as a LeRobotDataset v3.0; one that is finished is kept.
         world: a world instead of a checkpoint.
         device: of the world made from the checkpoint, and of policies that are networks.
-        on_progress: called with the frames done, and what is done.
+        on_progress: called with the frames done, and what is done; of the dataset, with all its frames too.
 
     Raises:
         HMAError: the robot, the shards or the policy do not fit, the folder holds something else, the judge
@@ -207,10 +209,10 @@ def augment(
             found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
             shutil.rmtree(folder / WORK)
         if dataset is not None and not done:
-            frames = settings.episodes * settings.frames
+            frames = sum(split["frames"] for split in found.splits.values()) * found.frame_stride
 
             def tell(at: int, words: str) -> None:
-                on_progress(frames, f"LeRobot: {words}" + (f", {at} so far" if at else ""))
+                on_progress(at, f"LeRobot: {words}", frames)
 
             write_as_lerobot(dataset, folder, world.tokenizer, tell)
     return found
@@ -272,7 +274,7 @@ class _Maker:
             raise UsageError(shards.folder, fault, "give fewer --frames")
         return found
 
-    def run(self, work: Path, on_progress: Callable[[float, str], None]) -> list[Batch]:
+    def run(self, work: Path, on_progress: Update) -> list[Batch]:
         """Return all batches; those in the folder are not made again."""
         count, frames = self.settings.episodes, self.settings.frames
         batches = []
@@ -281,28 +283,34 @@ class _Maker:
             arrays = kept_arrays(path)
             if arrays is None:
                 self._train(on_progress)
-                on_progress(begin * frames, "episodes")  # the clock of the time left starts here
+                on_progress(begin * frames, "")  # the clock of the time left starts here
                 numbers = range(begin, min(begin + BATCH, count))
-                batch = self._make(numbers, lambda at, b=begin: on_progress(b * frames + at, "episodes"))  # type: ignore[misc]
+                batch = self._make(numbers, lambda at, b=begin: on_progress(b * frames + at, ""))  # type: ignore[misc]
                 arrays = vars(batch)
                 with atomic_path(path) as part, part.open("wb") as file:
                     np.savez(file, **arrays)
             batches.append(Batch(**arrays))
-            on_progress(min(begin + BATCH, count) * frames, "episodes")
+            on_progress(min(begin + BATCH, count) * frames, "")
         return batches
 
-    def _train(self, on_progress: Callable[[float, str], None]) -> None:
+    def _train(self, on_progress: Update) -> None:
         """Train the judge, or the probe alone, if they are asked for."""
         settings = self.settings
         if self.probe is not None or not settings.looked_at:
             return
-        on_progress(0, "training the judge")
-        name, stride = settings.embodiment, self.scenes.stride
-        self.probe = train_probe(name, self.world.tokenizer, stride, settings.seed)
+        name, stride, tell = settings.embodiment, self.scenes.stride, partial(on_progress, 0)
+        self.probe = train_probe(name, self.world.tokenizer, stride, settings.seed, tell)
         if settings.judge:
             task, frames = task_of(name, settings.judge), settings.frames + 1
             self.judge = train_judge(
-                name, self.world.tokenizer, stride, frames, task, seed=settings.seed, probe=self.probe
+                name,
+                self.world.tokenizer,
+                stride,
+                frames,
+                task,
+                seed=settings.seed,
+                probe=self.probe,
+                tell=tell,
             )
             if isinstance(self.policy, Judged):
                 self.policy.judged(self.judge)
