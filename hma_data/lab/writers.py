@@ -258,6 +258,7 @@ def write_lerobot(
         encoder_threads=1,  # the output bytes depend on the number of threads
     )
     done = 0
+    on_progress(done, "writing frames")
     with _quiet():
         try:
             for episode in chain([first], rest):

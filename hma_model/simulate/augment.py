@@ -11,6 +11,7 @@ N episodes, P frames of a prompt, T generated frames, A action dims, K = stride 
 import hashlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -237,7 +238,7 @@ class _Maker:
             self.cameras = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
 
     def _policy(self, commands: str) -> Policy:
-        _, given, number = commands.partition("=")
+        kind, _, number = commands.partition("=")
         std = self.world.model.embodiments[self.robot.id].std
         if not self.settings.recorded:
             policy = read_policy(commands, self.scenes, self.world)
@@ -245,12 +246,12 @@ class _Maker:
                 fault = f"{commands!r} plans for what a judge calls success"
                 raise UsageError("--commands", fault, "add --judge moved, or another task")
             return policy
-        try:
-            share = float(number) if given else 0.0
-        except ValueError:
-            share = np.nan
+        share = 0.0 if commands == "replay" else np.nan
+        if kind == "perturb":
+            with suppress(ValueError):
+                share = float(number)
         if not 0 <= share < np.inf:
-            raise UsageError("--commands", f"{commands!r} is unknown", "give perturb=SHARE, such as 0.3")
+            raise UsageError("--commands", f"{commands!r} is unknown", "give replay, or perturb=0.3")
         return Replay(share, std)
 
     def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:

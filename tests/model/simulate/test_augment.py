@@ -167,6 +167,14 @@ def test_the_surest_episodes_are_kept(kind: str, request: pytest.FixtureRequest,
         asked(keep=0.0)
 
 
+@pytest.mark.parametrize(
+    "words", ["perturb", "perturb=", "perturb=-1", "replay=0.3", "replay=", "perturb=inf"]
+)
+def test_noise_without_a_share_is_refused(words: str, world: World, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--commands: .* is unknown . give replay, or perturb=0.3"):
+        augment(tmp_path / "out", asked(commands=words), world=world)
+
+
 @pytest.mark.slow
 def test_first_frames_and_commands_come_from_shards(world: World, tmp_path: Path) -> None:
     recording = record(ROBOT, tmp_path, 1)

@@ -283,7 +283,7 @@ def test_a_saved_dataset_reads_as_what_was_driven(name: str, tmp_path: Path) -> 
     assert [words for words, _ in groupby(words for words, *_ in told)] == [
         "loading lerobot", "writing frames", "encoding videos", "packing the files",
     ]  # fmt: skip
-    assert [done for words, done, _ in told if words == "writing frames"] == [*range(1, rows + 1)]
+    assert [done for words, done, _ in told if words == "writing frames"] == [*range(rows + 1)]
     assert {total for *_, total in told} == {rows}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         archive.extractall(tmp_path)
