@@ -207,11 +207,12 @@ def _record(data: bytes) -> bytes:
 class LeRobotEpisode:
     """One episode of T frames for LeRobot."""
 
-    pictures: Mapping[str, NDArray[np.uint8]]  # camera feature -> (T, H, W, 3) RGB
+    pictures: Mapping[str, Sequence[NDArray[np.uint8]] | NDArray[np.uint8]]  # camera -> T/hold of (H, W, 3)
     action: NDArray[np.float32]  # (T, A), the command issued at each frame
     state: NDArray[np.float32] | None  # (T, S), seen at each frame
     task: str  # in words
     further: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # other features -> (T, values)
+    hold: int = 1  # frames for which a picture stands
 
 
 def write_lerobot(
@@ -257,15 +258,17 @@ def write_lerobot(
         encoder_threads=1,  # the output bytes depend on the number of threads
     )
     done = 0
+    on_progress(done, "writing frames")
     with _quiet():
         try:
             for episode in chain([first], rest):
-                seen = {**episode.pictures, **episode.further}
                 for row, action in enumerate(episode.action):
-                    values = {key: array[row] for key, array in seen.items()} | {"action": action}
+                    values: dict[str, Any] = {"action": action, "task": episode.task}
+                    values |= {key: shown[row // episode.hold] for key, shown in episode.pictures.items()}
+                    values |= {key: array[row] for key, array in episode.further.items()}
                     if episode.state is not None:
                         values["observation.state"] = episode.state[row]
-                    writer.add_frame({**values, "task": episode.task})
+                    writer.add_frame(values)
                     done += 1
                     on_progress(done, "writing frames")
                 on_progress(done, "encoding videos")

@@ -32,7 +32,8 @@ MALFORMED = (KeyError, TypeError, ValueError, AttributeError, RecursionError)  #
 _FOOTER = b"hma"
 # a footer as `to_metadata` writes it; in a text of JSON, quotes have a backslash before them
 _EPISODES_OF_TEXT = re.compile(rb'(.*?), "episodes": (\[.*\])(, "quarantine": .*)')
-MEASURES = {"millinats"}  # flags that measure an episode and count no frames: a sum of them means nothing
+# flags that measure an episode and count no frames: a sum of them means nothing
+MEASURES = {"millinats", "millilatents"}
 PAUSES = "pauses="  # begins the word of an episode's flags that states its pauses
 PLAN_HASH = b"hma.plan_hash"  # states the plan beside the footer's JSON, for those who need no more
 

@@ -108,6 +108,7 @@ def augment(
     Example: hma augment rails_03 synthetic/rails_03 --episodes 64 --commands perturb=0.3
     """
     from hma_data.shards.manifest import MANIFEST
+    from hma_data.shards.reader import ShardSet
     from hma_model.simulate.augment import Augmentation
     from hma_model.simulate.augment import augment as run
     from hma_model.simulate.synthetic import FACTS
@@ -133,8 +134,9 @@ def augment(
         print_json({"out": str(out), "made": episodes, "kept": kept, "plan": made.plan})
         return
     before = "finished already: " if finished else ""
+    begun = len(set(ShardSet(out).episodes["group"].to_pylist()))
     said = f"kept {human_count(kept, 'episode')} of {episodes} in {out}"
-    print(f"{before}{said}; synthetic: true in every file")
+    print(f"{before}{said}, begun in {human_count(begun, 'real one')}; synthetic: true in every file")
     if lerobot:
         print(f"the same as a LeRobotDataset: {lerobot}")
 

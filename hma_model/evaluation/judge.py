@@ -161,6 +161,7 @@ def train_judge(
     seed: int = 0,
     examples: int = EXAMPLES,
     probe: Probe | None = None,
+    tell: Callable[[str], None] = lambda words: None,
 ) -> StateJudge:
     """Train a judge on recorded episodes of a laboratory robot.
 
@@ -173,12 +174,13 @@ def train_judge(
         seed: of the probe, the episodes and the intervals.
         examples: recorded episodes for the limit and its test.
         probe: one that is trained already.
+        tell: called with how far it is.
 
     Raises:
         HMAError: the robot has no loose parts that can be read, or the judge is no better than chance.
     """
     task = task or task_of(robot)
-    probe = probe or train_probe(robot, tokenizer, stride, seed)
+    probe = probe or train_probe(robot, tokenizer, stride, seed, tell)
     unread = {"reached": not len(probe.own), "placed": len(probe.loose) < 2}
     if not len(probe.loose) or unread.get(task.name):
         fault = f"cannot tell whether {task.text}: the probe does not read these parts"
@@ -191,6 +193,7 @@ def train_judge(
         shown = as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures))
         true[row] = _true_score(task, probe, made.parts[None])[0]
         read[row] = _read_score(task, probe, shown[None])[0]
+        tell(f"training the judge: episode {row + 1} of {examples}")
     half, success = examples // 2, true >= task.limit
     limit = best_limit(read[:half], success[:half], task.limit)
     found = accuracy(success[half:], read[half:] >= limit)

@@ -12,6 +12,7 @@ of each part's colour, wherever they are. A true picture of another time has som
 N pictures of S pixels a side, P parts. Places are px of a picture of 128 by 128.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -164,7 +165,13 @@ def as_shown(tokenizer: "Tokenizer", pictures: Images) -> Images:
     return tokenizer.decode(tokenizer.encode(pictures))
 
 
-def train_probe(robot: str, tokenizer: "Tokenizer", stride: int, seed: int = 0) -> Probe:
+def train_probe(
+    robot: str,
+    tokenizer: "Tokenizer",
+    stride: int,
+    seed: int = 0,
+    tell: Callable[[str], None] = lambda words: None,
+) -> Probe:
     """Train a probe on simulated episodes of a laboratory robot; it takes some 15 CPU seconds.
 
     Args:
@@ -172,14 +179,18 @@ def train_probe(robot: str, tokenizer: "Tokenizer", stride: int, seed: int = 0) 
         tokenizer: whose pictures the probe is to read.
         stride: control steps a frame.
         seed: of the episodes and the training; the same seed gives the same probe.
+        tell: called with how far it is.
     """
     numbers = range(FIRST, FIRST + EPISODES)
     kept = range(0, FRAMES, EVERY)
-    made = [truth.episode(robot, FRAMES, stride, seed, number, kept) for number in numbers]
-    pictures = np.concatenate([episode.pictures for episode in made])
-    parts = np.concatenate([episode.parts[kept] for episode in made])
-    shown = as_shown(tokenizer, as_seen(robot, tokenizer, pictures))
-    return fit(shown, parts, made[0].driven, HELD_OUT / EPISODES, seed, tee=TeeFinder.of(robot))
+    shown, parts = [], []
+    for count, number in enumerate(numbers, 1):
+        made = truth.episode(robot, FRAMES, stride, seed, number, kept)
+        shown.append(as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures)))
+        parts.append(made.parts[kept])
+        tell(f"training the probe: episode {count} of {EPISODES}")
+    pictures, places = np.concatenate(shown), np.concatenate(parts)
+    return fit(pictures, places, made.driven, HELD_OUT / EPISODES, seed, tee=TeeFinder.of(robot), tell=tell)
 
 
 def fit(
@@ -190,6 +201,7 @@ def fit(
     seed: int = 0,
     steps: int = STEPS,
     tee: TeeFinder | None = None,
+    tell: Callable[[str], None] = lambda words: None,
 ) -> Probe:
     """Train a probe on pictures whose state is known.
 
@@ -201,10 +213,11 @@ def fit(
         seed: of the training.
         steps: of the training.
         tee: of a pusher.
+        tell: called with how far it is.
     """
     used = round(len(pictures) * (1 - held_out))
     small = _small(pictures)
-    network = _trained(small[:used], parts[:used], seed, steps)
+    network = _trained(small[:used], parts[:used], seed, steps, tell)
     spread = np.linalg.norm(parts - np.median(parts, axis=0), axis=-1).mean(axis=0)
     background = np.median(small[:used], axis=0).astype(np.float32)
     within = parts if tee is None else tee.within(parts)
@@ -214,7 +227,7 @@ def fit(
     return replace(untested, error=error)
 
 
-def _trained(small: Images, parts: Floats, seed: int, steps: int) -> nn.Module:
+def _trained(small: Images, parts: Floats, seed: int, steps: int, tell: Callable[[str], None]) -> nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = PlaceNetwork(parts.shape[1])
@@ -222,7 +235,7 @@ def _trained(small: Images, parts: Floats, seed: int, steps: int) -> nn.Module:
     inputs, targets = _pixels(small), torch.tensor(parts / (truth.SIZE / 2) - 1, dtype=torch.float32)
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
-    for _ in range(steps):
+    for step in range(steps):
         chosen = torch.randint(0, len(inputs), (BATCH,), generator=generator)
         noisy = inputs[chosen] + NOISE * torch.randn(BATCH, 3, SIDE, SIDE, generator=generator)
         loss = nn.functional.smooth_l1_loss(network(noisy), targets[chosen], beta=0.02)
@@ -230,6 +243,7 @@ def _trained(small: Images, parts: Floats, seed: int, steps: int) -> nn.Module:
         loss.backward()
         optimizer.step()
         schedule.step()
+        tell(f"training the probe: step {step + 1} of {steps}")
     return network.eval()
 
 

@@ -66,8 +66,9 @@ class Rollout:
     Attributes:
         state: the state of the rows.
         passes: of the trunk over their frames.
-        entropy: (n,) of the rows of the last step, twins last: mean nats a token of the trunk, by what was
-            predicted when it was decided; if `decoding` measures it.
+        uncertainty: (n,) of the rows of the last step, twins last; if `decoding` measures it. Of tokens, the
+            mean entropy of what was predicted when a token of the trunk was decided, in nats. Of latents,
+            the standard deviation of what might have been drawn for a value, in the tokenizer's units.
     """
 
     def __init__(
@@ -325,8 +326,7 @@ class Rollout:
             if count > 0:
                 self._unmask(frame, passes, count, first=left == tokens)
                 left -= count
-        if isinstance(frame, TokenFrame):
-            self.entropy = frame.nats / tokens
+        self.uncertainty = frame.uncertainty / self.config.latent_scale
         return frame.values
 
     def _unmask(self, frame: TokenFrame | PatchFrame, passes: list[Pass], count: int, first: bool) -> None:

@@ -40,7 +40,7 @@ class Decoding:
         sample_steps: sampling steps of the diffusion head; None for the configuration's.
         guidance: how much the commands change, times what they change; of rows with twins only.
         noise_level: the share of a generated frame's digits that the model is told to distrust.
-        measure: add up the entropy of the decided tokens' predictions; of discrete models.
+        measure: add up how unsure the model is of what it decides; see `uncertainty` of the frames.
     """
 
     steps: int = 2
@@ -109,6 +109,11 @@ class TokenFrame:
         """Predict tokens from features (B, S, D) of frames at times (1 or B, 1), and keep `count` more."""
         self.values = self.unmasked(readout, features, count)
 
+    @property
+    def uncertainty(self) -> Tensor:
+        """Return the mean entropy (B,) of what was predicted for a token when it was decided, in nats."""
+        return self.nats / self.values.shape[1]
+
     def unmasked(self, readout: TokenReadout, features: Tensor, count: int) -> Tensor:
         """Return the tokens (B, S) with `count` more of them predicted from features (B, S, D)."""
         masked = self.masked
@@ -167,6 +172,7 @@ class PatchFrame:
         values: (B, S, C) scaled patches.
         masked: (B, S) bool, True for masked patches.
         before: (B, S, C) those of the frame before; None for models that do not copy it.
+        variance: (B,) of the values of the patches drawn so far, summed over patches, if it is measured.
     """
 
     def __init__(
@@ -180,6 +186,12 @@ class PatchFrame:
         self.copies = len(values) // len(generators)
         self.masked = torch.ones(values.shape[:2], dtype=torch.bool, device=values.device)
         self.rank = _ranks(values, generators, self.copies)
+        self.variance = torch.zeros(len(values), device=values.device)
+
+    @property
+    def uncertainty(self) -> Tensor:
+        """Return the standard deviation (B,) of what might have been drawn for a value, in scaled latents."""
+        return (self.variance / self.values.shape[1]).sqrt()
 
     def unmask(self, readout: LatentReadout, features: Tensor, position: Tensor, count: int) -> None:
         """Draw `count` more patches from features (B, S, D) of frames at times (1 or B, 1)."""
@@ -189,10 +201,26 @@ class PatchFrame:
         conditions = _gather(conditions, chosen).flatten(0, 1)
         way = self.decoding
         guidance = None if self.copies == 1 else way.guidance
-        patches = readout.sample(conditions, way.sample_steps, way.temperature, self.generators, guidance)
-        patches = patches.view(len(self.generators), chosen.shape[1], -1).repeat(self.copies, 1, 1)
+
+        def draw(generators: Sequence[torch.Generator]) -> Tensor:
+            drawn = readout.sample(conditions, way.sample_steps, way.temperature, generators, guidance)
+            return drawn.view(len(generators), chosen.shape[1], -1)
+
+        patches = draw(self.generators)
+        if way.measure:  # half the squared difference of two draws is their variance
+            other = draw([_copy(one) for one in self.generators])
+            variance = (patches - other).square().mean(-1).sum(1) / 2
+            self.variance = self.variance + variance.repeat(self.copies)
+        patches = patches.repeat(self.copies, 1, 1)
         self.values = self.values.scatter(1, chosen.unsqueeze(-1).expand_as(patches), patches)
         self.masked = self.masked.scatter(1, chosen, False)
+
+
+def _copy(generator: torch.Generator) -> torch.Generator:
+    """Return a generator that draws the numbers which this one will draw next."""
+    made = torch.Generator(generator.device)
+    made.set_state(generator.get_state())
+    return made
 
 
 def _ranks(values: Tensor, generators: Sequence[torch.Generator], copies: int) -> Tensor:

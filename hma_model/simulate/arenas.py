@@ -274,9 +274,9 @@ class ModelArena:
         """Return the newest frames (N, …) as shards store them."""
         return np.stack([self._env.world.stored(session) for session in self._sessions])
 
-    def entropies(self) -> NDArray[np.float64]:
+    def uncertainty(self) -> NDArray[np.float64]:
         """Return how unsure the model was of the newest frames (N,), if its world measures it."""
-        return np.array([self._env.world.entropies.get(session, 0.0) for session in self._sessions])
+        return np.array([self._env.world.uncertainty.get(session, 0.0) for session in self._sessions])
 
     @property
     def _sessions(self) -> list[int]:

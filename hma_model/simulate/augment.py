@@ -11,13 +11,16 @@ N episodes, P frames of a prompt, T generated frames, A action dims, K = stride 
 import hashlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.console import Update
 from hma_data.conversion.output import locked
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab.simulator import simulated
@@ -50,6 +53,7 @@ from hma_model.simulate.world import World, load_world
 
 WORK = ".augment"
 BATCH = 16  # episodes that step in one pass
+MEASURES = {"discrete": "millinats", "continuous": "millilatents"}  # flags: thousandths of `uncertainty`
 DRAWS = 100  # of a beginning, until one is found whose commands are all known
 
 
@@ -105,14 +109,14 @@ class Batch:
     Of a policy's episodes P is one: what was commanded before is none of its own.
 
     Attributes:
-        nats: (n,) mean entropy of the generated tokens' predictions, in nats a token.
+        uncertainty: (n,) how unsure the model was of the generated frames, their mean; see `Rollout`.
         success: (n,) as judged; all True without a judge.
         groups: (n,) ids of the real episodes that they begin with.
     """
 
     stored: NDArray[Any]
     chunks: Floats
-    nats: NDArray[np.float64]
+    uncertainty: NDArray[np.float64]
     success: NDArray[np.bool_]
     groups: NDArray[np.str_]
 
@@ -161,7 +165,7 @@ def augment(
     lerobot: StrPath | None = None,
     world: World | None = None,
     device: str = "cpu",
-    on_progress: Callable[[float, str], None] = lambda done, words: None,
+    on_progress: Update = lambda done, extra="", total=None: None,
 ) -> Manifest:
     """Make synthetic episodes, and write those that are kept as a shard set.
 
@@ -173,7 +177,7 @@ def augment(
         lerobot: folder for the same episodes as a LeRobotDataset v3.0; one that is finished is kept.
         world: a world instead of a checkpoint.
         device: of the world made from the checkpoint, and of policies that are networks.
-        on_progress: called with the frames done, and what is done.
+        on_progress: called with the frames done, and what is done; of the dataset, with all its frames too.
 
     Raises:
         HMAError: the robot, the shards or the policy do not fit, the folder holds something else, the judge
@@ -184,8 +188,6 @@ def augment(
         require_dataset(as_path(lerobot))
     drawn: dict[str, Any] = {"unmask_steps": settings.unmask_steps, "temperature": settings.temperature}
     world = world or load_world(checkpoint, device=device, **drawn)
-    if world.model.config.kind != "discrete":
-        raise HMAError("augment", "takes models of discrete tokens", "choose another checkpoint")
     if (views := world.model.config.views) > 1 and (shards is None or settings.looked_at):
         fault = f"the laboratory's simulator shows one camera, and the model sees {views}"
         remedy = "name shards with --from, and leave out --judge and policies that read the robot's state"
@@ -203,14 +205,15 @@ def augment(
         if found is None:
             maker = _Maker(world, settings, begins)
             batches = maker.run(begun(folder, WORK, made_by, world.model), on_progress)
-            chosen, spec = _chosen(batches, settings), world.tokenizer.spec
+            spec = world.tokenizer.spec
+            chosen = _chosen(batches, settings, MEASURES[spec.kind])
             found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
             shutil.rmtree(folder / WORK)
         if dataset is not None and not done:
-            frames = settings.episodes * settings.frames
+            frames = sum(split["frames"] for split in found.splits.values()) * found.frame_stride
 
             def tell(at: int, words: str) -> None:
-                on_progress(frames, f"LeRobot: {words}" + (f", {at} so far" if at else ""))
+                on_progress(at, f"LeRobot: {words}", frames)
 
             write_as_lerobot(dataset, folder, world.tokenizer, tell)
     return found
@@ -235,7 +238,7 @@ class _Maker:
             self.cameras = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
 
     def _policy(self, commands: str) -> Policy:
-        _, given, number = commands.partition("=")
+        kind, _, number = commands.partition("=")
         std = self.world.model.embodiments[self.robot.id].std
         if not self.settings.recorded:
             policy = read_policy(commands, self.scenes, self.world)
@@ -243,12 +246,12 @@ class _Maker:
                 fault = f"{commands!r} plans for what a judge calls success"
                 raise UsageError("--commands", fault, "add --judge moved, or another task")
             return policy
-        try:
-            share = float(number) if given else 0.0
-        except ValueError:
-            share = np.nan
+        share = 0.0 if commands == "replay" else np.nan
+        if kind == "perturb":
+            with suppress(ValueError):
+                share = float(number)
         if not 0 <= share < np.inf:
-            raise UsageError("--commands", f"{commands!r} is unknown", "give perturb=SHARE, such as 0.3")
+            raise UsageError("--commands", f"{commands!r} is unknown", "give replay, or perturb=0.3")
         return Replay(share, std)
 
     def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:
@@ -272,7 +275,7 @@ class _Maker:
             raise UsageError(shards.folder, fault, "give fewer --frames")
         return found
 
-    def run(self, work: Path, on_progress: Callable[[float, str], None]) -> list[Batch]:
+    def run(self, work: Path, on_progress: Update) -> list[Batch]:
         """Return all batches; those in the folder are not made again."""
         count, frames = self.settings.episodes, self.settings.frames
         batches = []
@@ -281,28 +284,34 @@ class _Maker:
             arrays = kept_arrays(path)
             if arrays is None:
                 self._train(on_progress)
-                on_progress(begin * frames, "episodes")  # the clock of the time left starts here
+                on_progress(begin * frames, "")  # the clock of the time left starts here
                 numbers = range(begin, min(begin + BATCH, count))
-                batch = self._make(numbers, lambda at, b=begin: on_progress(b * frames + at, "episodes"))  # type: ignore[misc]
+                batch = self._make(numbers, lambda at, b=begin: on_progress(b * frames + at, ""))  # type: ignore[misc]
                 arrays = vars(batch)
                 with atomic_path(path) as part, part.open("wb") as file:
                     np.savez(file, **arrays)
             batches.append(Batch(**arrays))
-            on_progress(min(begin + BATCH, count) * frames, "episodes")
+            on_progress(min(begin + BATCH, count) * frames, "")
         return batches
 
-    def _train(self, on_progress: Callable[[float, str], None]) -> None:
+    def _train(self, on_progress: Update) -> None:
         """Train the judge, or the probe alone, if they are asked for."""
         settings = self.settings
         if self.probe is not None or not settings.looked_at:
             return
-        on_progress(0, "training the judge")
-        name, stride = settings.embodiment, self.scenes.stride
-        self.probe = train_probe(name, self.world.tokenizer, stride, settings.seed)
+        name, stride, tell = settings.embodiment, self.scenes.stride, partial(on_progress, 0)
+        self.probe = train_probe(name, self.world.tokenizer, stride, settings.seed, tell)
         if settings.judge:
             task, frames = task_of(name, settings.judge), settings.frames + 1
             self.judge = train_judge(
-                name, self.world.tokenizer, stride, frames, task, seed=settings.seed, probe=self.probe
+                name,
+                self.world.tokenizer,
+                stride,
+                frames,
+                task,
+                seed=settings.seed,
+                probe=self.probe,
+                tell=tell,
             )
             if isinstance(self.policy, Judged):
                 self.policy.judged(self.judge)
@@ -310,11 +319,11 @@ class _Maker:
     def _make(self, numbers: range, tell: Callable[[float], None]) -> Batch:
         begun = self._simulated(numbers) if self.shards is None else self._recorded(self.shards, numbers)
         arena = ModelArena(self.world, begun, self.probe)
-        kept, nats = [], []
+        kept, uncertainty = [], []
 
         def look(done: float) -> None:
             kept.append(arena.stored())
-            nats.append(arena.entropies())
+            uncertainty.append(arena.uncertainty())
             tell(done)
 
         self.world.measure = True
@@ -328,13 +337,14 @@ class _Maker:
         success: NDArray[np.bool_] = np.ones(count, np.bool_)
         if self.judge is not None:
             success = self.judge.success(self.judge.score(np.stack(pictures, axis=1)))
-        first, before = _prompt_tokens(self.world, begun.prompts), [prompt.chunks for prompt in begun.prompts]
+        first = np.stack([self.world.encoded(self.robot.id, prompt.frames) for prompt in begun.prompts])
+        first, before = first.astype(kept[0].dtype), [prompt.chunks for prompt in begun.prompts]
         if not self.settings.recorded:  # what was commanded before is none of the policy's
             first, before = first[:, -1:], [chunks[:0] for chunks in before]
         return Batch(
             np.concatenate([first, np.stack(kept, axis=1)], axis=1),
             np.concatenate([np.stack(before), own], axis=1),
-            np.stack(nats).mean(axis=0),
+            np.stack(uncertainty).mean(axis=0),
             success,
             np.array(begun.groups),
         )
@@ -384,41 +394,36 @@ class _Maker:
         raise UsageError(shards.folder, fault, "give fewer --frames, or shards with more of the commands")
 
 
-def _prompt_tokens(world: World, prompts: Sequence[Prompt]) -> NDArray[Any]:
-    """Return the frames of prompts as shards store them (N, P, h, w)."""
-    frames = [prompt.frames for prompt in prompts]
-    if frames[0].ndim == 4:
-        frames = [world.tokenizer.encode(pictures) for pictures in frames]
-    return np.stack(frames).astype(world.tokenizer.spec.dtype)
-
-
 # -- what is kept
 
 
-def _chosen(batches: Sequence[Batch], settings: Augmentation) -> list[Made]:
-    """Return the episodes of which the model was least unsure, without those that are judged failures."""
-    nats = np.concatenate([batch.nats for batch in batches])
+def _chosen(batches: Sequence[Batch], settings: Augmentation, measure: str) -> list[Made]:
+    """Return the episodes of which the model was least unsure, without those that are judged failures.
+
+    `measure` is the name of the flag that says how unsure it was.
+    """
+    unsure = np.concatenate([batch.uncertainty for batch in batches])
     success = np.concatenate([batch.success for batch in batches])
-    kept = np.zeros(len(nats), np.bool_)
-    kept[np.argsort(nats, kind="stable")[: max(1, round(settings.keep * len(nats)))]] = True
+    kept = np.zeros(len(unsure), np.bool_)
+    kept[np.argsort(unsure, kind="stable")[: max(1, round(settings.keep * len(unsure)))]] = True
     if not (kept & success).any():
-        fault = f"none of the {kept.sum()} surest of {len(nats)} episodes is judged a success"
+        fault = f"none of the {kept.sum()} surest of {len(unsure)} episodes is judged a success"
         raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")
-    every = zip(_each(batches, settings), kept & success, strict=True)
+    every = zip(_each(batches, settings, measure), kept & success, strict=True)
     return [one for one, chosen in every if chosen]
 
 
-def _each(batches: Sequence[Batch], settings: Augmentation) -> Iterator[Made]:
+def _each(batches: Sequence[Batch], settings: Augmentation, measure: str) -> Iterator[Made]:
     """Yield all episodes, numbered through."""
     number = 0
     for batch in batches:
-        for stored, chunks, group, nats in zip(
-            batch.stored, batch.chunks, batch.groups, batch.nats, strict=True
+        for stored, chunks, group, unsure in zip(
+            batch.stored, batch.chunks, batch.groups, batch.uncertainty, strict=True
         ):
             counts = {
                 "prompt_frames": len(stored) - settings.frames,
                 "generated_frames": settings.frames - 1,  # the last one has no commands after it
-                "millinats": round(1000 * float(nats)),
+                measure: round(1000 * float(unsure)),
             }
             judged = True if settings.judge else None
             yield Made(f"synthetic_{number:06d}", stored, chunks, counts, str(group), judged)

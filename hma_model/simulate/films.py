@@ -124,11 +124,11 @@ def lerobot_episode(robot: Drivable, frames: Sequence[Frame]) -> tuple[LeRobotEp
     stride, views = robot.embodiment.stride, len(robot.cameras)
     following = [*frames[1:], frames[-1]]
     actions = np.concatenate([frame.commands for frame in following])
-    shown = {"": [decode_image(frame.model, "a frame") for frame in frames]}
+    shown = {"": [frame.model for frame in frames]}
     if all(frame.true is not None for frame in frames):
-        shown["_true"] = [decode_image(frame.true or b"", "a frame") for frame in frames]
+        shown["_true"] = [frame.true or b"" for frame in frames]
     cameras = {
-        name + end: [np.split(picture, views, axis=1)[view] for picture in pictures]
+        name + end: _Views(pictures, view, views)
         for end, pictures in shown.items()
         for view, name in enumerate(robot.cameras)
     }
@@ -136,12 +136,23 @@ def lerobot_episode(robot: Drivable, frames: Sequence[Frame]) -> tuple[LeRobotEp
     stated = robot.embodiment.state is not None and len(states) == len(frames)
     size = cameras[robot.cameras[0]][0].shape[:2]
     own = embodiment_of(robot.embodiment, DRIVEN, size, list(cameras), stated)
-    pictures = {
-        camera.key: np.stack(views).repeat(stride, axis=0)
-        for camera, views in zip(own.cameras, cameras.values(), strict=True)
-    }
+    seen = {camera.key: views for camera, views in zip(own.cameras, cameras.values(), strict=True)}
     state = np.stack(states).repeat(stride, axis=0) if own.state else None
-    return LeRobotEpisode(pictures, actions, state, "driven by hand in a world model"), own
+    return LeRobotEpisode(seen, actions, state, "driven by hand in a world model", hold=stride), own
+
+
+class _Views(Sequence[Picture]):
+    """One of several views side by side in JPEG pictures; a picture is decoded when it is asked for."""
+
+    def __init__(self, pictures: Sequence[bytes], view: int, views: int) -> None:
+        self._pictures, self._view, self._views = pictures, view, views
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def __getitem__(self, index: Any) -> Any:
+        picture = decode_image(self._pictures[index], "a frame")
+        return np.split(picture, self._views, axis=1)[self._view]
 
 
 def embodiment_of(

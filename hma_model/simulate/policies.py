@@ -128,8 +128,11 @@ def _named(words: str) -> Any:
         for part in name.split("."):
             found = getattr(found, part)
     except Exception as fault:
+        remedy = WAYS
+        if isinstance(fault, ModuleNotFoundError) and fault.name == module.partition(".")[0]:
+            remedy = f"run hma in the folder of {fault.name}.py, or install its package"
         raise HMAError(
-            f"policy {words}", f"cannot be imported: {type(fault).__name__}: {fault}", WAYS
+            f"policy {words}", f"cannot be imported: {type(fault).__name__}: {fault}", remedy
         ) from fault
     finally:
         sys.path.pop(0)

@@ -223,8 +223,9 @@ def evaluate_policies(
                 _try(name, policy, TrueArena(scenes.take(range(1)), world.picture_shape[0]))
         if not isinstance(judge, StateJudge):
             task = task_of(embodiment, judge)
-            tell(0, "training the judge")
-            judge = train_judge(embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed)
+            judge = train_judge(
+                embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed, tell=partial(tell, 0)
+            )
         for _, policy in made:
             if isinstance(policy, Judged):
                 policy.judged(judge)
@@ -287,8 +288,8 @@ def _try(name: str, policy: Policy, arena: Arena) -> None:
     checked(name, policy, arena)
 
 
-def _tell(tell: Progress, begun: float, name: str, done: float) -> None:
-    tell(begun + done, name)
+def _tell(tell: Progress, begun: float, name: str, done: float, where: str) -> None:
+    tell(begun + done, f"{name}, {where}")
 
 
 def _correlation(one: Scores, other: Scores) -> float | None:
@@ -305,16 +306,16 @@ def score_policy(
     scenes: Scenes,
     judge: StateJudge,
     frames: int,
-    tell: Callable[[float], None] = lambda done: None,
+    tell: Progress = lambda done, where: None,
 ) -> Scored:
     """Return what comes of one policy in the simulator and in the model."""
     size, limit = world.picture_shape[0], judge.task.limit
     shown = tuple(sorted({round(frame) for frame in np.linspace(0, frames, SHOWN)}))
     true = TrueArena(scenes, size)
-    true_pictures, _ = run(name, policy, true, frames)
+    true_pictures, _ = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
     model = ModelArena(world, true, judge.probe)
     try:
-        model_pictures, commands = run(name, policy, model, frames, tell)
+        model_pictures, commands = run(name, policy, model, frames, lambda done: tell(done, "in the model"))
     finally:
         model.close()
     again = TrueArena(scenes, size, drawn=False)

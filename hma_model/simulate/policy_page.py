@@ -11,6 +11,7 @@ import numpy as np
 from hma_data.console import print_table
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.storage.files import atomic_path
+from hma_model.evaluation.agreement import Estimate
 from hma_model.evaluation.pages import COLOURS, MARKERS, Page, label_axes, svg_bytes
 from hma_model.simulate.policy_eval import WORK, Correlation, PolicyEvaluation, Scored
 
@@ -51,6 +52,8 @@ def sentences(found: PolicyEvaluation) -> list[str]:
     scores = "the way it moved" if found.judge.task.name == "moved" else "minus the distance, 0 is best"
     said = [
         f"success: {found.judge.task.text}; shares with 95 % intervals over episodes; scores in px: {scores}",
+        "alike: episodes with the same outcome in both; same commands, sim.: the simulator, under the "
+        "commands that the policy gave in the model",
         f"judge on held-out true episodes: {found.judge.held_out}",
         f"judge on generated frames, against the simulator under the same commands: {found.generated}; "
         f"correlation of the scores {share}",
@@ -109,8 +112,14 @@ def html(found: PolicyEvaluation) -> str:
     page = Page("Policies inside the world model", lead)
     page.figures(
         [
-            (_value(found.success.pearson.value), "correlation of success rates over policies"),
-            (_value(found.success.spearman.value), "correlation of their ranks"),
+            (
+                _value(found.success.pearson.value),
+                f"correlation of success rates{_ends(found.success.pearson)}",
+            ),
+            (
+                _value(found.success.spearman.value),
+                f"correlation of their ranks{_ends(found.success.spearman)}",
+            ),
             (_value(found.judge.held_out.balanced), "judge's balanced accuracy on true episodes"),
             (_value(found.generated.balanced), "and on generated ones; 0.5 is chance"),
         ]
@@ -133,6 +142,10 @@ def html(found: PolicyEvaluation) -> str:
 
 def _value(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
+
+
+def _ends(found: Estimate) -> str:
+    return "" if found.low is None else f"; 95 %: {found.low:.2f} to {found.high:.2f}"
 
 
 def _chosen(found: PolicyEvaluation, kind: tuple[bool, bool]) -> Iterator[tuple[Scored, int]]:

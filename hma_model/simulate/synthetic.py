@@ -219,8 +219,8 @@ def _decoded(made: ShardSet, own: Embodiment, tokenizer: "Tokenizer") -> Iterato
         stored, columns = seen_frames(made, reader, row, names)
         views = np.split(stored, len(names), axis=-2)
         pictures = {
-            camera.key: tokenizer.decode(view).repeat(own.stride, axis=0)
-            for camera, view in zip(own.cameras, views, strict=True)
+            camera.key: tokenizer.decode(view) for camera, view in zip(own.cameras, views, strict=True)
         }
         actions = columns["action"].reshape(-1, own.action_dim)
-        yield LeRobotEpisode(pictures, actions, None, ORIGIN)  # one task: it is what a policy is told
+        # one task: it is what a policy is told
+        yield LeRobotEpisode(pictures, actions, None, ORIGIN, hold=own.stride)

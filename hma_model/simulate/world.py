@@ -58,8 +58,8 @@ class World:
 
     Attributes:
         unmask_steps, temperature, order, sample_steps: may be set between steps; they count for all sessions.
-        measure: set it to know how unsure the model is, see `entropies`; of discrete models.
-        entropies: session → mean nats a token of the newest frame, if they are measured.
+        measure: set it to know how unsure the model is, see `uncertainty`; latents are then drawn twice.
+        uncertainty: session → that of the newest frame as of `Rollout`, if it is measured.
         picture_shape: (S, V·S, 3) of every picture.
     """
 
@@ -80,7 +80,7 @@ class World:
         self.unmask_steps = unmask_steps
         self.temperature = default_temperature(model.config) if temperature is None else temperature
         self.order, self.sample_steps = order, sample_steps
-        self.measure, self.entropies = False, dict[int, float]()
+        self.measure, self.uncertainty = False, dict[int, float]()
         products_in(precision, model.device, compile)  # checks that the device has them
         self._decoding()
         self.picture_shape = picture_shape(model.config)
@@ -157,7 +157,7 @@ class World:
         rollout.decoding = self._decoding()
         frames = rollout.step(chunks, known=known, rows=rows)
         if self.measure:
-            self.entropies |= dict(zip(order, rollout.entropy.tolist()))
+            self.uncertainty |= dict(zip(order, rollout.uncertainty.tolist()))
         return dict(zip(order, decode(self.tokenizer, frames.unsqueeze(1))[:, 0]))
 
     def act(self, sessions: Iterable[int]) -> dict[int, Floats]:
@@ -196,6 +196,16 @@ class World:
         if frames.ndim == 4 and frames.dtype == np.uint8:
             return frames
         return decode(self.tokenizer, torch.from_numpy(np.asarray(frames)).unsqueeze(0))[0]
+
+    def encoded(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:
+        """Return the tokens (P, h, w) int64 or latents (P, c, h, w) float32 of frames as a prompt takes them.
+
+        Pictures are encoded, those of another size resized as in a conversion of the embodiment.
+        """
+        config = self.model.config
+        if len(frames) and frames.shape[1:] == config.frame_shape:
+            return frames.astype(np.int64 if config.kind == "discrete" else np.float32)
+        return self._encoded(embodiment, frames)
 
     def stored(self, session: int) -> NDArray[Any]:
         """Return the newest frame of a session as shards store it: tokens (h, w) or latents (c, h, w)."""
@@ -292,7 +302,7 @@ class World:
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return stored frames (P, ...), chunks (P - 1, K), and which are known (P - 1,)."""
         commands = self.commands(embodiment)
-        stored = self._stored(embodiment, np.asarray(frames))[-self.model.config.frames :]
+        stored = self.encoded(embodiment, np.asarray(frames)[-self.model.config.frames :])
         rows = [] if chunks is None else [commands.read(chunk) for chunk in np.asarray(chunks)]
         if chunks is None:
             rows = [(np.zeros(commands.stride * len(commands.names), np.float32), False)] * (len(stored) - 1)
@@ -303,13 +313,6 @@ class World:
         known = torch.tensor([known for _, known in rows], dtype=torch.bool)
         values = np.stack([chunk for chunk, _ in rows]) if rows else np.zeros((0, 1), np.float32)
         return torch.from_numpy(stored), torch.from_numpy(values), known
-
-    def _stored(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:
-        """Return frames as the model stores them; encode pictures."""
-        config = self.model.config
-        if len(frames) and frames.shape[1:] == config.frame_shape:
-            return frames.astype(np.int64 if config.kind == "discrete" else np.float32)
-        return self._encoded(embodiment, frames[-config.frames :])
 
     def _encoded(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:
         """Return pictures (n, H, W, 3) as the model stores them."""

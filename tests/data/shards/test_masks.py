@@ -178,5 +178,5 @@ def test_marks_that_are_not_those_of_the_values_are_found(
 
 
 def test_totals_count_frames_and_add_up_no_measures():
-    flags = pa.chunked_array([["masked_actions=2,millinats=900", "millinats=1100", "masked_actions=3", None]])
+    flags = pa.chunked_array([["masked_actions=2,millinats=9", "millilatents=11", "masked_actions=3", None]])
     assert flag_totals(flags) == {"masked_actions": 5}

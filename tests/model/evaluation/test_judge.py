@@ -101,8 +101,18 @@ def test_the_limit_is_the_nearest_of_those_that_tell_about_best() -> None:
 
 
 def test_a_judge_tells_its_accuracy_on_episodes_that_it_was_not_fitted_to(episodes: None) -> None:
-    made = train_judge("rails_03", None, 2, 12, probe=WrittenPlaces(), examples=40)  # type: ignore[arg-type]
+    told: list[str] = []
+    made = train_judge(
+        "rails_03",
+        None,
+        2,
+        12,
+        probe=WrittenPlaces(),
+        examples=40,
+        tell=told.append,  # type: ignore[arg-type]
+    )
     assert made.held_out.balanced == 1 and made.held_out.count == 20
+    assert told == [f"training the judge: episode {count} of 40" for count in range(1, 41)]
     parts = np.full((12, 3, 2), 40.0)
     reward, ended = made(written(parts), None)
     assert reward == 0 and not ended

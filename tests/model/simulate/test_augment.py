@@ -28,7 +28,7 @@ from hma_model.simulate.synthetic import Made, write_shards
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
 from tests.model.shards import state_pauses
-from tests.model.simulate.worlds import trained_on
+from tests.model.simulate.worlds import BlockLatents, latent_model, trained_on
 
 ROBOT, FRAMES, KNOWN = "rails_03", 4, 2
 
@@ -36,6 +36,12 @@ ROBOT, FRAMES, KNOWN = "rails_03", 4, 2
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(augment_module, "BATCH", 2)
+
+
+@pytest.fixture
+def latents() -> World:
+    """A world of latents, whose pictures have half the size of the simulator's."""
+    return World(latent_model(ROBOT), BlockLatents())
 
 
 def asked(**given: Any) -> Augmentation:
@@ -107,7 +113,11 @@ def test_perturbed_commands_lie_around_the_recorded_ones(world: World, tmp_path:
     assert {len(one["action"]) for one in still} == {FRAMES}
 
 
-def test_a_stopped_run_continues_and_gives_the_same_bytes(world: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["world", "latents"])
+def test_a_stopped_run_continues_and_gives_the_same_bytes(
+    kind: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    world = request.getfixturevalue(kind)
     whole = augment(tmp_path / "whole", asked(), world=world)
 
     def stop(done: float, words: str) -> None:
@@ -129,17 +139,40 @@ def test_a_stopped_run_continues_and_gives_the_same_bytes(world: World, tmp_path
         augment(tmp_path / "cut", asked(seed=1), world=world)
 
 
+def test_the_first_frames_of_latents_are_the_simulators_at_their_own_size(
+    latents: World, tmp_path: Path
+) -> None:
+    augment(tmp_path / "out", asked(episodes=2), world=latents)
+    assert verify(tmp_path / "out") == []
+    true, shards = TrueArena(Scenes.of(latents, ROBOT, 2, 0), 64), ShardSet(tmp_path / "out")
+    reader = EpisodeReader(shards, shards.columns())
+    for row, prompt in zip(shards.episodes.to_pylist(), true.prompts, strict=True):
+        stored = reader.episode(row, shards.manifest.cameras[0])["latents"].reshape(-1, 3, 8, 8)
+        means = prompt.frames.reshape(-1, 8, 16, 8, 16, 3).astype(np.float32).mean(axis=(2, 4)) / 17
+        np.testing.assert_allclose(stored[: len(means)], means.transpose(0, 3, 1, 2), atol=0.06)
+
+
 @pytest.mark.slow
-def test_the_surest_episodes_are_kept(world: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["world", "latents"])
+def test_the_surest_episodes_are_kept(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    world, measure = request.getfixturevalue(kind), {"world": "millinats", "latents": "millilatents"}[kind]
     augment(tmp_path / "all", asked(), world=world)
     augment(tmp_path / "half", asked(keep=0.5), world=world)
     unsure = {}
     for name in ("all", "half"):
         rows = ShardSet(tmp_path / name).episodes.to_pylist()
-        unsure[name] = sorted(flag_counts(row["flags"])["millinats"] for row in rows)
+        unsure[name] = sorted(flag_counts(row["flags"])[measure] for row in rows)
     assert unsure["half"] == unsure["all"][:2] and unsure["all"][0] < unsure["all"][-1]
     with pytest.raises(UsageError, match="--keep: is 0"):
         asked(keep=0.0)
+
+
+@pytest.mark.parametrize(
+    "words", ["perturb", "perturb=", "perturb=-1", "replay=0.3", "replay=", "perturb=inf"]
+)
+def test_noise_without_a_share_is_refused(words: str, world: World, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--commands: .* is unknown . give replay, or perturb=0.3"):
+        augment(tmp_path / "out", asked(commands=words), world=world)
 
 
 @pytest.mark.slow
@@ -303,11 +336,19 @@ def test_the_camera_that_is_shown_is_the_one_that_is_named(tmp_path: Path) -> No
 def test_lerobot_loads_the_dataset(world: World, tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    augment(tmp_path / "out", asked(episodes=2), world=world, lerobot=tmp_path / "rails")
+    told: list[tuple[Any, ...]] = []
+    given: Any = {"world": world, "lerobot": tmp_path / "rails", "on_progress": lambda *now: told.append(now)}
+    augment(tmp_path / "out", asked(episodes=2), **given)
     loaded = LeRobotDataset("lab/rails", root=tmp_path / "rails")
     stride = world.model.embodiments[ROBOT].stride
     columns = episodes(tmp_path / "out")
     assert loaded.num_episodes == 2 and len(loaded) == sum(len(one["action"]) for one in columns) * stride
+    written = [now for now in told if now[1].startswith("LeRobot")]  # with frames of its own
+    assert written[0][0] == 0 and written[-1][0] == len(loaded) == written[-1][2]
+    first, second = (world.tokenizer.decode(columns[0]["tokens"][at].reshape(1, 8, 8))[0] for at in (0, 1))
+    for at, shown in ((0, first), (stride - 1, first), (stride, second)):
+        stored = loaded[at]["observation.images.top"].permute(1, 2, 0).numpy() * 255
+        assert np.abs(stored - shown).mean() < 4 < np.abs(first.astype(float) - second).mean()
     row = loaded[stride]
     np.testing.assert_allclose(row["action"], columns[0]["action"][1][: len(row["action"])])
     assert "synthetic" in row["task"]

@@ -17,14 +17,14 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
-from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer
+from hma_data.tokenizers.base import get_tokenizer
 from hma_model.generation import commands
 from hma_model.simulate import World, labels, read_prompt
 from hma_model.simulate.labels import ShardFilm, VideoFilm, infer, label_actions
 from tests.conftest import BlockTokenizer
 from tests.data import cameras
 from tests.model.shards import state_pauses
-from tests.model.simulate.worlds import tiny_model, trained_on
+from tests.model.simulate.worlds import BlockLatents, tiny_model, trained_on
 
 ROBOT = "rails_03"
 
@@ -249,16 +249,6 @@ def test_film_that_has_grown_or_changed_is_never_taken_for_what_was_labelled(
     grey(tmp_path / "film", e=90)
     with pytest.raises(OutputError, match="out: holds another shard set — choose another folder"):
         run()
-
-
-class BlockLatents(BlockTokenizer):
-    """The mean colours of 8×8 blocks as latents."""
-
-    spec = TokenizerSpec("latents", 1, "continuous", 64, (8, 8), channels=3, dtype="float16")
-
-    def encode(self, frames: np.ndarray) -> np.ndarray:
-        blocks = frames.reshape(-1, 8, 8, 8, 8, 3).astype(np.float32).mean(axis=(2, 4)) / 17
-        return blocks.transpose(0, 3, 1, 2).astype(np.float16)
 
 
 @pytest.fixture(scope="module", params=[BlockTokenizer, BlockLatents])

@@ -268,6 +268,11 @@ def test_a_policy_that_fails_is_named_before_the_judge_is_trained(world: World, 
     assert name in str(fault.value) and "\n" not in str(fault.value)
 
 
+def test_a_module_that_is_not_there_is_said_with_where_it_is_looked_for(world: World) -> None:
+    with pytest.raises(HMAError, match="No module named 'nowhere' . run hma in the folder of nowhere.py"):
+        read_policy("nowhere:policy", Scenes.of(world, ROBOT, 1, 0))
+
+
 @pytest.mark.parametrize("words", ["fly", "scripted:noise=2", "scripted:speed=1"])
 def test_words_that_are_no_policy_are_refused(world: World, words: str) -> None:
     with pytest.raises(UsageError, match="is unknown"):

@@ -11,14 +11,16 @@ from numpy.typing import NDArray
 
 from hma_data.lab import family
 from hma_data.lab.simulator import LabSimulator
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
-from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint, action_stats
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.network.model import HMA
 from hma_model.simulate.scenes import PROMPT, SEED, Drivable, LabRobot
 from hma_model.simulate.session import Frame
+from tests.conftest import BlockTokenizer
 from tests.model.robots import stats
 
 
@@ -104,10 +106,40 @@ def tiny_model(robot: str, *objectives: str) -> HMA:
         tokenizer=tokenizer.spec.to_json(),
         objectives=dict.fromkeys(objectives or ("forward",), 1.0),
     )  # fmt: skip
-    made = HMA(config)
+    return _of_robot(HMA(config), own, bool(objectives))
+
+
+class BlockLatents(BlockTokenizer):
+    """The mean colours of 8×8 blocks of a 64-pixel picture as latents."""
+
+    spec = TokenizerSpec("latents", 1, "continuous", 64, (8, 8), channels=3, dtype="float16")
+
+    def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.float16]:
+        blocks = frames.reshape(-1, 8, 8, 8, 8, 3).astype(np.float32).mean(axis=(2, 4)) / 17
+        return blocks.transpose(0, 3, 1, 2).astype(np.float16)
+
+    def decode(self, latents: NDArray[np.float16]) -> NDArray[np.uint8]:
+        levels = np.clip(latents.astype(np.float32) * 17, 0, 255).astype(np.uint8).transpose(0, 2, 3, 1)
+        return levels.repeat(8, axis=1).repeat(8, axis=2)
+
+
+def latent_model(robot: str) -> HMA:
+    """Return a model of `BlockLatents` that knows nothing of a robot of the family."""
+    torch.manual_seed(0)
+    config = HMAConfig(
+        kind="continuous", layers=1, width=32, heads=2, frames=4, grid=(8, 8), channels=3, patch=4,
+        latent_scale=0.2, diffusion_width=32, diffusion_depth=1, training_pass="pairs",
+        tokenizer=BlockLatents.spec.to_json(),
+    )  # fmt: skip
+    model = HMA(config)
+    torch.nn.init.normal_(model.readout.diffusion.output.weight, std=0.3)
+    return _of_robot(model, family.embodiment(robot), False)
+
+
+def _of_robot(made: HMA, own: Embodiment, stirred: bool) -> HMA:
     stats = {"action": {"mean": [0.0] * own.action_dim, "std": [30.0] * own.action_dim}}
     made.add_embodiment(ActionSpace.of(own, action_stats(stats, own.id)))
-    for parameter in made.heads.parameters() if objectives else ():
+    for parameter in made.heads.parameters() if stirred else ():
         torch.nn.init.normal_(parameter, std=0.3)
     return made.eval()
 
