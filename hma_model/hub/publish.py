@@ -16,7 +16,7 @@ from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_data.hub.repository import Repository
 from hma_data.registry.embodiment import ID_PATTERN, find
 from hma_data.storage.files import cache_folder, file_sha256, json_object
-from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
+from hma_data.storage.paths import StrPath, addressed, as_address, as_path, as_text, is_repository
 from hma_data.storage.remote import RemotePath
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint import weights
@@ -192,17 +192,20 @@ def _pull(
     return place, wanted
 
 
-def open_published(source: str | Path, revision: str | None) -> tuple[Store, dict[str, int]]:
+def open_published(source: StrPath, revision: str | None) -> tuple[Store, dict[str, int]]:
     """Return a hub and its files; a name that may also be a mistyped path is told to be neither."""
     try:
         store = open_store(source, revision)
         return store, store.files()
     except HubError as fault:
-        if revision or not is_repository(source) or "://" in str(source):
+        name = as_text(source)
+        if not is_repository(source) or "://" in name:
             raise
+        if revision:
+            raise HubError(f"{name}@{revision}", fault.fault, fault.remedy) from fault
         both = f"is no folder here; as a repository of the hub: {fault.fault}"
         remedy = f"give the path of a checkpoint or run, or: {fault.remedy}"
-        raise HubError(str(source), both, remedy) from fault
+        raise HubError(name, both, remedy) from fault
 
 
 def list_embodiments(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
