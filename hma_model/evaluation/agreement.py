@@ -18,6 +18,7 @@ Bools = NDArray[np.bool_]
 
 RESAMPLES = 2000
 MIN_POLICIES, MIN_EPISODES = 3, 8  # fewer say nothing about a correlation
+FEW_POLICIES = 5  # fewer are drawn as the same few again and again: the interval would say nothing
 TAIL = 0.025  # chance beyond either end of an interval
 
 
@@ -39,6 +40,8 @@ class Estimate:
     def __str__(self) -> str:
         if self.value is None:
             return f"not computed: {self.reason}"
+        if self.low is None:
+            return f"{self.value:.2f} (too few for an interval)"
         return f"{self.value:.2f} ({self.low:.2f} to {self.high:.2f})"
 
 
@@ -109,7 +112,7 @@ def correlations(one: Floats, other: Floats, seed: int = 0) -> dict[str, Estimat
 
     A resample draws policies and episodes, the episodes jointly for all policies and both judgements, because
     they share their beginnings. Resamples of fewer than three different policies, or of constant means, have
-    no correlation and are drawn out.
+    no correlation and are drawn out. Fewer than five policies have no interval.
 
     Args:
         one, other: (M, N).
@@ -122,13 +125,16 @@ def correlations(one: Floats, other: Floats, seed: int = 0) -> dict[str, Estimat
     if reason:
         return dict.fromkeys(("pearson", "spearman"), Estimate(None, reason=reason))
     rng, (policies, episodes) = np.random.default_rng(seed), one.shape
+    means = one.mean(axis=1), other.mean(axis=1)
+    measures = {"pearson": pearson, "spearman": spearman}
+    if policies < FEW_POLICIES:
+        return {name: Estimate(float(measure(*means))) for name, measure in measures.items()}
     rows = rng.integers(policies, size=(RESAMPLES, policies))
     rows = rows[[len(set(drawn)) >= MIN_POLICIES for drawn in rows.tolist()]]
     columns = rng.integers(episodes, size=(len(rows), episodes))
     drawn = [values[rows[:, :, None], columns[:, None]].mean(axis=-1) for values in (one, other)]
-    means = one.mean(axis=1), other.mean(axis=1)
     found = {}
-    for name, measure in (("pearson", pearson), ("spearman", spearman)):
+    for name, measure in measures.items():
         spread = measure(*drawn)
         low, high = np.nanpercentile(spread, (2.5, 97.5))
         found[name] = Estimate(float(measure(*means)), float(low), float(high))

@@ -282,7 +282,7 @@ class _Maker:
         for begin in range(0, count, BATCH):
             path = work / f"batch-{begin:06d}.npz"
             arrays = kept_arrays(path)
-            if arrays is None:
+            if arrays is None or arrays.keys() != Batch.__annotations__.keys():  # or of an older release
                 self._train(on_progress)
                 on_progress(begin * frames, "")  # the clock of the time left starts here
                 numbers = range(begin, min(begin + BATCH, count))

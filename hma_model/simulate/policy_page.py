@@ -145,7 +145,11 @@ def _value(value: float | None) -> str:
 
 
 def _ends(found: Estimate) -> str:
-    return "" if found.low is None else f"; 95 %: {found.low:.2f} to {found.high:.2f}"
+    if found.value is None:
+        return ""
+    if found.low is None:
+        return "; too few policies for an interval"
+    return f"; 95 %: {found.low:.2f} to {found.high:.2f}"
 
 
 def _chosen(found: PolicyEvaluation, kind: tuple[bool, bool]) -> Iterator[tuple[Scored, int]]:

@@ -55,6 +55,14 @@ def test_too_little_is_said_and_not_computed(shape: tuple[int, int], said: str) 
         assert found.value is None and said in found.reason and said in str(found)
 
 
+def test_three_or_four_policies_have_a_correlation_without_an_interval() -> None:
+    one = np.random.default_rng(4).random((5, 9))
+    for count, there in ((3, False), (4, False), (5, True)):
+        for name, found in correlations(one[:count], one[:count] ** 2).items():
+            assert found.value is not None and (found.low is not None) == there, name
+            assert ("too few for an interval" in str(found)) != there
+
+
 def test_accuracy_counts_successes_and_failures_alike() -> None:
     true = np.arange(40) < 10
     always = accuracy(true, np.ones(40, bool))
