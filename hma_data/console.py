@@ -51,6 +51,7 @@ def print_json(values: Any) -> None:
 
 
 MAX_TITLE = 40  # letters in the column of titles; a longer title pushes its text to the right
+MAX_NAME = 20  # letters of a path, beyond which `short_paths` shortens it
 GAP = 3  # letters between columns
 MANY_ROWS = 500  # laying out more than this with rich takes seconds
 
@@ -184,9 +185,6 @@ def print_lines(lines: Iterable[tuple[str, str]]) -> None:
             shown = title if i == 0 and title != last else ""
             print(f"{shown:{width}}  {part}")
         last = title
-
-
-MAX_NAME = 20  # letters of a path, beyond which `short_paths` shortens it
 
 
 def short_paths(paths: Sequence[str]) -> dict[str, str]:

@@ -3,12 +3,13 @@
 import json
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hma_data.console import print_table
+from hma_data.console import print_lines, print_table, short_paths
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.storage.files import atomic_path
 from hma_model.evaluation.agreement import Estimate
@@ -23,6 +24,14 @@ KINDS = {  # (success in the simulator, in the model) -> title
     (True, False): "Success in the simulator only",
     (False, True): "Success in the model only",
 }
+
+
+def renamed(found: PolicyEvaluation) -> tuple[PolicyEvaluation, list[tuple[str, str]]]:
+    """Return the evaluation under short names of the policies that are paths, and the pairs (short, full)."""
+    names = short_paths([one.policy for one in found.policies if "/" in one.policy])
+    policies = tuple(replace(one, policy=names.get(one.policy, one.policy)) for one in found.policies)
+    legend = [(short, name) for name, short in names.items() if short != name]
+    return replace(found, policies=policies), legend
 
 
 def table(found: PolicyEvaluation) -> list[list[Any]]:
@@ -86,6 +95,8 @@ def _correlation(what: str, found: Correlation) -> str:
 
 def show(found: PolicyEvaluation) -> None:
     """Print the table and what it means."""
+    found, legend = renamed(found)
+    print_lines(legend)
     print_table(list(COLUMNS), table(found))
     for sentence in sentences(found):
         print(sentence)
@@ -104,6 +115,7 @@ def write_report(found: PolicyEvaluation, folder: Path) -> Path:
 
 def html(found: PolicyEvaluation) -> str:
     """Return the page."""
+    found, legend = renamed(found)
     count = len(found.policies[0].true.scores)
     lead = (
         f"{found.embodiment} in {found.checkpoint} ({found.sampling}): {count} episodes of {found.frames} "
@@ -126,6 +138,7 @@ def html(found: PolicyEvaluation) -> str:
     )
     for sentence in doubt(found):  # before anybody reads the rates
         page.section("Do not rely on the model's rates", sentence[:1].upper() + sentence[1:] + ".")
+    page.definitions(legend)
     page.table(COLUMNS, table(found))
     for sentence in [one for one in sentences(found) if one not in doubt(found)]:
         page.text(sentence[:1].upper() + sentence[1:] + ".")

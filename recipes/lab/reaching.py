@@ -15,9 +15,9 @@
     hma policy-eval mover_04 hma:runs/reach/{real_100,both,real_500,real_1000},memory=1 reach still \\
         --judge reached --frames 20 --episodes 64 --out policies
 
-What is made begins at real frames of the robot at play, and the driver acts in the model, by what its
-pictures show. With --lerobot the reaches are written as a LeRobotDataset besides, on which lerobot trains
-policies of its own, which are better or worse by the steps that they had:
+What is made begins at real frames of the robot at play, in as many scenes as there are, and the driver acts
+in the model, by what its pictures show. With --lerobot the reaches are written as a LeRobotDataset besides,
+on which lerobot trains policies of its own, which are better or worse by the steps that they had:
 
     python recipes/lab/reaching.py build/reach --lerobot
     uv run --with accelerate lerobot-train --dataset.repo_id=lab/mover_04 --dataset.root=build/reach/lerobot \
@@ -65,7 +65,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Record reaches for the nearest block, and play")
     parser.add_argument("out", type=Path)
     parser.add_argument("--reaches", type=int, default=1000)
-    parser.add_argument("--play", type=int, default=90, help="episodes of random manoeuvres")
+    parser.add_argument("--play", type=int, default=600, help="episodes of random manoeuvres")
     parser.add_argument("--lerobot", action="store_true", help="write the reaches for lerobot, too")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)

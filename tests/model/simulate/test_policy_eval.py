@@ -300,3 +300,13 @@ def _world_of(model: HMA) -> World:
     made = object.__new__(World)
     made.model, made._commands = model, {}
     return made
+
+
+def test_policies_that_are_paths_go_by_short_names_with_a_legend(world: World, judge: StateJudge) -> None:
+    found = evaluate_policies(ROBOT, ["still"], world=world, judge=judge, episodes=8, frames=4)
+    names = ("hma:build/runs/of/a/policy/few,memory=1", "hma:build/runs/of/a/policy/many,memory=1")
+    (still,) = found.policies
+    page = html(replace(found, policies=(*(replace(still, policy=name) for name in names), still)))
+    for short, name in zip(("few,memory=1", "many,memory=1"), names, strict=True):
+        assert f"<dt>{short}</dt><dd>{name}</dd>" in page and page.count(name) == 1
+        assert page.index(name) < page.index("<table") < page.index(f">{short}<", page.index("<table"))
