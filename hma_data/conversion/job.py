@@ -56,7 +56,8 @@ from hma_data.storage.files import remove_parts
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.records import Records
 from hma_data.storage.remote import parquet_file, place
-from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_spec, get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
+from hma_data.tokenizers.shapes import get_spec
 
 
 def plan_conversion(

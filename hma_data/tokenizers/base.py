@@ -127,7 +127,7 @@ def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, devi
         PluginError: the package that adds it is broken.
     """
     name, given = as_text(name_or_path), None if weights is None else as_text(weights)
-    entry = _usable_entry(name)
+    entry = usable_entry(name)
     keywords = {"weights": given, "device": device, **entry.arguments}
     if name not in CATALOG:
         return _of_package(entry, keywords)
@@ -135,19 +135,7 @@ def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, devi
     return tokenizer
 
 
-def get_spec(name_or_path: StrPath, *, weights: StrPath | None = None) -> TokenizerSpec:
-    """Return the spec of the tokenizer that `get_tokenizer` makes of the same arguments.
-
-    With weights from inside the package, neither torch nor the weights are loaded.
-    """
-    entry = _usable_entry(as_text(name_or_path))
-    if entry.weights == "embedded" and weights is None and entry.name in CATALOG:
-        spec: TokenizerSpec = import_module("hma_data.tokenizers.shapes").embedded_spec(entry)
-        return spec
-    return get_tokenizer(name_or_path, weights=weights).spec
-
-
-def _usable_entry(name: str) -> Entry:
+def usable_entry(name: str) -> Entry:
     """Return the entry of that name; raise if there is none, or if a package that it needs is missing."""
     entry = find_entry(name)
     if missing := entry.missing():

@@ -13,8 +13,9 @@ from safetensors import SafetensorError, safe_open
 from hma_data.errors import TokenizerError
 from hma_data.storage.files import file_sha256
 from hma_data.storage.kinds import unreadable
-from hma_data.tokenizers.base import TokenizerSpec
-from hma_data.tokenizers.catalog import EMBEDDED, Entry
+from hma_data.storage.paths import StrPath, as_text
+from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer, usable_entry
+from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 
 VERSION = 1
 PATCH = 8
@@ -131,8 +132,14 @@ def read_shape[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[C,
     return shape, metadata.get("tokens_sha256") or file_sha256(path)
 
 
-def embedded_spec(entry: Entry) -> TokenizerSpec:
-    """Return the spec of a tokenizer whose weights are inside the package."""
-    kind: type[FsqConfig | VaeConfig] = FsqConfig if entry.name.startswith("fsq") else VaeConfig
-    shape, sha256 = read_shape(EMBEDDED / entry.file, kind.format, kind)
-    return shape.spec(entry.name, entry.image_size, sha256)
+def get_spec(name_or_path: StrPath, *, weights: StrPath | None = None) -> TokenizerSpec:
+    """Return the spec of the tokenizer that `get_tokenizer` makes of the same arguments.
+
+    With weights from inside the package, neither torch nor the weights are loaded.
+    """
+    entry = usable_entry(as_text(name_or_path))
+    if entry.weights == "embedded" and weights is None and entry.name in CATALOG:
+        kind: type[FsqConfig | VaeConfig] = FsqConfig if entry.name.startswith("fsq") else VaeConfig
+        shape, sha256 = read_shape(EMBEDDED / entry.file, kind.format, kind)
+        return shape.spec(entry.name, entry.image_size, sha256)
+    return get_tokenizer(name_or_path, weights=weights).spec

@@ -11,11 +11,11 @@ from safetensors.torch import load_file, save_file
 
 from hma_data.errors import TokenizerError
 from hma_data.storage.paths import shipped
-from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_spec, get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 from hma_data.tokenizers.checkpoints import read_weights, save_weights
 from hma_data.tokenizers.embedded import FsqAutoencoder, Quantizer
-from hma_data.tokenizers.shapes import FsqConfig
+from hma_data.tokenizers.shapes import FsqConfig, get_spec
 from hma_data.tokenizers.training.eval import CodebookUse, evaluate, psnr_db, ssim, to_markdown
 from hma_data.tokenizers.training.frames import read_films
 from hma_data.tokenizers.training.recipe import load_recipe
