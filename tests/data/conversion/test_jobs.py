@@ -371,6 +371,7 @@ Hdf5Source.read = troubled
 shard_work.get_tokenizer = lambda *a, **k: BlockTokenizer()
 import hma_data.conversion.job
 hma_data.conversion.job.get_tokenizer = shard_work.get_tokenizer
+hma_data.conversion.job.get_spec = lambda *a, **k: BlockTokenizer().spec
 if __name__ == "__main__":
     summary = convert(
         Embodiment.from_yaml(ARM_YAML), sys.argv[1], "block", Path(sys.argv[2]), workers=2,

@@ -344,6 +344,7 @@ def slowly(self, uri, episode_id, embodiment):
 Hdf5Source.read = slowly
 shard_work.get_tokenizer = lambda *a, **k: BlockTokenizer()
 hma_data.conversion.job.get_tokenizer = shard_work.get_tokenizer
+hma_data.conversion.job.get_spec = lambda *a, **k: BlockTokenizer().spec
 if __name__ == "__main__":
     hma_data.conversion.job.convert(
         Embodiment.from_yaml({ARM_YAML!r}), sys.argv[1], "block", Path(sys.argv[2]),
