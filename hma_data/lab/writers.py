@@ -128,21 +128,21 @@ def write_rlds(
 def _features(
     sizes: Mapping[str, tuple[int, int]], codec: str, widths: Mapping[str, int], facts: Mapping[str, Any]
 ) -> dict[str, Any]:
-    words = {"pythonClassName": f"{_CORE}.Text", "text": {}}
+    words = {"pythonClassName": f"{_CORE}.text_feature.Text", "text": {}}
     leaves: dict[str, Any] = {"language_instruction": words}
     for key, (height, width) in sizes.items():
         shape = {"dimensions": [str(height), str(width), "3"]}
         image = {"shape": shape, "dtype": "uint8", "encodingFormat": codec}
-        leaves[key] = {"pythonClassName": f"{_CORE}.Image", "image": image}
+        leaves[key] = {"pythonClassName": f"{_CORE}.image_feature.Image", "image": image}
     for key, width in widths.items():
         tensor = {"shape": {"dimensions": [str(width)]}, "dtype": "float32", "encoding": "none"}
-        leaves[key] = {"pythonClassName": f"{_CORE}.Tensor", "tensor": tensor}
+        leaves[key] = {"pythonClassName": f"{_CORE}.tensor_feature.Tensor", "tensor": tensor}
     nested: dict[str, Any] = {}
     for path, leaf in leaves.items():
         *parents, last = path.split("/")
         reduce(lambda at, parent: at.setdefault(parent, {}), parents, nested)[last] = leaf
     steps = {"feature": _dict(nested), "length": "-1"}
-    episode: dict[str, Any] = {"steps": {"pythonClassName": f"{_CORE}.Dataset", "sequence": steps}}
+    episode: dict[str, Any] = {"steps": {"pythonClassName": f"{_CORE}.dataset_feature.Dataset", "sequence": steps}}
     if facts:
         episode["episode_metadata"] = {
             key: words if isinstance(value, str) else _scalar("bool" if isinstance(value, bool) else "int64")
@@ -153,12 +153,12 @@ def _features(
 
 def _scalar(dtype: str) -> dict[str, Any]:
     tensor = {"shape": {}, "dtype": dtype, "encoding": "none"}
-    return {"pythonClassName": f"{_CORE}.Scalar", "tensor": tensor}
+    return {"pythonClassName": f"{_CORE}.scalar.Scalar", "tensor": tensor}
 
 
 def _dict(items: dict[str, Any]) -> dict[str, Any]:
     known = {key: value if "pythonClassName" in value else _dict(value) for key, value in items.items()}
-    return {"pythonClassName": f"{_CORE}.FeaturesDict", "featuresDict": {"features": known}}
+    return {"pythonClassName": f"{_CORE}.features_dict.FeaturesDict", "featuresDict": {"features": known}}
 
 
 def _example(episode: RldsEpisode) -> bytes:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hma_data.errors import EpisodeError
-from hma_data.registry.embodiment import Embodiment
+from hma_data.lab.formats import Recorded, as_rlds
+from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.sources.rlds.features import Steps
 from hma_data.sources.rlds.folder import open_folder
@@ -216,3 +217,46 @@ def test_every_template_of_shard_names(toy, written, truth, tmp_path, template):
         np.testing.assert_array_equal(
             ours(folder, name).numbers("is_last"), [step["is_last"].numpy() for step in episode["steps"]]
         )
+
+
+def test_what_the_laboratory_records_is_read_by_tfds(toy, tmp_path):
+    from hma_data import lab
+
+    folder = lab.record("pendulum", tmp_path, 2, seed=3)
+    _is_what_tfds_reads(toy, folder, find("pendulum"))
+
+
+def test_a_simulator_recorded_as_rlds_is_read_by_tfds(toy, tmp_path):
+    draw, robot = np.random.default_rng(0), find("pendulum")
+    pictures = draw.integers(0, 256, (4, *robot.cameras[0].size, 3), np.uint8)
+    made = Recorded(
+        number=5, copy=1, seed=2, style="noised", task="swing up", pictures=pictures,
+        states=draw.normal(size=(4, 3)), objects=draw.normal(size=(4, 3)),
+        commands=draw.normal(size=(4, 1)).astype(np.float32), done=np.array([False, False, True, False]),
+    )  # fmt: skip
+    as_rlds(tmp_path / "made", robot, [made])
+    (episode,) = _is_what_tfds_reads(toy, tmp_path / "made", robot)
+    facts = {key: value.numpy() for key, value in episode["episode_metadata"].items()}
+    assert facts == {
+        "success": True,
+        **{k: v.encode() if isinstance(v, str) else v for k, v in made.facts.items()},
+    }
+    assert {step["language_instruction"].numpy() for step in episode["steps"]} == {b"swing up"}
+    np.testing.assert_array_equal(
+        [step["observation"]["image"].numpy() for step in episode["steps"]], pictures
+    )
+
+
+def _is_what_tfds_reads(toy: ModuleType, folder: Path, robot: Embodiment) -> list[dict[str, Any]]:
+    """Check that TFDS reads the pictures and commands that we read; return its episodes."""
+    found: list[dict[str, Any]] = toy.episodes(folder, "train")
+    names = RLDS.episode_ids(str(folder))
+    assert len(found) == len(names)
+    for name, theirs in zip(names, found, strict=True):
+        episode = RLDS.read(str(folder), name, robot)
+        (camera,) = episode.streams.values()
+        expected = [step["observation"]["image"].numpy() for step in theirs["steps"]]
+        np.testing.assert_array_equal(camera.frames(range(len(expected))), expected)
+        commands = [step["action"].numpy() for step in theirs["steps"]]
+        np.testing.assert_array_equal(episode.actions[0].values, commands)
+    return found
