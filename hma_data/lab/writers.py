@@ -142,7 +142,8 @@ def _features(
         *parents, last = path.split("/")
         reduce(lambda at, parent: at.setdefault(parent, {}), parents, nested)[last] = leaf
     steps = {"feature": _dict(nested), "length": "-1"}
-    episode: dict[str, Any] = {"steps": {"pythonClassName": f"{_CORE}.dataset_feature.Dataset", "sequence": steps}}
+    sequence = {"pythonClassName": f"{_CORE}.dataset_feature.Dataset", "sequence": steps}
+    episode: dict[str, Any] = {"steps": sequence}
     if facts:
         episode["episode_metadata"] = {
             key: words if isinstance(value, str) else _scalar("bool" if isinstance(value, bool) else "int64")
