@@ -224,6 +224,14 @@ class _Environment:
         self.drive = Drive(self.episodes)
 
 
+def _known(options: dict[str, Any] | None, *keys: str) -> dict[str, Any]:
+    """Return the options of a reset; raise HMAError for one that would have no effect."""
+    options = options or {}
+    if other := next((key for key in options if key not in keys), None):
+        raise HMAError("reset", f"there is no option {other!r}", f"it takes {' and '.join(keys)}")
+    return options
+
+
 class WorldModelEnv(_Environment, gymnasium.Env[Picture, Floats]):
     """One robot in a world model, as a gymnasium environment.
 
@@ -255,8 +263,9 @@ class WorldModelEnv(_Environment, gymnasium.Env[Picture, Floats]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Picture, dict[str, Any]]:
         """Start an episode; `options["prompt"]` is what it starts from, as `read_prompt` takes it."""
+        given = _known(options, "prompt")
         super().reset(seed=seed)
-        return self.drive.begin(self.np_random, (options or {}).get("prompt")), {"frames": 0}
+        return self.drive.begin(self.np_random, given.get("prompt")), {"frames": 0}
 
     def step(self, action: Floats) -> tuple[Picture, float, bool, bool, dict[str, Any]]:
         """Send a command, or a chunk; between chunks the last picture is shown."""
@@ -307,7 +316,7 @@ class WorldModelVectorEnv(_Environment, VectorEnv[Picture, Floats, NDArray[Any]]
             seed: one for each; a number is that of the first, and the others follow it.
             options: "prompt": what all start from; "reset_mask": (N,) bool, those to start.
         """
-        options = options or {}
+        options = _known(options, "prompt", "reset_mask")
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
         chosen = np.asarray(options.get("reset_mask", np.ones(self.num_envs)), np.bool_)
         infos: dict[str, Any] = {}

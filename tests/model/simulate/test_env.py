@@ -273,6 +273,12 @@ def test_bad_settings_are_refused(world: World, change: dict[str, Any], message:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("maker", [WorldModelEnv, WorldModelVectorEnv])
+def test_an_option_of_a_reset_that_would_have_no_effect_is_refused(maker: Any, world: World) -> None:
+    with pytest.raises(HMAError, match="reset: there is no option 'promt' — it takes prompt"):
+        maker(embodiment=PUSH, world=world).reset(options={"promt": {}})
+
+
 def test_the_examples_of_the_page_run_without_a_warning() -> None:
     page = (Path(__file__).parents[3] / "docs/environment.md").read_text()
     first, by_hand = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
