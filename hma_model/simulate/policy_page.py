@@ -17,6 +17,7 @@ from hma_model.evaluation.pages import COLOURS, MARKERS, Page, label_axes, svg_b
 from hma_model.simulate.policy_eval import WORK, Correlation, PolicyEvaluation, Scored
 
 COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same commands, sim.")
+GOOD = 0.75  # balanced accuracy; an interval that holds chance and this says nothing
 CHOSEN = 2  # episodes of each kind on the page
 KINDS = {  # (success in the simulator, in the model) -> title
     (True, True): "Both say success",
@@ -78,12 +79,15 @@ def sentences(found: PolicyEvaluation) -> list[str]:
 
 def doubt(found: PolicyEvaluation) -> list[str]:
     """Return the sentence that says why the model's success rates mean nothing, if they do."""
-    if few := found.generated.too_few:
-        why = f"there are too few {few} to tell whether the judge is better than chance"
-    elif not found.generated.better_than_chance:
-        why = "the judge is no better than chance"
-    else:
+    judged = found.generated
+    if judged.too_few:
+        why = f"there are too few {judged.too_few} to tell whether the judge is better than chance"
+    elif judged.better_than_chance:
         return []
+    elif judged.high is not None and judged.high >= GOOD:
+        why = "the judge may be no better than chance; more episodes would tell"
+    else:
+        why = "the judge is no better than chance"
     return [f"on generated frames {why}: the model's success rates mean nothing"]
 
 
