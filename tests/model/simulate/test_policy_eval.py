@@ -138,7 +138,10 @@ def test_shares_have_exact_intervals_and_too_few_successes_are_said(world: World
     assert doubt in sentences(found)[-1]
     page = html(found)
     assert page.count(doubt) == 1 and page.index(doubt) < page.index("<table")
-    for high, said in ((0.6, "the judge is no better than chance"), (0.9, "may be no better than chance; more")):
+    for high, said in (
+        (0.6, "the judge is no better than chance"),
+        (0.9, "may be no better than chance; more"),
+    ):
         generated = Accuracy(0.5, 0.4, high, share=0.5, count=32, successes=4)
         assert said in sentences(replace(found, generated=generated))[-1]
 
