@@ -262,6 +262,12 @@ def test_bad_settings_are_refused(world: World, change: dict[str, Any], message:
         WorldModelEnv(**{"embodiment": PUSH, "world": world, **change})
 
 
+def test_a_gray_picture_is_refused_with_its_shape(world: World) -> None:
+    env = WorldModelEnv(embodiment=PUSH, world=world)
+    with pytest.raises(HMAError, match=r"uint8 of the shape \(1, 96, 96\) — give pictures \(P, H, W, 3\)"):
+        env.reset(options={"prompt": np.zeros((96, 96), np.uint8)})
+
+
 @pytest.mark.slow
 def test_the_examples_of_the_page_run_without_a_warning() -> None:
     page = (Path(__file__).parents[3] / "docs/environment.md").read_text()
