@@ -119,13 +119,25 @@ class NetworkTokenizer:
         return latents
 
     @torch.inference_mode()
+    def pictures(self, tokens: Tensor) -> Tensor:
+        """Decode ids (N, h, w) int64, or latents (N, c, h, w), in batches.
+
+        They are not checked, because a check would wait for the device.
+
+        Returns:
+            (N, S, S, 3) uint8 RGB on the network's device.
+        """
+        parts, dtype = [], torch.int64 if self.spec.kind == "discrete" else self.dtype
+        for part in tokens.split(self.batch):
+            pixels = self._decode(part.to(self.device, dtype)).float()
+            whole = pixels.add(1).mul_(127.5).round_().clamp_(0, 255).to(torch.uint8)
+            parts.append(whole.permute(0, 2, 3, 1))
+        return torch.cat(parts)
+
     def _decode_batch(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
         """Decode at most one batch of ids or latents."""
-        discrete = self.spec.kind == "discrete"
-        values = self._moved(tokens.astype(np.int64 if discrete else np.float32))  # pixels may differ by 1
-        pixels = self._decode(values if discrete else values.to(self.dtype)).float()
-        whole = pixels.add(1).mul_(127.5).round_().clamp_(0, 255).to(torch.uint8)
-        made: NDArray[np.uint8] = whole.permute(0, 2, 3, 1).cpu().numpy()
+        values = tokens.astype(np.int64 if self.spec.kind == "discrete" else np.float32)
+        made: NDArray[np.uint8] = self.pictures(self._moved(values)).cpu().numpy()
         return made
 
     def _padded(self, part: NDArray[Any]) -> Tensor:

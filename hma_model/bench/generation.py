@@ -193,9 +193,9 @@ class Frames:
 
     def _show(self, frames: "torch.Tensor") -> Any:
         """Return the pictures of frames if they are to be decoded."""
-        if self.tokenizer is not None:
-            return self.tokenizer.decode(frames.cpu().numpy().astype(self.tokenizer.spec.dtype))
-        return frames
+        from hma_model.evaluation.rollouts import decode
+
+        return frames if self.tokenizer is None else decode(self.tokenizer, frames.unsqueeze(1))
 
 
 GENERATE = Bench(

@@ -16,6 +16,7 @@ from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch
 from hma_data.loading.views import FIRST, Cameras, view_count
 from hma_data.shards.reader import ShardSet
+from hma_data.tokenizers.network import NetworkTokenizer
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.generation.commands import OutsideRangeWarning
 
@@ -114,10 +115,14 @@ def default_prompt(length: int) -> int:
 
 def decode(tokenizer: "Tokenizer", stored: Tensor) -> NDArray[np.uint8]:
     """Decode ids (B, T, C·h, w) or latents (B, T, c, C·H, W) to pictures (B, T, S, C·S, 3), side by side."""
-    views = stored.flatten(0, 1).cpu().numpy()
-    dtype = np.uint32 if tokenizer.spec.kind == "discrete" else np.dtype(tokenizer.spec.dtype)
-    cameras = np.split(views.astype(dtype), views.shape[-2] // tokenizer.spec.grid[0], axis=-2)
-    pictures = np.concatenate([tokenizer.decode(view) for view in cameras], axis=2)
+    views, rows = stored.flatten(0, 1), tokenizer.spec.grid[0]
+    if isinstance(tokenizer, NetworkTokenizer) and not stored.is_cpu:  # tokens stay on the GPU
+        kept = views if tokenizer.spec.kind == "discrete" else views.half()
+        pictures = torch.cat([tokenizer.pictures(view) for view in kept.split(rows, -2)], 2).numpy(force=True)
+    else:
+        dtype = np.uint32 if tokenizer.spec.kind == "discrete" else np.dtype(tokenizer.spec.dtype)
+        cameras = np.split(views.cpu().numpy().astype(dtype), views.shape[-2] // rows, axis=-2)
+        pictures = np.concatenate([tokenizer.decode(view) for view in cameras], axis=2)
     return pictures.reshape(*stored.shape[:2], *pictures.shape[1:])
 
 

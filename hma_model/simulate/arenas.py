@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError
 from hma_data.lab import FAMILY, truth
-from hma_data.lab.scripted import SeenState, State, seen_state, state_of
+from hma_data.lab.scripted import PUSHER, SeenState, State, seen_state, state_of
 from hma_data.lab.simulator import LabSimulator, simulated
 from hma_model.generation.commands import described
 from hma_model.simulate.scenes import Dimension, LabRobot, LabScene, Prompt
@@ -100,6 +100,11 @@ class Scenes:
         return [np.random.default_rng((self.seed, what, number)) for number in self.numbers]
 
 
+def shows_state(robot: str) -> bool:
+    """Check whether the state that a robot's recordings hold can be read off a picture: no velocities."""
+    return robot == PUSHER or FAMILY.fullmatch(robot) is not None
+
+
 class Arena(Protocol):
     """A place where a policy acts."""
 
@@ -156,7 +161,7 @@ class TrueArena:
         return [state_of(scene.simulator.simulation) for scene in self._begun]
 
     def observed(self) -> Floats | None:
-        if not FAMILY.fullmatch(self.scenes.name):  # as in the model, which shows no velocities
+        if not shows_state(self.scenes.name):
             return None
         return np.stack([scene.simulator.state for scene in self._begun])
 
@@ -252,7 +257,7 @@ class ModelArena:
         return [seen.state for seen in self._seen]
 
     def observed(self) -> Floats | None:
-        if self._probe is None or not FAMILY.fullmatch(self.scenes.name):
+        if self._probe is None or not shows_state(self.scenes.name):
             return None
         return np.stack([state.pose for state in self.states()]).astype(np.float32)
 

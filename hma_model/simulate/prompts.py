@@ -132,7 +132,7 @@ def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int 
         pictures = np.asarray(prompt)
     except ValueError as fault:
         raise HMAError("prompt", "its pictures differ in size", "give pictures of one size") from fault
-    return (pictures[None] if pictures.ndim == 3 else pictures), None
+    return (pictures[None] if pictures.ndim in (2, 3) else pictures), None
 
 
 def starting_window(model: "HMA", embodiment: str, seed: int = 0) -> Prompt:

@@ -46,6 +46,7 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 FIRST = "rails_03"  # the robot that a page opens with: it follows its commands longest (docs/results-log.md)
 MOST_VIEWERS = 32
 RATE, BURST = 200.0, 400.0  # messages of a viewer a second, and at once
+SCENE = 40.0  # messages that one counts as which begins a scene: all other sessions wait for it
 AHEAD = 2  # frames that are sent before a page says that it has shown one
 STALLED_S, SEND_S = 10.0, 20.0  # without a sign of reading: the session stands still; the viewer is dropped
 _GONE = (WebSocketDisconnect, TimeoutError, OSError)  # of a viewer that has left, or reads nothing
@@ -240,18 +241,26 @@ class Server:
         finally:
             self.viewers -= 1
             connection.leave()
+        if reason := connection.fault.encode()[:120].decode(errors="ignore"):
+            with contextlib.suppress(*_GONE), anyio.fail_after(SEND_S):
+                await websocket.close(1008, reason)
 
     async def _in_engine(self, function: Callable[[], T]) -> T:
         return await asyncio.wrap_future(self.engine.call(function))
 
 
 class Connection:
-    """One websocket, and the session that it drives."""
+    """One websocket, and the session that it drives.
+
+    Attributes:
+        fault: why the page is no longer listened to; "" if it has left.
+    """
 
     def __init__(self, server: Server, websocket: WebSocket) -> None:
         self.server, self.engine, self.websocket = server, server.engine, websocket
         self.page = Page(websocket)
         self.session: Session | None = None
+        self.fault = ""
         self._credit, self._filled = BURST, time.monotonic()
         robots = [describe(robot) for robot in self.engine.robots.values()]
         orders = list(self.engine.orders)
@@ -264,26 +273,24 @@ class Connection:
             received = await self.websocket.receive()
             if received["type"] == "websocket.disconnect":
                 return
-            fault = ""
-            if not self._allowed():
-                fault = f"more than {RATE:.0f} messages a second"
-            elif received.get("text") is None:
-                fault = "messages are JSON, not bytes"
-            else:
-                try:
-                    await self._do(messages.parse(received["text"]))
-                except UsageError as problem:
-                    fault = str(problem)
-            if fault:
-                await self.websocket.close(1008, fault.encode()[:120].decode(errors="ignore"))
+            try:
+                if received.get("text") is None:
+                    raise UsageError("message", "is bytes, not JSON")
+                message = messages.parse(received["text"])
+                self._charge(message)
+                await self._do(message)
+            except UsageError as problem:
+                self.fault = str(problem)
                 return
 
-    def _allowed(self) -> bool:
-        """Take one message off the credit, which time restores."""
+    def _charge(self, message: messages.Message) -> None:
+        """Take a message off the credit, which time restores; raise UsageError if none is left."""
+        begins = isinstance(message, messages.Open | messages.Scene | messages.Sync)
         now = time.monotonic()
-        self._credit = min(BURST, self._credit + RATE * (now - self._filled)) - 1
+        self._credit = min(BURST, self._credit + RATE * (now - self._filled)) - (SCENE if begins else 1)
         self._filled = now
-        return self._credit >= 0
+        if self._credit < 0:
+            raise UsageError("messages", "come faster than a person sends them")
 
     def leave(self) -> None:
         """Let the session stand still."""

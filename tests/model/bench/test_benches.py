@@ -83,7 +83,9 @@ def test_frames_are_decoded_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> 
     decode = NetworkTokenizer.decode
 
     def seen(self: NetworkTokenizer, tokens: Any) -> Any:
-        decoded.append(decode(self, tokens).shape)
+        pictures = decode(self, tokens)
+        decoded.append(pictures.shape)
+        return pictures
 
     monkeypatch.setattr(NetworkTokenizer, "decode", seen)
     generation.measure_frames(_generate(decode=True, batch=2, kind="discrete", cache=True))

@@ -15,12 +15,13 @@ from typer.testing import CliRunner
 from hma_data.errors import HMAError, OutputError, UsageError
 from hma_data.lab import truth
 from hma_data.lab.simulator import LabSimulator
+from hma_data.tokenizers.base import get_tokenizer
 from hma_model.evaluation.agreement import Accuracy
 from hma_model.evaluation.judge import StateJudge, task_of
 from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.network.model import HMA
 from hma_model.simulate import World, policy_eval
-from hma_model.simulate.arenas import Scenes, TrueArena
+from hma_model.simulate.arenas import ModelArena, Scenes, TrueArena
 from hma_model.simulate.policies import Called, begin, checked, read_policy
 from hma_model.simulate.policy_eval import WORK, PolicyEvaluation, Scored, evaluate_policies, score_policy
 from hma_model.simulate.policy_page import html, sentences, write_report
@@ -88,6 +89,22 @@ def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJu
     (reason,) = [one for one in sentences(found) if "correlation" in one and "policies" in one]
     assert found.success.pearson.value is None
     assert reason == "correlations over policies are not computed: 4 of at least 8 episodes"
+
+
+def test_policies_of_gym_pusht_are_told_where_the_disc_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = HMA.from_pretrained("embedded", ["pusht_fast"])
+    world = FlawlessWorld(World(model, get_tokenizer(model.config.tokenizer["name"])))
+    probe: Any = KnownPlaces(monkeypatch)
+    true = TrueArena(Scenes.of(world, "pusht_fast", 2, 0), 128)  # type: ignore[arg-type]
+    arena = ModelArena(world, true, probe)  # type: ignore[arg-type]
+    for step in range(2 * arena.scenes.stride + 1):
+        told = arena.observed()
+        assert told is not None and told.shape == (2, 2)
+        near = 1 if arena.fresh else 25  # of 512 px; between pictures it is estimated
+        np.testing.assert_allclose(told, true.observed(), atol=near)
+        for one in (true, arena):
+            one.step(np.array([[100, 400], [250, 60 + 5 * step]], np.float32))
+    arena.close()
 
 
 @pytest.mark.slow

@@ -200,6 +200,24 @@ def test_a_flood_and_bytes_close_their_connections_alone(
         Page(good).works()
 
 
+@pytest.mark.parametrize("do", ["open", "scene", "sync"])
+def test_a_page_cannot_begin_scenes_so_often_that_the_others_wait(
+    client: TestClient, engine: Engine, monkeypatch: pytest.MonkeyPatch, do: str
+) -> None:
+    monkeypatch.setattr(server, "RATE", 0.0)  # time restores no credit
+    values = {"open": {"robot": "mover_04"}, "scene": {"number": 1}, "sync": {}}[do]
+    world = engine._world
+    assert isinstance(world, TrueWorld)
+    with client.websocket_connect(DRIVE) as bad:
+        Page(bad).open()
+        with pytest.raises(WebSocketDisconnect, match="1008"):
+            for _ in range(50):
+                Page(bad).send(do, **values)
+            Page(bad).message("never")
+        engine.call(lambda: None).result(10)
+        assert 5 <= len(world.begun) <= 10
+
+
 def test_wrong_values_are_told_and_the_session_goes_on(client: TestClient) -> None:
     with client.websocket_connect(DRIVE) as socket:
         page = Page(socket)
