@@ -4,6 +4,7 @@ import json as json_text
 import shlex
 import sys
 from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -43,6 +44,7 @@ FIGURES = {  # figures of `hma evaluate` as its table names them; the others hav
 ROLLOUTS = ("true", "shuffled", "none", "copy")
 HIDDEN = ("checkpoint", "data", "seconds_a_frame", "sees_actions", "merge")  # of the readable form
 MEASURES = {"lpips": "LPIPS", "fid": "FID", "fvd": "FVD", "fvd_videogpt": "FVD (VideoGPT)"}
+DIGITS = {"ssim": 3, "lpips": 3}  # of the figures of rollouts; the others have two
 LPIPS_HELP = "Weights of LPIPS, with their hash."
 
 
@@ -147,7 +149,7 @@ def _print_one(part: "Part") -> None:
     columns = {"psnr": "PSNR dB", "psnr_last": "last frame dB", "ssim": "SSIM"}
     columns |= {key: name for key, name in MEASURES.items() if key in found["true"]}
     rows = [
-        [name, *(found[name].get(key) for key in columns), _ends(found[name]["psnr_last_95"])]
+        [name, *(_rounded(found[name].get(key), key) for key in columns), _ends(found[name]["psnr_last_95"])]
         for name in ROLLOUTS
     ]
     print_table(["rollout", *columns.values(), "last frame, 95 %"], rows)
@@ -169,7 +171,11 @@ def _print_state(state: dict[str, Any] | None) -> None:
     if not state or "true" not in state:
         return
     rows = [
-        [name, state[name]["error_px"], state[name]["error_px_last"], _ends(state[name]["error_px_last_95"])]
+        [
+            name,
+            *(_rounded(state[name][key], key) for key in ("error_px", "error_px_last")),
+            _ends(state[name]["error_px_last_95"]),
+        ]
         for name in (*ROLLOUTS, "reconstruction")
     ]
     print_table(["robot's place", "error px of 128", "last frame", "95 %"], rows)
@@ -220,9 +226,13 @@ def _print_table(parts: "Sequence[Part]") -> None:
 
 def _number(cell: Any) -> Any:
     try:
-        return float(cell) if isinstance(cell, str) else cell
-    except ValueError:
+        return Decimal(cell) if isinstance(cell, str) else cell
+    except InvalidOperation:
         return cell
+
+
+def _rounded(value: float | None, key: str) -> Decimal | None:
+    return None if value is None else Decimal(f"{value:.{DIGITS.get(key, 2)}f}")
 
 
 def _print_absences(parts: "Sequence[Part]") -> None:

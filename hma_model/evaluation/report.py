@@ -62,9 +62,7 @@ def page(parts: Sequence[Part], command: str) -> str:
     made.section("Does it follow its commands?")
     made.definitions([(_whose(part, parts), verdict(part.found)) for part in parts])
     made.section("Figures", "Below a figure: the 95 % interval of its mean, by bootstrap of whole episodes.")
-    names, lines = rows(parts)
-    made.table(names, [[_below(cell) for cell in line] for line in lines])
-    made.definitions([(name, WORDS[name]) for name in names if name in WORDS])
+    _figures(made, parts)
     if said := absences(parts):
         made.section("Not measured, and to be known")
         made.definitions(said)
@@ -79,6 +77,18 @@ def page(parts: Sequence[Part], command: str) -> str:
     made.section("The command")
     made.commands(command)
     return made.html()
+
+
+def _figures(made: Page, parts: Sequence[Part]) -> None:
+    """Add the table: a column a checkpoint and robot, so that what is compared stands side by side."""
+    names, lines = rows(parts)
+    several = len({part.checkpoint for part in parts}) > 1
+    heads = [f"{line[0]}\n{line[1]}" if several else line[1] for line in lines]
+    turned = zip(names[2:], *(line[2:] for line in lines), strict=True)
+    made.table(
+        ["figure", *heads],
+        [[f"{name}\n{WORDS.get(name, '')}", *map(_below, cells)] for name, *cells in turned],
+    )
 
 
 def _whose(part: Part, parts: Sequence[Part]) -> str:
