@@ -73,9 +73,15 @@ def evaluate(
         bool, typer.Option("--paper", help="Also follow the paper's protocol: Gaussian actions, true past.")
     ] = False,
     state: Annotated[
-        bool, typer.Option("--state", help="Of a laboratory robot: measure what it does in the pictures.")
+        bool,
+        typer.Option(
+            "--state",
+            help="Measure what the robot does in the pictures, against its recorded or simulated state.",
+        ),
     ] = False,
-    episodes: Annotated[int, typer.Option("--episodes", min=2, help="Episodes that --state simulates.")] = 32,
+    episodes: Annotated[
+        int, typer.Option("--episodes", min=2, help="Episodes that --state simulates of a laboratory robot.")
+    ] = 32,
     lpips: Annotated[str | None, typer.Option("--lpips", metavar="FILE#SHA256", help=LPIPS_HELP)] = None,
     fid: Annotated[
         str | None, typer.Option("--fid", metavar="FILE#SHA256", help="Weights of FID's Inception.")
@@ -170,6 +176,9 @@ def _print_one(part: "Part") -> None:
 def _print_state(state: dict[str, Any] | None) -> None:
     if not state or "true" not in state:
         return
+    if "values" in state:
+        _print_recorded_state(state)
+        return
     rows = [
         [
             name,
@@ -186,6 +195,25 @@ def _print_state(state: dict[str, Any] | None) -> None:
     ]
     print_table(["commands", "PSNR dB", "last frame dB", "perplexity"], rows)
     print(f"{state['episodes']} simulated episodes; the probe errs by {state['probe_px']:.2f} px")
+
+
+def _print_recorded_state(state: dict[str, Any]) -> None:
+    kinds = (*ROLLOUTS, "reconstruction")
+    rows: list[list[Any]] = [
+        [
+            name,
+            *(_rounded(state[name][key], key) for key in ("error_sd", "error_sd_last")),
+            _ends(state[name]["error_sd_last_95"]),
+        ]
+        for name in kinds
+    ]
+    print_table(["recorded state", "error, standard deviations", "last frame", "95 %"], rows)
+    rows = [[row["name"], row["unit"], *(row[kind] for kind in kinds)] for row in state["values"]]
+    print_table(["last frame, error of", "unit", *kinds], rows)
+    print(
+        f"{state['read']} of {state['of']} values can be read off the pictures; what reads them errs by "
+        f"{state['reader_sd']:.2f} standard deviations on true pictures of other episodes"
+    )
 
 
 def _figure(key: str, found: dict[str, Any]) -> str:

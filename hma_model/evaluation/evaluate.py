@@ -82,7 +82,8 @@ class Settings:
     Attributes:
         windows: their number; the other attributes up to `cameras` are as of `evaluate`.
         paper: also follow the paper's protocol.
-        state: simulated episodes of a laboratory robot; 0 measures no state.
+        state: simulated episodes of a laboratory robot; of others any number measures the recorded state; 0
+            measures no state.
         sampling: options of `HMA.generate`.
     """
 

@@ -159,15 +159,14 @@ def _state(made: Page, part: Part, seconds: float) -> None:
     state = part.found.get("state")
     if not state or "true" not in state:
         return
-    curves = {
-        words: (state[kind]["error_px_by_frame"], state[kind]["error_px_by_frame_95"])
-        for kind, words in STATE.items()
-    }
+    if "values" in state:
+        _recorded_state(made, part.checkpoint, state, seconds)
+        return
     caption = (
         f"{part.checkpoint}: how far the robot in the picture is from where the simulator's is, "
         f"{state['episodes']} new episodes; the probe that reads it errs by {state['probe_px']:.2f} px"
     )
-    made.picture(over_horizon(curves, seconds, "px of 128"), "svg+xml", caption)
+    made.picture(over_horizon(_errors(state, "error_px"), seconds, "px of 128"), "svg+xml", caption)
     noisy = state["perturbed"]
     about = f"perturbed by {noisy['scale']:g} standard deviations, against the simulator's answer to them"
     names = ["commands", "PSNR dB", "last frame dB", *(["perplexity"] if "perplexity" in noisy else [])]
@@ -176,6 +175,29 @@ def _state(made: Page, part: Part, seconds: float) -> None:
         line = [words, noisy[f"psnr{mark}"], noisy[f"psnr{mark}_last"]]
         lines.append([*line, *([noisy[f"perplexity{mark}"]] if "perplexity" in noisy else [])])
     made.table(names, lines)
+
+
+def _recorded_state(made: Page, checkpoint: str, state: dict[str, Any], seconds: float) -> None:
+    caption = (
+        f"{checkpoint}: how far the state read off the pictures is from the recorded one, mean of "
+        f"{state['read']} of {state['of']} values; the network that reads them errs by "
+        f"{state['reader_sd']:.2f} on true pictures"
+    )
+    curves = _errors(state, "error_sd")
+    made.picture(over_horizon(curves, seconds, "standard deviations"), "svg+xml", caption)
+    kinds = [kind for kind in STATE if kind in state]
+    heads = ["error of, last frame", "unit", *(STATE[kind] for kind in kinds)]
+    lines = [[row["name"], row["unit"], *(row[kind] for kind in kinds)] for row in state["values"]]
+    made.table(heads, lines)
+
+
+def _errors(state: dict[str, Any], key: str) -> dict[str, tuple[Any, Any]]:
+    """Return the errors by frame and their intervals of each kind of rollout whose errors are finite."""
+    return {
+        words: (state[kind][f"{key}_by_frame"], state[kind][f"{key}_by_frame_95"])
+        for kind, words in STATE.items()
+        if None not in state[kind][f"{key}_by_frame"]
+    }
 
 
 # -- strips
