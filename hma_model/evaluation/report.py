@@ -32,6 +32,13 @@ BASELINES = {
     "none": "no commands",
     "copy": "prompt's last frame repeated",
 }
+SHORT = {
+    "true": "true commands",
+    "shuffled": "another window's",
+    "none": "none",
+    "copy": "frame repeated",
+    "reconstruction": "true pictures",
+}
 STATE = {"true": "true commands", **BASELINES, "reconstruction": "true pictures, from their tokens"}
 
 
@@ -186,7 +193,7 @@ def _recorded_state(made: Page, checkpoint: str, state: dict[str, Any], seconds:
     curves = _errors(state, "error_sd")
     made.picture(over_horizon(curves, seconds, "standard deviations"), "svg+xml", caption)
     kinds = [kind for kind in STATE if kind in state]
-    heads = ["error of, last frame", "unit", *(STATE[kind] for kind in kinds)]
+    heads = ["error, last frame", "unit", *(SHORT[kind] for kind in kinds)]
     lines = [[row["name"], row["unit"], *(row[kind] for kind in kinds)] for row in state["values"]]
     made.table(heads, lines)
 

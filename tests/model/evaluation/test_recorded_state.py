@@ -15,7 +15,7 @@ from hma_model.evaluation.recorded_state import Reader, learn, measure_recorded_
 from tests.conftest import BlockTokenizer
 from tests.model.evaluation.test_probe import scenes
 
-PROMPT, STEPS = 2, 150
+PROMPT, STEPS = 2, 100
 YAML = """
 id: disc
 kind: simulation
@@ -50,10 +50,13 @@ def disc(tmp_path_factory: pytest.TempPathFactory) -> ShardSet:
             demo["obs/image"], demo["obs/place"] = pictures, 8 * places + 8.0
             demo["obs/noise"], demo["obs/still"] = rng.normal(size=(40, 1)), np.ones((40, 1))
     robot = Embodiment.from_yaml(YAML)
-    convert(robot, folder / "disc.hdf5", BlockTokenizer(), folder / "shards", settings=Settings(val_fraction=0.2))
+    convert(
+        robot, folder / "disc.hdf5", BlockTokenizer(), folder / "shards", settings=Settings(val_fraction=0.2)
+    )
     return ShardSet(folder / "shards")
 
 
+@pytest.mark.slow
 def test_what_is_in_the_picture_is_read_and_the_rest_is_left_out() -> None:
     pictures, parts = scenes(400, 0)
     noise = np.random.default_rng(1).normal(size=(len(parts), 1))
@@ -66,8 +69,8 @@ def test_what_is_in_the_picture_is_read_and_the_rest_is_left_out() -> None:
     assert grown[0] == pytest.approx(1, abs=0.3) and grown[1] == 0  # errors are in standard deviations
 
 
+@pytest.mark.slow
 def test_errors_are_of_the_recorded_steps(disc: ShardSet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorded_state, "STEPS", STEPS)
     monkeypatch.setattr(learn, "__defaults__", (0, STEPS))
     batches = list(windows(disc, "val", 8, 12))
     ahead = [batch.tokens[:, PROMPT:] for batch in batches]  # type: ignore[index]
