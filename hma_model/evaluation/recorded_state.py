@@ -3,8 +3,9 @@
 A small network, the reader, learns to read the recorded state off the training split's pictures, as the
 tokenizer shows them. It then reads rollouts, and what it reads is compared with the state that was recorded
 at each step. Its own error is that on true pictures of training episodes that it did not learn from. A value
-that hardly changes, or that it cannot read, is left out. Errors are in standard deviations of the value over
-the training split (`sd`), so that metres and radians can be averaged.
+that hardly changes, or that it cannot read off these or the windows' true pictures, is left out. Errors are
+in standard deviations of the value over the training split (`sd`), so that metres and radians can be
+averaged.
 
 The states of robots of the laboratory are simulated instead (`hma_model.evaluation.simulated`).
 
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Images = NDArray[np.uint8]
 
-CHANNELS, POINTS, HIDDEN = 24, 24, 128
-STEPS, BATCH, RATE, NOISE = 800, 32, 4e-3, 0.03  # noise in pictures of -1 to 1
+CHANNELS, POINTS, HIDDEN = 16, 16, 128
+STEPS, BATCH, RATE, NOISE = 600, 32, 4e-3, 0.03  # noise in pictures of -1 to 1
 PICTURES, EPISODES = 1500, 5  # most pictures to learn from, fewest episodes
 HELD_OUT = 0.2  # share of the pictures, the last ones, on which the reader's error is measured
 STILL = 1e-6  # a value whose standard deviation is smaller never changes
@@ -162,22 +163,14 @@ def measure_recorded_state(
         reader's own error, `spread_sd` what knows nothing would have. `values` has them by value, in its own
         unit. Also the error (N,) of each window at the last step, NaN where a state is unknown.
     """
-    states = _States(shards)
-    dataset = WindowDataset(shards, "train", 1, cameras=cameras)
-    episodes = shards.manifest.splits["train"]["episodes"]
     count, nothing = sum(map(len, batches)), {"windows": 0}
     unknown = np.full(count, np.nan)
-    if episodes < EPISODES:
+    if (episodes := shards.manifest.splits["train"]["episodes"]) < EPISODES:
         few = f"{episodes} training episodes are too few to learn to read their states, {EPISODES} are needed"
         return nothing | {"missing": few}, unknown
-    numbers = np.unique(np.linspace(0, len(dataset) - 1, min(PICTURES, len(dataset))).astype(np.int64))
-    seen = dataset.batch(numbers)
-    wanted = states.of(seen, 1)[:, 0]
-    known = np.isfinite(wanted).all(axis=1)
-    reader = learn(decode(tokenizer, _stored(seen))[known, 0], wanted[known], seed)
-    own = reader.readable
-    if not len(own):
-        return nothing | {"missing": "no recorded state can be read off the pictures"}, unknown
+    states = _States(shards)
+    hashable: Any = tokenizer
+    reader = _reader(hashable, shards, cameras if isinstance(cameras, str) else tuple(cameras), seed)
     errors: dict[str, list[Floats]] = {}
     for number, batch in enumerate(batches):
         truth = decode(tokenizer, _stored(batch))
@@ -187,7 +180,7 @@ def measure_recorded_state(
         for kind, made in predicted.items():
             films[kind] = decode(tokenizer, made[number].nan_to_num(0, 0, 0))
         for kind, film in films.items():
-            found_errors = reader.errors(film, true)[..., own]
+            found_errors = reader.errors(film, true)
             if kind in predicted:
                 found_errors[~predicted[kind][number].isfinite().flatten(2).all(dim=2).numpy()] = np.nan
             errors.setdefault(kind, []).append(found_errors)
@@ -196,17 +189,34 @@ def measure_recorded_state(
     whose = np.concatenate([np.arange(len(b)) if b.episode is None else b.episode.numpy() for b in batches])
     if not kept.any():
         return nothing | {"missing": "the states of all windows are unknown in part"}, unknown
+    here = joined["reconstruction"][kept].mean(axis=(0, 1))  # the windows may be unlike what it learned from
+    own = np.array([n for n in reader.readable if here[n] <= UNREADABLE * reader.spread[n]], np.int64)
+    if not len(own):
+        cannot = "no recorded state can be read off the true pictures; more training episodes may help"
+        return nothing | {"missing": cannot}, unknown
+    joined = {kind: part[..., own] for kind, part in joined.items()}
     found: dict[str, Any] = {
         "windows": int(kept.sum()),
         "reader_sd": rounded(reader.error[own].mean()),
         "spread_sd": rounded(reader.spread[own].mean()),
         "read": len(own),
         "of": len(reader.std),
-        "values": _values(shards, reader, {kind: part[kept] for kind, part in joined.items()}),
+        "values": _values(shards, reader, own, {kind: part[kept] for kind, part in joined.items()}),
     }
     for kind, part in joined.items():
         found[kind] = _figures(part[kept].mean(axis=-1), seed, whose[kept])
     return found, joined["true"][:, -1].mean(axis=-1)
+
+
+@lru_cache(maxsize=16)
+def _reader(tokenizer: "Tokenizer", shards: ShardSet, cameras: Cameras, seed: int) -> Reader:
+    """Train the reader of a set; several checkpoints share it."""
+    dataset = WindowDataset(shards, "train", 1, cameras=cameras)
+    numbers = np.unique(np.linspace(0, len(dataset) - 1, min(PICTURES, len(dataset))).astype(np.int64))
+    seen = dataset.batch(numbers)
+    wanted = _States(shards).of(seen, 1)[:, 0]
+    known = np.isfinite(wanted).all(axis=1)
+    return learn(decode(tokenizer, _stored(seen))[known, 0], wanted[known], seed)
 
 
 def _figures(errors: Floats, seed: int, episodes: NDArray[np.int64]) -> dict[str, Any]:
@@ -219,13 +229,15 @@ def _figures(errors: Floats, seed: int, episodes: NDArray[np.int64]) -> dict[str
     }
 
 
-def _values(shards: ShardSet, reader: Reader, errors: dict[str, Floats]) -> list[dict[str, Any]]:
-    """Return for each readable value its errors at the last step, in its own unit."""
+def _values(
+    shards: ShardSet, reader: Reader, own: NDArray[np.int64], errors: dict[str, Floats]
+) -> list[dict[str, Any]]:
+    """Return for each value that is read its errors at the last step, in its own unit."""
     state = shards.embodiment.state
     assert state is not None
     units = [component.unit for component in state.components for _ in range(component.dims)]
     rows = []
-    for place, number in enumerate(reader.readable):
+    for place, number in enumerate(own):
         std = reader.std[number]
         row = {"name": state.names()[number], "unit": units[number]}
         row["reader"] = _digits(reader.error[number] * std)

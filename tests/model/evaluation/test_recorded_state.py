@@ -109,6 +109,25 @@ def test_a_prediction_that_is_not_finite_has_no_error(
     assert found["true"]["error_sd_last"] is None and found["true"]["error_sd_by_frame"][0] == 0
 
 
+def test_what_cannot_be_read_off_the_windows_own_pictures_is_left_out(
+    disc: ShardSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = np.ones(4)
+    monkeypatch.setattr(recorded_state, "learn", lambda *_: Reader(torch.nn.Module(), one, one, 0 * one, one))
+    monkeypatch.setattr(Reader, "errors", lambda self, pictures, states: 0 * states + [0.1, 0.6, 0.7, 0.8])
+    batches = list(windows(disc, "val", 8, 12))
+    made = {"true": [batch.tokens[:, PROMPT:] for batch in batches]}  # type: ignore[index]
+    found, _ = measure_recorded_state(BlockTokenizer(), disc, batches, made, prompt=PROMPT, cameras="first")
+    assert [row["name"] for row in found["values"]] == ["x"] and found["copy"]["error_sd"] == pytest.approx(
+        0.1
+    )
+    monkeypatch.setattr(Reader, "errors", lambda self, pictures, states: 0 * states + 0.6)
+    found, last = measure_recorded_state(
+        BlockTokenizer(), disc, batches, made, prompt=PROMPT, cameras="first"
+    )
+    assert "no recorded state can be read off the true pictures" in found["missing"] and np.isnan(last).all()
+
+
 def test_too_few_episodes_are_said(disc: ShardSet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorded_state, "EPISODES", 100)
     found, last = measure_recorded_state(
