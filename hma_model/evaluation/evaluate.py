@@ -252,7 +252,7 @@ def verdict(found: Mapping[str, Any]) -> str:
     if 2 * found.get("unmoved_windows", 0) > found.get("windows", 0):
         return "cannot be judged: most of the true pictures never change"
     gain = found["psnr_action_gain_last"]
-    if gain is None:
+    if gain is None or found.get("loss", 0.0) is None:
         return "cannot be judged: its predictions are not finite"
     ends, count = found.get("psnr_action_gain_last_95"), found.get("episodes", 0)
     said = f"{gain:+.1f} dB on the last frame, true less shuffled actions"

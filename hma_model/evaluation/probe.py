@@ -110,8 +110,8 @@ class Probe:
         found = torch.cat([self.network(pixels(part)) for part in np.array_split(flat, len(flat) // 64 + 1)])
         places: Floats = (found.double().numpy() + 1) * (truth.SIZE / 2)
         if self.tee is not None:
-            for row, pixels in enumerate(self._colored(flat)[..., -1]):
-                seen = self.tee.find(pixels)
+            for row, mask in enumerate(self._colored(flat)[..., -1]):
+                seen = self.tee.find(mask)
                 places[row, -2:] = places[row, -2:] if seen is None else seen
         return places.reshape(*pictures.shape[:-3], *places.shape[1:])
 
@@ -124,8 +124,8 @@ class Probe:
 
     def _colored(self, small: Images) -> NDArray[np.bool_]:
         """Return (N, SIDE, SIDE, P), which pixels have a part's colour."""
-        pixels = small.astype(np.float32)
-        near = [np.linalg.norm(pixels - color, axis=-1) <= DISTANCE for color in self.colors]
+        values = small.astype(np.float32)
+        near = [np.linalg.norm(values - color, axis=-1) <= DISTANCE for color in self.colors]
         return np.stack(near, axis=-1)
 
     def wholeness(self, pictures: Images, true: Images) -> Floats:
