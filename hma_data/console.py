@@ -11,6 +11,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from decimal import Decimal
 from typing import Any, Protocol
 
 from hma_data.errors import HMAError, Interrupted
@@ -66,7 +67,7 @@ def print_table(
 
     Args:
         columns: headings.
-        rows: a cell for each column.
+        rows: a cell for each column; a Decimal is a number whose digits are all shown.
         title: printed above.
         repeated: so many of the first columns begin each part of a table that is cut.
     """
@@ -140,7 +141,9 @@ def _parts(widths: Sequence[int], repeated: int, room: int) -> list[list[int]]:
 
 
 def _is_numeric(values: Sequence[Any]) -> bool:
-    return any(isinstance(value, int | float) for value in values) and not any(map(_is_word, values))
+    return any(isinstance(value, int | float | Decimal) for value in values) and not any(
+        map(_is_word, values)
+    )
 
 
 def stdout() -> Any:

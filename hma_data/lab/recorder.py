@@ -17,12 +17,14 @@ T frames, H×W pixels, A values of a command, S of the robot's state, O of the o
 import argparse
 import os
 import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -39,6 +41,15 @@ from hma_data.storage.files import atomic_path
 Floats = NDArray[np.float64]
 
 STYLES = ("scripted", "scripted", "noised", "scripted", "random") * 2  # of ten episodes
+CONTEXT = """
+import os, sys, mujoco
+try:
+    mujoco.GLContext(16, 16).make_current()
+except Exception as fault:
+    print(" ".join(str(fault).split()), file=sys.stderr, flush=True)
+    os._exit(1)
+os._exit(0)
+"""  # without the exits MuJoCo would add to what it said
 MEMORY_S = 0.4  # time in which smooth noise forgets its value
 
 
@@ -254,6 +265,8 @@ def _drawing() -> Iterator[None]:
     """
     if sys.platform == "linux":
         os.environ.setdefault("MUJOCO_GL", "egl")
+        if find_spec("mujoco"):
+            _require_opengl()
     try:
         yield
     except ImportError as fault:
@@ -261,6 +274,24 @@ def _drawing() -> Iterator[None]:
         raise MissingDependencyError(
             fault.name or "a package", f"cannot be imported: {fault}", remedy
         ) from fault
+
+
+def _require_opengl() -> None:
+    """Make a context of OpenGL as MuJoCo does; where that fails, each simulator fails in its own way later.
+
+    It is made in a process of its own, because a context that is made twice, or half, complains at the exit.
+
+    Raises:
+        MissingDependencyError: the library that $MUJOCO_GL names is missing, or finds no driver.
+    """
+    tried = subprocess.run([sys.executable, "-c", CONTEXT], capture_output=True, text=True)
+    if tried.returncode:
+        reason = tried.stderr.strip().splitlines()[-1] if tried.stderr.strip() else "it was killed"
+        remedy = (
+            "on Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri, and leave MUJOCO_GL unset; or "
+            "apt-get install libosmesa6, and set MUJOCO_GL=osmesa"
+        )
+        raise MissingDependencyError(f"MUJOCO_GL={os.environ['MUJOCO_GL']}", f"cannot draw: {reason}", remedy)
 
 
 def _size(path: Path) -> int:

@@ -4,6 +4,7 @@ import json as json_text
 import shlex
 import sys
 from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -43,6 +44,7 @@ FIGURES = {  # figures of `hma evaluate` as its table names them; the others hav
 ROLLOUTS = ("true", "shuffled", "none", "copy")
 HIDDEN = ("checkpoint", "data", "seconds_a_frame", "sees_actions", "merge")  # of the readable form
 MEASURES = {"lpips": "LPIPS", "fid": "FID", "fvd": "FVD", "fvd_videogpt": "FVD (VideoGPT)"}
+DIGITS = {"ssim": 3, "lpips": 3}  # of the figures of rollouts; the others have two
 LPIPS_HELP = "Weights of LPIPS, with their hash."
 
 
@@ -71,9 +73,15 @@ def evaluate(
         bool, typer.Option("--paper", help="Also follow the paper's protocol: Gaussian actions, true past.")
     ] = False,
     state: Annotated[
-        bool, typer.Option("--state", help="Of a laboratory robot: measure what it does in the pictures.")
+        bool,
+        typer.Option(
+            "--state",
+            help="Measure what the robot does in the pictures, against its recorded or simulated state.",
+        ),
     ] = False,
-    episodes: Annotated[int, typer.Option("--episodes", min=2, help="Episodes that --state simulates.")] = 32,
+    episodes: Annotated[
+        int, typer.Option("--episodes", min=2, help="Episodes that --state simulates of a laboratory robot.")
+    ] = 32,
     lpips: Annotated[str | None, typer.Option("--lpips", metavar="FILE#SHA256", help=LPIPS_HELP)] = None,
     fid: Annotated[
         str | None, typer.Option("--fid", metavar="FILE#SHA256", help="Weights of FID's Inception.")
@@ -147,7 +155,7 @@ def _print_one(part: "Part") -> None:
     columns = {"psnr": "PSNR dB", "psnr_last": "last frame dB", "ssim": "SSIM"}
     columns |= {key: name for key, name in MEASURES.items() if key in found["true"]}
     rows = [
-        [name, *(found[name].get(key) for key in columns), _ends(found[name]["psnr_last_95"])]
+        [name, *(_rounded(found[name].get(key), key) for key in columns), _ends(found[name]["psnr_last_95"])]
         for name in ROLLOUTS
     ]
     print_table(["rollout", *columns.values(), "last frame, 95 %"], rows)
@@ -168,8 +176,15 @@ def _print_one(part: "Part") -> None:
 def _print_state(state: dict[str, Any] | None) -> None:
     if not state or "true" not in state:
         return
+    if "values" in state:
+        _print_recorded_state(state)
+        return
     rows = [
-        [name, state[name]["error_px"], state[name]["error_px_last"], _ends(state[name]["error_px_last_95"])]
+        [
+            name,
+            *(_rounded(state[name][key], key) for key in ("error_px", "error_px_last")),
+            _ends(state[name]["error_px_last_95"]),
+        ]
         for name in (*ROLLOUTS, "reconstruction")
     ]
     print_table(["robot's place", "error px of 128", "last frame", "95 %"], rows)
@@ -180,6 +195,25 @@ def _print_state(state: dict[str, Any] | None) -> None:
     ]
     print_table(["commands", "PSNR dB", "last frame dB", "perplexity"], rows)
     print(f"{state['episodes']} simulated episodes; the probe errs by {state['probe_px']:.2f} px")
+
+
+def _print_recorded_state(state: dict[str, Any]) -> None:
+    kinds = (*ROLLOUTS, "reconstruction")
+    rows: list[list[Any]] = [
+        [
+            name,
+            *(_rounded(state[name][key], key) for key in ("error_sd", "error_sd_last")),
+            _ends(state[name]["error_sd_last_95"]),
+        ]
+        for name in kinds
+    ]
+    print_table(["recorded state", "error, standard deviations", "last frame", "95 %"], rows)
+    rows = [[row["name"], row["unit"], *(row[kind] for kind in kinds)] for row in state["values"]]
+    print_table(["last frame, error of", "unit", *kinds], rows)
+    print(
+        f"{state['read']} of {state['of']} values can be read off the pictures; what reads them errs by "
+        f"{state['reader_sd']:.2f} standard deviations on true pictures of other episodes"
+    )
 
 
 def _figure(key: str, found: dict[str, Any]) -> str:
@@ -220,9 +254,13 @@ def _print_table(parts: "Sequence[Part]") -> None:
 
 def _number(cell: Any) -> Any:
     try:
-        return float(cell) if isinstance(cell, str) else cell
-    except ValueError:
+        return Decimal(cell) if isinstance(cell, str) else cell
+    except InvalidOperation:
         return cell
+
+
+def _rounded(value: float | None, key: str) -> Decimal | None:
+    return None if value is None else Decimal(f"{value:.{DIGITS.get(key, 2)}f}")
 
 
 def _print_absences(parts: "Sequence[Part]") -> None:

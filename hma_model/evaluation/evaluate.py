@@ -82,7 +82,8 @@ class Settings:
     Attributes:
         windows: their number; the other attributes up to `cameras` are as of `evaluate`.
         paper: also follow the paper's protocol.
-        state: simulated episodes of a laboratory robot; 0 measures no state.
+        state: simulated episodes of a laboratory robot; of others any number measures the recorded state; 0
+            measures no state.
         sampling: options of `HMA.generate`.
     """
 
@@ -251,7 +252,7 @@ def verdict(found: Mapping[str, Any]) -> str:
     if 2 * found.get("unmoved_windows", 0) > found.get("windows", 0):
         return "cannot be judged: most of the true pictures never change"
     gain = found["psnr_action_gain_last"]
-    if gain is None:
+    if gain is None or found.get("loss", 0.0) is None:
         return "cannot be judged: its predictions are not finite"
     ends, count = found.get("psnr_action_gain_last_95"), found.get("episodes", 0)
     said = f"{gain:+.1f} dB on the last frame, true less shuffled actions"

@@ -43,7 +43,8 @@ table { border-collapse:collapse; margin:.6rem 0; font-variant-numeric:tabular-n
 th, td { text-align:left; padding:.34rem .9rem .34rem 0; border-bottom:1px solid var(--line);
   white-space:nowrap }
 td.n, th.n { text-align:right } td { vertical-align:top }
-td small { color:var(--soft) }
+td small { color:var(--soft) } small { display:inline-block; line-height:1.35; font-weight:400 }
+td:first-child small { white-space:normal; min-width:6.5rem }
 .dense { font-size:.8rem } .dense th { font-size:.76rem } .dense th, .dense td { padding-right:.55rem }
 .dense small { font-size:.66rem } th { font-weight:600; font-size:.86rem }
 figure { margin:1rem 0 } figcaption { font-size:.9rem; margin-top:.3rem; max-width:48rem }
@@ -91,7 +92,7 @@ class Page:
         """Add a table; columns of numbers are aligned to the right. A second line of a cell is small."""
         numeric = [all(isinstance(row[i], int | float) for row in rows) for i in range(len(columns))]
         styles = [" class=n" if right else "" for right in numeric]
-        lines = ["".join(f"<th{s}>{_text(name)}</th>" for name, s in zip(columns, styles, strict=True))]
+        lines = ["".join(f"<th{s}>{_cell(name)}</th>" for name, s in zip(columns, styles, strict=True))]
         for row in rows:
             lines.append("".join(f"<td{s}>{_cell(v)}</td>" for v, s in zip(row, styles, strict=True)))
         body = "".join(f"<tr>{line}</tr>" for line in lines)

@@ -106,26 +106,26 @@ class Probe:
     @torch.no_grad()
     def read(self, pictures: Images) -> Floats:
         """Return the places (…, P, 2) of the parts in pictures (…, S, S, 3)."""
-        flat = _small(pictures.reshape(-1, *pictures.shape[-3:]))
-        found = torch.cat([self.network(_pixels(part)) for part in np.array_split(flat, len(flat) // 64 + 1)])
+        flat = resized(pictures.reshape(-1, *pictures.shape[-3:]))
+        found = torch.cat([self.network(pixels(part)) for part in np.array_split(flat, len(flat) // 64 + 1)])
         places: Floats = (found.double().numpy() + 1) * (truth.SIZE / 2)
         if self.tee is not None:
-            for row, pixels in enumerate(self._colored(flat)[..., -1]):
-                seen = self.tee.find(pixels)
+            for row, mask in enumerate(self._colored(flat)[..., -1]):
+                seen = self.tee.find(mask)
                 places[row, -2:] = places[row, -2:] if seen is None else seen
         return places.reshape(*pictures.shape[:-3], *places.shape[1:])
 
     def areas(self, pictures: Images) -> Floats:
         """Return (…, P), how many pixels of (…, S, S, 3) have a part's colour and not the background's."""
-        flat = _small(pictures.reshape(-1, *pictures.shape[-3:]))
+        flat = resized(pictures.reshape(-1, *pictures.shape[-3:]))
         stands = np.linalg.norm(flat - self.background, axis=-1) > DISTANCE
         counts: Floats = (stands[..., None] & self._colored(flat)).sum(axis=(1, 2), dtype=np.float64)
         return counts.reshape(*pictures.shape[:-3], len(self.colors))
 
     def _colored(self, small: Images) -> NDArray[np.bool_]:
         """Return (N, SIDE, SIDE, P), which pixels have a part's colour."""
-        pixels = small.astype(np.float32)
-        near = [np.linalg.norm(pixels - color, axis=-1) <= DISTANCE for color in self.colors]
+        values = small.astype(np.float32)
+        near = [np.linalg.norm(values - color, axis=-1) <= DISTANCE for color in self.colors]
         return np.stack(near, axis=-1)
 
     def wholeness(self, pictures: Images, true: Images) -> Floats:
@@ -216,7 +216,7 @@ def fit(
         tell: called with how far it is.
     """
     used = round(len(pictures) * (1 - held_out))
-    small = _small(pictures)
+    small = resized(pictures)
     network = _trained(small[:used], parts[:used], seed, steps, tell)
     spread = np.linalg.norm(parts - np.median(parts, axis=0), axis=-1).mean(axis=0)
     background = np.median(small[:used], axis=0).astype(np.float32)
@@ -232,7 +232,7 @@ def _trained(small: Images, parts: Floats, seed: int, steps: int, tell: Callable
         torch.manual_seed(seed)
         network = PlaceNetwork(parts.shape[1])
     generator = torch.Generator().manual_seed(seed)
-    inputs, targets = _pixels(small), torch.tensor(parts / (truth.SIZE / 2) - 1, dtype=torch.float32)
+    inputs, targets = pixels(small), torch.tensor(parts / (truth.SIZE / 2) - 1, dtype=torch.float32)
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
     for step in range(steps):
@@ -254,11 +254,11 @@ def _colors(small: Images, parts: Floats) -> Floats:
     return found
 
 
-def _small(pictures: Images) -> Images:
+def resized(pictures: Images) -> Images:
     """Return pictures (N, SIDE, SIDE, 3)."""
     cv2 = opencv()
     return np.stack([cv2.resize(one, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for one in pictures])
 
 
-def _pixels(small: Images) -> Tensor:
+def pixels(small: Images) -> Tensor:
     return torch.from_numpy(small).permute(0, 3, 1, 2).float() / 127.5 - 1

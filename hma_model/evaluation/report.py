@@ -32,6 +32,13 @@ BASELINES = {
     "none": "no commands",
     "copy": "prompt's last frame repeated",
 }
+SHORT = {
+    "true": "true commands",
+    "shuffled": "another window's",
+    "none": "none",
+    "copy": "frame repeated",
+    "reconstruction": "true pictures",
+}
 STATE = {"true": "true commands", **BASELINES, "reconstruction": "true pictures, from their tokens"}
 
 
@@ -62,9 +69,7 @@ def page(parts: Sequence[Part], command: str) -> str:
     made.section("Does it follow its commands?")
     made.definitions([(_whose(part, parts), verdict(part.found)) for part in parts])
     made.section("Figures", "Below a figure: the 95 % interval of its mean, by bootstrap of whole episodes.")
-    names, lines = rows(parts)
-    made.table(names, [[_below(cell) for cell in line] for line in lines])
-    made.definitions([(name, WORDS[name]) for name in names if name in WORDS])
+    _figures(made, parts)
     if said := absences(parts):
         made.section("Not measured, and to be known")
         made.definitions(said)
@@ -79,6 +84,18 @@ def page(parts: Sequence[Part], command: str) -> str:
     made.section("The command")
     made.commands(command)
     return made.html()
+
+
+def _figures(made: Page, parts: Sequence[Part]) -> None:
+    """Add the table: a column a checkpoint and robot, so that what is compared stands side by side."""
+    names, lines = rows(parts)
+    several = len({part.checkpoint for part in parts}) > 1
+    heads = [f"{line[0]}\n{line[1]}" if several else line[1] for line in lines]
+    turned = zip(names[2:], *(line[2:] for line in lines), strict=True)
+    made.table(
+        ["figure", *heads],
+        [[f"{name}\n{WORDS.get(name, '')}", *map(_below, cells)] for name, *cells in turned],
+    )
 
 
 def _whose(part: Part, parts: Sequence[Part]) -> str:
@@ -149,15 +166,14 @@ def _state(made: Page, part: Part, seconds: float) -> None:
     state = part.found.get("state")
     if not state or "true" not in state:
         return
-    curves = {
-        words: (state[kind]["error_px_by_frame"], state[kind]["error_px_by_frame_95"])
-        for kind, words in STATE.items()
-    }
+    if "values" in state:
+        _recorded_state(made, part.checkpoint, state, seconds)
+        return
     caption = (
         f"{part.checkpoint}: how far the robot in the picture is from where the simulator's is, "
         f"{state['episodes']} new episodes; the probe that reads it errs by {state['probe_px']:.2f} px"
     )
-    made.picture(over_horizon(curves, seconds, "px of 128"), "svg+xml", caption)
+    made.picture(over_horizon(_errors(state, "error_px"), seconds, "px of 128"), "svg+xml", caption)
     noisy = state["perturbed"]
     about = f"perturbed by {noisy['scale']:g} standard deviations, against the simulator's answer to them"
     names = ["commands", "PSNR dB", "last frame dB", *(["perplexity"] if "perplexity" in noisy else [])]
@@ -166,6 +182,29 @@ def _state(made: Page, part: Part, seconds: float) -> None:
         line = [words, noisy[f"psnr{mark}"], noisy[f"psnr{mark}_last"]]
         lines.append([*line, *([noisy[f"perplexity{mark}"]] if "perplexity" in noisy else [])])
     made.table(names, lines)
+
+
+def _recorded_state(made: Page, checkpoint: str, state: dict[str, Any], seconds: float) -> None:
+    caption = (
+        f"{checkpoint}: how far the state read off the pictures is from the recorded one, mean of "
+        f"{state['read']} of {state['of']} values; the network that reads them errs by "
+        f"{state['reader_sd']:.2f} on true pictures"
+    )
+    curves = _errors(state, "error_sd")
+    made.picture(over_horizon(curves, seconds, "standard deviations"), "svg+xml", caption)
+    kinds = [kind for kind in STATE if kind in state]
+    heads = ["error, last frame", "unit", *(SHORT[kind] for kind in kinds)]
+    lines = [[row["name"], row["unit"], *(row[kind] for kind in kinds)] for row in state["values"]]
+    made.table(heads, lines)
+
+
+def _errors(state: dict[str, Any], key: str) -> dict[str, tuple[Any, Any]]:
+    """Return the errors by frame and their intervals of each kind of rollout whose errors are finite."""
+    return {
+        words: (state[kind][f"{key}_by_frame"], state[kind][f"{key}_by_frame_95"])
+        for kind, words in STATE.items()
+        if None not in state[kind][f"{key}_by_frame"]
+    }
 
 
 # -- strips

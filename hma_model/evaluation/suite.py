@@ -36,6 +36,7 @@ from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.evaluation.evaluate import Settings, measure
 from hma_model.evaluation.losses import no_window
 from hma_model.evaluation.perceptual import Networks
+from hma_model.evaluation.recorded_state import measure_recorded_state
 from hma_model.evaluation.rollouts import cameras_for, default_prompt
 from hma_model.evaluation.simulated import measure_state
 
@@ -154,9 +155,10 @@ def _check(model: "HMA", shards: ShardSet, settings: Settings) -> None:
         raise UsageError("--prompt", fault, "give fewer, or more --frames")
     if not len(WindowDataset(shards, settings.split, length, cameras=cameras)):
         raise no_window(shards, settings.split, length)
-    if settings.state and not simulated(shards.embodiment.id):
-        fault = "is no robot of the laboratory, so its state is not known"
-        raise UsageError(shards.embodiment.id, fault, "leave --state out")
+    if settings.state and not simulated(shards.embodiment.id) and not shards.embodiment.state:
+        fault = "is no robot of the laboratory, and its shards have no states"
+        remedy = "leave --state out, or name the recorded states in its YAML and convert again"
+        raise UsageError(shards.embodiment.id, fault, remedy)
 
 
 def _frames(model: "HMA", shards: ShardSet, settings: Settings) -> int:
@@ -203,7 +205,13 @@ def _measured(
     sampling: Any = dict(settings.sampling)
     measured = measure(model, tokenizer, shards, settings, networks, counter)
     found, robot = measured.found, shards.embodiment.id
-    if settings.state:
+    if settings.state and not simulated(robot):
+        counter.begins("its state, as it was recorded")
+        found["state"], measured.by_window["state.error_sd_last"] = measure_recorded_state(
+            tokenizer, shards, measured.batches, measured.predicted, prompt=found["prompt"],
+            cameras=cameras_for(model, shards, settings.cameras), seed=settings.seed,
+        )  # fmt: skip
+    elif settings.state:
         counter.begins("its state, in new episodes")
         found["state"] = measure_state(
             model, tokenizer, robot, frames=found["frames"], prompt=found["prompt"], episodes=settings.state,
@@ -212,8 +220,8 @@ def _measured(
     else:
         found["missing"]["state"] = (
             "not measured: --state reads what the robot does off its pictures"
-            if simulated(robot)
-            else "not measured: the true state is known of the laboratory's robots only"
+            if simulated(robot) or shards.embodiment.state
+            else "not measured: the shards have no states, and the robot is none of the laboratory"
         )
     found = {"checkpoint": label, "data": str(shards.folder), **found}
     if networks.facts:

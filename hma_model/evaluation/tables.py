@@ -32,6 +32,7 @@ COLUMNS: tuple[tuple[str, str, str, int, bool], ...] = (
     ("FVD (VideoGPT)", "", "true.fvd_videogpt", 1, False),
     ("ΔPSNR (paper)", "paper.delta_psnr", "paper.delta_psnr", 2, False),
     ("state px", "", "state.true.error_px_last", 2, False),
+    ("state sd", "state.error_sd_last", "state.true.error_sd_last", 2, False),
     ("PSNR none", "none.psnr_last", "none.psnr_last", 2, False),
     ("PSNR copy", "copy.psnr_last", "copy.psnr_last", 2, False),
 )
@@ -50,6 +51,7 @@ WORDS = {
     "FVD (VideoGPT)": "the same, I3D of VideoGPT",
     "ΔPSNR (paper)": "dB, last frame after the true past, true less Gaussian actions",
     "state px": "error of the robot's place at the last frame, px of 128",
+    "state sd": "error of the recorded state at the last frame, in its standard deviations",
     "PSNR none": "dB, last frame, without commands",
     "PSNR copy": "dB, last frame, the prompt's last frame repeated",
 }

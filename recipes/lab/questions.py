@@ -248,6 +248,23 @@ def summary(lines: list[dict[str, Any]]) -> dict[str, dict[str, tuple[float, flo
     return found
 
 
+def by_budget(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the lines; where they are of several budgets, their rows say which, and are never averaged."""
+    if len({line["cpu_seconds"] for line in lines}) < 2:
+        return lines
+    return [line | {"row": f"{line['row']}, {float(line['cpu_seconds']):g} CPU s"} for line in lines]
+
+
+def _said(line: dict[str, Any]) -> str:
+    """Return what a run found, in words."""
+    found = [
+        f"{key.replace('_', ' ')} {float(line[key]):,.{digits}f}"
+        for key, digits in FIGURES.items()
+        if line.get(key) not in (None, "")
+    ]
+    return f"{line['row']}, seed {line['seed']}, {line['cpu_seconds']:g} CPU s: {', '.join(found)}"
+
+
 def table(lines: list[dict[str, Any]]) -> str:
     """Return a Markdown table: a row of the question a line, means over its seeds ± half the interval."""
     rows = summary(lines)
@@ -311,9 +328,10 @@ def main() -> None:
                     continue
                 key = (row.name, str(seed), str(budget))
                 if key not in [(line["row"], line["seed"], line["cpu_seconds"]) for line in read(path)]:
-                    append(path, measure(given.question, row, seed, budget, shards))
-                    print(read(path)[-1], flush=True)
-    lines = read(path)
+                    line = measure(given.question, row, seed, budget, shards)
+                    append(path, line)
+                    print(_said(line), flush=True)
+    lines = by_budget(read(path))
     if not lines:
         raise SystemExit(f"{path}: has no line yet; run without --table")
     write_atomic(path.with_suffix(".md"), table(lines) + "\n")

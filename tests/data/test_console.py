@@ -1,6 +1,7 @@
 """Progress off a terminal: amounts in their unit, elapsed and remaining time; tables as they are."""
 
 import re
+from decimal import Decimal
 
 import pytest
 
@@ -143,3 +144,13 @@ def test_a_row_of_words_too_wide_for_a_terminal_becomes_a_paragraph(
 )
 def test_short_paths_leave_out_what_all_have_in_common(paths: list[str], short: list[str]) -> None:
     assert console.short_paths(paths) == dict(zip(paths, short, strict=True))
+
+
+def test_a_decimal_is_a_number_that_keeps_its_digits(capsys: pytest.CaptureFixture[str]) -> None:
+    console.print_table(
+        ["set", "SSIM"], [["one", Decimal("0.960")], ["two", Decimal("12.947")], ["three", None]]
+    )
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    (one,) = (line for line in lines if "one" in line)
+    (two,) = (line for line in lines if "two" in line)
+    assert one.endswith(" 0.960") and two.endswith("12.947") and len(one) == len(two)

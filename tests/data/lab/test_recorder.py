@@ -2,6 +2,7 @@
 
 import hashlib
 import runpy
+import sys
 import tomllib
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 from hma_data.conversion.job import convert
 from hma_data.errors import Interrupted, OutputError
 from hma_data.lab.formats import Recorded
-from hma_data.lab.recorder import STYLES, record_copy, record_episode, record_simulator
+from hma_data.lab.recorder import STYLES, main, record_copy, record_episode, record_simulator
 from hma_data.registry.embodiment import find
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
@@ -158,6 +159,26 @@ def test_a_stopped_recording_continues_at_the_next_episode(tmp_path: Path) -> No
         record_simulator(stopped, tmp_path / "parts", EPISODES, SEED)
     with pytest.raises(OutputError, match="is a file, not a folder"):
         record_simulator(stopped, tmp_path / "parts" / "fetch.hdf5", EPISODES, SEED)
+
+
+@pytest.mark.parametrize(
+    ("way", "fault"),
+    [("egl", "ImportError('Cannot initialize')"), ("osmesa", "AttributeError('glGetError')")],
+)
+def test_a_machine_that_cannot_draw_is_told_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], way: str, fault: str
+) -> None:
+    (tmp_path / "mujoco.py").write_text(f"def GLContext(width, height):\n    raise {fault}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("MUJOCO_GL", way)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(sys, "argv", ["fetch.py", str(tmp_path / "out")])
+    with pytest.raises(SystemExit):
+        main(lambda: DiscSimulator("fetch"), None)
+    said = capsys.readouterr().err
+    assert f"MUJOCO_GL={way}: cannot draw: " in said and said.count("\n") == 1
+    assert "apt-get install libegl1 libgl1-mesa-dri" in said and "libosmesa6" in said
 
 
 @pytest.mark.parametrize("robot", RECIPES)

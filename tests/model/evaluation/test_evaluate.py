@@ -484,6 +484,11 @@ def test_predictions_that_are_not_finite_are_said_in_words(data, model, monkeypa
     assert found["true"]["psnr_last"] is None and found["copy"]["psnr_last"] is not None
     assert "predicted frames are NaN or infinite" in found["notes"][0]
     assert verdict(found) == "cannot be judged: its predictions are not finite"
+    tokens = {
+        "psnr_action_gain_last": 0.0,
+        "loss": None,
+    }  # a discrete model decodes tokens of NaN all the same
+    assert verdict(tokens) == "cannot be judged: its predictions are not finite"
 
 
 def test_pictures_that_never_change_are_said_in_words(model, data):

@@ -20,7 +20,7 @@ from hma_model.evaluation.evaluate import verdict
 from hma_model.evaluation.report import difference, write_results
 from hma_model.evaluation.simulated import PERTURBATION, perturbed
 from hma_model.evaluation.suite import Settings, evaluate_all
-from hma_model.evaluation.tables import absences, means, results, rows
+from hma_model.evaluation.tables import MEAN, absences, means, results, rows
 from tests.model.evaluation.test_evaluate import Blocks
 from tests.model.robots import CONFIG, SPEC, make_model, save
 from tests.model.shards import make_shards
@@ -57,7 +57,7 @@ def run(
     return evaluate_all(folders, [made / "arm", made / "hand"], settings, out=out)
 
 
-BOTH = ("one", "other")
+BOTH, ROBOTS = ("one", "other"), ("arm", "hand")
 
 
 def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_once(made: Path) -> None:
@@ -155,7 +155,9 @@ def test_the_page_is_one_file_that_shows_each_robot_and_checkpoint(made: Path, t
     said = verdict(run(made)[0].found)
     assert said in page and f"- {made / 'one'} on arm {said}" in table
     shown = re.sub(r"<h2>The command.*", "", page, flags=re.DOTALL)
-    assert shown.count(str(made / "one")) == 1 and "<td>one</td>" in shown  # a legend, then short names
+    assert shown.count(str(made / "one")) == 1  # a legend, then short names
+    heads = ["figure", *(f"{one}<br><small>{robot}</small>" for one in BOTH for robot in (*ROBOTS, MEAN))]
+    assert "".join(f"<th>{head}</th>" for head in heads) in shown  # checkpoints stand side by side
     results = json.loads((tmp_path / "results.json").read_bytes())
     assert {row["checkpoint"] for row in results["means"]} == {str(made / name) for name in BOTH}
 

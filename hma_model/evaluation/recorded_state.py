@@ -1,0 +1,279 @@
+"""Measure the state error of any robot whose shards have states: `hma evaluate --state`.
+
+A small network, the reader, learns to read the recorded state off the training split's pictures, as the
+tokenizer shows them. It then reads rollouts, and what it reads is compared with the state that was recorded
+at each step. Its own error is that on true pictures of training episodes that it did not learn from. A value
+that hardly changes, or that it cannot read off these or the windows' true pictures, is left out. Errors are
+in standard deviations of the value over the training split (`sd`), so that metres and radians can be
+averaged.
+
+The states of robots of the laboratory are simulated instead (`hma_model.evaluation.simulated`).
+
+N pictures or windows, T frames, P predicted frames, S values of a state.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hma_data.loading.dataset import Batch, WindowDataset
+from hma_data.loading.views import Cameras
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.schema import mask_columns
+from hma_model.evaluation.intervals import NATURAL, interval, rounded, summary
+from hma_model.evaluation.probe import MAPS, SIDE, UNREADABLE, pixels, resized
+from hma_model.evaluation.rollouts import decode
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+
+Floats = NDArray[np.float64]
+Images = NDArray[np.uint8]
+
+CHANNELS, POINTS, HIDDEN = 16, 16, 128
+STEPS, BATCH, RATE, NOISE = 600, 32, 4e-3, 0.03  # noise in pictures of -1 to 1
+PICTURES, EPISODES = 1500, 5  # most pictures to learn from, fewest episodes
+HELD_OUT = 0.2  # share of the pictures, the last ones, on which the reader's error is measured
+STILL = 1e-6  # a value whose standard deviation is smaller never changes
+
+
+class StateNetwork(nn.Module):
+    """A network that reads states (N, S), in standard deviations from their mean, off pictures.
+
+    Maps become points, the means of their softmax (Levine et al. 2016), and heights, their largest values.
+    """
+
+    def __init__(self, values: int) -> None:
+        super().__init__()
+        self.maps = nn.Sequential(
+            nn.Conv2d(3, CHANNELS, 5, stride=2, padding=2),
+            nn.GELU(),
+            nn.Conv2d(CHANNELS, CHANNELS, 3, padding=2, dilation=2),
+            nn.GELU(),
+            nn.Conv2d(CHANNELS, POINTS, 3, padding=1),
+        )
+        self.head = nn.Sequential(nn.Linear(3 * POINTS, HIDDEN), nn.GELU(), nn.Linear(HIDDEN, values))
+        line = (torch.arange(MAPS) + 0.5) * (2 / MAPS) - 1
+        self.register_buffer("grid", torch.stack(torch.meshgrid(line, line, indexing="xy"), -1).view(-1, 2))
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        maps = self.maps(pictures).flatten(2)
+        points = (maps * 4).softmax(-1) @ self.grid
+        return self.head(torch.cat([points.flatten(1), maps.amax(-1)], dim=1))
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A trained network and what it can read.
+
+    Attributes:
+        mean, std: (S,) of the states that it learned from.
+        error: (S,) its mean error on pictures of other episodes, in standard deviations.
+        spread: (S,) the mean distance of their states from the median, in standard deviations.
+    """
+
+    network: nn.Module
+    mean: Floats
+    std: Floats
+    error: Floats
+    spread: Floats
+
+    @property
+    def readable(self) -> NDArray[np.int64]:
+        """Return the numbers of the values that change and that it reads."""
+        return np.flatnonzero((self.std > STILL) & (self.error <= UNREADABLE * self.spread))
+
+    def errors(self, pictures: Images, states: Floats) -> Floats:
+        """Return (…, S), how far from states (…, S) it reads pictures (…, H, W, 3), in std."""
+        found = _read(self.network, resized(pictures.reshape(-1, *pictures.shape[-3:])))
+        true = (states - self.mean) / np.maximum(self.std, STILL)
+        return np.abs(found.reshape(states.shape) - true)
+
+
+def learn(pictures: Images, states: Floats, seed: int = 0, steps: int = STEPS) -> Reader:
+    """Train a reader on pictures whose state is known.
+
+    Args:
+        pictures: (N, H, W, 3), by episode.
+        states: (N, S).
+        seed: of the training.
+        steps: of the training.
+    """
+    used, small = round(len(pictures) * (1 - HELD_OUT)), resized(pictures)
+    mean, std = states[:used].mean(axis=0), states[:used].std(axis=0)
+    scaled = (states - mean) / np.maximum(std, STILL)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = StateNetwork(states.shape[1])
+    generator = torch.Generator().manual_seed(seed)
+    inputs, targets = pixels(small[:used]), torch.tensor(scaled[:used], dtype=torch.float32)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
+    for _ in range(steps):
+        chosen = torch.randint(0, used, (BATCH,), generator=generator)
+        noisy = inputs[chosen] + NOISE * torch.randn(BATCH, 3, SIDE, SIDE, generator=generator)
+        loss = nn.functional.smooth_l1_loss(network(noisy), targets[chosen], beta=0.1)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    other = scaled[used:]
+    error = np.abs(_read(network.eval(), small[used:]) - other).mean(axis=0)
+    spread = np.abs(other - np.median(other, axis=0)).mean(axis=0)
+    return Reader(network, mean, std, error, spread)
+
+
+@torch.no_grad()
+def _read(network: nn.Module, small: Images) -> Floats:
+    parts = np.array_split(small, len(small) // 64 + 1)
+    found: Floats = torch.cat([network(pixels(part)) for part in parts]).double().numpy()
+    return found
+
+
+def measure_recorded_state(
+    tokenizer: "Tokenizer",
+    shards: ShardSet,
+    batches: Sequence[Batch],
+    predicted: Mapping[str, Sequence[Tensor]],
+    *,
+    prompt: int,
+    cameras: Cameras,
+    seed: int = 0,
+) -> tuple[dict[str, Any], Floats]:
+    """Compute the figures of rollouts from the recorded states.
+
+    Args:
+        tokenizer: of the shards.
+        shards: a set with states.
+        batches: the windows.
+        predicted: the predicted tokens or latents of each batch, by the kind of rollout.
+        prompt: true frames that a rollout starts from.
+        cameras: those that the windows show.
+        seed: of the reader.
+
+    Returns:
+        The figures: `error_sd` of the rollouts, of `copy` and of the true pictures as the tokenizer shows
+        them (`reconstruction`): the mean over the horizon, at its last step, and by frame. `reader_sd` is the
+        reader's own error, `spread_sd` what knows nothing would have. `values` has them by value, in its own
+        unit. Also the error (N,) of each window at the last step, NaN where a state is unknown.
+    """
+    count, nothing = sum(map(len, batches)), {"windows": 0}
+    unknown = np.full(count, np.nan)
+    if (episodes := shards.manifest.splits["train"]["episodes"]) < EPISODES:
+        few = f"{episodes} training episodes are too few to learn to read their states, {EPISODES} are needed"
+        return nothing | {"missing": few}, unknown
+    states = _States(shards)
+    hashable: Any = tokenizer
+    reader = _reader(hashable, shards, cameras if isinstance(cameras, str) else tuple(cameras), seed)
+    errors: dict[str, list[Floats]] = {}
+    for number, batch in enumerate(batches):
+        truth = decode(tokenizer, _stored(batch))
+        true = states.of(batch, truth.shape[1])[:, prompt:]
+        films = {"copy": truth[:, prompt - 1 : prompt].repeat(true.shape[1], axis=1)}
+        films["reconstruction"] = truth[:, prompt:]
+        for kind, made in predicted.items():
+            films[kind] = decode(tokenizer, made[number].nan_to_num(0, 0, 0))
+        for kind, film in films.items():
+            found_errors = reader.errors(film, true)
+            if kind in predicted:
+                found_errors[~predicted[kind][number].isfinite().flatten(2).all(dim=2).numpy()] = np.nan
+            errors.setdefault(kind, []).append(found_errors)
+    joined = {kind: np.concatenate(parts) for kind, parts in errors.items()}
+    kept = np.isfinite(joined["copy"]).all(axis=(1, 2))
+    whose = np.concatenate([np.arange(len(b)) if b.episode is None else b.episode.numpy() for b in batches])
+    if not kept.any():
+        return nothing | {"missing": "the states of all windows are unknown in part"}, unknown
+    here = joined["reconstruction"][kept].mean(axis=(0, 1))  # the windows may be unlike what it learned from
+    own = np.array([n for n in reader.readable if here[n] <= UNREADABLE * reader.spread[n]], np.int64)
+    if not len(own):
+        cannot = "no recorded state can be read off the true pictures; more training episodes may help"
+        return nothing | {"missing": cannot}, unknown
+    joined = {kind: part[..., own] for kind, part in joined.items()}
+    found: dict[str, Any] = {
+        "windows": int(kept.sum()),
+        "reader_sd": rounded(reader.error[own].mean()),
+        "spread_sd": rounded(reader.spread[own].mean()),
+        "read": len(own),
+        "of": len(reader.std),
+        "values": _values(shards, reader, own, {kind: part[kept] for kind, part in joined.items()}),
+    }
+    for kind, part in joined.items():
+        found[kind] = _figures(part[kept].mean(axis=-1), seed, whose[kept])
+    return found, joined["true"][:, -1].mean(axis=-1)
+
+
+@lru_cache(maxsize=16)
+def _reader(tokenizer: "Tokenizer", shards: ShardSet, cameras: Cameras, seed: int) -> Reader:
+    """Train the reader of a set; several checkpoints share it."""
+    dataset = WindowDataset(shards, "train", 1, cameras=cameras)
+    numbers = np.unique(np.linspace(0, len(dataset) - 1, min(PICTURES, len(dataset))).astype(np.int64))
+    seen = dataset.batch(numbers)
+    wanted = _States(shards).of(seen, 1)[:, 0]
+    known = np.isfinite(wanted).all(axis=1)
+    return learn(decode(tokenizer, _stored(seen))[known, 0], wanted[known], seed)
+
+
+def _figures(errors: Floats, seed: int, episodes: NDArray[np.int64]) -> dict[str, Any]:
+    """Return the figures of errors (N, P)."""
+    return {
+        **summary("error_sd", errors.mean(axis=1), seed, episodes=episodes, within=NATURAL),
+        **summary("error_sd_last", errors[:, -1], seed, episodes=episodes, within=NATURAL),
+        "error_sd_by_frame": rounded(errors.mean(axis=0)),
+        "error_sd_by_frame_95": rounded(interval(errors, seed, episodes, NATURAL).T),
+    }
+
+
+def _values(
+    shards: ShardSet, reader: Reader, own: NDArray[np.int64], errors: dict[str, Floats]
+) -> list[dict[str, Any]]:
+    """Return for each value that is read its errors at the last step, in its own unit."""
+    state = shards.embodiment.state
+    assert state is not None
+    units = [component.unit for component in state.components for _ in range(component.dims)]
+    rows = []
+    for place, number in enumerate(own):
+        std = reader.std[number]
+        row = {"name": state.names()[number], "unit": units[number]}
+        row["reader"] = _digits(reader.error[number] * std)
+        rows.append(row | {kind: _digits(one[:, -1, place].mean() * std) for kind, one in errors.items()})
+    return rows
+
+
+def _digits(value: float) -> float | None:
+    return float(f"{value:.4g}") if np.isfinite(value) else None
+
+
+def _stored(batch: Batch) -> Tensor:
+    stored = batch.latents if batch.tokens is None else batch.tokens
+    assert stored is not None
+    return stored
+
+
+class _States:
+    """Looks up the recorded states of windows."""
+
+    def __init__(self, shards: ShardSet) -> None:
+        self._shards = shards
+        known = [name for name in mask_columns(shards.embodiment) if name == "state_known"]
+        columns = ["frame_index", "state", *known]
+        self._rows = lru_cache(256)(lambda episode: shards.episode_rows(episode, columns))
+
+    def of(self, batch: Batch, frames: int) -> Floats:
+        """Return (N, T, S) of the windows' frames, NaN where unknown."""
+        assert batch.episode is not None and batch.frame is not None
+        found = []
+        for episode, frame in zip(batch.episode.tolist(), batch.frame.tolist(), strict=True):
+            rows = self._rows(episode)
+            first = int(np.flatnonzero(rows["frame_index"] == frame)[0])
+            chosen = first + np.arange(frames) * self._shards.row_stride
+            states = rows["state"][chosen].astype(np.float64)
+            if "state_known" in rows:
+                states[~rows["state_known"][chosen]] = np.nan
+            found.append(states)
+        return np.stack(found)
