@@ -7,7 +7,7 @@ import typer
 
 from hma_data.console import human_count, interruptible, print_json, progress
 from hma_model.cli.hub import Json
-from hma_model.cli.options import Device, Temperature, UnmaskSteps, device_name
+from hma_model.cli.options import Compile, Device, Precision, Temperature, UnmaskSteps, device_name
 
 
 def policy_eval(
@@ -30,6 +30,8 @@ def policy_eval(
     ] = "moved",
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
+    precision: Precision = "float32",
+    compile: Compile = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
     device: Device = "auto",
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the page and the figures.")] = None,
@@ -52,7 +54,7 @@ def policy_eval(
         found = evaluate_policies(
             embodiment, policies, checkpoint=checkpoint, episodes=episodes, frames=frames, judge=judge,
             seed=seed, out=out, unmask_steps=unmask_steps, temperature=temperature, device=there,
-            on_progress=update,
+            precision=precision, compile=compile, on_progress=update,
         )  # fmt: skip
     page = write_report(found, out) if out else None
     if json:
@@ -99,6 +101,8 @@ def augment(
     ] = None,
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
+    precision: Precision = "float32",
+    compile: Compile = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
     device: Device = "auto",
     json: Json = False,
@@ -115,7 +119,7 @@ def augment(
 
     there, name = device_name(device), source.resolve().name if source else ""
     settings = Augmentation(
-        embodiment, name, episodes, frames, commands, keep, judge, seed, unmask_steps, temperature
+        embodiment, name, episodes, frames, commands, keep, judge, seed, unmask_steps, temperature, precision
     )
     finished = (out / MANIFEST).is_file() and (lerobot is None or (lerobot / FACTS).is_file())
     words = f"finished batches are kept in {out}; run the same command again to continue"
@@ -127,6 +131,7 @@ def augment(
             shards=source,
             lerobot=lerobot,
             device=there,
+            compile=compile,
             on_progress=update,
         )
     kept = sum(split["episodes"] for split in made.splits.values())

@@ -70,7 +70,7 @@ class Augmentation:
         keep: share of the episodes that is kept.
         judge: the task whose successes are kept, as `task_of` takes it; empty for none.
         seed: of everything.
-        unmask_steps, temperature: as of `World`.
+        unmask_steps, temperature, precision: as of `World`.
     """
 
     embodiment: str
@@ -83,6 +83,7 @@ class Augmentation:
     seed: int = 0
     unmask_steps: int = 2
     temperature: float | None = None
+    precision: str = "float32"
 
     def __post_init__(self) -> None:
         if not 0 < self.keep <= 1:
@@ -165,6 +166,7 @@ def augment(
     lerobot: StrPath | None = None,
     world: World | None = None,
     device: str = "cpu",
+    compile: bool = False,
     on_progress: Update = lambda done, extra="", total=None: None,
 ) -> Manifest:
     """Make synthetic episodes, and write those that are kept as a shard set.
@@ -177,7 +179,8 @@ def augment(
         lerobot: folder for the same episodes as a LeRobotDataset v3.0; one that is finished is kept.
         world: a world instead of a checkpoint.
         device: of the world made from the checkpoint, and of policies that are networks.
-        on_progress: called with the frames done, and what is done; of the dataset, with all its frames too.
+        compile: of that world, as of `World`.
+        on_progress: called with the frames done, what is done, and of the dataset with all its frames too.
 
     Raises:
         HMAError: the robot, the shards or the policy do not fit, the folder holds something else, the judge
@@ -186,15 +189,18 @@ def augment(
     folder = as_path(out)
     if lerobot is not None:
         require_dataset(as_path(lerobot))
-    drawn: dict[str, Any] = {"unmask_steps": settings.unmask_steps, "temperature": settings.temperature}
-    world = world or load_world(checkpoint, device=device, **drawn)
+    world = world or load_world(
+        checkpoint, device=device, unmask_steps=settings.unmask_steps, temperature=settings.temperature,
+        precision=settings.precision, compile=compile,
+    )  # fmt: skip
     if (views := world.model.config.views) > 1 and (shards is None or settings.looked_at):
         fault = f"the laboratory's simulator shows one camera, and the model sees {views}"
         remedy = "name shards with --from, and leave out --judge and policies that read the robot's state"
         raise UsageError("augment", fault, remedy)
-    made_by = (
-        {"by": "hma augment", "synthetic": True} | asdict(settings) | digests(world, settings.embodiment)
-    )
+    told = asdict(settings) | {"precision": world.precision}
+    if world.precision == "float32":  # plans of earlier versions do not name it
+        del told["precision"]
+    made_by = {"by": "hma augment", "synthetic": True} | told | digests(world, settings.embodiment)
     begins = None if shards is None else ShardSet(shards)
     if begins is not None:
         made_by |= {"source_sha256": hashlib.sha256(begins.manifest.to_text().encode()).hexdigest()}

@@ -181,6 +181,8 @@ def evaluate_policies(
     unmask_steps: int = 2,
     temperature: float | None = None,
     device: str = "cpu",
+    precision: str = "float32",
+    compile: bool = False,
     on_progress: Progress | None = None,
 ) -> PolicyEvaluation:
     """Score policies in the simulator of a laboratory robot and inside a world model.
@@ -197,6 +199,7 @@ def evaluate_policies(
         world: a world instead of a checkpoint.
         unmask_steps, temperature: of the world, as of `World`.
         device: of the world made from the checkpoint, and of policies that are networks.
+        precision, compile: of that world, as of `World`.
         on_progress: called with the frames done, and what is done.
 
     Raises:
@@ -212,9 +215,11 @@ def evaluate_policies(
     with locked(folder) if folder else nullcontext():
         tell = on_progress or (lambda done, words: None)
         world = world or load_world(
-            checkpoint, device=device, unmask_steps=unmask_steps, temperature=temperature
-        )
+            checkpoint, device=device, unmask_steps=unmask_steps, temperature=temperature,
+            precision=precision, compile=compile,
+        )  # fmt: skip
         sampling = f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}"
+        sampling += "" if world.precision == "float32" else f",precision={world.precision}"
         scenes = Scenes.of(world, embodiment, episodes, seed)
         made = [(one, read_policy(one, scenes, world)) if isinstance(one, str) else one for one in policies]
         keys = [""] * len(made) if folder is None else _keys(policies, world, embodiment, judge)

@@ -81,6 +81,14 @@ def test_replayed_episodes_hold_the_recorders_commands_and_say_that_they_are_syn
 
 
 @pytest.mark.slow
+def test_the_plan_names_a_precision_that_changes_tokens(
+    world: World, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert "precision" not in augment(tmp_path / "whole", asked(), world=world).plan["made_by"]
+    monkeypatch.setattr(world, "precision", "bf16")
+    assert augment(tmp_path / "half", asked(), world=world).plan["made_by"]["precision"] == "bf16"
+
+
 def test_synthetic_episodes_merge_with_recorded_ones_and_the_whole_says_so(
     world: World, tmp_path: Path
 ) -> None:
@@ -390,7 +398,7 @@ def test_a_robot_without_simulator_needs_shards(tmp_path: Path) -> None:
     from tests.model.robots import make_model
 
     world = object.__new__(World)
-    world.model, world._commands = make_model({"arm": 2}), {}
+    world.model, world._commands, world.precision = make_model({"arm": 2}), {}, "float32"
     with pytest.raises(HMAError, match="arm: has no true simulator"):
         augment(tmp_path / "out", Augmentation("arm"), world=world)
 

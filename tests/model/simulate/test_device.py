@@ -1,4 +1,4 @@
-"""The option --device of the verbs that work inside the world model."""
+"""The options --device, --precision and --compile of the verbs that work inside the world model."""
 
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,26 @@ def test_the_device_reaches_the_world(
     monkeypatch.setattr(module, "load_world", load)
     with pytest.raises(Asked, match="chosen cuda:1"):
         main(["--debug", *words, "--device", "cuda:1"])
+
+
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        (policy_eval, ["policy-eval", "rails_03", "random", "still"]),
+        (augment, ["augment", "rails_03", "made"]),
+    ],
+)
+def test_the_precision_reaches_the_world(
+    module: Any, words: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def load(checkpoint: str, **given: Any) -> World:
+        raise Asked(given["precision"], given["compile"])
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(module, "load_world", load)
+    with pytest.raises(Asked) as said:
+        main(["--debug", *words, "--precision", "bf16", "--compile", "--device", "cpu"])
+    assert said.value.args == ("bf16", True)
 
 
 def test_a_device_that_is_not_here_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
