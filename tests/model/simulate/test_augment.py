@@ -80,7 +80,6 @@ def test_replayed_episodes_hold_the_recorders_commands_and_say_that_they_are_syn
         np.testing.assert_array_equal(columns["tokens"][:known].reshape(stored.shape), stored)
 
 
-@pytest.mark.slow
 def test_the_plan_names_a_precision_that_changes_tokens(
     world: World, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -89,6 +88,7 @@ def test_the_plan_names_a_precision_that_changes_tokens(
     assert augment(tmp_path / "half", asked(), world=world).plan["made_by"]["precision"] == "bf16"
 
 
+@pytest.mark.slow
 def test_synthetic_episodes_merge_with_recorded_ones_and_the_whole_says_so(
     world: World, tmp_path: Path
 ) -> None:
