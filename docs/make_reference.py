@@ -86,7 +86,7 @@ def _command(name: str, command: Any) -> list[str]:
 
 def _spelled(param: Any, names: str) -> str:
     """Return an option's names with its values in words: `--limit <int>`."""
-    names = re.sub(r"<(int|float) range>", r"<\1>", names)
+    names = re.sub(r"<(int|float) range>", r"<\1>", names).replace("|", " or ")  # tables end a cell at a |
     return re.sub(r"<list\[(\w+)\]>", lambda kind: f"<{kind[1].lower()}>", names)
 
 

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -61,9 +62,27 @@ def test_its_metadata_ask_for_one_opencv_and_state_the_version(installed: Path) 
     (folder,) = installed.glob("hma_toolkit-*.dist-info")
     metadata = PathDistribution(folder).metadata
     asked = {re.split(r"[^\w-]", line)[0] for line in metadata.get_all("Requires-Dist", [])}
-    assert metadata["Version"] == __version__ and (folder / "licenses" / "LICENSE").is_file()
+    licences = {path.name for path in (folder / "licenses").iterdir()}
+    assert metadata["Version"] == __version__ and licences == {"LICENSE", "NOTICE"}
     assert {name for name in asked if "opencv" in name} == {"opencv-python-headless"}
     assert "gym-pusht" not in asked  # it asks for the other build of OpenCV
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no checkout")
+def test_it_says_which_revision_it_was_built_from(installed: Path, tmp_path: Path) -> None:
+    command = ["git", "-C", str(ROOT), "rev-parse", "HEAD"]
+    built = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)  # a user's repository around it
+    shutil.copytree(installed, tmp_path / "site")
+    code = "import torch, hma_model.training.runtime as r; print(r.environment(torch.device('cpu')))"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code],
+        env={**os.environ, "PYTHONPATH": str(tmp_path / "site")},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert f"'git_revision': '{built}'" in done.stdout
 
 
 def test_every_extra_that_an_error_names_is_one(installed: Path) -> None:

@@ -282,7 +282,8 @@ class _Draft:
 
     def _component(self, key: KeyInfo) -> dict[str, Any]:
         component = _named(key, key.names)
-        switch = key.dtype == "bool" or (is_gripper(key.key) and not self.bag)  # in bags: metres, or 0 to 255
+        ends = key.low in (0, -1) and key.high == 1  # in bags a gripper may also be in metres, or 0 to 255
+        switch = key.dtype == "bool" or (is_gripper(key.key) and (ends or not self.bag))
         return component | ({"normalize": False} if component["dims"] == 1 and switch else {})
 
     def _cameras(self) -> list[dict[str, Any]]:

@@ -38,10 +38,14 @@ p { max-width:48rem } .soft, figcaption, th { color:var(--soft) } a { color:var(
   padding:.7rem .9rem }
 .figures b { display:block; font-size:1.3rem; white-space:nowrap; font-variant-numeric:tabular-nums }
 .figures span { color:var(--soft); font-size:.86rem }
-.scroll { overflow-x:auto }
+.scroll { overflow-x:auto;  /* a shadow at the edge says that columns go on beyond it */
+  background:linear-gradient(90deg, var(--paper) 50%, transparent) left / 3rem 100% no-repeat local,
+    linear-gradient(270deg, var(--paper) 50%, transparent) right / 3rem 100% no-repeat local,
+    linear-gradient(90deg, var(--line), transparent) left / 1rem 100% no-repeat scroll,
+    linear-gradient(270deg, var(--line), transparent) right / 1rem 100% no-repeat scroll }
 table { border-collapse:collapse; margin:.6rem 0; font-variant-numeric:tabular-nums }
 th, td { text-align:left; padding:.34rem .9rem .34rem 0; border-bottom:1px solid var(--line);
-  white-space:nowrap }
+  white-space:nowrap } th { white-space:normal }
 td.n, th.n { text-align:right } td { vertical-align:top }
 td small { color:var(--soft) } small { display:inline-block; line-height:1.35; font-weight:400 }
 td:first-child small { white-space:normal; min-width:6.5rem }
@@ -57,7 +61,9 @@ h3 { font-size:1rem; margin:1.6rem 0 0 } h3 + p { margin:.1rem 0 .5rem }
 .strips { display:grid; grid-template-columns:8.5rem 1fr; gap:.3rem .8rem; align-items:center }
 .strips span { color:var(--soft); font-size:.86rem } .strips img { display:block; border-radius:4px }
 @media (max-width:640px) { .strips, dl { grid-template-columns:1fr; gap:.15rem } .strips img, dd
-  { margin-bottom:.5rem } }
+  { margin-bottom:.5rem } table:not(.dense) { font-size:.75rem }
+  table:not(.dense) :is(th, td) { padding-right:.4rem; font-size:inherit }
+  table:not(.dense) td:first-child { white-space:normal; overflow-wrap:anywhere; min-width:4.2rem } }
 pre { background:var(--card); border:1px solid var(--line); border-radius:10px; padding:.8rem 1rem;
   overflow-x:auto; font:13.5px/1.5 ui-monospace, monospace }
 """

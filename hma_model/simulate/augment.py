@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.console import Update
 from hma_data.conversion.output import locked
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab.simulator import simulated
@@ -36,7 +35,7 @@ from hma_model.evaluation.probe import Probe, train_probe
 from hma_model.simulate.arenas import Arena, Floats, ModelArena, Scenes, TrueArena
 from hma_model.simulate.pictures import seen_cameras
 from hma_model.simulate.policies import Judged, Policy, read_policy
-from hma_model.simulate.policy_eval import run
+from hma_model.simulate.policy_eval import Progress, run
 from hma_model.simulate.prompts import default_frames, read_prompt
 from hma_model.simulate.scenes import Prompt
 from hma_model.simulate.synthetic import (
@@ -167,7 +166,7 @@ def augment(
     world: World | None = None,
     device: str = "cpu",
     compile: bool = False,
-    on_progress: Update = lambda done, extra="", total=None: None,
+    on_progress: Progress = lambda done, words: None,
 ) -> Manifest:
     """Make synthetic episodes, and write those that are kept as a shard set.
 
@@ -180,7 +179,7 @@ def augment(
         world: a world instead of a checkpoint.
         device: of the world made from the checkpoint, and of policies that are networks.
         compile: of that world, as of `World`.
-        on_progress: called with the frames done, what is done, and of the dataset with all its frames too.
+        on_progress: called with the frames made, of `episodes` × `frames`, and what is done.
 
     Raises:
         HMAError: the robot, the shards or the policy do not fit, the folder holds something else, the judge
@@ -216,10 +215,11 @@ def augment(
             found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
             shutil.rmtree(folder / WORK)
         if dataset is not None and not done:
-            frames = sum(split["frames"] for split in found.splits.values()) * found.frame_stride
+            made = settings.episodes * settings.frames
+            kept = sum(split["frames"] for split in found.splits.values()) * found.frame_stride
 
             def tell(at: int, words: str) -> None:
-                on_progress(at, f"LeRobot: {words}", frames)
+                on_progress(made, f"LeRobot: {at:,} of {kept:,} frames, {words}")
 
             write_as_lerobot(dataset, folder, world.tokenizer, tell)
     return found
@@ -281,7 +281,7 @@ class _Maker:
             raise UsageError(shards.folder, fault, "give fewer --frames")
         return found
 
-    def run(self, work: Path, on_progress: Update) -> list[Batch]:
+    def run(self, work: Path, on_progress: Progress) -> list[Batch]:
         """Return all batches; those in the folder are not made again."""
         count, frames = self.settings.episodes, self.settings.frames
         batches = []
@@ -300,7 +300,7 @@ class _Maker:
             on_progress(min(begin + BATCH, count) * frames, "")
         return batches
 
-    def _train(self, on_progress: Update) -> None:
+    def _train(self, on_progress: Progress) -> None:
         """Train the judge, or the probe alone, if they are asked for."""
         settings = self.settings
         if self.probe is not None or not settings.looked_at:

@@ -56,6 +56,12 @@ def _rate(row: dict[str, Any], name: str) -> str:
     return f"{row[f'{name}_success']:.0%} ({low:.0%}–{high:.0%})"
 
 
+def _below(cell: Any) -> Any:
+    """Return a cell with its interval below the value, which leaves room for the last columns."""
+    share, bracket, interval = cell.rpartition(" (") if isinstance(cell, str) else ("", "", "")
+    return f"{share}\n{interval.rstrip(')')}" if bracket else cell
+
+
 def sentences(found: PolicyEvaluation) -> list[str]:
     """Return in words what the table means: the task, the judge, the correlations."""
     share = "not known" if found.followed is None else f"{found.followed:.2f}"
@@ -143,7 +149,7 @@ def html(found: PolicyEvaluation) -> str:
     for sentence in doubt(found):  # before anybody reads the rates
         page.section("Do not rely on the model's rates", sentence[:1].upper() + sentence[1:] + ".")
     page.definitions(legend)
-    page.table(COLUMNS, table(found))
+    page.table(COLUMNS, [[_below(cell) for cell in row] for row in table(found)])
     for sentence in [one for one in sentences(found) if one not in doubt(found)]:
         page.text(sentence[:1].upper() + sentence[1:] + ".")
     page.section("Success rates", "A policy is a point; bars are 95 % intervals over episodes.")

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+import hma_data
 from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
 
 if TYPE_CHECKING:
@@ -46,21 +47,28 @@ def choose_device(name: str) -> torch.device:
 
 def environment(device: torch.device) -> dict[str, Any]:
     """Return the facts besides the recipe on which the run's figures may depend."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)
-        revision = done.stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        revision = ""
     return {
         "hma_toolkit": version("hma-toolkit"),
-        "git_revision": revision,
+        "git_revision": _git_revision(),
         "python": platform.python_version(),
         "torch": torch.__version__,
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device),
         "threads": torch.get_num_threads(),
         "platform": platform.platform(),
     }
+
+
+def _git_revision() -> str:
+    """Return the revision of the checkout, or the one that the wheel was built from; empty if unknown."""
+    root = Path(hma_data.__file__).parents[1]
+    with suppress(OSError):
+        return (root / "hma_data/shipped/REVISION").read_text(encoding="utf-8")
+    if not (root / ".git").exists():  # git would answer for a repository around the installation
+        return ""
+    with suppress(OSError, subprocess.SubprocessError):
+        command = ["git", "-C", str(root), "rev-parse", "HEAD"]
+        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+    return ""
 
 
 @contextmanager

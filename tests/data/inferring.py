@@ -138,6 +138,18 @@ def floats(count: int) -> Message:
     return "std_msgs/msg/Float64MultiArray", make
 
 
+def switch(low: float, high: float) -> Message:
+    """A value that is low in even periods of 50 ms and high in odd ones."""
+    kind, make = floats(1)
+
+    def turn(store: Any, ns: int) -> Any:
+        message = make(store, ns)
+        message.data[:] = high if ns // 50_000_000 % 2 else low
+        return message
+
+    return kind, turn
+
+
 def trajectory() -> Message:
     def make(store: Any, ns: int) -> Any:
         none = np.zeros(0)

@@ -18,6 +18,7 @@ from tests.data.inferring import (
     pictures,
     pose,
     questions,
+    switch,
     trajectory,
     twist,
 )
@@ -94,6 +95,18 @@ def test_a_gripper_that_is_commanded_more_often_does_not_replace_its_arm(tmp_pat
         "/gripper/command.position",
     ]
     assert first_clip(path, values).actions.shape[1] == 7
+
+
+def test_a_gripper_that_opens_and_closes_keeps_its_two_values(tmp_path: Path) -> None:
+    for low, high, kept in ((0, 1, True), (-1, 1, True), (0, 0.04, False), (0, 255, False)):
+        topics = {
+            "/camera/image": (picture_of(), 20),
+            "/arm/command": (joints_of("a", "b"), 20),
+            "/gripper/command": (switch(low, high), 20),
+        }
+        arm, gripper = inferred(bag(tmp_path / f"{high}_{low}", topics))["action"]["components"]
+        assert gripper["key"] == "/gripper/command.data" and "normalize" not in arm
+        assert gripper.get("normalize", True) is not kept
 
 
 def test_several_commands_are_a_question_that_names_the_others(tmp_path: Path) -> None:

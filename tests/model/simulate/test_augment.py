@@ -344,15 +344,20 @@ def test_the_camera_that_is_shown_is_the_one_that_is_named(tmp_path: Path) -> No
 def test_lerobot_loads_the_dataset(world: World, tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    told: list[tuple[Any, ...]] = []
-    given: Any = {"world": world, "lerobot": tmp_path / "rails", "on_progress": lambda *now: told.append(now)}
+    told: list[tuple[float, str]] = []
+
+    def tell(done: float, words: str) -> None:
+        told.append((done, words))
+
+    given: Any = {"world": world, "lerobot": tmp_path / "rails", "on_progress": tell}
     augment(tmp_path / "out", asked(episodes=2), **given)
     loaded = LeRobotDataset("lab/rails", root=tmp_path / "rails")
     stride = world.model.embodiments[ROBOT].stride
     columns = episodes(tmp_path / "out")
     assert loaded.num_episodes == 2 and len(loaded) == sum(len(one["action"]) for one in columns) * stride
-    written = [now for now in told if now[1].startswith("LeRobot")]  # with frames of its own
-    assert written[0][0] == 0 and written[-1][0] == len(loaded) == written[-1][2]
+    written = [words for done, words in told if words.startswith("LeRobot") and done == 2 * FRAMES]
+    assert written[0].startswith(f"LeRobot: 0 of {len(loaded)} frames, ")
+    assert written[-1].startswith(f"LeRobot: {len(loaded)} of {len(loaded)} frames, ")
     first, second = (world.tokenizer.decode(columns[0]["tokens"][at].reshape(1, 8, 8))[0] for at in (0, 1))
     for at, shown in ((0, first), (stride - 1, first), (stride, second)):
         stored = loaded[at]["observation.images.top"].permute(1, 2, 0).numpy() * 255

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -323,6 +324,22 @@ def _world_of(model: HMA) -> World:
     made = object.__new__(World)
     made.model, made._commands = model, {}
     return made
+
+
+@pytest.mark.slow
+def test_a_narrow_window_shows_the_last_columns(world: World, judge: StateJudge) -> None:
+    from playwright.sync_api import sync_playwright
+
+    if not (chromium := shutil.which("chromium")):
+        pytest.skip("no Chromium")
+    found = evaluate_policies(ROBOT, ["random", "still"], world=world, judge=judge, episodes=8, frames=4)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 500, "height": 900})
+        page.set_content(html(found))
+        table = page.locator(".scroll").first
+        assert table.evaluate("box => box.scrollWidth - box.clientWidth") == 0
+        browser.close()
 
 
 def test_policies_that_are_paths_go_by_short_names_with_a_legend(world: World, judge: StateJudge) -> None:
