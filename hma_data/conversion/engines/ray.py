@@ -9,6 +9,8 @@ LOSSES_AT_A_STEP attempts that go step by step have ended at one step; then that
 """
 
 import os
+import re
+import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -25,6 +27,7 @@ from hma_data.errors import HMAError, MissingDependencyError, install_command
 TICK_S = 0.5
 ANSWER_S = 1.0  # seconds for which an actor collects events before it answers
 ANSWERS_A_S = 100.0  # largest number of answers a second that the driver processes
+CONNECT_S = 10.0  # for the answer of a cluster's address
 NO_ROOM_S = 900.0  # seconds without any actor that could be placed
 SLOW_START_S = 60.0  # seconds after which the user hears that no actor is ready
 LOST_STARTS = 4  # limit of losses in a row, for each worker and one more, before any actor is ready
@@ -102,11 +105,14 @@ def import_ray() -> Any:
 
 
 def _join(ray: Any) -> None:
+    address = os.environ.get("RAY_ADDRESS")
     try:
+        if address and (found := re.fullmatch(r"(?:ray://)?\[?([^/]+?)]?:(\d+)", address)):
+            # Ray itself asks a wrong address again and again for many minutes
+            socket.create_connection((found[1], int(found[2])), CONNECT_S).close()
         ray.init(log_to_driver=False, logging_level="warning", include_dashboard=False)
     except Exception as fault:  # Ray raises some errors of this class here
         ray.shutdown()
-        address = os.environ.get("RAY_ADDRESS")
         where = f"the Ray cluster at {address}" if address else "Ray on this machine"
         what = f"cannot be {'joined' if address else 'started'}: {_first_line(fault)}"
         remedy = "check the address with `ray status`" if address else "leave out --engine ray"

@@ -273,7 +273,8 @@ def actors_of(pid: int) -> list[int]:
     ("address", "said"),
     [
         ("", "Ray on this machine: cannot be started: timed out"),
-        ("10.0.0.9:6379", "the Ray cluster at 10.0.0.9:6379: cannot be joined: timed out"),
+        ("auto", "the Ray cluster at auto: cannot be joined: timed out"),
+        ("127.0.0.1:1", "the Ray cluster at 127.0.0.1:1: cannot be joined: [Errno 111] Connection refused"),
     ],
 )
 def test_a_cluster_that_does_not_answer_is_one_error(
