@@ -4,7 +4,8 @@ A reader that knows which parts it will need says so (`Blocks.expect`). While it
 blocks of expected parts are on their way. Blocks that nobody expects are fetched when they are read.
 
 What a reader will need once more, such as the pictures of an episode of which it looks for the times first,
-it can keep until then. One cache serves all files of a process, so memory does not grow with their number or size.
+it can keep until then. One cache serves all files of a process, so memory does not grow with their number or
+size.
 """
 
 import itertools
