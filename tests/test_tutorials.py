@@ -97,3 +97,36 @@ def test_a_tutorial_has_no_command_that_the_test_passes_over(page: Path) -> None
     text = page.read_text()
     fences = [fence for fence in re.findall(r"^```(\S.*)$", text, re.MULTILINE) if fence != "text"]
     assert len(fences) == len(BLOCK.findall(text)) >= 5
+
+
+@pytest.mark.slow
+def test_the_slurm_script_of_batch_jobs_runs_task_by_task(tmp_path: Path) -> None:
+    from hma_data.lab import record
+
+    page = (ROOT / "docs/batch-jobs.md").read_text()
+    text = re.search(r"^```bash\n(#!/bin/bash\n.*?)^```", page, re.MULTILINE | re.DOTALL)[1]
+    record("pendulum", tmp_path / "raw", episodes=4)
+    here = {
+        "-e my_arm": "-e pendulum --tokenizer fsq-8",
+        "/shared/raw/my_arm": str(tmp_path / "raw/pendulum"),
+        "/shared/shards/my_arm": str(tmp_path / "out"),
+        "--shard-frames 50000": "--shard-frames 200",
+        "--shard-count 64": "--shard-count 2",
+        "--workers 4": "--workers 1",
+        ".venv/bin/hma": f"{sys.executable} -m hma_model.cli",
+    }
+    for stated, small in here.items():
+        assert text.count(stated) == 1, stated
+        text = text.replace(stated, small)
+    (tmp_path / "job.sh").write_text(text)
+    stand_in = tmp_path / "srun"
+    stand_in.write_text('#!/bin/bash\nwhile [[ $1 == --* ]]; do shift; done\nexec "$@"\n')
+    stand_in.chmod(0o755)
+    for task in (1, 0):
+        slurm = {"SLURM_ARRAY_TASK_ID": str(task), "SLURM_CPUS_PER_TASK": "4", "SLURM_SUBMIT_DIR": str(ROOT)}
+        env = {**os.environ, **slurm, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+        done = subprocess.run(
+            ["bash", str(tmp_path / "job.sh")], env=env, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+    assert "the manifest is written" in done.stdout

@@ -320,16 +320,15 @@ def _ready(job: _Job) -> Any:
 @contextmanager
 def _shown(job: _Job) -> "Iterator[Callable[[Progress], None]]":
     with progress(f"convert {Path(job.embodiment).stem}") as update:
-        told, idle = 0, ""
+        noticed = told = 0
 
         def show(state: "Progress") -> None:
-            nonlocal told, idle
-            if state.idle and not idle:
-                idle = state.idle
-                typer.echo(idle, err=True)
+            nonlocal noticed, told
+            for line in state.notices[noticed:]:
+                typer.echo(line, err=True)
             for reason in state.retries[told:]:
                 typer.echo(f"again: a worker {reason}", err=True)
-            told = len(state.retries)
+            noticed, told = len(state.notices), len(state.retries)
             words = f"{state.episodes:,}/{state.total_episodes:,} episodes, {human_bytes(state.bytes)}"
             if state.quarantined:
                 words += f", {state.quarantined:,} in quarantine"

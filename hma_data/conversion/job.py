@@ -305,7 +305,8 @@ class _Conversion:
         )
         if todo or (plan.units and not mine):  # a share may have no shard at all
             tasks = share.count if share else 1
-            progress.idle = idle_workers(plan, len(todo), self.workers, tasks, bool(there))
+            if line := idle_workers(plan, len(todo), self.workers, tasks, bool(there)):
+                progress.notices.append(line)
         on_progress(progress)
         if todo:
             with Journal(self.out, share) as journal:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from hma_data.conversion.engines import Retry
+from hma_data.conversion.engines import Notice, Retry
 from hma_data.conversion.plan import Plan
 from hma_data.conversion.worker import Seen, Tick
 from hma_data.errors import RegistryError
@@ -22,7 +22,7 @@ class Progress:
     """The progress of a conversion, as the console shows it.
 
     Attributes:
-        idle: a line for the user where workers have no shard to make, see `idle_workers`; else empty.
+        notices: lines for the user: workers that have no shard to make, or that no node can hold.
     """
 
     episodes: int = 0
@@ -34,7 +34,7 @@ class Progress:
     total_frames: int = 0
     retries: list[str] = field(default_factory=list)
     pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
-    idle: str = ""
+    notices: list[str] = field(default_factory=list)
     started: float = field(default_factory=time.monotonic)
 
 
@@ -94,9 +94,13 @@ class Counter:
         self._progress, self._on_progress = progress, on_progress
         self._by_unit: dict[int, dict[str, int]] = {}
 
-    def __call__(self, unit: int, event: Tick | Seen | Retry) -> None:
+    def __call__(self, unit: int, event: Tick | Seen | Retry | Notice) -> None:
         if isinstance(event, Seen):
             self._progress.pictures.setdefault(event.camera, (event.height, event.width))
+            return
+        if isinstance(event, Notice):
+            self._progress.notices.append(event.text)
+            self._on_progress(self._progress)
             return
         counts = self._by_unit.setdefault(unit, dict.fromkeys(vars(Tick()), 0))
         if isinstance(event, Retry):

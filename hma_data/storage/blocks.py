@@ -3,8 +3,9 @@
 A reader that knows which parts it will need says so (`Blocks.expect`). While it reads such a part, the next
 blocks of expected parts are on their way. Blocks that nobody expects are fetched when they are read.
 
-What a reader will need again, such as the pictures of an episode of which it looks for the times first, it
-can keep. One cache serves all files of a process, so memory does not grow with their number or size.
+What a reader will need once more, such as the pictures of an episode of which it looks for the times first,
+it can keep until then. One cache serves all files of a process, so memory does not grow with their number or
+size.
 """
 
 import itertools
@@ -26,7 +27,7 @@ from hma_data.storage.remote import RemotePath, SeekableFile, fetch_range
 BLOCK = 1 << 20  # bytes of a request
 AHEAD = 32  # expected blocks on their way while one is read
 KEPT = 64  # blocks in memory
-PARTS = 256 << 20  # bytes of parts in memory, such as pictures, that will be read again
+PARTS = 256 << 20  # most bytes of parts in memory, such as pictures, that will be read once more
 REQUESTS = 16  # at once
 
 Fetch = Callable[[int, int], bytes]  # (start, end) -> the bytes between them
@@ -51,10 +52,12 @@ class _Cache:
             while self._bytes > PARTS:
                 self._bytes -= len(self._parts.popitem(last=False)[1])
 
-    def kept(self, key: tuple[int, Hashable]) -> bytes | None:
-        """Return a part that was kept; None where it is not there any more."""
+    def take(self, key: tuple[int, Hashable]) -> bytes | None:
+        """Return a part that was kept, and drop it; None where it is not there any more."""
         with self._lock:
-            return self._parts.get(key)
+            found = self._parts.pop(key, None)
+            self._bytes -= len(found or b"")
+        return found
 
     def want(self, key: tuple[int, int], load: Callable[[], bytes]) -> Future[bytes]:
         """Return a block, or begin to fetch it; blocks not wanted for longest are dropped."""
@@ -140,9 +143,9 @@ class Blocks:
         """Keep a part of the file under a name, while there is room."""
         _cache(os.getpid()).keep((self._number, name), data)
 
-    def kept(self, name: Hashable) -> bytes | None:
-        """Return the part of that name; None where it is not kept."""
-        return _cache(os.getpid()).kept((self._number, name))
+    def take(self, name: Hashable) -> bytes | None:
+        """Return the part of that name, which is then kept no longer; None where it is not kept."""
+        return _cache(os.getpid()).take((self._number, name))
 
     def _ahead(self, at: int, count: int) -> None:
         """Begin to fetch the expected blocks from the `at`th on, here and in the files that follow."""

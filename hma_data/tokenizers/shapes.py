@@ -4,6 +4,11 @@ The command that plans a conversion needs what a tokenizer is, not its network: 
 """
 
 import math
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -135,11 +140,20 @@ def read_shape[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[C,
 def get_spec(name_or_path: StrPath, *, weights: StrPath | None = None) -> TokenizerSpec:
     """Return the spec of the tokenizer that `get_tokenizer` makes of the same arguments.
 
-    With weights from inside the package, neither torch nor the weights are loaded.
+    Where torch is not loaded yet, it stays so: weights from inside the package are only looked at, others
+    are opened in a process that ends.
     """
     entry = usable_entry(as_text(name_or_path))
     if entry.weights == "embedded" and weights is None and entry.name in CATALOG:
         kind: type[FsqConfig | VaeConfig] = FsqConfig if entry.name.startswith("fsq") else VaeConfig
         shape, sha256 = read_shape(EMBEDDED / entry.file, kind.format, kind)
         return shape.spec(entry.name, entry.image_size, sha256)
+    if "torch" in entry.imports and "torch" not in sys.modules:
+        with suppress(BrokenProcessPool), ProcessPoolExecutor(1, get_context("spawn")) as apart:
+            return apart.submit(_open_spec, name_or_path, weights).result()
+        # a script that does not guard its entry: the workers say so
+    return _open_spec(name_or_path, weights)
+
+
+def _open_spec(name_or_path: StrPath, weights: StrPath | None) -> TokenizerSpec:
     return get_tokenizer(name_or_path, weights=weights).spec

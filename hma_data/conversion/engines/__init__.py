@@ -31,6 +31,13 @@ class Retry:
 
 
 @dataclass(frozen=True)
+class Notice:
+    """An event of the engine: a line for the user, about no unit."""
+
+    text: str
+
+
+@dataclass(frozen=True)
 class Attempt:
     """The attempt at a unit: 0 is the first, later ones take one step at a time to find the failing step."""
 

@@ -9,6 +9,8 @@ LOSSES_AT_A_STEP attempts that go step by step have ended at one step; then that
 """
 
 import os
+import re
+import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -18,18 +20,21 @@ from functools import partial
 from threading import Condition
 from typing import Any
 
-from hma_data.conversion.engines import LIMITS, Attempt, Cause, Ledger, Limits, OnEvent, Step, Work
+from hma_data.conversion.engines import LIMITS, Attempt, Cause, Ledger, Limits, Notice, OnEvent, Step, Work
 from hma_data.cpu import take_ordinary_priority
 from hma_data.errors import HMAError, MissingDependencyError, install_command
 
 TICK_S = 0.5
 ANSWER_S = 1.0  # seconds for which an actor collects events before it answers
 ANSWERS_A_S = 100.0  # largest number of answers a second that the driver processes
+CONNECT_S = 10.0  # for the answer of a cluster's address
 NO_ROOM_S = 900.0  # seconds without any actor that could be placed
+SLOW_START_S = 60.0  # seconds after which the user hears that no actor is ready
 LOST_STARTS = 4  # limit of losses in a row, for each worker and one more, before any actor is ready
 LOSSES_AT_A_STEP = 3
 UV_ENVIRONMENT = "RAY_ENABLE_UV_RUN_RUNTIME_ENV"
 INSTALLED = "install hma-toolkit and what it needs on every node; see Ray's logs"
+SMALLER = "change --worker-cpus, --worker-gpus or --device"
 
 
 def run(
@@ -56,8 +61,13 @@ def run(
     ours = not ray.is_initialized()
     if ours:
         _join(ray)
-    if not os.environ.get("RAY_ADDRESS"):
-        _check_room(ray, {"CPU": cpus, "GPU": gpus}, ours)
+    if lack := _lack_of_room(ray, {"CPU": cpus, "GPU": gpus}):
+        if not os.environ.get("RAY_ADDRESS"):  # a cluster of this machine does not grow
+            if ours:
+                ray.shutdown()
+            raise HMAError("Ray on this machine", lack, f"set RAY_ADDRESS to a larger cluster, or {SMALLER}")
+        text = f"the Ray cluster {lack}; waiting for a node, {NO_ROOM_S / 60:g} minutes at most"
+        on_event(0, Notice(f"{text}: Ctrl-C and {SMALLER} if the cluster does not grow"))
     ledger = Ledger(units, limits, on_event)
     count = min(max(workers, 1), max(len(ledger.units), 1))
     # no task events: for its dashboard, Ray keeps a record of each call in three processes
@@ -95,27 +105,28 @@ def import_ray() -> Any:
 
 
 def _join(ray: Any) -> None:
+    address = os.environ.get("RAY_ADDRESS")
     try:
+        if address and (found := re.fullmatch(r"(?:ray://)?\[?([^/]+?)]?:(\d+)", address)):
+            # Ray itself asks a wrong address again and again for many minutes
+            socket.create_connection((found[1], int(found[2])), CONNECT_S).close()
         ray.init(log_to_driver=False, logging_level="warning", include_dashboard=False)
     except Exception as fault:  # Ray raises some errors of this class here
         ray.shutdown()
-        address = os.environ.get("RAY_ADDRESS")
         where = f"the Ray cluster at {address}" if address else "Ray on this machine"
         what = f"cannot be {'joined' if address else 'started'}: {_first_line(fault)}"
-        raise HMAError(where, what, "see `ray status`, or leave out --engine ray") from fault
+        remedy = "check the address with `ray status`" if address else "leave out --engine ray"
+        raise HMAError(where, what, remedy) from fault
 
 
-def _check_room(ray: Any, wanted: dict[str, float], ours: bool) -> None:
-    """Raise HMAError if no node has what a worker reserves; a cluster of this machine does not grow."""
+def _lack_of_room(ray: Any, wanted: dict[str, float]) -> str:
+    """Return in words that no node has what a worker reserves; empty if one has, busy or not."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     if any(all(node.get(kind, 0) >= count for kind, count in wanted.items()) for node in nodes):
-        return
-    if ours:
-        ray.shutdown()
+        return ""
     best = {kind: max((node.get(kind, 0) for node in nodes), default=0) for kind in wanted}
     text = " and ".join(f"{count:g} {kind} (of {best[kind]:g})" for kind, count in wanted.items() if count)
-    remedy = "set RAY_ADDRESS to a larger cluster, or change --worker-cpus, --worker-gpus or --device"
-    raise HMAError("Ray on this machine", f"has no room for a worker, which reserves {text}", remedy)
+    return f"has no room for a worker, which reserves {text}"
 
 
 # -- in an actor
@@ -212,6 +223,7 @@ class _Actors:
         self._losses: Counter[tuple[int, str]] = Counter()  # of attempts that went step by step
         self._lost_starts = 0
         self._placed = time.monotonic()  # when an actor was last ready
+        self._told = False  # that none is
         for slot in self._slots:
             self._open(slot)
 
@@ -241,11 +253,20 @@ class _Actors:
             if slot.unit is not None and not slot.hung and quiet_s is not None and waited > quiet_s:
                 slot.hung = True
                 self._ray.kill(slot.actor, no_restart=False)
+        self._watch_start()
+
+    def _watch_start(self) -> None:
+        """Tell the user once that no actor is ready; raise HMAError after NO_ROOM_S."""
         if any(slot.task is None or slot.unit is not None for slot in self._slots):
             self._placed = time.monotonic()
-        elif time.monotonic() - self._placed > NO_ROOM_S:
+        waited = time.monotonic() - self._placed
+        if waited > NO_ROOM_S:
             remedy = "see `ray status`; every worker needs a CPU, and a GPU with --device cuda"
             raise HMAError("the Ray cluster", f"has had no room for a worker for {NO_ROOM_S:g} s", remedy)
+        if waited > SLOW_START_S and not self._told:
+            self._told = True
+            text = f"no worker is ready after {waited:.0f} s: they wait for room, or load the tokenizer"
+            self._on_event(0, Notice(f"{text}; `ray status` shows what is reserved"))
 
     def _hear(self, slot: _Slot) -> None:
         look, slot.look = slot.look, None
@@ -267,7 +288,7 @@ class _Actors:
         except self._ray.exceptions.RayTaskError as fault:
             raise HMAError("the Ray cluster", f"cannot work: {_first_line(fault)}", INSTALLED) from fault
         except self._ray.exceptions.RayError as fault:
-            self._lost(slot, "was lost: " + _first_line(fault))
+            self._lost(slot, "was lost: " + _first_line(fault).split(": ")[0].split(". ")[0].rstrip("."))
             return
         if number is not None:
             end, events = end

@@ -235,7 +235,7 @@ class IndexedFile(ABC):
         with reading(self.path), self._file.open() as file:
             last = -1
             for offset, at in places:
-                kept = file.blocks.kept((offset, at)) if isinstance(file, BlockFile) else None
+                kept = file.blocks.take((offset, at)) if isinstance(file, BlockFile) else None
                 if kept is not None:
                     yield kept
                     continue

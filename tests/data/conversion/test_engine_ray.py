@@ -61,6 +61,7 @@ def test_a_process_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None
     assert results["bad"] == ["a", "b", "c"]
     (retry,) = [event for _, event in events if isinstance(event, Retry)]
     assert retry.reason.startswith("was lost: ")
+    assert "rpc" not in retry.reason.lower()  # what Ray says of its connections
 
 
 @on_a_cluster
@@ -106,6 +107,24 @@ def test_a_worker_that_no_node_of_this_machine_can_hold_is_one_error(
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     with pytest.raises(HMAError, match=f"has no room for a worker.*{said}"):
         list(engine.run(PLAIN, Unreadable(), 1, lambda number, event: None, LIMITS, **wanted))
+
+
+@on_a_cluster
+def test_a_cluster_that_was_named_is_waited_for_and_the_user_hears_of_it(
+    cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hma_data.conversion.engines import ray as engine
+
+    said: list[str] = []
+    monkeypatch.setenv("RAY_ADDRESS", cluster.address)
+    monkeypatch.setattr(engine, "SLOW_START_S", 0.5)
+    monkeypatch.setattr(engine, "NO_ROOM_S", 3)
+    with pytest.raises(HMAError, match="has had no room for a worker for 3 s"):
+        heard = lambda number, event: said.append(event.text)  # noqa: E731
+        list(engine.run(PLAIN, Unreadable(), 1, heard, LIMITS, gpus=1))
+    assert len(said) == 2
+    assert "1 GPU (of 0); waiting for a node" in said[0]
+    assert "no worker is ready" in said[1]
 
 
 @on_a_cluster
@@ -254,7 +273,8 @@ def actors_of(pid: int) -> list[int]:
     ("address", "said"),
     [
         ("", "Ray on this machine: cannot be started: timed out"),
-        ("10.0.0.9:6379", "the Ray cluster at 10.0.0.9:6379: cannot be joined: timed out"),
+        ("auto", "the Ray cluster at auto: cannot be joined: timed out"),
+        ("127.0.0.1:1", "the Ray cluster at 127.0.0.1:1: cannot be joined: [Errno 111] Connection refused"),
     ],
 )
 def test_a_cluster_that_does_not_answer_is_one_error(

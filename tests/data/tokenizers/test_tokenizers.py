@@ -20,7 +20,7 @@ from hma_data.tokenizers.training.eval import CodebookUse, evaluate, psnr_db, ss
 from hma_data.tokenizers.training.frames import read_films
 from hma_data.tokenizers.training.recipe import load_recipe
 from tests.data.fresh import run_fresh
-from tests.data.tokenizer_files import draw_scene
+from tests.data.tokenizer_files import draw_scene, write_tiny_whole
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
 FORMAT, WEIGHTS = FsqConfig.format, EMBEDDED / "fsq.safetensors"
@@ -63,6 +63,24 @@ def test_the_spec_of_embedded_weights_needs_no_torch() -> None:
 def test_the_spec_of_other_weights_is_theirs(tmp_path: Path) -> None:
     save_weights(tmp_path / "w", FORMAT, SMALL, dict(FsqAutoencoder(SMALL).named_parameters()), {})
     assert get_spec("fsq-8", weights=tmp_path / "w") != get_spec("fsq-8")
+
+
+@pytest.mark.slow  # a process that imports torch
+def test_the_spec_of_a_file_of_weights_is_read_without_torch_in_this_process(tmp_path: Path) -> None:
+    path = write_tiny_whole(tmp_path / "taesd.safetensors")
+    run_fresh(
+        "import sys\n"
+        "from hma_data.errors import TokenizerError\n"
+        "from hma_data.tokenizers.base import get_tokenizer\n"
+        "from hma_data.tokenizers.shapes import get_spec\n"
+        f"path = {str(path)!r}\n"
+        "spec = get_spec('taesd', weights=path)\n"
+        "try: get_spec('magvit2', weights=path)\n"
+        "except TokenizerError as fault: assert path in str(fault)\n"
+        "else: raise AssertionError\n"
+        "assert 'torch' not in sys.modules\n"
+        "assert spec == get_tokenizer('taesd', weights=path).spec"
+    )
 
 
 @pytest.mark.parametrize("name", HERE)

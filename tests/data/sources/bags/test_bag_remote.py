@@ -143,6 +143,18 @@ def test_blocks_ahead_are_fetched_before_they_are_read() -> None:
     assert len(asked) == len(set(asked))  # each block once
 
 
+def test_pictures_that_were_read_twice_take_no_memory(small, tmp_path: Path) -> None:
+    """Of bags of any length, a process holds the pictures of an episode, not the last 256 MiB of them."""
+    uri = put(large_run(tmp_path), tmp_path.name)
+    cache = blocks._cache(os.getpid())
+    before = cache._bytes
+    episode = SOURCE.read(uri, SOURCE.index(uri, GAP)[0].id, GAP)
+    held = cache._bytes
+    first = episode.streams["cam"].frames(range(20))
+    assert cache._bytes == before < held
+    np.testing.assert_array_equal(episode.streams["cam"].frames(range(20)), first)  # fetched again
+
+
 def test_a_store_that_stops_answering_is_not_the_bag_s_fault(small, tmp_path, monkeypatch) -> None:
     path = large_run(tmp_path)
     uri = put(path, tmp_path.name)
