@@ -1,6 +1,7 @@
 """The command line: exit codes, one-line errors, JSON, and that light verbs stay light."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -120,6 +121,19 @@ assert not heavy, heavy
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_tab_completes_verbs_robots_tokenizers_and_recipes() -> None:
+    for typed, offered in (
+        ("hma reg", {"registry"}),
+        ("hma convert -e pusht_", {"pusht_fast", "pusht_slow"}),
+        ("hma convert --tokenizer fsq-l", {"fsq-lab"}),
+        ("hma train discrete_t", {"discrete_tiny"}),
+    ):
+        asked = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" ")), "_HMA_COMPLETE": "complete_bash"}
+        words = [sys.executable, "-c", "from hma_model.cli import main; main()"]
+        done = subprocess.run(words, env={**os.environ, **asked}, cwd=ROOT, capture_output=True, text=True)
+        assert set(done.stdout.split()) == offered, done.stderr
 
 
 @pytest.mark.slow

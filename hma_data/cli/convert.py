@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Option
 
+from hma_data.cli.complete import robots, tokenizers
 from hma_data.console import (
     human_bytes,
     human_count,
@@ -55,13 +56,21 @@ class _Job:
 
 def convert(
     embodiment: Annotated[
-        str, Option("--embodiment", "-e", help="The robot: an id of the registry, or a YAML file.")
+        str,
+        Option(
+            "--embodiment",
+            "-e",
+            help="The robot: an id of the registry, or a YAML file.",
+            autocompletion=robots,
+        ),
     ],
     out: Annotated[Path, Option(help="Folder of the shard set.")],
     source: Annotated[
         Text, Option(help="Recording: file, folder or URI; default: source.uri of the YAML.")
     ] = None,
-    tokenizer: Annotated[str, Option(help="Name of the tokenizer; see hma tokenizer list.")] = "fsq-16",
+    tokenizer: Annotated[
+        str, Option(help="Name of the tokenizer; see hma tokenizer list.", autocompletion=tokenizers)
+    ] = "fsq-16",
     weights: Annotated[
         Text, Option(help="The tokenizer's weights, if not the usual ones.", rich_help_panel=RARE)
     ] = None,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 import typer
 from typer import Argument, Option
 
+from hma_data.cli.complete import robots
 from hma_data.console import human_count, human_number, print_json, print_lines, print_table
 
 if TYPE_CHECKING:
@@ -25,7 +26,12 @@ def inspect(
     uri: Annotated[str, Argument(help="A recording (file, folder or URI), or a folder of several.")],
     embodiment: Annotated[
         str | None,
-        Option("--embodiment", "-e", help="Check whether this robot fits: a registry id, or a YAML file."),
+        Option(
+            "--embodiment",
+            "-e",
+            help="Check whether this robot fits: a registry id, or a YAML file.",
+            autocompletion=robots,
+        ),
     ] = None,
     episodes: Episodes = 20,
     fail_on: FailOn = "error",
@@ -137,7 +143,8 @@ def _print_checks(report: dict[str, Any]) -> None:
 def doctor(
     target: Annotated[str, Argument(help="A recording, or the folder of a shard set.")],
     embodiment: Annotated[
-        str | None, Option("--embodiment", "-e", help="Look into the episodes as this robot's.")
+        str | None,
+        Option("--embodiment", "-e", help="Look into the episodes as this robot's.", autocompletion=robots),
     ] = None,
     episodes: Episodes = 20,
     fail_on: FailOn = "error",

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from hma_data.cli.complete import tokenizers
 from hma_data.console import human_bytes, interruptible, print_json, print_table
 from hma_data.errors import MissingDependencyError, RecipeError, UsageError
 
@@ -89,7 +90,7 @@ def tokenizer_train(
 
 @tokenizer_app.command("eval")
 def tokenizer_eval(
-    tokenizer: Annotated[str, Argument(help="Name of the tokenizer.")],
+    tokenizer: Annotated[str, Argument(help="Name of the tokenizer.", autocompletion=tokenizers)],
     data: Annotated[list[str], Argument(help="Pictures, videos, folders of them, recordings, shard sets.")],
     embodiment: Annotated[
         str | None, Option("--embodiment", "-e", help="DATA are recordings of this robot: id or YAML.")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hma_data.cli.complete import recipes
 from hma_data.cli.shards import refuse_early
 from hma_data.console import human_seconds, interruptible, print_json
 
@@ -29,7 +30,7 @@ def mount(app: typer.Typer) -> None:
 
 
 def train(
-    recipe: Annotated[str, typer.Argument(help="A recipe: name or YAML file.")],
+    recipe: Annotated[str, typer.Argument(help="A recipe: name or YAML file.", autocompletion=recipes)],
     overrides: Overrides = None,
     out: Out = None,
     force: Force = False,

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hma_data.cli.complete import robots
 from hma_data.errors import UsageError
 from hma_model.cli.play import has_display
 
@@ -19,7 +20,12 @@ def view(
     ] = None,
     embodiment: Annotated[
         str | None,
-        typer.Option("--embodiment", "-e", help="Robot of a recording: a registry id, or a YAML file."),
+        typer.Option(
+            "--embodiment",
+            "-e",
+            help="Robot of a recording: a registry id, or a YAML file.",
+            autocompletion=robots,
+        ),
     ] = None,
     episode: Annotated[
         int, typer.Option("--episode", min=0, help="Number of the episode; of a run, of the held-out window.")

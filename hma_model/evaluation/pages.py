@@ -63,7 +63,7 @@ h3 { font-size:1rem; margin:1.6rem 0 0 } h3 + p { margin:.1rem 0 .5rem }
 @media (max-width:640px) { .strips, dl { grid-template-columns:1fr; gap:.15rem } .strips img, dd
   { margin-bottom:.5rem } table:not(.dense) { font-size:.75rem }
   table:not(.dense) :is(th, td) { padding-right:.4rem; font-size:inherit }
-  table:not(.dense) td:first-child { white-space:normal; overflow-wrap:anywhere; min-width:4.2rem } }
+  table:not(.dense) td:first-child { white-space:normal; overflow-wrap:anywhere; min-width:5rem } }
 pre { background:var(--card); border:1px solid var(--line); border-radius:10px; padding:.8rem 1rem;
   overflow-x:auto; font:13.5px/1.5 ui-monospace, monospace }
 """

@@ -47,7 +47,9 @@ def existing_path(uri: str) -> Path:
         return local_path(uri)
     path = place(uri)
     if not path.exists():
-        raise SourceError(uri, "does not exist", "check the URI, or source.uri in the embodiment's YAML")
+        web = uri.startswith(("http://", "https://"))  # fsspec tells a silent server like an absent file
+        fault = "does not exist, or its server does not answer" if web else "does not exist"
+        raise SourceError(uri, fault, "check the URI, or source.uri in the embodiment's YAML")
     return path
 
 

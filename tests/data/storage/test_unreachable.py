@@ -7,8 +7,9 @@ import fsspec
 import pytest
 import s3fs
 
-from hma_data.errors import StorageAwayError, StorageError
+from hma_data.errors import SourceError, StorageAwayError, StorageError
 from hma_data.sources.base import open_source
+from hma_data.sources.common.places import existing_path
 from hma_data.storage import fetch as fetching
 from hma_data.storage import remote as store
 from hma_data.storage.fetch import CONNECT_S, file_system
@@ -61,6 +62,11 @@ def test_what_the_user_configures_for_the_driver_wins(monkeypatch: pytest.Monkey
 def test_a_web_server_is_waited_for_for_seconds() -> None:
     files, _ = file_system("http://127.0.0.1:9/x")
     assert files.client_kwargs["timeout"].sock_connect == CONNECT_S
+
+
+def test_a_recording_on_a_silent_web_server_may_exist() -> None:
+    with pytest.raises(SourceError, match="does not exist, or its server does not answer — check the URI"):
+        existing_path("http://127.0.0.1:9/run.mcap")
 
 
 def test_a_store_at_a_closed_port_is_tried_four_times(
