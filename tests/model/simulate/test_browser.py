@@ -466,7 +466,10 @@ def test_a_picture_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(
     page.keyboard.press("y")
     page.wait_for_selector("#sync:not(.call)")
     bright = "Math.max(...$('model-view').getContext('2d').getImageData(5, 5, 1, 1).data.slice(0, 3)) > 50"
-    page.wait_for_function(bright)  # the true picture, where the model of before was black
+    for _ in range(100):  # until the true picture is there, where the model of before was black
+        if page.evaluate(bright):
+            break
+        page.wait_for_timeout(100)
     page.wait_for_timeout(1000)
     shown = page.evaluate("() => seen")
     assert shown[-1] == "" and "parted at 0.1 s" not in shown[shown.index("") :]
