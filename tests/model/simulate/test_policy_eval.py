@@ -73,7 +73,7 @@ class FlawlessWorld(TrueWorld):
     def __init__(self, world: World) -> None:
         super().__init__()
         self.model, self.tokenizer, self.picture_shape = world.model, world.tokenizer, world.picture_shape
-        self.commands, self.shown = world.commands, world.shown
+        self.commands, self.shown, self.precision = world.commands, world.shown, world.precision
 
 
 def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJudge) -> None:
