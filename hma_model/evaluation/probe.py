@@ -42,23 +42,33 @@ UNREADABLE = 0.5  # share of a part's spread; a probe with a larger error does n
 DISTANCE, SEEN = 45.0, 3  # of RGB, up to which two colours are one; least pixels of a part that is seen
 
 
+def feature_maps(count: int, kernel: int) -> nn.Sequential:
+    """Return layers from pictures (N, 3, SIDE, SIDE) to maps (N, count, MAPS, MAPS)."""
+    return nn.Sequential(
+        nn.Conv2d(3, CHANNELS, 5, stride=2, padding=2),
+        nn.GELU(),
+        nn.Conv2d(CHANNELS, CHANNELS, 3, padding=2, dilation=2),
+        nn.GELU(),
+        nn.Conv2d(CHANNELS, count, kernel, padding=kernel // 2),
+    )
+
+
+def map_grid() -> Tensor:
+    """Return the places (MAPS², 2) of a map's cells, x and y from -1 to 1."""
+    line = (torch.arange(MAPS) + 0.5) * (2 / MAPS) - 1
+    return torch.stack(torch.meshgrid(line, line, indexing="xy"), -1).view(-1, 2)
+
+
 class PlaceNetwork(nn.Module):
     """A network that finds parts in pictures (N, 3, SIDE, SIDE); pixels and places (N, P, 2) are -1 to 1."""
 
     def __init__(self, parts: int) -> None:
         super().__init__()
-        self.maps = nn.Sequential(
-            nn.Conv2d(3, CHANNELS, 5, stride=2, padding=2),
-            nn.GELU(),
-            nn.Conv2d(CHANNELS, CHANNELS, 3, padding=2, dilation=2),
-            nn.GELU(),
-            nn.Conv2d(CHANNELS, parts, 1),
-        )
+        self.maps = feature_maps(parts, kernel=1)
         self.correct = nn.Linear(2 * parts, 2 * parts)
         nn.init.eye_(self.correct.weight)
         nn.init.zeros_(self.correct.bias)
-        line = (torch.arange(MAPS) + 0.5) * (2 / MAPS) - 1
-        self.register_buffer("grid", torch.stack(torch.meshgrid(line, line, indexing="xy"), -1).view(-1, 2))
+        self.register_buffer("grid", map_grid())
 
     def forward(self, pictures: Tensor) -> Tensor:
         chance = (self.maps(pictures).flatten(2) * SHARPNESS).softmax(-1)
@@ -231,20 +241,32 @@ def _trained(small: Images, parts: Floats, seed: int, steps: int, tell: Callable
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = PlaceNetwork(parts.shape[1])
+    targets = torch.tensor(parts / (truth.SIZE / 2) - 1, dtype=torch.float32)
+
+    def tell_step(step: int) -> None:
+        tell(f"training the probe: step {step} of {steps}")
+
+    train(network, pixels(small), targets, seed, steps, RATE, 0.02, tell_step)
+    return network.eval()
+
+
+def train(
+    network: nn.Module, inputs: Tensor, targets: Tensor, seed: int, steps: int, rate: float, beta: float,
+    tell: Callable[[int], None] = lambda step: None,
+) -> None:  # fmt: skip
+    """Train a network from noisy pictures (N, 3, SIDE, SIDE) to targets (N, …), by a loss of that beta."""
     generator = torch.Generator().manual_seed(seed)
-    inputs, targets = pixels(small), torch.tensor(parts / (truth.SIZE / 2) - 1, dtype=torch.float32)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
     for step in range(steps):
         chosen = torch.randint(0, len(inputs), (BATCH,), generator=generator)
         noisy = inputs[chosen] + NOISE * torch.randn(BATCH, 3, SIDE, SIDE, generator=generator)
-        loss = nn.functional.smooth_l1_loss(network(noisy), targets[chosen], beta=0.02)
+        loss = nn.functional.smooth_l1_loss(network(noisy), targets[chosen], beta=beta)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
-        tell(f"training the probe: step {step + 1} of {steps}")
-    return network.eval()
+        tell(step + 1)
 
 
 def _colors(small: Images, parts: Floats) -> Floats:

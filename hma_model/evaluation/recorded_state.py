@@ -27,7 +27,7 @@ from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns
 from hma_model.evaluation.intervals import NATURAL, interval, rounded, summary
-from hma_model.evaluation.probe import MAPS, SIDE, UNREADABLE, pixels, resized
+from hma_model.evaluation.probe import SHARPNESS, UNREADABLE, feature_maps, map_grid, pixels, resized, train
 from hma_model.evaluation.rollouts import decode
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Images = NDArray[np.uint8]
 
-CHANNELS, POINTS, HIDDEN = 16, 16, 128
-STEPS, BATCH, RATE, NOISE = 600, 32, 4e-3, 0.03  # noise in pictures of -1 to 1
+POINTS, HIDDEN = 16, 128
+STEPS, RATE = 600, 4e-3
 PICTURES, EPISODES = 1500, 5  # most pictures to learn from, fewest episodes
 HELD_OUT = 0.2  # share of the pictures, the last ones, on which the reader's error is measured
 STILL = 1e-6  # a value whose standard deviation is smaller never changes
@@ -51,20 +51,13 @@ class StateNetwork(nn.Module):
 
     def __init__(self, values: int) -> None:
         super().__init__()
-        self.maps = nn.Sequential(
-            nn.Conv2d(3, CHANNELS, 5, stride=2, padding=2),
-            nn.GELU(),
-            nn.Conv2d(CHANNELS, CHANNELS, 3, padding=2, dilation=2),
-            nn.GELU(),
-            nn.Conv2d(CHANNELS, POINTS, 3, padding=1),
-        )
+        self.maps = feature_maps(POINTS, kernel=3)
         self.head = nn.Sequential(nn.Linear(3 * POINTS, HIDDEN), nn.GELU(), nn.Linear(HIDDEN, values))
-        line = (torch.arange(MAPS) + 0.5) * (2 / MAPS) - 1
-        self.register_buffer("grid", torch.stack(torch.meshgrid(line, line, indexing="xy"), -1).view(-1, 2))
+        self.register_buffer("grid", map_grid())
 
     def forward(self, pictures: Tensor) -> Tensor:
         maps = self.maps(pictures).flatten(2)
-        points = (maps * 4).softmax(-1) @ self.grid
+        points = (maps * SHARPNESS).softmax(-1) @ self.grid
         return self.head(torch.cat([points.flatten(1), maps.amax(-1)], dim=1))
 
 
@@ -111,18 +104,8 @@ def learn(pictures: Images, states: Floats, seed: int = 0, steps: int = STEPS) -
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = StateNetwork(states.shape[1])
-    generator = torch.Generator().manual_seed(seed)
-    inputs, targets = pixels(small[:used]), torch.tensor(scaled[:used], dtype=torch.float32)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
-    for _ in range(steps):
-        chosen = torch.randint(0, used, (BATCH,), generator=generator)
-        noisy = inputs[chosen] + NOISE * torch.randn(BATCH, 3, SIDE, SIDE, generator=generator)
-        loss = nn.functional.smooth_l1_loss(network(noisy), targets[chosen], beta=0.1)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
+    targets = torch.tensor(scaled[:used], dtype=torch.float32)
+    train(network, pixels(small[:used]), targets, seed, steps, RATE, 0.1)
     other = scaled[used:]
     error = np.abs(_read(network.eval(), small[used:]) - other).mean(axis=0)
     spread = np.abs(other - np.median(other, axis=0)).mean(axis=0)
