@@ -40,12 +40,14 @@ class Episode:
         pictures: (T, S, S, 3) uint8, as the recorder draws them, or only those asked for.
         chunks: (T, K) float32, the commands from each picture to the next.
         parts: (T, P, 2) x, y of the parts in px of a picture of 128 by 128.
+        states: (T, S) float32, as the recorder stores them.
         driven: how many of the parts, the first ones, are the robot's own; the others lie loose.
     """
 
     pictures: NDArray[np.uint8]
     chunks: NDArray[np.float32]
     parts: Floats
+    states: NDArray[np.float32]
     driven: int
 
 
@@ -86,18 +88,19 @@ def episode(
     if wander and robot in PUSHERS:
         number = number * len(pusht.STARTS) + pusht.STARTS.index("random")
     simulator.reset(seed, number)
-    pictures, parts, given, driven = [], [], [], 0
+    pictures, parts, states, given, driven = [], [], [], [], 0
     for step in range(frames * stride):
         if step % stride == 0:
             driven, places = parts_of(simulator.simulation)
             parts.append(places)
+            states.append(simulator.state)
             if drawn is None or step // stride in drawn:
                 pictures.append(simulator.simulation.picture())
         own = simulator.recorded() if commands is None else commands[step].astype(np.float32)
         given.append(own)
         simulator.advance(own)
     chunks = np.stack(given).reshape(frames, -1)
-    return Episode(np.stack(pictures), chunks, np.stack(parts), driven)
+    return Episode(np.stack(pictures), chunks, np.stack(parts), np.stack(states), driven)
 
 
 def own_places(robot: str) -> Callable[[Floats], Floats]:

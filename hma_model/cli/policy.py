@@ -111,6 +111,7 @@ def augment(
 
     Example: hma augment rails_03 synthetic/rails_03 --episodes 64 --commands perturb=0.3
     """
+    from hma_data.registry.embodiment import Embodiment
     from hma_data.shards.manifest import MANIFEST
     from hma_data.shards.reader import ShardSet
     from hma_model.simulate.augment import Augmentation
@@ -144,6 +145,9 @@ def augment(
     print(f"{before}{said}, begun in {human_count(begun, 'real one')}; synthetic: true in every file")
     if lerobot:
         print(f"the same as a LeRobotDataset: {lerobot}")
+        state = Embodiment.load(lerobot / "embodiment.yaml").provenance.get("state")
+        few = "none: the shards have none, or too few episodes to learn it from; policies of lerobot need it"
+        print(f"  observation.state: {state or few}")
 
 
 def label_actions(

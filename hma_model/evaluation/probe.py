@@ -191,16 +191,25 @@ def train_probe(
         seed: of the episodes and the training; the same seed gives the same probe.
         tell: called with how far it is.
     """
-    numbers = range(FIRST, FIRST + EPISODES)
-    kept = range(0, FRAMES, EVERY)
-    shown, parts = [], []
-    for count, number in enumerate(numbers, 1):
-        made = truth.episode(robot, FRAMES, stride, seed, number, kept)
+    pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
+    places, driven = np.concatenate([one.parts for one in made]), made[0].driven
+    return fit(pictures, places, driven, HELD_OUT / EPISODES, seed, tee=TeeFinder.of(robot), tell=tell)
+
+
+def shown_episodes(
+    robot: str, tokenizer: "Tokenizer", stride: int, seed: int, tell: Callable[[str], None]
+) -> tuple[Images, list[truth.Episode]]:
+    """Return simulated episodes, and their pictures (N, S, S, 3) as the tokenizer shows them.
+
+    The episodes have one frame of every EVERY. Arguments are those of `train_probe`.
+    """
+    shown, kept = [], []
+    for count in range(EPISODES):
+        made = truth.episode(robot, FRAMES, stride, seed, FIRST + count, range(0, FRAMES, EVERY))
         shown.append(as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures)))
-        parts.append(made.parts[kept])
-        tell(f"training the probe: episode {count} of {EPISODES}")
-    pictures, places = np.concatenate(shown), np.concatenate(parts)
-    return fit(pictures, places, made.driven, HELD_OUT / EPISODES, seed, tee=TeeFinder.of(robot), tell=tell)
+        kept.append(replace(made, parts=made.parts[::EVERY], states=made.states[::EVERY]))
+        tell(f"simulating episode {count + 1} of {EPISODES}")
+    return np.concatenate(shown), kept
 
 
 def fit(

@@ -1,18 +1,18 @@
-"""Measure the state error of any robot whose shards have states: `hma evaluate --state`.
+"""Read the state of a robot off pictures, and measure the state error of rollouts: `hma evaluate --state`.
 
 A small network, the reader, learns to read the recorded state off the training split's pictures, as the
 tokenizer shows them. It then reads rollouts, and what it reads is compared with the state that was recorded
 at each step. Its own error is that on true pictures of training episodes that it did not learn from. A value
 that hardly changes, or that it cannot read off these or the windows' true pictures, is left out. Errors are
 in standard deviations of the value over the training split (`sd`), so that metres and radians can be
-averaged.
+averaged. What it reads is also the state of the LeRobotDatasets that `hma augment` writes.
 
 The states of robots of the laboratory are simulated instead (`hma_model.evaluation.simulated`).
 
 N pictures or windows, T frames, P predicted frames, S values of a state.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -27,7 +27,16 @@ from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns
 from hma_model.evaluation.intervals import NATURAL, interval, rounded, summary
-from hma_model.evaluation.probe import SHARPNESS, UNREADABLE, feature_maps, map_grid, pixels, resized, train
+from hma_model.evaluation.probe import (
+    SHARPNESS,
+    UNREADABLE,
+    feature_maps,
+    map_grid,
+    pixels,
+    resized,
+    shown_episodes,
+    train,
+)
 from hma_model.evaluation.rollouts import decode
 
 if TYPE_CHECKING:
@@ -35,6 +44,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Images = NDArray[np.uint8]
+Tell = Callable[[str], None]
 
 POINTS, HIDDEN = 16, 128
 STEPS, RATE = 600, 4e-3
@@ -66,7 +76,7 @@ class Reader:
     """A trained network and what it can read.
 
     Attributes:
-        mean, std: (S,) of the states that it learned from.
+        mean, std, low, high: (S,) of the states that it learned from.
         error: (S,) its mean error on pictures of other episodes, in standard deviations.
         spread: (S,) the mean distance of their states from the median, in standard deviations.
     """
@@ -74,6 +84,8 @@ class Reader:
     network: nn.Module
     mean: Floats
     std: Floats
+    low: Floats
+    high: Floats
     error: Floats
     spread: Floats
 
@@ -88,8 +100,20 @@ class Reader:
         true = (states - self.mean) / np.maximum(self.std, STILL)
         return np.abs(found.reshape(states.shape) - true)
 
+    def read(self, pictures: Images) -> Floats:
+        """Return the states (N, S) of pictures (N, H, W, 3), within the range of those that it learned from.
 
-def learn(pictures: Images, states: Floats, seed: int = 0, steps: int = STEPS) -> Reader:
+        A value that it cannot read is the mean.
+        """
+        states = np.tile(self.mean, (len(pictures), 1))
+        own = self.readable
+        states[:, own] += _read(self.network, resized(pictures))[:, own] * self.std[own]
+        return np.clip(states, self.low, self.high)
+
+
+def learn(
+    pictures: Images, states: Floats, seed: int = 0, steps: int = STEPS, tell: Tell = lambda words: None
+) -> Reader:
     """Train a reader on pictures whose state is known.
 
     Args:
@@ -97,6 +121,7 @@ def learn(pictures: Images, states: Floats, seed: int = 0, steps: int = STEPS) -
         states: (N, S).
         seed: of the training.
         steps: of the training.
+        tell: called with how far it is.
     """
     used, small = round(len(pictures) * (1 - HELD_OUT)), resized(pictures)
     mean, std = states[:used].mean(axis=0), states[:used].std(axis=0)
@@ -105,11 +130,15 @@ def learn(pictures: Images, states: Floats, seed: int = 0, steps: int = STEPS) -
         torch.manual_seed(seed)
         network = StateNetwork(states.shape[1])
     targets = torch.tensor(scaled[:used], dtype=torch.float32)
-    train(network, pixels(small[:used]), targets, seed, steps, RATE, 0.1)
+
+    def tell_step(step: int) -> None:
+        tell(f"learning to read the state: step {step} of {steps}")
+
+    train(network, pixels(small[:used]), targets, seed, steps, RATE, 0.1, tell_step)
     other = scaled[used:]
     error = np.abs(_read(network.eval(), small[used:]) - other).mean(axis=0)
     spread = np.abs(other - np.median(other, axis=0)).mean(axis=0)
-    return Reader(network, mean, std, error, spread)
+    return Reader(network, mean, std, states[:used].min(axis=0), states[:used].max(axis=0), error, spread)
 
 
 @torch.no_grad()
@@ -153,7 +182,7 @@ def measure_recorded_state(
         return nothing | {"missing": few}, unknown
     states = _States(shards)
     hashable: Any = tokenizer
-    reader = _reader(hashable, shards, cameras if isinstance(cameras, str) else tuple(cameras), seed)
+    reader = _kept_reader(hashable, shards, cameras if isinstance(cameras, str) else tuple(cameras), seed)
     errors: dict[str, list[Floats]] = {}
     for number, batch in enumerate(batches):
         truth = decode(tokenizer, _stored(batch))
@@ -191,15 +220,35 @@ def measure_recorded_state(
     return found, joined["true"][:, -1].mean(axis=-1)
 
 
-@lru_cache(maxsize=16)
-def _reader(tokenizer: "Tokenizer", shards: ShardSet, cameras: Cameras, seed: int) -> Reader:
-    """Train the reader of a set; several checkpoints share it."""
+def recorded_reader(
+    tokenizer: "Tokenizer", shards: ShardSet, cameras: Cameras, seed: int, tell: Tell = lambda words: None
+) -> Reader:
+    """Train the reader of a set on its training split.
+
+    Args:
+        tokenizer: of the shards.
+        shards: a set with states.
+        cameras: those whose pictures it is to read, side by side.
+        seed: of the training.
+        tell: called with how far it is.
+    """
     dataset = WindowDataset(shards, "train", 1, cameras=cameras)
     numbers = np.unique(np.linspace(0, len(dataset) - 1, min(PICTURES, len(dataset))).astype(np.int64))
     seen = dataset.batch(numbers)
     wanted = _States(shards).of(seen, 1)[:, 0]
     known = np.isfinite(wanted).all(axis=1)
-    return learn(decode(tokenizer, _stored(seen))[known, 0], wanted[known], seed)
+    return learn(decode(tokenizer, _stored(seen))[known, 0], wanted[known], seed, tell=tell)
+
+
+_kept_reader = lru_cache(maxsize=16)(recorded_reader)  # several checkpoints share it
+
+
+def simulated_reader(
+    robot: str, tokenizer: "Tokenizer", stride: int, seed: int, tell: Tell = lambda words: None
+) -> Reader:
+    """Train the reader of a laboratory robot on simulated episodes; arguments as of `train_probe`."""
+    pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
+    return learn(pictures, np.concatenate([one.states for one in made]).astype(np.float64), seed, tell=tell)
 
 
 def _figures(errors: Floats, seed: int, episodes: NDArray[np.int64]) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from hma_data.conversion.output import locked
 from hma_data.errors import HMAError, UsageError
+from hma_data.lab import truth
 from hma_data.lab.simulator import simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
@@ -32,6 +33,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.evaluate import cameras_for
 from hma_model.evaluation.judge import StateJudge, task_of, train_judge
 from hma_model.evaluation.probe import Probe, train_probe
+from hma_model.evaluation.recorded_state import EPISODES, Reader, recorded_reader, simulated_reader
 from hma_model.simulate.arenas import Arena, Floats, ModelArena, Scenes, TrueArena
 from hma_model.simulate.pictures import seen_cameras
 from hma_model.simulate.policies import Judged, Policy, read_policy
@@ -175,7 +177,8 @@ def augment(
         settings: what to make.
         checkpoint: as `load_world` takes it.
         shards: shard set whose episodes give first frames and commands; by default the simulator does.
-        lerobot: folder for the same episodes as a LeRobotDataset v3.0; one that is finished is kept.
+        lerobot: folder for the same episodes as a LeRobotDataset v3.0; one that is finished is kept. Its
+            state is read off the pictures, if the shards or the simulator have one to learn it from.
         world: a world instead of a checkpoint.
         device: of the world made from the checkpoint, and of policies that are networks.
         compile: of that world, as of `World`.
@@ -221,8 +224,27 @@ def augment(
             def tell(at: int, words: str) -> None:
                 on_progress(made, f"LeRobot: {at:,} of {kept:,} frames, {words}")
 
-            write_as_lerobot(dataset, folder, world.tokenizer, tell)
+            stated = _stated(world, settings, begins, found.cameras, partial(on_progress, made))
+            write_as_lerobot(dataset, folder, world.tokenizer, stated, tell)
     return found
+
+
+def _stated(
+    world: World,
+    settings: Augmentation,
+    shards: ShardSet | None,
+    cameras: Sequence[str],
+    tell: Callable[[str], None],
+) -> tuple[Embodiment, Reader] | None:
+    """Return the real robot, and what reads its state off pictures; None if no state is known."""
+    if shards is None:
+        robot = truth.embodiment(settings.embodiment)
+        if robot.state is None:
+            return None
+        return robot, simulated_reader(robot.id, world.tokenizer, robot.stride, settings.seed, tell)
+    if shards.embodiment.state is None or shards.manifest.splits["train"]["episodes"] < EPISODES:
+        return None
+    return shards.embodiment, recorded_reader(world.tokenizer, shards, tuple(cameras), settings.seed, tell)
 
 
 class _Maker:

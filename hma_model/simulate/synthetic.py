@@ -27,6 +27,7 @@ from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.storage.files import atomic_path, file_sha256, read_json, sync_folder
 from hma_model.checkpoint.folder import STEM, Checkpoint
+from hma_model.evaluation.recorded_state import Reader
 from hma_model.simulate.films import embodiment_of
 from hma_model.simulate.prompts import seen_frames
 
@@ -185,6 +186,7 @@ def write_as_lerobot(
     folder: Path,
     shards: Path,
     tokenizer: "Tokenizer",
+    stated: tuple[Embodiment, Reader] | None = None,
     on_progress: Callable[[int, str], None] = lambda done, words: None,
 ) -> None:
     """Write the episodes of synthetic shards as a LeRobotDataset, with its embodiment beside it.
@@ -193,14 +195,19 @@ def write_as_lerobot(
         folder: of the dataset; what an interrupted call left of it is removed.
         shards: the synthetic ones.
         tokenizer: of the shards.
+        stated: the real robot, and what reads its state off the pictures; None for a dataset without one.
         on_progress: as of `write_lerobot`.
     """
     made, size = ShardSet(shards), tokenizer.spec.image_size
-    own = embodiment_of(made.embodiment, ORIGIN, (size, size), made.manifest.cameras)
+    robot, reader = stated or (made.embodiment, None)
+    own = embodiment_of(robot, ORIGIN, (size, size), made.manifest.cameras, reader is not None)
+    if reader is not None:
+        provenance = own.provenance | {"state": how_read(own, reader)}
+        own = Embodiment.from_values(own.to_dict() | {"provenance": provenance}, f"embodiment {own.id}")
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     try:
-        write_lerobot(part, own, _decoded(made, own, tokenizer), on_progress)
+        write_lerobot(part, own, _decoded(made, own, tokenizer, reader), on_progress)
         (part / "embodiment.yaml").write_text(own.to_yaml(), encoding="utf-8")
         facts = json.dumps(made.manifest.plan["made_by"], indent=1)
         (part / FACTS).write_text(facts, encoding="utf-8")
@@ -211,16 +218,32 @@ def write_as_lerobot(
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _decoded(made: ShardSet, own: Embodiment, tokenizer: "Tokenizer") -> Iterator[LeRobotEpisode]:
+def how_read(robot: Embodiment, reader: Reader) -> str:
+    """Return in words how well each value of a state is read off pictures."""
+    assert robot.state is not None
+    units = [f" {one.unit}" if one.unit else "" for one in robot.state.components for _ in range(one.dims)]
+    own = set(reader.readable.tolist())
+    errors = reader.error * reader.std
+    read = [f"{name} {errors[i]:.3g}{units[i]}" for i, name in enumerate(robot.state.names()) if i in own]
+    rest = [name for i, name in enumerate(robot.state.names()) if i not in own]
+    said = f"read off the pictures, mean error {', '.join(read)}" if read else ""
+    left = f"not seen in the pictures, always the mean: {', '.join(rest)}" if rest else ""
+    return "; ".join(part for part in (said, left) if part)
+
+
+def _decoded(
+    made: ShardSet, own: Embodiment, tokenizer: "Tokenizer", reader: Reader | None
+) -> Iterator[LeRobotEpisode]:
     """Yield episodes at the control rate; a frame stands for `stride` rows."""
     names = made.manifest.cameras
-    reader = EpisodeReader(made, made.columns(names))
+    opened = EpisodeReader(made, made.columns(names))
     for row in made.episodes.to_pylist():
-        stored, columns = seen_frames(made, reader, row, names)
-        views = np.split(stored, len(names), axis=-2)
-        pictures = {
-            camera.key: tokenizer.decode(view) for camera, view in zip(own.cameras, views, strict=True)
-        }
+        stored, columns = seen_frames(made, opened, row, names)
+        shown = [tokenizer.decode(view) for view in np.split(stored, len(names), axis=-2)]
+        pictures = {camera.key: view for camera, view in zip(own.cameras, shown, strict=True)}
         actions = columns["action"].reshape(-1, own.action_dim)
+        state = None
+        if reader is not None:
+            state = reader.read(np.concatenate(shown, axis=2)).astype(np.float32).repeat(own.stride, axis=0)
         # one task: it is what a policy is told
-        yield LeRobotEpisode(pictures, actions, None, ORIGIN, hold=own.stride)
+        yield LeRobotEpisode(pictures, actions, state, ORIGIN, hold=own.stride)

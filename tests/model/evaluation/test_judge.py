@@ -45,7 +45,9 @@ def episodes(monkeypatch: pytest.MonkeyPatch) -> None:
         rng = np.random.default_rng(number)
         parts = np.repeat(rng.uniform(30, 90, (1, 3, 2)), frames, axis=0)
         parts[-4:, 1] += (8 * (number % 2), 0)
-        return truth.Episode(written(parts)[sorted(drawn)], np.zeros((frames, 1), np.float32), parts, 1)
+        return truth.Episode(
+            written(parts)[sorted(drawn)], np.zeros((frames, 1), np.float32), parts, parts[:, 0], 1
+        )
 
     monkeypatch.setattr(truth, "episode", episode)
     for name in ("as_seen", "as_shown"):

@@ -1,5 +1,7 @@
 """The recorded state of any robot is read off pictures, and rollouts are compared with it."""
 
+from typing import Any
+
 import h5py
 import numpy as np
 import pytest
@@ -67,6 +69,10 @@ def test_what_is_in_the_picture_is_read_and_the_rest_is_left_out() -> None:
     moved = states + np.array([reader.std[0], 0, 0, 0])
     grown = (reader.errors(pictures, moved) - reader.errors(pictures, states)).mean(axis=0)
     assert grown[0] == pytest.approx(1, abs=0.3) and grown[1] == 0  # errors are in standard deviations
+    read = reader.read(pictures)
+    assert np.abs(read[:, 0] - states[:, 0]).mean() < 0.25 * reader.std[0]  # in the unit of the value
+    assert (read[:, 2:] == reader.mean[2:]).all()  # of what is not seen the mean
+    assert (read <= states.max(axis=0)).all() and (read >= states.min(axis=0)).all()
 
 
 @pytest.mark.slow
@@ -90,13 +96,14 @@ def test_errors_are_of_the_recorded_steps(disc: ShardSet, monkeypatch: pytest.Mo
     assert found["copy"]["error_sd_by_frame"][0] < found["copy"]["error_sd_by_frame"][-1]
 
 
+def exact(*_: Any, **__: Any) -> Reader:
+    one = np.ones(4)
+    return Reader(torch.nn.Module(), one, one, one, one, 0 * one, one)
+
+
 def test_a_prediction_that_is_not_finite_has_no_error(
     disc: ShardSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def exact(pictures: np.ndarray, states: np.ndarray, seed: int) -> Reader:
-        one = np.ones(4)
-        return Reader(torch.nn.Module(), one, one, 0 * one, one)
-
     monkeypatch.setattr(recorded_state, "learn", exact)
     monkeypatch.setattr(Reader, "errors", lambda self, pictures, states: 0 * states)
     batches = list(windows(disc, "val", 8, 12))
@@ -112,8 +119,7 @@ def test_a_prediction_that_is_not_finite_has_no_error(
 def test_what_cannot_be_read_off_the_windows_own_pictures_is_left_out(
     disc: ShardSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one = np.ones(4)
-    monkeypatch.setattr(recorded_state, "learn", lambda *_: Reader(torch.nn.Module(), one, one, 0 * one, one))
+    monkeypatch.setattr(recorded_state, "learn", exact)
     monkeypatch.setattr(Reader, "errors", lambda self, pictures, states: 0 * states + [0.1, 0.6, 0.7, 0.8])
     batches = list(windows(disc, "val", 8, 12))
     made = {"true": [batch.tokens[:, PROMPT:] for batch in batches]}  # type: ignore[index]

@@ -18,7 +18,7 @@ from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
-from hma_model.simulate import World, synthetic
+from hma_model.simulate import World, load_world, synthetic
 from hma_model.simulate import augment as augment_module
 from hma_model.simulate.acting import Acting
 from hma_model.simulate.arenas import Scenes, TrueArena
@@ -371,6 +371,50 @@ def test_lerobot_loads_the_dataset(world: World, tmp_path: Path) -> None:
     assert not list((tmp_path / "more").glob("*/*.parquet"))
 
 
+@pytest.mark.slow
+def test_a_policy_of_lerobot_trains_on_the_dataset_with_the_state_in_its_pictures(tmp_path: Path) -> None:
+    import torch
+    from lerobot.configs.types import FeatureType
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    world = load_world("embedded")
+    augment(tmp_path / "out", asked(), world=world, lerobot=tmp_path / "rails")
+    robot = Embodiment.load(tmp_path / "rails" / "embodiment.yaml")
+    said = robot.provenance["state"]
+    assert "read off the pictures, mean error slider_1 " in said and robot.state is not None
+    step = {"action": [row / robot.rate_hz for row in range(4)]}
+    loaded = LeRobotDataset("lab/rails", root=tmp_path / "rails", delta_timestamps=step)
+    assert loaded.meta.features["observation.state"]["names"] == robot.state.names()
+    true = TrueArena(Scenes.of(world, ROBOT, 4, 0), 128)
+    known, stride = len(true.prompts[0].frames), robot.stride
+    begins = loaded.meta.episodes["dataset_from_index"]
+    read = np.stack([loaded[begin + (known - 1) * stride]["observation.state"] for begin in begins])
+    seen = true.observed()
+    assert seen is not None and np.abs(read - seen).mean() < 0.2 * np.abs(seen - seen[::-1]).mean()
+    features = dataset_to_policy_features(loaded.meta.features)
+    outputs = {key: one for key, one in features.items() if one.type is FeatureType.ACTION}
+    config = ACTConfig(
+        input_features={key: one for key, one in features.items() if key not in outputs},
+        output_features=outputs, chunk_size=4, n_action_steps=4, dim_model=32, n_heads=2, dim_feedforward=32,
+        n_encoder_layers=1, n_vae_encoder_layers=1, pretrained_backbone_weights=None, device="cpu",
+    )  # fmt: skip
+    policy = ACTPolicy(config).train()
+    prepare, _ = make_pre_post_processors(config, dataset_stats=loaded.meta.stats)
+    batch = prepare(next(iter(torch.utils.data.DataLoader(loaded, batch_size=4))))
+    optimizer, losses = torch.optim.AdamW(policy.parameters(), lr=1e-3), []
+    for _ in range(6):
+        loss, _ = policy(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0]
+
+
 def test_the_same_call_keeps_a_finished_dataset_and_finishes_one_that_was_cut_off(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -385,6 +429,7 @@ def test_the_same_call_keeps_a_finished_dataset_and_finishes_one_that_was_cut_of
         written.append(folder)
 
     monkeypatch.setattr(synthetic, "write_lerobot", write)
+    monkeypatch.setattr(augment_module, "_stated", lambda *_: None)
     given: Any = {"world": world, "lerobot": dataset}
     with pytest.raises(KeyboardInterrupt):
         augment(tmp_path / "out", asked(episodes=2), **given)
