@@ -322,15 +322,16 @@ def main() -> None:
 
         torch.set_num_threads(1)
         shards, budget = Shards(given.out, given.data), given.cpu_seconds
-        for seed in range(given.seeds):
-            for row in QUESTIONS[given.question]:
-                if given.rows and row.name not in given.rows:
-                    continue
-                key = (row.name, str(seed), str(budget))
-                if key not in [(line["row"], line["seed"], line["cpu_seconds"]) for line in read(path)]:
-                    line = measure(given.question, row, seed, budget, shards)
-                    append(path, line)
-                    print(_said(line), flush=True)
+        done = [(line["row"], line["seed"], line["cpu_seconds"]) for line in read(path)]
+        rows = [row for row in QUESTIONS[given.question] if not given.rows or row.name in given.rows]
+        asked = [(seed, row) for seed in range(given.seeds) for row in rows]
+        missing = [(seed, row) for seed, row in asked if (row.name, str(seed), str(budget)) not in done]
+        begun = time.monotonic()
+        for number, (seed, row) in enumerate(missing, 1):
+            line = measure(given.question, row, seed, budget, shards)
+            append(path, line)
+            minutes = (time.monotonic() - begun) / number * (len(missing) - number) / 60
+            print(f"{number}/{len(missing)}, {minutes:.0f} min left: {_said(line)}", flush=True)
     lines = by_budget(read(path))
     if not lines:
         raise SystemExit(f"{path}: has no line yet; run without --table")
