@@ -11,6 +11,8 @@ import hashlib
 import logging
 import math
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
 
@@ -31,7 +33,7 @@ from hma_data.storage.paths import StrPath, as_text
 SAMPLED_SHARDS, SAMPLED_REMOTE = 16, 2  # shards whose first record is read to estimate lengths
 INSTRUCTIONS = ("language_instruction", "natural_language_instruction")
 MAX_VECTOR = 4096  # most values of an action or a state
-INSPECTED_EPISODES, INSPECTED_BYTES = 1000, 256 << 20  # most episodes and bytes read for their lengths
+COUNTED_EPISODES, COUNTED_BYTES = 1000, 256 << 20  # most episodes and bytes read for their lengths
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +46,7 @@ class RldsSource:
         return [ref.id for ref in self.index(uri)]
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
-        """See Source. Frames are estimated from the records' bytes.
+        """See Source. Frames are counted in a small folder, else estimated from the records' bytes.
 
         With `source.split`, only that split is indexed and refs carry no split. They carry none either where
         the dataset has only one split. Otherwise `train` becomes "train" and every other split "val".
@@ -67,6 +69,8 @@ class RldsSource:
             rate = _steps_per_byte(folder, name)
             for shard in folder.splits[name]:
                 refs += (_remote_refs if folder.remote and shard.stated else _refs)(name, shard, own, rate)
+        if lengths := _lengths(folder, names, refs):
+            refs = [replace(ref, frames=lengths.get(ref.id, ref.frames)) for ref in refs]
         if not any(ref.fingerprint for ref in refs):
             remedy = "its files are empty or damaged; copy them again"
             raise SourceError(uri, "holds no readable episode", remedy)
@@ -133,6 +137,20 @@ def _remote_refs(split: str, shard: Shard, own: str | None, rate: float) -> list
     frames = max(1, round(rate * found["size"] / records))
     ids = (episode_id(split, shard.first + position) for position in range(records))
     return [EpisodeRef(name, frames, own, fingerprint) for name in ids]
+
+
+def _lengths(folder: Folder, splits: list[str], refs: list[EpisodeRef]) -> dict[str, int]:
+    """Return the lengths of the readable episodes; none of a folder that is remote or too large to read."""
+    if folder.remote or len(refs) > COUNTED_EPISODES:
+        return {}
+    shards = [shard for split in splits for shard in folder.splits[split]]
+    if sum(int(shard.framing().lengths.sum()) for shard in shards) > COUNTED_BYTES:
+        return {}
+    lengths = {}
+    for ref in refs:
+        with suppress(EpisodeError):  # reading it fails again, and it is quarantined
+            lengths[ref.id] = Steps(folder.example(ref.id)[0], folder.step_features, ref.id).count
+    return lengths
 
 
 def _steps_per_byte(folder: Folder, split: str) -> float:
@@ -305,10 +323,10 @@ def _survey(
 ) -> tuple[tuple[int, ...], Steps | None]:
     """Sample the chosen episodes; return the lengths of the episodes read, and the first of them."""
     wanted = set(chosen)
-    more = range(0 if folder.remote else min(len(refs), INSPECTED_EPISODES))
+    more = range(0 if folder.remote else min(len(refs), COUNTED_EPISODES))
     lengths: dict[int, int] = {}
     first: Steps | None = None
-    budget = INSPECTED_BYTES
+    budget = COUNTED_BYTES
     pairs = max(1, checks.PAIRS // max(len(chosen), 1))
     for i in [*chosen, *(i for i in more if i not in wanted)]:
         if budget < 0 and i not in wanted:

@@ -258,7 +258,17 @@ def test_a_dataset_with_one_split_leaves_splitting_to_the_toolkit(tmp_path):
     assert {ref.split for ref in RLDS.index(str(toy(tmp_path / "d")))} == {None}
 
 
-def test_frames_are_estimated_from_bytes(tmp_path):
+@pytest.mark.parametrize("long_text", [1, 2])
+def test_the_plan_of_a_small_dataset_has_as_many_frames_as_its_inspection(tmp_path, long_text):
+    records = [record(0, 10), record(1, 20), record(2, 5)]
+    records[long_text]["episode_metadata/file_path"] = [b"x" * 50_000]
+    folder = str(write(tmp_path / "d", {"toy-train.tfrecord-00000-of-00001": records}))
+    assert [ref.frames for ref in RLDS.index(folder)] == [10, 20, 5]
+    assert RLDS.inspect(folder).frames == 35
+
+
+def test_frames_of_a_large_dataset_are_estimated_from_bytes(tmp_path, monkeypatch):
+    monkeypatch.setattr("hma_data.sources.rlds.source.COUNTED_EPISODES", 2)
     refs = RLDS.index(str(toy(tmp_path / "d", (10, 20, 5))))
     assert refs[0].frames == 10
     assert all(abs(ref.frames - true) <= 1 for ref, true in zip(refs, (10, 20, 5), strict=True))
