@@ -6,10 +6,11 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from importlib.metadata import PathDistribution
+from importlib.metadata import PathDistribution, requires
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from hma_data import __version__
 
@@ -66,6 +67,17 @@ def test_its_metadata_ask_for_one_opencv_and_state_the_version(installed: Path) 
     assert metadata["Version"] == __version__ and licences == {"LICENSE", "NOTICE"}
     assert {name for name in asked if "opencv" in name} == {"opencv-python-headless"}
     assert "gym-pusht" not in asked  # it asks for the other build of OpenCV
+
+
+def test_an_extra_asks_for_what_pip_can_install_and_for_all_that_is_imported(installed: Path) -> None:
+    (folder,) = installed.glob("hma_toolkit-*.dist-info")
+    asked = [Requirement(line) for line in PathDistribution(folder).metadata.get_all("Requires-Dist", [])]
+    stores = [one for one in asked if one.name in ("gcsfs", "s3fs")]
+    (fsspec,) = [one for one in map(Requirement, requires("datasets") or ()) if one.name == "fsspec"]
+    for store in stores:  # each release asks for the same release of fsspec
+        assert not store.specifier.contains("2026.3") and fsspec.specifier.contains("2026.2")
+    planning = {one.name for one in asked if one.marker and one.marker.evaluate({"extra": "planning"})}
+    assert {"imageio", "stable-worldmodel"} <= planning  # it imports imageio, and does not ask for it
 
 
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no checkout")

@@ -219,8 +219,8 @@ def solver_of(kind: str) -> tuple[Any, Any]:
             warnings.filterwarnings("ignore", "ale-py not found")  # solvers need no Atari games
             from stable_worldmodel import policy, solver
     except ImportError as fault:
-        remedy = install_command("planning")
-        raise MissingDependencyError("policy plan", "stable-worldmodel is not installed", remedy) from fault
+        said = f"stable-worldmodel cannot be imported ({fault})"
+        raise MissingDependencyError("policy plan", said, install_command("planning")) from fault
     return getattr(solver, SOLVERS[kind]), policy.PlanConfig
 
 
