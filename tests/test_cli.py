@@ -129,6 +129,7 @@ def test_tab_completes_verbs_robots_tokenizers_and_recipes() -> None:
         ("hma convert -e pusht_", {"pusht_fast", "pusht_slow"}),
         ("hma convert --tokenizer fsq-l", {"fsq-lab"}),
         ("hma train discrete_t", {"discrete_tiny"}),
+        ("hma policy-eval rails_", {"rails_03", "rails_09"}),
     ):
         asked = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" ")), "_HMA_COMPLETE": "complete_bash"}
         words = [sys.executable, "-c", "from hma_model.cli import main; main()"]

@@ -6,13 +6,12 @@ from contextlib import contextmanager
 from typing import Any
 
 from hma_data.errors import HMAError, HubError
-from hma_data.storage.fetch import causes
+from hma_data.storage.fetch import SECRET, causes
 
 TRANSIENT = (408, 429, 500, 502, 503, 504)
 LOG_IN = "log in with hf auth login, or set HF_TOKEN"
 AGAIN = "run the same command again; it goes on where it stopped"
 LONGEST_WAIT = 300.0  # seconds; the hub counts requests over five minutes
-_SECRET = re.compile(r"(?i)\b(hf_|bearer )\w+")
 
 
 @contextmanager
@@ -150,7 +149,7 @@ def _hidden(text: str) -> str:
     from huggingface_hub import get_token
 
     token = get_token()
-    return _SECRET.sub(r"\1…", text.replace(token, "…") if token else text)
+    return SECRET.sub(r"\1…", text.replace(token, "…") if token else text)
 
 
 def without_token(fault: BaseException) -> BaseException:

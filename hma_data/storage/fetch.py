@@ -6,6 +6,7 @@ server) are tried again; faults of the data are not.
 
 import errno
 import logging
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -39,6 +40,8 @@ _OF_THE_NETWORK = _UNREACHABLE | {
     "HTTPClientError", "ReadTimeoutError", "ResponseParserError", "IncompleteRead",  # botocore
     "TransportError",  # google-auth, httpx
 }  # fmt: skip
+
+SECRET = re.compile(r"(?i)\b(hf_|bearer )\w+")  # a token of the hub, or of a request
 
 log = logging.getLogger(__name__)
 
@@ -86,9 +89,16 @@ def may_pass(fault: BaseException) -> bool:
 
 
 def said(fault: BaseException) -> str:
-    """Return an exception as one line of text."""
-    text = " ".join(str(fault).split())
+    """Return an exception as one line of text, without a token that a server repeats."""
+    text = SECRET.sub(r"\1…", " ".join(str(fault).split()))
     return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
+
+
+def without_secrets(fault: BaseException) -> BaseException:
+    """Return the error after removing tokens from its text and from the texts of its causes."""
+    for link in causes(fault):
+        link.args = tuple(SECRET.sub(r"\1…", part) if isinstance(part, str) else part for part in link.args)
+    return fault
 
 
 def _kinds(fault: BaseException) -> set[str]:
@@ -198,7 +208,7 @@ def attempt[T](files: Any, path: str, action: Callable[[], T]) -> T:
         raise
     except Exception as fault:  # file systems raise exceptions of any kind
         text = f"cannot be read: {said(fault)}"
-        raise SourceError(path, text, "check the path and your access to it") from fault
+        raise SourceError(path, text, "check the path and your access to it") from without_secrets(fault)
 
 
 def info(files: Any, path: str) -> dict[str, Any]:

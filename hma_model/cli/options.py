@@ -7,6 +7,13 @@ import typer
 
 from hma_data.errors import HMAError, UsageError
 
+
+def embedded_robots(incomplete: str) -> list[str]:
+    """Return the robots of the embedded checkpoint whose ids begin so, for the Tab key."""
+    folders = (Path(__file__).parents[1] / "embedded" / "embodiments").iterdir()
+    return sorted(folder.name for folder in folders if folder.name.startswith(incomplete))
+
+
 Checkpoint = Annotated[
     str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
 ]

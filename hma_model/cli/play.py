@@ -13,7 +13,7 @@ from urllib.parse import quote
 import typer
 
 from hma_data.errors import UsageError
-from hma_model.cli.options import Compile, Device, Precision, device_name, require_checkpoint
+from hma_model.cli.options import Compile, Device, Precision, device_name, embedded_robots, require_checkpoint
 
 
 def play(
@@ -32,7 +32,10 @@ def play(
         typer.Option("--prompt", help="A picture to begin from; repeat it for several, in their order."),
     ] = None,
     embodiment: Annotated[
-        str | None, typer.Option("-e", "--embodiment", help="The robot that the page opens with.")
+        str | None,
+        typer.Option(
+            "-e", "--embodiment", help="The robot that the page opens with.", autocompletion=embedded_robots
+        ),
     ] = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one.")] = 0,
     host: Annotated[

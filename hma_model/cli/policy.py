@@ -7,11 +7,24 @@ import typer
 
 from hma_data.console import human_count, interruptible, print_json, progress
 from hma_model.cli.hub import Json
-from hma_model.cli.options import Compile, Device, Precision, Temperature, UnmaskSteps, device_name
+from hma_model.cli.options import (
+    Compile,
+    Device,
+    Precision,
+    Temperature,
+    UnmaskSteps,
+    device_name,
+    embedded_robots,
+)
 
 
 def policy_eval(
-    embodiment: Annotated[str, typer.Argument(help="A robot of the laboratory that the checkpoint has.")],
+    embodiment: Annotated[
+        str,
+        typer.Argument(
+            help="A robot of the laboratory that the checkpoint has.", autocompletion=embedded_robots
+        ),
+    ],
     policies: Annotated[
         list[str],
         typer.Argument(
@@ -66,7 +79,9 @@ def policy_eval(
 
 
 def augment(
-    embodiment: Annotated[str, typer.Argument(help="A robot that the checkpoint has.")],
+    embodiment: Annotated[
+        str, typer.Argument(help="A robot that the checkpoint has.", autocompletion=embedded_robots)
+    ],
     out: Annotated[Path, typer.Argument(help="Folder for the shard set.")],
     checkpoint: Annotated[
         str, typer.Option("--checkpoint", help="A checkpoint, a run's folder, or a hub repo.")

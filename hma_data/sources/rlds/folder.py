@@ -217,8 +217,11 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
     """Return the folder with features.json: `path`, or one at most two levels below it."""
     if is_listless(files) or files.isfile(f"{path}/features.json"):
         return path
-    if not files.exists(path):
-        raise SourceError(uri, "does not exist", "check the path, or source.uri in the embodiment's YAML")
+    try:
+        files.info(path)  # `exists` of fsspec says no where access is refused, too
+    except FileNotFoundError as fault:
+        remedy = "check the path, or source.uri in the embodiment's YAML"
+        raise SourceError(uri, "does not exist", remedy) from fault
     found: list[Any] = []
     for pattern in ("*/features.json", "*/*/features.json"):
         if is_local(files):  # its name may contain the wildcards of patterns

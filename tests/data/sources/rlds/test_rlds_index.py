@@ -223,6 +223,16 @@ def test_no_permission_is_not_tried_again(memory, monkeypatch):
     assert len(calls) == 1
 
 
+def test_a_folder_that_may_not_be_read_is_not_called_missing(memory, monkeypatch):
+    def info(self, path, **options):
+        raise PermissionError("forbidden for Bearer hf_SECRET")
+
+    monkeypatch.setattr(MemoryFileSystem, "info", info)
+    with pytest.raises(SourceError, match=r"forbidden.*your access") as found:
+        open_folder(f"{memory}/inside")
+    assert "SECRET" not in f"{found.value}{found.value.__cause__}"
+
+
 def test_a_remote_file_cut_short_is_an_episode_error(memory):
     files = fsspec.filesystem("memory")
     path = memory.removeprefix("memory:/") + "/toy-train.tfrecord-00001-of-00003"
