@@ -118,8 +118,9 @@ class Acting:
         require_actor(config, where)
         if horizon > 1 and not config.predicts_video:
             raise UsageError(where, "predicts no video to look ahead in", "give horizon=1")
-        if memory is not None and memory < 1:
-            raise UsageError(where, f"memory={memory} is not allowed", "give 1 or more")
+        for name, value in {"horizon": horizon, "memory": memory}.items():
+            if value is not None and value < 1:
+                raise UsageError(where, f"{name}={value} is not allowed", "give 1 or more")
         self._follower, self._horizon = Follower(world, scenes, where, memory), horizon
 
     def begin(self, arena: Arena) -> None:

@@ -47,11 +47,15 @@ class Cost:
         world: in which candidates are tried.
         embodiment: the robot.
         judge: its score, negative, is the cost; without one, the distance from `info["goal"]`.
+
+    Raises:
+        HMAError: the model lacks the robot.
     """
 
     def __init__(self, world: World, embodiment: str, judge: "StateJudge | None" = None) -> None:
         self.world, self.embodiment, self.judge = world, embodiment, judge
-        space, own = world.model.embodiments[embodiment], world.commands(embodiment)
+        own = world.commands(embodiment)
+        space = world.model.embodiments[embodiment]
         self._own, self._mean = own, np.array(space.mean, np.float32)
         self._std = np.array(space.std, np.float32)
         self.sessions: list[int] = []

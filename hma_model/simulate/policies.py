@@ -80,7 +80,7 @@ def read_policy(words: str, scenes: Scenes, world: "World | None" = None) -> Pol
             raise UsageError("policy reach", f"{scenes.name} has no driver that reaches", "give scripted")
         return Scripted(_noise(words, kind, rest), kind == "reach")
     if rest:
-        return Called(_named(words))
+        return Called(_named(words), f"policy {words}")
     raise UsageError("policy", f"{words!r} is unknown", WAYS)
 
 
@@ -209,9 +209,9 @@ class Called:
     to one episode. Its `reset()`, if there is one, is called when an episode begins.
     """
 
-    def __init__(self, given: Any) -> None:
+    def __init__(self, given: Any, where: str = "policy") -> None:
         if not callable(given):
-            raise UsageError("policy", f"{given!r} cannot be called", WAYS)
+            raise UsageError(where, f"is {given!r}, which cannot be called", "name a function or class")
         self._given = given
 
     def begin(self, arena: Arena) -> None:

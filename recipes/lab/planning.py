@@ -11,12 +11,13 @@ deviations from their mean.
 """
 
 import argparse
+import contextlib
+import io
+import warnings
 from typing import Any
 
 import gymnasium
 import numpy as np
-from stable_worldmodel import World
-from stable_worldmodel.policy import PlanConfig, RandomPolicy, WorldModelPolicy
 
 from hma_data.console import run_script
 from hma_data.lab import truth
@@ -24,11 +25,16 @@ from hma_model.simulate.arenas import Scenes
 from hma_model.simulate.planning import ELITES, SOLVERS, Cost, solver_of
 from hma_model.simulate.world import load_world
 
+with warnings.catch_warnings():
+    warnings.filterwarnings("ignore", "ale-py not found")  # solvers need no Atari games
+    from stable_worldmodel import World
+    from stable_worldmodel.policy import PlanConfig, RandomPolicy, WorldModelPolicy
+
 
 class GoalEnv(gymnasium.Env[Any, Any]):
     """A laboratory robot in its simulator, with a picture to bring about; a step is a frame of the model."""
 
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(self, cost: Cost, scenes: Scenes, ahead: int, near: float, render_mode: str = "rgb_array"):
         self.cost, self.scenes, self.ahead, self.near = cost, scenes, ahead, near
@@ -92,10 +98,11 @@ def main() -> None:
     parser.add_argument("--horizon", type=int, default=5)
     parser.add_argument("--samples", type=int, default=32)
     parser.add_argument("--steps", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=7, help="of the episodes")
     given = parser.parse_args()
     world = load_world(given.checkpoint, unmask_steps=1, temperature=0.0)
     cost = HistoryCost(world, given.robot)
-    scenes = Scenes.of(world, given.robot, given.episodes, 7)
+    scenes = Scenes.of(world, given.robot, given.episodes, given.seed)
     own = {"cost": cost, "scenes": scenes, "ahead": given.ahead, "near": given.near}
     gymnasium.register("hma/Goal-v0", entry_point=GoalEnv)
     made, _ = solver_of(given.solver)
@@ -107,7 +114,8 @@ def main() -> None:
     for name, policy in (("random", RandomPolicy(seed=0)), (given.solver, WorldModelPolicy(solver, plan))):
         arena = World("hma/Goal-v0", given.episodes, (128, 128), max_episode_steps=given.budget, **own)
         arena.set_policy(policy)
-        found = arena.evaluate(episodes=given.episodes, seed=0, reset_mode="wait")
+        with contextlib.redirect_stdout(io.StringIO()):  # solvers print their time
+            found = arena.evaluate(episodes=given.episodes, seed=0, reset_mode="wait")
         print(f"{name}: {found['success_rate']:.0f} % of {given.episodes} reach the goal picture", flush=True)
         arena.close()
 

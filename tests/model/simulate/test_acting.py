@@ -109,6 +109,8 @@ def test_models_that_cannot_act_and_unknown_options_are_refused() -> None:
         Acting(world, scenes)
     with pytest.raises(UsageError, match="predicts no video to look ahead in"):
         Acting(actor("policy"), scenes, horizon=2)
+    with pytest.raises(UsageError, match="horizon=0 is not allowed — give 1 or more"):
+        Acting(actor("full"), scenes, horizon=0)
     with pytest.raises(UsageError, match="'speed=2' is unknown — allowed: horizon="):
         read_policy("hma:runs/policy,speed=2", scenes)
     with pytest.raises(HMAError, match="no/such run"):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data.errors import UsageError
+from hma_data.errors import HMAError, UsageError
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.simulate import World
 from hma_model.simulate.arenas import Scenes, TrueArena
@@ -36,6 +36,12 @@ def test_imagined_pictures_are_those_of_sessions_that_take_the_commands() -> Non
             for ahead in range(2):
                 made = world.step({session: commands[scene, candidate, ahead]})[session]
                 np.testing.assert_array_equal(pictures[scene, candidate, ahead], made)
+
+
+def test_a_robot_that_the_model_lacks_is_named() -> None:
+    world = World(tiny_model(ROBOT), get_tokenizer("fsq-8"), unmask_steps=1, temperature=0.0)
+    with pytest.raises(HMAError, match="nope_01"):
+        Cost(world, "nope_01")
 
 
 class DotWorld:

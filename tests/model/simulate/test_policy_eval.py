@@ -284,6 +284,7 @@ def test_what_a_policy_remembers_belongs_to_one_episode(world: World, name: str)
         ("nan", "returns NaN or infinite values"),
         ("broken", "raised KeyError: 'left'"),
         ("missing", "cannot be imported: AttributeError"),
+        ("ROBOT", "is 'rails_03', which cannot be called — name a function or class"),
     ],
 )
 def test_a_policy_that_fails_is_named_before_the_judge_is_trained(world: World, name: str, said: str) -> None:
