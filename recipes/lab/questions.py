@@ -99,7 +99,7 @@ QUESTIONS: dict[str, tuple[Row, ...]] = {
     ),
     "fig6": (
         *(
-            Row(f"{count} robots before", robot=NEW, before=ROBOTS[:count])
+            Row(f"{count} robot{'s' if count > 1 else ''} before", robot=NEW, before=ROBOTS[:count])
             for count in (1, 4, 16)
         ),
         *(Row(f"{count} episodes", episodes=count) for count in (15, 60, 240)),
