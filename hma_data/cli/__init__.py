@@ -15,7 +15,7 @@ from hma_data.cli.mixture import mixture
 from hma_data.cli.registry import registry_app
 from hma_data.cli.shards import shards_app
 from hma_data.cli.tokenizer import tokenizer_app
-from hma_data.console import print_json, print_table
+from hma_data.console import human_count, print_json, print_table
 
 DATA = "Recordings and shards"  # the panel of `hma --help`
 Json = Annotated[bool, Option("--json", help="Print JSON.")]
@@ -63,7 +63,8 @@ def bench(
         columns = list(dict.fromkeys(key for result in results for key in result))
         print_table(columns, [[result.get(key) for key in columns] for result in results], title=chosen.about)
         facts = told["machine"]
-        print(f"{facts['processor']}, {facts['cores']} cores, load {facts['load_average']}, {facts['date']}")
+        cores = human_count(facts["cores"], "core")
+        print(f"{facts['processor']}, {cores}, load {facts['load_average']}, {facts['date']}")
     if fault := chosen.fault(results):
         print(fault, file=sys.stderr)
         raise Exit(1)

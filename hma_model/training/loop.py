@@ -156,6 +156,8 @@ def _loop(
         stopped = bool(asked[0])
         last = run.done >= 1
         if run.held_out and (last or _due(run.step, recipe.eval_every)):
+            if last:
+                log.note("the steps are done; the held-out loss is measured")
             log.evaluation({**run.evaluate(), "mixture": run.train_data.realised()})
             log.pictures(run.out, run.step)
             _show_notes(run, log)
