@@ -292,7 +292,7 @@ def _labels_of(model: "HMA", commands: Commands, film: Film, number: int) -> dic
     try:
         stored = film.read(number)
         if len(stored) < 2:
-            raise EpisodeError(film.name, "has fewer than two frames at the model's rate")
+            raise EpisodeError(film.heads()[number][0], "has fewer than two frames at the model's rate")
     except EpisodeError as fault:
         return {"fault": np.array(str(fault))}
     return {"stored": stored, "chunks": infer(model, commands, stored)}

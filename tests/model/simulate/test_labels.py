@@ -190,13 +190,14 @@ def test_film_that_cannot_be_read_goes_to_quarantine(
     whole = (places / "long.mp4").read_bytes()
     (places / "cut.mp4").write_bytes(whole[: len(whole) // 2])
     (places / "none.mp4").write_bytes(b"")
+    write_mp4(places / "one.mp4", [np.zeros((96, 128, 3), np.uint8)], 10)
     monkeypatch.setattr(
         labels, "measure", lambda *_: labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
     )
     found = label_actions(places, tmp_path / "out", ROBOT, checkpoint="", check=real, world=world)
-    assert found.manifest.quarantined == 2 and verify(tmp_path / "out") == []
+    assert found.manifest.quarantined == 3 and verify(tmp_path / "out") == []
     said = (tmp_path / "out" / "quarantine.jsonl").read_text()
-    assert "cut.mp4" in said and "none.mp4" in said
+    assert "cut.mp4" in said and "none.mp4" in said and "one: has fewer than two frames" in said
     assert [row["id"] for row in ShardSet(tmp_path / "out").episodes.to_pylist()] == ["long"]
 
 
