@@ -1,5 +1,6 @@
 """The recorded state of any robot is read off pictures, and rollouts are compared with it."""
 
+from functools import partial
 from typing import Any
 
 import h5py
@@ -77,7 +78,7 @@ def test_what_is_in_the_picture_is_read_and_the_rest_is_left_out() -> None:
 
 @pytest.mark.slow
 def test_errors_are_of_the_recorded_steps(disc: ShardSet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learn, "__defaults__", (0, STEPS))
+    monkeypatch.setattr(recorded_state, "learn", partial(learn, steps=STEPS))
     batches = list(windows(disc, "val", 8, 12))
     ahead = [batch.tokens[:, PROMPT:] for batch in batches]  # type: ignore[index]
     made = {"true": ahead, "shuffled": [tokens.roll(1, 0) for tokens in ahead]}
