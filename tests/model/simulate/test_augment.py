@@ -341,9 +341,10 @@ def test_the_camera_that_is_shown_is_the_one_that_is_named(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_lerobot_loads_the_dataset(world: World, tmp_path: Path) -> None:
+def test_lerobot_loads_the_dataset(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    monkeypatch.setattr(augment_module, "_stated", lambda *_: None)
     told: list[tuple[float, str]] = []
 
     def tell(done: float, words: str) -> None:
@@ -354,6 +355,7 @@ def test_lerobot_loads_the_dataset(world: World, tmp_path: Path) -> None:
     loaded = LeRobotDataset("lab/rails", root=tmp_path / "rails")
     stride = world.model.embodiments[ROBOT].stride
     columns = episodes(tmp_path / "out")
+    assert "observation.state" not in loaded.meta.features
     assert loaded.num_episodes == 2 and len(loaded) == sum(len(one["action"]) for one in columns) * stride
     written = [words for done, words in told if words.startswith("LeRobot") and done == 2 * FRAMES]
     assert written[0].startswith(f"LeRobot: 0 of {len(loaded)} frames, ")
