@@ -183,6 +183,8 @@ def measure_recorded_state(
     states = _States(shards)
     hashable: Any = tokenizer
     reader = _kept_reader(hashable, shards, cameras if isinstance(cameras, str) else tuple(cameras), seed)
+    if reader is None:
+        return nothing | {"missing": "the states of the training split are unknown in part"}, unknown
     errors: dict[str, list[Floats]] = {}
     for number, batch in enumerate(batches):
         truth = decode(tokenizer, _stored(batch))
@@ -222,8 +224,8 @@ def measure_recorded_state(
 
 def recorded_reader(
     tokenizer: "Tokenizer", shards: ShardSet, cameras: Cameras, seed: int, tell: Tell = lambda words: None
-) -> Reader:
-    """Train the reader of a set on its training split.
+) -> Reader | None:
+    """Train the reader of a set on its training split; None if all of its states are unknown in part.
 
     Args:
         tokenizer: of the shards.
@@ -237,6 +239,8 @@ def recorded_reader(
     seen = dataset.batch(numbers)
     wanted = _States(shards).of(seen, 1)[:, 0]
     known = np.isfinite(wanted).all(axis=1)
+    if not known.any():
+        return None
     return learn(decode(tokenizer, _stored(seen))[known, 0], wanted[known], seed, tell=tell)
 
 

@@ -244,7 +244,8 @@ def _stated(
         return robot, simulated_reader(robot.id, world.tokenizer, robot.stride, settings.seed, tell)
     if shards.embodiment.state is None or shards.manifest.splits["train"]["episodes"] < EPISODES:
         return None
-    return shards.embodiment, recorded_reader(world.tokenizer, shards, tuple(cameras), settings.seed, tell)
+    reader = recorded_reader(world.tokenizer, shards, tuple(cameras), settings.seed, tell)
+    return None if reader is None else (shards.embodiment, reader)
 
 
 class _Maker:

@@ -117,6 +117,23 @@ def test_a_prediction_that_is_not_finite_has_no_error(
     assert found["true"]["error_sd_last"] is None and found["true"]["error_sd_by_frame"][0] == 0
 
 
+def test_a_set_whose_states_are_all_unknown_in_part_has_no_reader(
+    disc: ShardSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unknown = np.array([0.0, np.nan, 0.0, 0.0])
+    monkeypatch.setattr(
+        recorded_state._States, "of", lambda _, batch, frames: np.full((len(batch), frames, 4), unknown)
+    )
+    assert recorded_state.recorded_reader(BlockTokenizer(), disc, "first", 0) is None
+    batches = list(windows(disc, "val", 8, 4))
+    made = {"true": [batch.tokens[:, PROMPT:] for batch in batches]}  # type: ignore[index]
+    found, last = measure_recorded_state(
+        BlockTokenizer(), disc, batches, made, prompt=PROMPT, cameras="first"
+    )
+    assert found["missing"] == "the states of the training split are unknown in part"
+    assert np.isnan(last).all()
+
+
 def test_what_cannot_be_read_off_the_windows_own_pictures_is_left_out(
     disc: ShardSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
