@@ -32,7 +32,13 @@ OTHERS = ("pendulum", "planar_arm", "pusht_fast", "pusht_slow")
 
 
 def make_work(
-    out: Path, episodes: int, seed: int, tokenizer: str | Tokenizer, settings: Settings, workers: int
+    out: Path,
+    episodes: int,
+    seed: int,
+    tokenizer: str | Tokenizer,
+    settings: Settings,
+    device: str,
+    workers: int,
 ) -> Work:
     """Return the function that records and converts a robot, and returns a line that tells what was made."""
     import torch
@@ -50,7 +56,7 @@ def make_work(
             recording = lab.record(robot, folder, episodes, seed, lambda done, total: report(done))
         recorded = time.monotonic()
         summary = convert(
-            embodiment, recording, tokenizer, out / "shards" / robot, settings=settings,
+            embodiment, recording, tokenizer, out / "shards" / robot, settings=settings, device=device,
             on_progress=lambda state: report(state.episodes),
         )  # fmt: skip
         shutil.rmtree(recording) if recording.is_dir() else recording.unlink()
@@ -72,6 +78,7 @@ def main() -> None:
     parser.add_argument("--further", type=int, default=0, help="more robots of the family")
     parser.add_argument("--workers", type=int, default=2, help="robots at the same time")
     parser.add_argument("--tokenizer", default="fsq-lab")
+    parser.add_argument("--device", default="cpu", help="of the tokenizer, as hma convert's")
     parser.add_argument("--frames", choices=("all", "strided"), default="strided", help="as hma convert's")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
@@ -79,7 +86,7 @@ def main() -> None:
     todo = [robot for robot in robots if not (given.out / "shards" / robot / MANIFEST).is_file()]
     print(f"{len(robots)} robots, {len(robots) - len(todo)} of them done already", flush=True)
     settings = Settings(val_fraction=0.05, frames=given.frames)
-    work = partial(make_work, given.out, given.episodes, given.seed, given.tokenizer, settings)
+    work = partial(make_work, given.out, given.episodes, given.seed, given.tokenizer, settings, given.device)
     for done, line in enumerate(run(todo, work, given.workers, _ignore), start=1):
         print(f"{done}/{len(todo)} {line}", flush=True)
 

@@ -198,7 +198,7 @@ def test_recipe_leaves_shards_and_no_recording(tmp_path: Path, block_tokenizer: 
     assert spec and spec.loader
     recipe = module_from_spec(spec)
     spec.loader.exec_module(recipe)
-    work = recipe.make_work(tmp_path, 2, SEED, block_tokenizer, Settings(frames="strided"), 1)
+    work = recipe.make_work(tmp_path, 2, SEED, block_tokenizer, Settings(frames="strided"), "cpu", 1)
     line = work("arm1_02", lambda event: None, FIRST)
     assert "80 frames" in line and not list((tmp_path / "recordings").iterdir())
     assert (tmp_path / "shards" / "arm1_02" / MANIFEST).is_file()
