@@ -18,7 +18,9 @@ from hma_model.checkpoint.folder import resolve
 from hma_model.cli import main
 from hma_model.evaluation.losses import validation_losses, windows
 from hma_model.generation.rollout import Rollout
+from hma_model.network.masking import VideoMask, corrupt_tokens
 from hma_model.network.model import HMA
+from hma_model.network.trunk import attend
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
@@ -43,6 +45,16 @@ def frames_of(batch: Batch, kind: str = "discrete") -> torch.Tensor:
     return frames
 
 
+@pytest.mark.parametrize("masked", [True, False])
+def test_more_sequences_than_a_kernel_takes_are_attended(masked: bool) -> None:
+    mask = torch.ones(6, 6, dtype=torch.bool).tril() if masked else None
+    q, k, v = torch.randn(3, 70_000, 1, 6, 8)
+    on_gpu = [x.to(GPU).requires_grad_() for x in (q, k, v)]
+    there = attend(on_gpu[0], on_gpu[1], on_gpu[2], None if mask is None else mask.to(GPU), 0.4)
+    there.sum().backward()
+    assert torch.allclose(there.cpu(), attend(q, k, v, mask, 0.4), atol=1e-4)
+
+
 @pytest.fixture(autouse=True)
 def exact_products() -> None:
     """Compare float32 with float32: no test here lets products be rounded to TF32."""
@@ -55,7 +67,8 @@ def exact_products() -> None:
 def test_losses_and_gradients_are_those_of_a_cpu(kind: str, way: str, objective: str) -> None:
     found = []
     for device in ("cpu", GPU):
-        model = small_model(kind=kind, training_pass=way, objectives={objective: 1.0}).to(device).train()
+        model = small_model(kind=kind, training_pass=way, objectives={objective: 1.0}, corrupt_max=0.0)
+        model = model.to(device).train()
         batch = small_batch(model.config, ROBOTS).to(torch.device(device))
         loss = model(batch, objective, torch.Generator().manual_seed(3)).loss
         loss.backward()
@@ -70,6 +83,18 @@ def test_losses_and_gradients_are_those_of_a_cpu(kind: str, way: str, objective:
     assert mine.keys() == theirs.keys()
     for name, gradient in mine.items():
         assert torch.allclose(theirs[name], gradient, rtol=1e-2, atol=1e-4), name
+
+
+def test_digits_are_corrupted_at_the_given_rate_by_draws_that_repeat() -> None:
+    config = small_model().config
+    tokens = torch.zeros(64, 5, 16, dtype=torch.int64, device=GPU)
+    mask = VideoMask(torch.zeros(64, 5, 16, dtype=torch.bool), torch.full((64, 5), 0.3))
+    one, again, other = (
+        corrupt_tokens(config, tokens, mask, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)
+    )
+    assert torch.equal(one, again) and not torch.equal(one, other)
+    low = one % config.digits[0]
+    assert float((low != 0).float().mean()) == pytest.approx(0.3 * (1 - 1 / config.digits[0]), abs=0.03)
 
 
 @pytest.mark.parametrize("cache", [True, False])
@@ -168,6 +193,7 @@ def test_a_run_has_the_curve_of_a_cpu_and_its_checkpoint_loads_there(
     shards: list[str], optimizer: str, tmp_path: Path
 ) -> None:
     given = {**TINY, "data": shards, "optimizer": optimizer, "ema": 0.5, "self_forward": 0.5}
+    given["model"] = {"layers": 1, "width": 16, "heads": 2, "corrupt_max": 0.0}  # a GPU draws its own digits
     runs = [
         train(make_recipe({**given, "device": device}), out=tmp_path / device, show=False)
         for device in ("cpu", GPU)

@@ -51,6 +51,17 @@ def device_of(generator: torch.Generator | None) -> torch.device | str:
     return "cpu" if generator is None else generator.device
 
 
+def nearby(generator: torch.Generator | None, device: torch.device) -> torch.Generator | None:
+    """Return a generator for many draws for a device: one of the device's own if the given one is another's.
+
+    Millions of numbers drawn on the CPU and moved would take a GPU longer than its passes.
+    """
+    if generator is None or generator.device.type == device.type:
+        return generator
+    seed = int(torch.randint(2**62, (), generator=generator, device=generator.device))
+    return torch.Generator(device).manual_seed(seed)
+
+
 # Chooses from the scores (B, f, k, V) of f digits, from the given one on, these digits (B, f, k).
 type Choose = Callable[[Tensor, int], Tensor]
 

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from hma_model.config import HMAConfig
-from hma_model.network.head import device_of, uniform
+from hma_model.network.head import device_of, nearby, uniform
 from hma_model.network.stem import from_digits, to_digits
 
 
@@ -84,6 +84,7 @@ def corrupt_tokens(
     digits = to_digits(tokens, config.digits)
     if config.corrupt_max:
         values = torch.tensor(config.digits, device=tokens.device)
+        generator = nearby(generator, tokens.device)
         random = (uniform(digits.shape, generator, tokens.device) * values).long()
         draw = uniform(digits.shape, generator, tokens.device)
         hit = draw < mask.corruption.to(tokens.device)[..., None, None]

@@ -219,14 +219,36 @@ class HMA(nn.Module):
         """
         self._require("discrete", "video_logits")
         groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
-        conditioning = self._condition(actions, action_mask, groups, times)
+        conditioning = self.condition(actions, action_mask, groups, times)
+        return self.logits_under(conditioning, tokens, groups, times, true, first)
+
+    def logits_under(
+        self,
+        conditioning: Conditioning,
+        tokens: Tensor,
+        groups: Groups,
+        times: TimePositions,
+        true: Tensor | None = None,
+        first: Tensor | None = None,
+        frame: Tensor | None = None,
+    ) -> Tensor:
+        """Compute `video_logits` under a conditioning that `condition` has computed.
+
+        With `frame` (B,) int64, only that frame of each window is scored, and T is 1.
+        """
         values = groups.sort(self.frame_values(tokens))
         x = self.embed_tokens(values, first=self._first(first, groups))
         given = None if true is None else to_digits(groups.sort(self.frame_values(true)), self.config.digits)
         before = None
         if self.config.copy_previous:
             before = frames_before(values, list(range(-1, values.shape[1] - 1)), self.config)
-        scores = self.token_readout(self.video_features(self.trunk(x, conditioning, times)), given, before)
+        features = self.video_features(self.trunk(x, conditioning, times))
+        if frame is not None:
+            at = torch.arange(len(frame), device=frame.device).unsqueeze(1), groups.sort(frame).unsqueeze(1)
+            features = features[at]
+            given = None if given is None else given[at]
+            before = None if before is None else before[at]
+        scores = self.token_readout(features, given, before)
         return groups.unsort(self.token_readout.split(scores)).unflatten(2, self.config.token_grid)
 
     def video_conditions(
@@ -252,7 +274,19 @@ class HMA(nn.Module):
         """
         self._require("continuous", "video_conditions")
         groups, times = Groups.of(embodiment, len(latents)), self.time_positions(latents.shape[1])
-        conditioning = self._condition(actions, action_mask, groups, times)
+        conditioning = self.condition(actions, action_mask, groups, times)
+        return self.conditions_under(conditioning, latents, mask, groups, times, first)
+
+    def conditions_under(
+        self,
+        conditioning: Conditioning,
+        latents: Tensor,
+        mask: Tensor,
+        groups: Groups,
+        times: TimePositions,
+        first: Tensor | None = None,
+    ) -> Tensor:
+        """Compute `video_conditions` under a conditioning that `condition` has computed."""
         patches, pixels = patchify(latents, self.config.patch), patchify(mask.unsqueeze(2), self.config.patch)
         x = self.embed_patches(groups.sort(patches), groups.sort(pixels), first=self._first(first, groups))
         before = None
@@ -326,13 +360,6 @@ class HMA(nn.Module):
         padded = [torch.nn.functional.pad(chunk, (0, widest - chunk.shape[-1])) for chunk in chunks]
         return groups.unsort(torch.cat(padded))
 
-    def _condition(
-        self, actions: Tensor | None, known: Tensor | None, groups: Groups, times: TimePositions
-    ) -> Conditioning:
-        frames = len(times.positions)
-        given = None if actions is None else align(self.config, actions, known, frames)
-        return condition(self, given, groups, times.positions)
-
     def _predict(self, pooled: Tensor, embodiment: str, readout: Readout, generator: Generators) -> Tensor:
         head = self.head(embodiment)
         chunks = head.predict(pooled.flatten(0, 1), POLICY, generator).unflatten(0, pooled.shape[:2])
@@ -400,6 +427,14 @@ class HMA(nn.Module):
         return made
 
     # -- parts that training and decoding share -----------------------------------------------------------
+
+    def condition(
+        self, actions: Tensor | None, known: Tensor | None, groups: Groups, times: TimePositions
+    ) -> Conditioning:
+        """Return the trunk's conditioning by chunks (B, T, K), of which some are known (B, T)."""
+        frames = len(times.positions)
+        given = None if actions is None else align(self.config, actions, known, frames)
+        return condition(self, given, groups, times.positions)
 
     def time_positions(self, frames: int) -> TimePositions:
         """Return the times of a window of this many frames."""

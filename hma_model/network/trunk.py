@@ -8,7 +8,7 @@ B batch, T frames, S tokens of a frame, N = S + action tokens, D width, L layers
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -20,6 +20,8 @@ from hma_model.config import HMAConfig
 from hma_model.network.linear import Linear, after_gelu, after_norm, recomputed
 from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv, turns_of
 from hma_model.network.stem import FirstFrame, LatentEmbedding, Modulation, NoiseEmbedding, TokenEmbedding
+
+MOST_SEQUENCES = 2**15  # of one call of attention: kernels of a GPU refuse 65,536 and more
 
 
 @dataclass
@@ -151,6 +153,23 @@ def sinusoids(grid: tuple[int, int], width: int) -> Tensor:
     return values[:, :width] * 0.5**0.5
 
 
+def attend(
+    q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None, scale: float, causal: bool = False
+) -> Tensor:
+    """Attend from queries (M, heads, T, head_dim) to keys and values (M, heads, R, head_dim).
+
+    `mask` (T, R) or (1 or M, 1, T, R) is True where attention is allowed. Attention over time has a sequence
+    for each place of each window: M may be large.
+    """
+    if len(q) <= MOST_SEQUENCES:
+        return F.scaled_dot_product_attention(q, k, v, mask, is_causal=causal, scale=scale)
+    masks: Sequence[Tensor | None] = [mask] * -(-len(q) // MOST_SEQUENCES)
+    if mask is not None and mask.dim() > 2 and len(mask) > 1:
+        masks = mask.split(MOST_SEQUENCES)
+    parts = zip(*(x.split(MOST_SEQUENCES) for x in (q, k, v)), masks, strict=True)
+    return torch.cat([attend(q, k, v, mask, scale, causal) for q, k, v, mask in parts])
+
+
 class Attention(nn.Module):
     """Scaled dot-product attention with its projections."""
 
@@ -188,7 +207,7 @@ class Attention(nn.Module):
     ) -> Tensor:
         """Attend over (M, length, heads, head_dim), and project the result to (M, length, D)."""
         q, k, v = (x.transpose(1, 2) for x in (q, k, v))
-        mixed = F.scaled_dot_product_attention(q, k, v, mask, is_causal=causal, scale=self.scale)
+        mixed = attend(q, k, v, mask, self.scale, causal)
         return self.proj(mixed.transpose(1, 2).flatten(-2))
 
 
@@ -220,7 +239,7 @@ class TemporalAttention(Attention):
             queries = q.transpose(1, 2).flatten(0, 1).transpose(1, 2)  # (B*N, heads, T, head_dim)
             k, v = cache.flatten(2, 3).permute(0, 2, 3, 1, 4)
             mask = allowed if len(allowed) == 1 else allowed.repeat_interleave(n, dim=0)
-            mixed = F.scaled_dot_product_attention(queries, k, v, mask.unsqueeze(1), scale=self.scale)
+            mixed = attend(queries, k, v, mask.unsqueeze(1), self.scale)
             return mixed.view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
         # On a CPU with so few frames a place, batched products take half as long as the fused kernel. The
         # softmax takes a tenth of the time if its vectors run over places instead of frames.
@@ -273,7 +292,7 @@ class ActionAttention(nn.Module):
         mask = times.allowed.repeat_interleave(n, dim=-2)
         if mask.dim() == 3:
             mask = mask.unsqueeze(1)
-        mixed = F.scaled_dot_product_attention(queries, k, v, mask, scale=self.scale)
+        mixed = attend(queries, k, v, mask, self.scale)
         return self.proj(mixed.transpose(1, 2).flatten(-2)).view(b, t, n, -1)
 
 

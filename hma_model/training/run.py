@@ -246,18 +246,29 @@ class Run:
         generator = torch.Generator().manual_seed(seed_for(recipe.seed, "masks", self.step, number))
         with self.parallel_model.passing(last):
             with self._autocast():
-                if recipe.self_rollout:
-                    share = share_at(self.step, recipe, recipe.self_rollout)
-                    batch = rolled(self.model, batch, share, recipe.frames, self._draws("rollout", number))
-                if share := share_at(self.step, recipe, recipe.self_forward):
-                    draws = self._draws("self_forward", number)
-                    batch = forwarded(self.model, batch, share, recipe.self_forward_frames, draws)
+                with self._uncompiled():
+                    batch = self._with_own_past(number, batch)
                 output = self.parallel_model(batch, generator=generator)
             if not output.loss.requires_grad:
                 fault = f"leaves nothing to train with the objective {output.objective}"
                 raise RecipeError("recipe: freeze", fault, "use freeze=nothing, or another objective")
             (output.loss / len(self.train_data.own)).backward()
         return output
+
+    def _with_own_past(self, number: int, batch: Batch) -> Batch:
+        """Return the batch, in which the past of some windows is the model's own, as the recipe has it."""
+        recipe = self.recipe
+        if recipe.self_rollout:
+            share = share_at(self.step, recipe, recipe.self_rollout)
+            batch = rolled(self.model, batch, share, recipe.frames, self._draws("rollout", number))
+        if share := share_at(self.step, recipe, recipe.self_forward):
+            draws = self._draws("self_forward", number)
+            batch = forwarded(self.model, batch, share, recipe.self_forward_frames, draws)
+        return batch
+
+    def _uncompiled(self) -> AbstractContextManager[Any]:
+        """Let compiled blocks run as they are: each number of windows would be compiled anew."""
+        return torch.compiler.set_stance("force_eager") if self.recipe.compile else nullcontext()
 
     def _draws(self, name: str, number: int) -> torch.Generator:
         return torch.Generator().manual_seed(seed_for(self.recipe.seed, name, self.step, number))

@@ -21,12 +21,16 @@ from torch import Tensor
 
 from hma_data.loading.dataset import Batch
 from hma_model.generation.rollout import generate
+from hma_model.network.conditioning import Groups
 from hma_model.network.head import uniform
 from hma_model.network.stem import from_digits, split_tokens, unpatchify
+from hma_model.network.trunk import Conditioning, TimePositions
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
     from hma_model.training.recipe import Recipe
+
+type Under = tuple[Conditioning, Groups, TimePositions]
 
 SAMPLE_STEPS = 8  # of the diffusion head; enough for a past to learn from
 
@@ -129,36 +133,53 @@ def forwarded(
     context, rows = true[chosen].clone(), torch.arange(int(chosen.sum()), device=true.device)
     names = [name for name, taken in zip(batch.embodiment, chosen.tolist()) if taken]
     earlier = None if batch.earlier is None else batch.earlier[chosen]
-    own = Batch(names, batch.actions[chosen], batch.action_mask[chosen], earlier=earlier)
     training = model.training
     model.eval()
+    groups, times = Groups.of(names, len(rows)), model.time_positions(frames)
+    actions, known = batch.actions[chosen], batch.action_mask[chosen]
+    conditioning = model.condition(actions if model.config.sees_actions else None, known, groups, times)
+    predicted = _predicted_tokens if model.config.kind == "discrete" else _predicted_latents
     for offset in range(depth):
         at = first[chosen] + offset
-        context[rows, at] = _predicted(model, context, at, own, generator)
+        context[rows, at] = predicted(model, context, at, (conditioning, groups, times), earlier, generator)
     model.train(training)
     seen = (true if batch.context is None else batch.context).clone()
     seen[chosen] = context
     return replace(batch, context=seen)
 
 
-def _predicted(
-    model: "HMA", context: Tensor, at: Tensor, batch: Batch, generator: torch.Generator | None
+def _predicted_tokens(
+    model: "HMA",
+    context: Tensor,
+    at: Tensor,
+    under: Under,
+    earlier: Tensor | None,
+    generator: torch.Generator | None,
 ) -> Tensor:
-    """Predict frame `at` (n,) of each window, wholly masked, from the frames before it."""
-    config, rows = model.config, torch.arange(len(at), device=at.device)
-    names = batch.embodiment
-    actions, known = (batch.actions, batch.action_mask) if model.config.sees_actions else (None, None)
-    if config.kind == "discrete":
-        hidden = context.clone()
-        hidden[rows, at] = config.vocab_size
-        scores = model.video_logits(hidden, actions, names, known, first=batch.earlier)
-        digits = scores[rows, at].argmax(-1)
-        tokens = from_digits(digits, config.digits).flatten(1)
-        return split_tokens(tokens, config.merge, config.vocab_size, config.token_grid)
+    """Predict the tokens of frame `at` (n,) of each window, wholly masked, from the frames before it."""
+    config, (conditioning, groups, times) = model.config, under
+    hidden = context.clone()
+    hidden[torch.arange(len(at), device=at.device), at] = config.vocab_size
+    scores = model.logits_under(conditioning, hidden, groups, times, first=earlier, frame=at)
+    tokens = from_digits(scores[:, 0].argmax(-1), config.digits).flatten(1)
+    return split_tokens(tokens, config.merge, config.vocab_size, config.token_grid)
+
+
+def _predicted_latents(
+    model: "HMA",
+    context: Tensor,
+    at: Tensor,
+    under: Under,
+    earlier: Tensor | None,
+    generator: torch.Generator | None,
+) -> Tensor:
+    """Predict the latents of frame `at` (n,) of each window, wholly masked, from the frames before it."""
+    config, (conditioning, groups, times) = model.config, under
+    rows = torch.arange(len(at), device=at.device)
     scaled = context.float() * config.latent_scale
     mask = torch.zeros(context.shape[:2] + context.shape[3:], dtype=torch.bool, device=context.device)
     mask[rows, at] = True
-    conditions = model.video_conditions(scaled, mask, actions, names, known, batch.earlier)[rows, at]
+    conditions = model.conditions_under(conditioning, scaled, mask, groups, times, earlier)[rows, at]
     patches = model.latent_readout.sample(conditions.flatten(0, 2), SAMPLE_STEPS, generator=generator)
     whole = patches.view(len(at), 1, -1, config.patch_dim)
     latents = unpatchify(whole, config.patch, config.token_grid)

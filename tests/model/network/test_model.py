@@ -9,6 +9,7 @@ import torch
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_model.config import CONDITIONINGS, OBJECTIVES, ActionSpace
+from hma_model.network.conditioning import Groups
 from hma_model.network.masking import draw_video_mask, drop_chunks
 from hma_model.network.model import HMA
 from hma_model.network.stem import from_digits, patchify, to_digits, unpatchify
@@ -204,6 +205,25 @@ def test_action_loss_is_the_mean_over_present_chunks(target: str) -> None:
     else:  # raw predictions have lost what the head says of the hand's constant dim
         expected = torch.stack([losses[0].mean(), losses[2].mean()])
         assert torch.allclose(out.per_sample[[0, 2]], expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"digit_order": "chain"}, {"copy_previous": True}, {"merge": 2, "factored": (6, 4)}],
+    ids=str,
+)
+def test_the_scores_of_one_frame_of_each_window_are_those_of_all_at_these_frames(
+    changes: dict[str, Any],
+) -> None:
+    model = small_model(**changes)
+    batch = small_batch(model.config, ["arm", "hand.v1", "arm"])
+    frame = torch.tensor([4, 1, 0])
+    groups, times = Groups.of(batch.embodiment, 3), model.time_positions(5)
+    conditioning = model.condition(batch.actions, None, groups, times)
+    for true in (None, batch.tokens):
+        whole = model.video_logits(batch.tokens, batch.actions, batch.embodiment, None, true)
+        one = model.logits_under(conditioning, batch.tokens, groups, times, true, frame=frame)
+        assert torch.allclose(one[:, 0], whole[torch.arange(3), frame], atol=1e-5)
 
 
 def test_predicted_actions_are_raw_and_padded() -> None:

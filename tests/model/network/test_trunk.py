@@ -6,6 +6,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from hma_data.errors import HMAError
 from hma_model.config import ActionSpace
+from hma_model.network import trunk
 from hma_model.network.model import HMA
 from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv
 from hma_model.network.stem import Normalizer
@@ -239,3 +240,14 @@ def test_checkpointed_blocks_give_the_same_gradients() -> None:
         out.loss.backward()
         grads.append(model.trunk.blocks[0].mlp.fc1.weight.grad)
     assert torch.allclose(*grads, atol=1e-7)
+
+
+@pytest.mark.parametrize("mask", [None, (5, 5), (1, 1, 5, 5), (7, 1, 5, 5)], ids=str)
+def test_many_sequences_are_attended_part_by_part(
+    mask: tuple[int, ...] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    q, k, v = torch.randn(3, 7, 2, 5, 4)
+    allowed = None if mask is None else torch.ones(mask, dtype=torch.bool).tril(1)
+    whole = trunk.attend(q, k, v, allowed, 0.5, causal=mask is None)
+    monkeypatch.setattr(trunk, "MOST_SEQUENCES", 3)
+    assert torch.equal(trunk.attend(q, k, v, allowed, 0.5, causal=mask is None), whole)
