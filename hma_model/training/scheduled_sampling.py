@@ -138,17 +138,16 @@ def forwarded(
     groups, times = Groups.of(names, len(rows)), model.time_positions(frames)
     actions, known = batch.actions[chosen], batch.action_mask[chosen]
     conditioning = model.condition(actions if model.config.sees_actions else None, known, groups, times)
-    predicted = _predicted_tokens if model.config.kind == "discrete" else _predicted_latents
     for offset in range(depth):
         at = first[chosen] + offset
-        context[rows, at] = predicted(model, context, at, (conditioning, groups, times), earlier, generator)
+        context[rows, at] = _predicted(model, context, at, (conditioning, groups, times), earlier, generator)
     model.train(training)
     seen = (true if batch.context is None else batch.context).clone()
     seen[chosen] = context
     return replace(batch, context=seen)
 
 
-def _predicted_tokens(
+def _predicted(
     model: "HMA",
     context: Tensor,
     at: Tensor,
@@ -156,26 +155,15 @@ def _predicted_tokens(
     earlier: Tensor | None,
     generator: torch.Generator | None,
 ) -> Tensor:
-    """Predict the tokens of frame `at` (n,) of each window, wholly masked, from the frames before it."""
-    config, (conditioning, groups, times) = model.config, under
-    hidden = context.clone()
-    hidden[torch.arange(len(at), device=at.device), at] = config.vocab_size
-    scores = model.logits_under(conditioning, hidden, groups, times, first=earlier, frame=at)
-    tokens = from_digits(scores[:, 0].argmax(-1), config.digits).flatten(1)
-    return split_tokens(tokens, config.merge, config.vocab_size, config.token_grid)
-
-
-def _predicted_latents(
-    model: "HMA",
-    context: Tensor,
-    at: Tensor,
-    under: Under,
-    earlier: Tensor | None,
-    generator: torch.Generator | None,
-) -> Tensor:
-    """Predict the latents of frame `at` (n,) of each window, wholly masked, from the frames before it."""
+    """Predict frame `at` (n,) of each window, wholly masked, from the frames before it."""
     config, (conditioning, groups, times) = model.config, under
     rows = torch.arange(len(at), device=at.device)
+    if config.kind == "discrete":
+        hidden = context.clone()
+        hidden[rows, at] = config.vocab_size
+        scores = model.logits_under(conditioning, hidden, groups, times, first=earlier, frame=at)
+        tokens = from_digits(scores[:, 0].argmax(-1), config.digits).flatten(1)
+        return split_tokens(tokens, config.merge, config.vocab_size, config.token_grid)
     scaled = context.float() * config.latent_scale
     mask = torch.zeros(context.shape[:2] + context.shape[3:], dtype=torch.bool, device=context.device)
     mask[rows, at] = True

@@ -70,6 +70,14 @@ def test_the_work_of_a_frame_is_that_of_its_products() -> None:
     assert flops.rate_of(products, torch.device("cpu")) > 0
 
 
+def test_products_are_counted_where_operators_arrive_whole() -> None:
+    # as on a GPU, and on a processor without the kernels of hma_model.generation.packed
+    linear, x = torch.nn.Linear(8, 4), torch.randn(16, 8)
+    with torch.inference_mode():
+        products = flops.products_of(lambda: lambda: (linear(x), x @ x.mT))
+    assert products == {("product", 16, 8, 4): 2 * 16 * 8 * 4, ("product", 16, 8, 16): 2 * 16 * 8 * 16}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("cache", [True, False])
 def test_latents_are_measured_in_either_precision(cache: bool) -> None:
