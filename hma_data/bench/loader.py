@@ -16,9 +16,10 @@ from typing import Any, get_args
 
 import numpy as np
 
-from hma_data.bench import Bench, in_fresh_process, make_robot, peak_rss_mib, rss_mib
-from hma_data.bench.peers import PEERS, run_peer
+from hma_data.bench import Bench, in_fresh_process, make_robot, peak_rss_mib, recipe_module, rss_mib
 from hma_data.loading.mixture import Draw
+
+PEERS = ("datasets", "lance", "litdata", "streaming")  # of recipes/bench/peers.py
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
@@ -26,7 +27,9 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         sets = [make_set(Path(folder) / str(i), i, settings) for i in range(settings["embodiments"])]
         results = [_timed(_load, case, sets, settings) for case in settings["cases"]]
-        return results + [_timed(run_peer, name, sets[0], settings) for name in settings["peers"]]
+        for name in settings["peers"]:
+            results.append(_timed(recipe_module("peers").run_peer, name, sets[0], settings))
+        return results
 
 
 def _timed(work: Callable[..., dict[str, Any]], name: str, *given: Any) -> dict[str, Any]:
@@ -165,5 +168,5 @@ BENCH = Bench(
         "runs": 3,
     },
     run,
-    choices={"draw": get_args(Draw), "cases": ("mixture", "random"), "peers": tuple(PEERS)},
+    choices={"draw": get_args(Draw), "cases": ("mixture", "random"), "peers": PEERS},
 )

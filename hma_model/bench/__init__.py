@@ -1,1 +1,1 @@
-"""Benchmark the model: `hma bench generate`, `play`, `train`, `mup`, `waiting`, `drift`, `quality`."""
+"""Benchmark the model: `hma bench drift`, `generate`, `play` and `train`. Others lie in `recipes/bench`."""

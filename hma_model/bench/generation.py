@@ -10,7 +10,7 @@ the cache, each frame follows the one before it. Without the cache, each frame i
 again. In a batch, the time of a frame is the time of the step divided by the batch size.
 
 `gflop_per_frame` counts the products of a frame; `limit_gflop_per_second` is the rate at which this machine
-does them when it does nothing else (`hma_model.bench.flops`); `share_of_limit` is the share of a frame's time
+does them when it does nothing else (recipes/bench/flops.py); `share_of_limit` is the share of a frame's time
 that they would then take. Each case runs in its own process. The fastest step after a warm-up counts.
 """
 
@@ -19,9 +19,8 @@ from collections.abc import Callable
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from hma_data.bench import Bench, in_fresh_process
+from hma_data.bench import Bench, in_fresh_process, recipe_module
 from hma_data.errors import UsageError
-from hma_model.bench.flops import products_of, rate_of
 from hma_model.bench.speed import (
     COMMON,
     KINDS,
@@ -99,9 +98,10 @@ def measure_frames(settings: dict[str, Any]) -> dict[str, Any]:
     made = Frames(model, settings)
     seconds = made.seconds()
     frame = min(seconds) / settings["batch"]
-    products = products_of(made.step)
+    flops = recipe_module("flops")
+    products = flops.products_of(made.step)
     gflop = sum(products.values()) / 1e9 / settings["batch"]
-    rate = rate_of(products, model.device, settings["precision"])
+    rate = flops.rate_of(products, model.device, settings["precision"])
     told = ("precision", "batch", "unmask_steps", "decode", "compile")
     return {
         **({"row": settings["row"]} if "row" in settings else {}),

@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from hma_data import __version__
-from hma_data.bench import BENCHES
+from hma_data.bench import BENCHES, RECIPES
 from hma_data.cli import mount
 from hma_data.console import fail, interruptible
 from hma_data.cpu import bound_spinning, take_ordinary_priority
@@ -241,10 +241,10 @@ app.command("label-actions", rich_help_panel=MODELS)(label_actions)
 BENCHES |= {
     "drift": "hma_model.bench.drift:BENCH",
     "generate": "hma_model.bench.generation:GENERATE",
-    "mup": "hma_model.bench.mup:BENCH",
+    "mup": f"{RECIPES}.mup:BENCH",
     "play": "hma_model.bench.play:BENCH",
-    "quality": "hma_model.bench.quality:BENCH",
+    "quality": f"{RECIPES}.quality:BENCH",
     "train": "hma_model.bench.speed:TRAIN",
-    "waiting": "hma_model.bench.waiting:WAITING",
+    "waiting": f"{RECIPES}.waiting:WAITING",
 }
 app.add_typer(hub_app, name="hub", rich_help_panel=MODELS)

@@ -28,13 +28,15 @@ from typing import Any
 import numpy as np
 from what_pays import append, read
 
+from hma_data.bench import recipe_module
 from hma_data.console import run_script
 from hma_data.lab.family import TRUNK
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
-from hma_model.bench.quality import FRAMES, PLAIN, PROMPT, recorded
 from hma_model.evaluation.intervals import T95
 
+quality = recipe_module("quality")
+FRAMES, PLAIN, PROMPT, recorded = quality.FRAMES, quality.PLAIN, quality.PROMPT, quality.recorded
 WINDOWS, DRAWS, STATES = 16, 2, 16
 NEW = "arm3_55"  # a robot that the embedded trunk has not seen
 ROBOTS = ("rails_03", *(name for name in TRUNK if name not in ("rails_03", "arm3_04")))

@@ -5,9 +5,10 @@ from typing import Any
 
 import pytest
 
-from hma_data.bench import loader, peers
+from hma_data.bench import loader
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
+from recipes.bench import peers
 from tests.data.loading.test_pools import SMALL
 
 

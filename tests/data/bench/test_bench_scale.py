@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from hma_data.bench import scale
 from hma_data.loading.dataset import MixtureDataset
 from hma_data.shards.reader import ShardSet
+from recipes.bench import scale
 
 SMALL = {"episodes": 120, "embodiments": 2, "folder": ""}
 

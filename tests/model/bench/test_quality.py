@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from hma_data.errors import UsageError
-from hma_model.bench import quality
 from hma_model.cli import app
+from recipes.bench import quality
 
 TINY = ["cases=discrete", "steps=2", "windows=2", "episodes=0"]
 

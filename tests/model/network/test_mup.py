@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from typer.testing import CliRunner
 
-from hma_model.bench.mup import SPACE, make_model, train, windows
 from hma_model.cli import app
 from hma_model.network.model import HMA
+from recipes.bench.mup import SPACE, make_model, train, windows
 
 WIDTHS = (64, 128, 256)
 

@@ -13,9 +13,9 @@ from scipy import stats
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model.bench.quality import PLAIN
 from hma_model.evaluation.rollouts import rollout
 from hma_model.training.recipe import load_recipe
+from recipes.bench.quality import PLAIN
 from tests.model.shards import make_shards
 
 sys.path.insert(0, str(shipped("recipes") / "lab"))

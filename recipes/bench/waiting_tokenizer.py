@@ -1,7 +1,7 @@
-"""A tokenizer whose work is done elsewhere, as on a GPU: it waits so many milliseconds a frame.
+"""Stand in for a tokenizer on a GPU: wait so many milliseconds a frame (`hma bench convert wait_ms=…`).
 
-With it, `hma bench convert` shows how all else scales with the number of workers, also on few cores.
-Other processes find it by an entry point, which `offered` puts on their path.
+The conversion then shows how everything else scales with the number of workers, also on few cores. Other
+processes find the tokenizer by an entry point, which `offered` puts on their path.
 """
 
 import os
@@ -20,6 +20,7 @@ from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.catalog import Entry
 
 NAME = "waiting"
+ROOT = str(Path(__file__).resolve().parents[2])  # from which this module is imported
 MILLISECONDS = "HMA_BENCH_WAIT_MS"
 SIZE, CELL = 128, 8
 ENTRY = Entry(
@@ -62,7 +63,7 @@ def offered(folder: Path, milliseconds: float) -> Iterator[None]:
     before = os.environ.get("PYTHONPATH")
     os.environ |= {
         MILLISECONDS: str(milliseconds),
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(folder), before])),
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(folder), ROOT, before])),
     }
     sys.path.insert(0, str(folder))
     try:
