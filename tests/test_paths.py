@@ -30,7 +30,8 @@ from hma_data.shards.memmap import export
 from hma_data.shards.preview import describe, preview, tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.base import open_source
+from hma_data.sources.detect import detect
 from hma_data.sources.hands.detect import load_models
 from hma_data.storage.files import file_sha256
 from hma_data.storage.paths import StrPath, as_address, as_path, as_text
@@ -382,7 +383,7 @@ PUBLIC = (
     "hma_data.loading.mixture", "hma_data.registry.catalog", "hma_data.registry.embodiment",
     "hma_data.shards.manifest", "hma_data.shards.memmap", "hma_data.shards.preview",
     "hma_data.shards.reader", "hma_data.shards.verify", "hma_data.sources.bags.source",
-    "hma_data.sources.base", "hma_data.sources.hands.detect",
+    "hma_data.sources.base", "hma_data.sources.detect", "hma_data.sources.hands.detect",
     "hma_data.sources.hands.source", "hma_data.sources.hdf5.source",
     "hma_data.sources.lerobot.source", "hma_data.sources.rlds.source", "hma_data.tokenizers.base",
     "hma_data.tokenizers.training.frames", "hma_data.tokenizers.training.recipe",
@@ -410,7 +411,7 @@ INNER = {  # take what a public function has made of a path already
         "Derived",
     },
     "hma_data.shards.verify": {"check_rows", "check_shard"},
-    "hma_data.sources.base": {"of_another_format", "by_files"},
+    "hma_data.sources.detect": {"of_another_format", "by_files"},
     "hma_data.sources.common.places": {
         "is_away",
         "existing_path",

@@ -12,7 +12,8 @@ import pytest
 
 from hma_data.errors import PluginError, SourceError, TokenizerError
 from hma_data.registry.embodiment import problems
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.base import open_source
+from hma_data.sources.detect import detect
 from hma_data.tokenizers.base import get_tokenizer
 from tests.command import ROOT, fails, hma
 from tests.conftest import write_toy

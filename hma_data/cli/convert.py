@@ -317,7 +317,7 @@ def _print_cameras(line: str, pictures: dict[str, tuple[int, int]], robot: Any, 
 def _ready(job: _Job) -> Any:
     """Return the robot; refuse what can be seen from the command line before torch is imported."""
     from hma_data.registry.embodiment import find
-    from hma_data.sources.base import require_there
+    from hma_data.sources.detect import require_there
     from hma_data.tokenizers.catalog import find_entry
 
     robot = find(job.embodiment)

@@ -50,8 +50,9 @@ from hma_data.errors import OutputError, RegistryError, SourceError, StorageAway
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, finish, shard_sizes
 from hma_data.shards.schema import RowLayout, flag_totals, to_numpy
-from hma_data.sources.base import EpisodeRef, of_another_format, open_source, require_utf8
+from hma_data.sources.base import EpisodeRef, open_source
 from hma_data.sources.common.choice import chosen_ids, ids_for_robot
+from hma_data.sources.detect import of_another_format, require_utf8
 from hma_data.storage.files import remove_parts
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.records import Records

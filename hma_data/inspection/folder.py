@@ -14,7 +14,8 @@ from typing import Any
 
 from hma_data.errors import HMAError
 from hma_data.registry import FORMATS
-from hma_data.sources.base import Recognition, by_files, open_source, recognitions
+from hma_data.sources.base import Recognition, open_source
+from hma_data.sources.detect import by_files, recognitions
 from hma_data.storage.paths import StrPath, as_path
 
 SHARDS = "shard set"

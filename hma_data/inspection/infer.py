@@ -36,8 +36,9 @@ from hma_data.inspection.infer_choices import (
 from hma_data.registry.catalog import entries
 from hma_data.registry.components import Space
 from hma_data.registry.embodiment import ID_PATTERN, ONE_INDEX, TODO, Embodiment, find
-from hma_data.sources.base import Inspection, KeyInfo, detect, open_source, require_utf8
+from hma_data.sources.base import Inspection, KeyInfo, open_source
 from hma_data.sources.common.checks import Finding
+from hma_data.sources.detect import detect, require_utf8
 from hma_data.sources.hdf5.videos import is_video
 from hma_data.storage.paths import StrPath
 

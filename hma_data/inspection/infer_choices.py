@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from hma_data.sources.base import KeyInfo
+from hma_data.sources.common.inspection import KeyInfo
 from hma_data.sources.hdf5.videos import FILE, is_video
 
 MAX_DIMS = 4096  # of a component

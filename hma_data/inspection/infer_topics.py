@@ -20,7 +20,7 @@ from hma_data.inspection.infer_choices import (
     strength,
     words,
 )
-from hma_data.sources.base import KeyInfo, TopicInfo
+from hma_data.sources.common.inspection import KeyInfo, TopicInfo
 
 _COMMAND_TYPE = re.compile(r"(Twist|JointTrajectory|Command|Cmd|Ackermann|Joy)[A-Za-z]*$")
 _NEVER = re.compile(r"(^|/)(rosout|parameter_events|clock|diagnostics|_action)(/|$)|_service_event$")

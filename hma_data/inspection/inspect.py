@@ -30,10 +30,11 @@ from hma_data.errors import HMAError, SourceError
 from hma_data.inspection.infer import commands, lacking
 from hma_data.registry.components import Sync
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment, find
-from hma_data.sources.base import SAMPLE, Inspection, LaidOut, Source, detect, of_another_format, open_source
+from hma_data.sources.base import SAMPLE, Inspection, LaidOut, Source, open_source
 from hma_data.sources.common.checks import SEVERITIES, Finding, Severity
 from hma_data.sources.common.choice import ids_for_robot
 from hma_data.sources.common.survey import CHECKS, alike, sampled
+from hma_data.sources.detect import detect, of_another_format
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import is_remote, place
 

@@ -35,9 +35,9 @@ from hma_data.sources.bags.messages import (
     numbers,
 )
 from hma_data.sources.bags.topic_track import Field, TopicTrack, camera_stream, parse_key
-from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, StreamTimes, measure, skew
+from hma_data.sources.common.inspection import Inspection, KeyInfo, TopicInfo
 from hma_data.sources.common.places import unfollowed
 from hma_data.sources.common.survey import Survey, sampled
 

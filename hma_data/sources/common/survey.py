@@ -19,9 +19,9 @@ from hma_data.episodes.align import divide_remedy
 from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import Images
 from hma_data.errors import HMAError
-from hma_data.sources.base import KeyInfo
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, Look, Severity, StreamTimes
+from hma_data.sources.common.inspection import KeyInfo
 
 CHECKS = {  # the checks of an inspection, in the order they are printed
     "readable": "episodes that can be read",

@@ -17,9 +17,9 @@ import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import HandsLayout
-from hma_data.sources.base import Inspection, KeyInfo
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding
+from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.places import file_fingerprint, local_path, unfollowed
 from hma_data.sources.common.survey import Survey, sampled
 from hma_data.sources.common.video_file import VideoFile

@@ -12,9 +12,9 @@ import numpy as np
 from hma_data.episodes.images import decode_image
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import Hdf5Layout
-from hma_data.sources.base import Inspection, KeyInfo
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, is_times, seconds_a_unit, seconds_of
+from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.places import local_path, unfollowed
 from hma_data.sources.common.survey import MAX_VALUES, Survey, listed, sampled
 from hma_data.sources.hdf5.file import (

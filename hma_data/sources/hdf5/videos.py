@@ -22,7 +22,7 @@ from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import Camera, Hdf5Layout
-from hma_data.sources.base import KeyInfo
+from hma_data.sources.common.inspection import KeyInfo
 from hma_data.sources.common.places import file_fingerprint, leaves
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.storage.files import parse_json

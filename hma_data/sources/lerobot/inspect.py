@@ -7,9 +7,9 @@ whose files are there. Nothing is fetched from the Hub for this.
 import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError
-from hma_data.sources.base import Inspection, KeyInfo
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding
+from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.survey import MAX_VALUES, Survey, sampled
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.sources.lerobot.metadata import Feature, Metadata, Span, episode_name

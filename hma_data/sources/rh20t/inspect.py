@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from hma_data.errors import HMAError
-from hma_data.sources.base import Inspection, KeyInfo
 from hma_data.sources.common import checks
+from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.places import local_path, unfollowed
 from hma_data.sources.common.survey import Survey, sampled
 from hma_data.sources.rh20t.scenes import Scene, scenes

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.episode import Decode
 from hma_data.episodes.images import decode_image
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources.rlds.records import Example
+from hma_data.sources.rlds.example import Example
 
 Shape = tuple[int | None, ...]
 BFLOAT16 = "bfloat16"  # NumPy lacks this dtype: values become float32

@@ -22,8 +22,9 @@ from pydantic.alias_generators import to_camel
 
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.common.places import local_path
+from hma_data.sources.rlds.example import Example
 from hma_data.sources.rlds.features import Feature, read_features
-from hma_data.sources.rlds.records import Example, Framing, RecordFile, open_records
+from hma_data.sources.rlds.records import Framing, RecordFile, open_records
 from hma_data.storage.blocks import Blocks
 from hma_data.storage.fetch import attempt, fetch_whole, file_system, is_listless, is_local
 

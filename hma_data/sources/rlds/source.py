@@ -24,9 +24,9 @@ from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, KeyInfo, compo
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, is_times, seconds_of
 from hma_data.sources.common.survey import Survey, sampled
+from hma_data.sources.rlds.example import Example
 from hma_data.sources.rlds.features import Feature, Steps, scalar
 from hma_data.sources.rlds.folder import Folder, Shard, episode_id, open_folder
-from hma_data.sources.rlds.records import Example
 from hma_data.storage.fetch import info, mark
 from hma_data.storage.paths import StrPath, as_text
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hma_data.errors import HMAError
 from hma_data.inspection.infer import from_inspection
 from hma_data.registry.embodiment import problems
-from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
+from hma_data.sources.common.inspection import Inspection, KeyInfo, TopicInfo
 from hma_data.storage.yaml_io import parse_yaml
 
 HOSTILE = [

@@ -15,7 +15,8 @@ from hma_data.lab.planar_arm import STEPS, TASK
 from hma_data.registry.embodiment import find
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.base import open_source
+from hma_data.sources.detect import detect
 from tests.conftest import BlockTokenizer
 
 EPISODES, SEED = 2, 3

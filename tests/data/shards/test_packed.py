@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hma_data.errors import SourceError
-from hma_data.sources.base import detect
+from hma_data.sources.detect import detect
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from hma_data.errors import EpisodeError, RegistryError, SourceError
 from hma_data.inspection.infer import infer
 from hma_data.registry.embodiment import find
 from hma_data.shards.reader import ShardSet
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.base import open_source
+from hma_data.sources.detect import detect
 from tests.data.rh20t_files import CAMERAS, LATE_MS, pose, robot, stamps, tables, write_scene
 from tests.data.videos import encode
 

@@ -15,8 +15,8 @@ from hma_data.errors import OutputError, StorageAwayError
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.bags import segments
 from hma_data.sources.bags.bag import find_bags
-from hma_data.sources.base import detect
 from hma_data.sources.common.places import existing_path
+from hma_data.sources.detect import detect
 from hma_data.storage import blocks, remote
 from tests.conftest import BlockTokenizer
 from tests.data.bag_files import SOURCE

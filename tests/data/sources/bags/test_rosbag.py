@@ -16,7 +16,7 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.messages import decode
-from hma_data.sources.base import detect
+from hma_data.sources.detect import detect
 from tests.data.bag_files import (
     CAMERA,
     COMMAND,

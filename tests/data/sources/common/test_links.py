@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hma_data.errors import SourceError
-from hma_data.sources.base import Inspection, detect, open_source
+from hma_data.sources.base import Inspection, open_source
+from hma_data.sources.detect import detect
 from tests.data.bag_files import make_recording, write_ros1
 from tests.data.videos import encode
 

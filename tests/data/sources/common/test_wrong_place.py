@@ -11,7 +11,8 @@ from hma_data.conversion.job import convert
 from hma_data.errors import HMAError, OutputError, RegistryError, SourceError, StorageError, UsageError
 from hma_data.inspection.inspect import examine, inspect_recording
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import detect, of_another_format, open_source
+from hma_data.sources.base import open_source
+from hma_data.sources.detect import detect, of_another_format
 from hma_model.cli import app
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 from tests.data.bag_files import make_recording, write_ros2

@@ -14,8 +14,9 @@ from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import HandsLayout
 from hma_data.registry.embodiment import find
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.base import open_source
 from hma_data.sources.common.video_file import VideoFile
+from hma_data.sources.detect import detect
 from hma_data.sources.hands.runs import (
     KEYS,
     POINTS,

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.base import open_source
+from hma_data.sources.detect import detect
 from hma_data.sources.hdf5 import file as hdf5_file
 from hma_data.sources.hdf5.file import OPEN_FILES, rows
 from tests.data.fresh import run_fresh

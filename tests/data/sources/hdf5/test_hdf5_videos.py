@@ -14,7 +14,8 @@ from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.reader import ShardSet
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.base import open_source
+from hma_data.sources.detect import detect
 from tests.conftest import BlockTokenizer
 from tests.data.inferring import answered, inferred
 from tests.data.videos import encode, number_of

@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.embodiment import Embodiment, find
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.base import open_source
 from hma_data.sources.common.video_file import VideoFile
+from hma_data.sources.detect import detect
 from hma_data.sources.lerobot.metadata import fill
 from tests.data.hub_cache import as_snapshot
 from tests.data.videos import (

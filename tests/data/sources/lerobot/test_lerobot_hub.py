@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.base import open_source
+from hma_data.sources.detect import detect
 from tests.data.sources.lerobot.test_lerobot import embodiment
 from tests.data.videos import CAMERA, STILL, actions_of, make_v2, make_v3, number_of
 from tests.hub_server import Hub, connect, serve

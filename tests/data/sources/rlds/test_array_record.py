@@ -9,7 +9,8 @@ import pytest
 from array_record.python.array_record_module import ArrayRecordWriter
 
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.base import open_source
+from hma_data.sources.detect import detect
 from hma_data.sources.rlds.folder import open_folder
 from hma_data.sources.rlds.records import open_records
 from tests.data import rlds_files

@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, HMAError, MissingDependencyError, SourceError
 from hma_data.registry.embodiment import Embodiment, find
-from hma_data.sources.base import detect, open_source
-from hma_data.sources.rlds.records import Example, varints
+from hma_data.sources.base import open_source
+from hma_data.sources.detect import detect
+from hma_data.sources.rlds.example import Example, varints
 from tests.data import rlds_files
 from tests.data.rlds_files import (
     PROTO,

@@ -1,0 +1,112 @@
+"""Define the result of inspecting a recording: its keys, with what was measured of them, and findings."""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from hma_data.episodes.offset import Offset
+from hma_data.sources.common.checks import Finding
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """The topic of a bag that holds a key, as measured from its messages.
+
+    Attributes:
+        name: of the topic.
+        type: of its messages.
+        gap_ms: the longest interval between two of them in which a camera saw something; of a camera, the
+            longest interval; None for fewer than two.
+        delay_ms: median from header stamp to receipt; None where messages carry no time.
+        goes_back: whether header stamps go back in time.
+        offsets: how the messages lie between the pictures of each camera; of topics with numbers only.
+    """
+
+    name: str
+    type: str
+    gap_ms: float | None = None
+    delay_ms: float | None = None
+    goes_back: bool = False
+    offsets: tuple[Offset, ...] = ()
+
+
+@dataclass(frozen=True)
+class KeyInfo:
+    """One key of a recording, as `hma inspect` lists it.
+
+    Attributes:
+        key: as an embodiment's YAML would name it.
+        kind: camera, vector, text or other.
+        shape: of one sample; pictures are (H, W, 3), or (H, W, 1) where they are recorded in grey.
+        dtype: of the values as they are decoded.
+        hz: measured or stated rate; None when unknown.
+        names: of the values, where the recording has them.
+        codec: of pictures: jpeg, png, raw, av1, h264.
+        count: samples seen (of one episode, or of the whole recording when it is a topic).
+        jitter_ms: standard deviation of the intervals.
+        topic: the topic that holds the key; of bags only.
+        constant: whether a vector never changes in the sampled episodes.
+        still: indices of the values of a vector that never change in the sampled episodes.
+        low, high: smallest and largest finite number in the sampled episodes; of pictures in mono16, their
+            values before they are scaled.
+        swapped: whether red and blue are swapped in the pictures: sure, no; None where it is unknown.
+        skew_ms: p50, p95 and max distance from the first camera's frames, for a stream with its own clock.
+        encoding: of a bag's pictures, as their messages state it: rgb8, mono8, mono16.
+    """
+
+    key: str
+    kind: str
+    shape: tuple[int, ...]
+    dtype: str
+    hz: float | None = None
+    names: tuple[str, ...] | None = None
+    codec: str | None = None
+    count: int | None = None
+    jitter_ms: float | None = None
+    topic: TopicInfo | None = None
+    constant: bool = False
+    still: tuple[int, ...] = ()
+    low: float | None = None
+    high: float | None = None
+    skew_ms: tuple[float, float, float] | None = None
+    swapped: str | None = None
+    encoding: str | None = None
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """The contents of a recording, found without an embodiment.
+
+    Attributes:
+        format: as `open_source` takes it.
+        episodes: how many.
+        frames: of all episodes together; None when counting them would need a full read.
+        lengths: of the first episodes (at most 1,000).
+        keys: each key once.
+        robot: the robot's name in the recording.
+        facts: other facts about the recording, by name.
+        looked_at: how many episodes were sampled for their values and pictures.
+        findings: what the checks found, in the order of the checks.
+        checks: names of the checks that could be made; a check without a finding passed.
+    """
+
+    format: str
+    uri: str
+    episodes: int
+    keys: tuple[KeyInfo, ...]
+    frames: int | None = None
+    lengths: tuple[int, ...] = ()
+    hz: float | None = None
+    robot: str | None = None
+    facts: dict[str, str] = field(default_factory=dict)
+    looked_at: int = 0
+    findings: tuple[Finding, ...] = ()
+    checks: tuple[str, ...] = ()
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Return the findings that are errors or warnings, one sentence each."""
+        return tuple(str(finding) for finding in self.findings if finding.severity != "info")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for `--json`."""
+        return asdict(self) | {"problems": list(self.problems)}
