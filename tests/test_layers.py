@@ -15,7 +15,8 @@ ROOMS = (
     "hma_data.shards", "hma_data.tokenizers.training", "hma_data.inspection", "hma_data.conversion",
     "hma_data.loading", "hma_data.loader", "hma_data.lab", "hma_data.bench", "hma_data.cli", "hma_data",
     "hma_model.config", "hma_model.network", "hma_model.checkpoint", "hma_model.generation",
-    "hma_model.evaluation", "hma_model.released", "hma_model.hub", "hma_model.simulate", "hma_model.training",
+    "hma_model.evaluation", "hma_model.released", "hma_model.hub", "hma_model.worlds",
+    "hma_model.simulate", "hma_model.play", "hma_model.policies", "hma_model.synthetic", "hma_model.training",
     "hma_model.demo", "hma_model.bench", "hma_model.cli", "hma_model",
 )  # fmt: skip
 DOORS = {  # HMA.generate; HMA.from_pretrained and push_to_hub: imported when they are called

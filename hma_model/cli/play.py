@@ -60,8 +60,8 @@ def play(
     from hma_data.shards.reader import ShardSet
     from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
     from hma_model.hub.publish import located
-    from hma_model.simulate.pictures import read_picture
-    from hma_model.simulate.scenes import drivable, opening, trained_on
+    from hma_model.worlds.images import read_picture
+    from hma_model.worlds.scenes import drivable, opening, trained_on
 
     # what is wrong with it, the data or the pictures is said before torch is imported
     sets, pictures = list(map(ShardSet, data or ())), list(map(read_picture, prompt or ()))
@@ -79,7 +79,7 @@ def play(
     first = opening(robots, embodiment, "pictures" if pictures else "recordings" if sets else None)
     if len(opened.embodiments) > 1 and pictures and embodiment is None:
         print("the picture is offered for every robot; -e ROBOT opens the page with yours", file=sys.stderr)
-    from hma_model.simulate.server import LOOPBACK, serve
+    from hma_model.play.server import LOOPBACK, serve
 
     listener = _listen(host, port)
     name = "the embedded model" if opened.folder == EMBEDDED else checkpoint

@@ -56,8 +56,8 @@ def policy_eval(
 
     Example: hma policy-eval rails_03 scripted scripted:noise=0.5 random still --out policies
     """
-    from hma_model.simulate.policy_eval import evaluate_policies
-    from hma_model.simulate.policy_page import show, write_report
+    from hma_model.policies.report import show, write_report
+    from hma_model.policies.scores import evaluate_policies
 
     there = device_name(device)
     words = "nothing is kept; with --out, finished policies are"
@@ -129,9 +129,9 @@ def augment(
     from hma_data.registry.embodiment import Embodiment
     from hma_data.shards.manifest import MANIFEST
     from hma_data.shards.reader import ShardSet
-    from hma_model.simulate.augment import Augmentation
-    from hma_model.simulate.augment import augment as run
-    from hma_model.simulate.synthetic import FACTS
+    from hma_model.synthetic.augment import Augmentation
+    from hma_model.synthetic.augment import augment as run
+    from hma_model.synthetic.recorder import FACTS
 
     there, name = device_name(device), source.resolve().name if source else ""
     settings = Augmentation(
@@ -186,7 +186,7 @@ def label_actions(
     Example: hma label-actions film --checkpoint runs/inverse -e mover_04 --out labelled/mover_04
     """
     from hma_data.shards.manifest import QUARANTINE
-    from hma_model.simulate.labels import label_actions as run
+    from hma_model.synthetic.labels import label_actions as run
 
     there = device_name(device)
     words = f"finished episodes are kept in {out}; run the same command again to continue"

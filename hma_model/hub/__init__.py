@@ -1,6 +1,6 @@
 """Publish and pull checkpoints, one embodiment at a time: the Hugging Face Hub, a folder, any fsspec URI.
 
-In goes a checkpoint, out comes the trunk with the embodiments asked for. Next: `hma_model.simulate`.
+In goes a checkpoint, out comes the trunk with the embodiments asked for. Next: `hma_model.worlds`.
 """
 
 from typing import TYPE_CHECKING

@@ -21,9 +21,9 @@ import numpy as np
 
 from hma_data.console import run_script
 from hma_data.lab import truth
-from hma_model.simulate.arenas import Scenes
-from hma_model.simulate.planning import ELITES, SOLVERS, Cost, solver_of
-from hma_model.simulate.world import load_world
+from hma_model.policies.arenas import Scenes
+from hma_model.policies.planning import ELITES, SOLVERS, Cost, solver_of
+from hma_model.worlds.world import load_world
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "ale-py not found")  # solvers need no Atari games

@@ -26,16 +26,17 @@ from hma_data.conversion.rewrite import merge
 from hma_data.lab import family, truth
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.manifest import MANIFEST
-from hma_model.evaluation.judge import task_of
-from hma_model.simulate.acting import Acting
-from hma_model.simulate.arenas import Scenes, TrueArena
-from hma_model.simulate.augment import Augmentation, augment
-from hma_model.simulate.policies import Policy, read_policy
-from hma_model.simulate.policy_eval import run
-from hma_model.simulate.synthetic import described_as
-from hma_model.simulate.world import World, load_world
+from hma_model.policies.acting import Acting
+from hma_model.policies.arenas import Scenes, TrueArena
+from hma_model.policies.base import Policy
+from hma_model.policies.catalog import read_policy
+from hma_model.policies.judge import task_of
+from hma_model.policies.scores import run
+from hma_model.synthetic.augment import Augmentation, augment
+from hma_model.synthetic.recorder import described_as
 from hma_model.training.loop import finetune, train
 from hma_model.training.recipe import load_recipe
+from hma_model.worlds.world import World, load_world
 
 FEW, MANY, SYNTHETIC = 10, 100, (0, 10, 50, 90)
 COLUMNS = ("seed", "row", "episodes", "success", "policy_cpu_s", "world_cpu_s")

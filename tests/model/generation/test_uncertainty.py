@@ -13,7 +13,7 @@ from hma_model.generation.rollout import Rollout
 from hma_model.network.head import randn
 from hma_model.network.model import HMA
 from tests.model.network_parts import ARM, small_config, small_model
-from tests.model.simulate.worlds import tiny_model
+from tests.model.true_world import tiny_model
 
 ROBOT = "rails_03"
 

@@ -1,0 +1,136 @@
+"""Define the messages of a page, and the bytes of a frame.
+
+A page sends JSON, at most MOST_BYTES a message. The server sends JSON, and binary messages with a frame:
+
+    2 bytes   length of the header, big-endian
+    header    JSON: serial, frame, psnr, still, ms, rate, input, command, parted, bytes of the model's JPEG
+    JPEG      the model's picture, then the true one if it is known
+"""
+
+import json
+import struct
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+
+from hma_data.errors import UsageError
+from hma_model.play.session import Frame
+
+MOST_BYTES = 8192
+Number = Annotated[int, Field(ge=0, le=1_000_000)]
+
+
+class _Message(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Open(_Message):
+    """Open a session of a robot."""
+
+    do: Literal["open"]
+    robot: str = Field(max_length=200)
+    scene: Number = 0
+
+
+class Resume(_Message):
+    """Go on with a session after a reload."""
+
+    do: Literal["resume"]
+    session: str = Field(max_length=64)
+
+
+class Drive(_Message):
+    """Hold a command (A,) from now on; `input` numbers it."""
+
+    do: Literal["drive"]
+    command: list[FiniteFloat] = Field(max_length=256)
+    input: int = Field(ge=0)
+
+
+class Seen(_Message):
+    """A frame has been shown."""
+
+    do: Literal["seen"]
+    serial: int = Field(ge=0)
+
+
+class Run(_Message):
+    """Run or pause."""
+
+    do: Literal["run"]
+    on: bool
+
+
+class Step(_Message):
+    """Make a single frame."""
+
+    do: Literal["step"]
+
+
+class Scene(_Message):
+    """Begin a scene, or the same anew."""
+
+    do: Literal["scene"]
+    number: Number
+
+
+class Sync(_Message):
+    """Restart the model from the true last frames."""
+
+    do: Literal["sync"]
+
+
+class Clock(_Message):
+    """Run as fast as possible, or at the robot's rate."""
+
+    do: Literal["clock"]
+    fast: bool
+
+
+class Replay(_Message):
+    """Follow the recorded commands, or those of the page."""
+
+    do: Literal["replay"]
+    on: bool
+
+
+class Sample(_Message):
+    """Change how frames are decoded."""
+
+    do: Literal["sample"]
+    passes: int = Field(ge=1, le=16)
+    temperature: float = Field(ge=0, le=2)
+    order: Literal["random", "confidence"]
+
+
+Message = Open | Resume | Drive | Seen | Run | Step | Scene | Sync | Clock | Replay | Sample
+_MESSAGES: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discriminator="do")])
+
+
+def parse(text: str) -> Message:
+    """Return the message of a page.
+
+    Raises:
+        UsageError: it is too long, or none of the messages; the text says why.
+    """
+    if len(text) > MOST_BYTES:
+        raise UsageError("message", f"is longer than {MOST_BYTES} bytes")
+    try:
+        return _MESSAGES.validate_json(text)
+    except ValidationError as fault:
+        first = fault.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"])) or "message"
+        raise UsageError(where, first["msg"]) from fault
+
+
+def frame_bytes(frame: Frame, facts: dict[str, Any], serial: int) -> bytes:
+    """Return a frame as the server sends it."""
+    about = {
+        "serial": serial,
+        "frame": frame.number,
+        "psnr": frame.psnr,
+        "still": frame.still,
+        "model": len(frame.model),
+    }
+    header = json.dumps(about | facts).encode()
+    return struct.pack(">H", len(header)) + header + frame.model + (frame.true or b"")

@@ -1,0 +1,167 @@
+"""Say how a person drives a robot on its picture: where to press, and what a drag does.
+
+A pad is a part of the picture in which dragging gives one or two values of a command. Every robot has at
+least one pad, unless all its values are switches. Keys and gamepads follow the same pads: a value that moves
+something up and down in the picture has keys for up and down.
+"""
+
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from hma_data.lab import FAMILY
+from hma_data.lab.family.bodies import Body
+from hma_data.lab.family.mechanisms import Arm, Gantry, Rails
+from hma_data.lab.simulator import SIZE
+from hma_model.worlds.scenes import Dimension, Drivable
+
+ARENAS = {"pusht_fast": 512.0}  # side of the picture in units of the command, for targets in the plane
+EDGE = 1.0  # rad: farthest that the first joint of an arm turns that stands at the picture's edge
+MOST_SHARED = 2  # pads side by side for values that no picture shows
+
+
+@dataclass(frozen=True)
+class Pad:
+    """A part of the picture to drag on.
+
+    Attributes:
+        x, y: the numbers of the values that a drag sideways and a drag up or down give; None for none.
+        flips: whether the values of x and y shrink to the right and downward.
+        low, high: the values of x and y at the picture's left and upper, right and lower edges, if the
+            pointer itself is the target; None if the way from where it was pressed counts.
+        zone: left, top, right and bottom of the part, as shares of the picture.
+    """
+
+    x: int | None
+    y: int | None
+    flips: tuple[bool, bool] = (False, False)
+    low: tuple[float, float] | None = None
+    high: tuple[float, float] | None = None
+    zone: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+
+
+def pads(robot: Drivable) -> list[Pad]:
+    """Return the pads of a robot; the first ones have the keys that are nearest at hand."""
+    dims = robot.dimensions
+    names = [dim.name for dim in dims]
+    for x, y, up in (("x", "y", False), ("vx", "vy", False), ("turn", "speed", True)):
+        if x in names and y in names:
+            return [_plane(robot, names.index(x), names.index(y), up)]
+    mechanism = Body.of(robot.embodiment.id).mechanism if FAMILY.fullmatch(robot.embodiment.id) else None
+    if isinstance(mechanism, Rails):
+        return _rails(mechanism, dims)
+    if isinstance(mechanism, Gantry):
+        return [Pad(0, 1) if mechanism.upright else Pad(1, 0)]
+    found = _shared([i for i, dim in enumerate(dims) if dim.kind != "switch"])
+    return _arm(mechanism, found) if isinstance(mechanism, Arm) else found
+
+
+def _plane(robot: Drivable, x: int, y: int, up: bool) -> Pad:
+    """Return the pad of a robot that moves in the plane."""
+    flips = (False, up)
+    dims = robot.dimensions[x], robot.dimensions[y]
+    if dims[0].kind == "rate":
+        return Pad(x, y, flips)
+    side = ARENAS.get(robot.embodiment.id, float(SIZE))
+    if robot.embodiment.id in ARENAS or FAMILY.fullmatch(robot.embodiment.id):
+        return Pad(x, y, flips, (0.0, 0.0), (side, side))
+    return Pad(x, y, flips, (dims[0].low, dims[1].low), (dims[0].high, dims[1].high))
+
+
+def _rails(mechanism: Rails, dims: Sequence[Dimension]) -> list[Pad]:
+    """Return a pad around each rail; of two upright ones the right one first, which has the arrow keys."""
+    middles = (mechanism.places[1:] + mechanism.places[:-1]) / 2 / SIZE
+    ends = np.array([0.0, *middles, 1.0]).round(4).tolist()
+    found = []
+    for number, (start, end) in enumerate(pairwise(ends)):
+        low, high = ((0.0, 0.0), (float(SIZE),) * 2) if dims[number].kind == "target" else (None, None)
+        if mechanism.upright:
+            found.append(Pad(None, number, low=low, high=high, zone=(start, 0.0, end, 1.0)))
+        else:
+            found.append(Pad(number, None, low=low, high=high, zone=(0.0, start, 1.0, end)))
+    return found[::-1] if mechanism.upright and len(found) == 2 else found
+
+
+def _shared(values: Sequence[int]) -> list[Pad]:
+    """Return pads side by side for values of which nobody knows where the picture shows them."""
+    pairs = [values[start : start + 2] for start in range(0, len(values), 2)][:MOST_SHARED]
+    width = 1 / max(1, len(pairs))
+    zones = [(n * width, 0.0, (n + 1) * width, 1.0) for n in range(len(pairs))]
+    return [
+        Pad(pair[0], pair[1] if len(pair) > 1 else None, (False, True), zone=zone)
+        for pair, zone in zip(pairs, zones, strict=True)
+    ]
+
+
+def _arm(mechanism: Arm, found: list[Pad]) -> list[Pad]:
+    """Return pads in which a drag moves the first link the way that it goes, if the arm stands at an edge."""
+    if mechanism.axes[0].high > EDGE:
+        return found  # it turns about: no way is its own
+    first, (across, along) = found[0], (-np.sin(mechanism.facing), np.cos(mechanism.facing))
+    if abs(across) > abs(along):
+        return [replace(first, flips=(bool(across < 0), first.flips[1])), *found[1:]]
+    return [replace(first, x=first.y, y=first.x, flips=(False, bool(along < 0))), *found[1:]]
+
+
+def hint(robot: Drivable) -> str:
+    """Return what a drag on the picture does, as a sentence without its full stop."""
+    found, dims = pads(robot), robot.dimensions
+    if not found:
+        return "Use the sliders"
+    first = found[0]
+    if first.low is not None:
+        return "Drag on the picture to move the target" + "s" * (len(found) > 1)
+    if all(pad.x is None or pad.y is None for pad in found) and len(found) > 1:
+        return f"Drag on the picture, along {'each' if len(found) > 2 else 'either'} rail"
+    names, shown = [dim.name for dim in dims], labels(robot)
+    if len(found) == 1 and {"vx", "speed", "bridge"} & set(names):
+        return "Drag on the picture to steer"
+    if len(found) > 1:
+        said = [" and ".join(shown[i] for i in (pad.x, pad.y) if i is not None) for pad in found]
+        return f"Drag on the picture: on its left half {said[0]}, on its right half {said[1]}"
+    ways = (("sideways", first.x), ("up or down", first.y))
+    return f"Drag on the picture: {', '.join(f'{way} {shown[i]}' for way, i in ways if i is not None)}"
+
+
+def labels(robot: Drivable) -> list[str]:
+    """Return a readable label of each value: its name in the YAML, else the end of its key and a number."""
+    parts, found = robot.embodiment.action.components, []
+    for part in parts:
+        names = part.names
+        if names is None:
+            end = _end(part.key, {other.key for other in parts if other.key != part.key})
+            first = part.slice[0] if part.slice else 0
+            alone = part.dims == 1 and not part.slice
+            names = (end,) if alone else tuple(f"{end} {first + i}" for i in range(part.dims))
+        found += [re.sub(r"[_.\s]+", " ", name).strip() or name for name in names]
+    return found
+
+
+def _end(key: str, others: Collection[str]) -> str:
+    """Return the end of a key: as many words of its path as tell it from the other keys."""
+    paths = [other.strip("/").split("/") for other in others]
+    words = key.strip("/").split("/")
+    counts = (n for n in range(1, len(words)) if all(path[-n:] != words[-n:] for path in paths))
+    return " ".join(words[-next(counts, len(words)) :])
+
+
+def describe(robot: Drivable) -> dict[str, Any]:
+    """Return what the page shows of a robot, as plain values."""
+    text = re.sub(r"^A made-up ", "", robot.embodiment.description)
+    return {
+        "key": robot.key,
+        "id": robot.embodiment.id,
+        "about": text[:1].upper() + text[1:],
+        "source": robot.source,
+        "hz": robot.embodiment.rate_hz,
+        "stride": robot.embodiment.stride,
+        "dimensions": [
+            vars(dim) | {"label": label} for dim, label in zip(robot.dimensions, labels(robot), strict=True)
+        ],
+        "pads": [asdict(pad) for pad in pads(robot)],
+        "hint": hint(robot),
+    }

@@ -1,0 +1,455 @@
+"""Serve the page to drive robots in: one page, a websocket for each viewer, and downloads.
+
+The server listens on loopback. Requests with another Host, and websockets of another Origin, are refused, so
+that no foreign page can reach it (DNS rebinding). On any other address a token is needed.
+"""
+
+import asyncio
+import contextlib
+import ipaddress
+import json
+import secrets
+import socket
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.parse import parse_qs, urlsplit
+
+import anyio
+import numpy as np
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from hma_data.errors import HMAError, UsageError
+from hma_model.checkpoint.folder import Checkpoint
+from hma_model.play import messages
+from hma_model.play.pads import describe, labels
+from hma_model.play.save import KINDS, film, told_by
+from hma_model.play.session import Frame, Sampling, Session
+from hma_model.play.stepper import Engine
+from hma_model.worlds.scenes import Drivable
+
+if TYPE_CHECKING:
+    import uvicorn
+
+    from hma_data.tokenizers.base import Tokenizer
+
+T = TypeVar("T")
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+FIRST = "rails_03"  # the robot that a page opens with: it follows its commands longest (docs/results-log.md)
+MOST_VIEWERS = 32
+RATE, BURST = 200.0, 400.0  # messages of a viewer a second, and at once
+SCENE = 20.0  # messages that one counts as which begins a scene: all other sessions wait for it
+AHEAD = 2  # frames that are sent before a page says that it has shown one
+STALLED_S, SEND_S = 10.0, 20.0  # without a sign of reading: the session stands still; the viewer is dropped
+_GONE = (WebSocketDisconnect, TimeoutError, OSError)  # of a viewer that has left, or reads nothing
+
+
+class Guard:
+    """Refuse requests with a foreign Host or Origin, or without the token."""
+
+    def __init__(self, app: ASGIApp, host: str, token: str | None) -> None:
+        self.app, self.host, self.token = app, host, token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] in ("http", "websocket") and (fault := self._fault(scope)):
+            if scope["type"] == "websocket":
+                await WebSocket(scope, receive, send).close(1008, fault)
+            else:
+                await PlainTextResponse(fault + "\n", 403)(scope, receive, send)
+            return
+        await self.app(scope, receive, send)
+
+    def _fault(self, scope: Scope) -> str:
+        headers = {name.decode().lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        host, origin = headers.get("host", ""), headers.get("origin")
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+            own = origin is None or urlsplit(origin).netloc == host
+        except ValueError:
+            return "refused: the host or the origin cannot be read"
+        if not self._known(name):
+            return f"refused: the host {host[:80]!r} is not this server's"
+        if not own:
+            return f"refused: a page of {origin!r:.80} may not connect here"
+        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        if self.token and not secrets.compare_digest(given.encode(), self.token.encode()):
+            return "refused: the token is missing or wrong; use the address that hma play printed"
+        return ""
+
+    def _known(self, name: str) -> bool:
+        if name in (*LOOPBACK, self.host):
+            return True
+        if self.host in LOOPBACK:
+            return False
+        with contextlib.suppress(ValueError):  # an address cannot be rebound
+            return bool(ipaddress.ip_address(name))
+        return name == socket.gethostname()
+
+
+class Page:
+    """A viewer: what is still to be sent to one websocket.
+
+    `show` and `tell` are called in the engine's thread. Of frames only the latest waits, so that a page that
+    reads slowly sees fewer.
+    """
+
+    def __init__(self, websocket: WebSocket) -> None:
+        self.websocket = websocket
+        self._loop, self._wake = asyncio.get_running_loop(), asyncio.Event()
+        self._messages: deque[dict[str, Any]] = deque(maxlen=100)
+        self._latest: tuple[Frame, dict[str, Any]] | None = None
+        self._sent = self._shown = 0  # serial numbers
+        self._heard = time.monotonic()
+
+    @property
+    def behind(self) -> int:
+        return self._sent - self._shown + (self._latest is not None)
+
+    @property
+    def stalled(self) -> bool:
+        return self.behind > 0 and time.monotonic() - self._heard > STALLED_S
+
+    def show(self, frame: Frame, facts: dict[str, Any]) -> None:
+        self._latest = (frame, facts)
+        self._notify()
+
+    def tell(self, message: dict[str, Any]) -> None:
+        self._messages.append(message)
+        self._notify()
+
+    def seen(self, serial: int) -> None:
+        """Note that the page has shown a frame."""
+        self._shown = max(self._shown, min(serial, self._sent))
+        self._heard = time.monotonic()
+        self._wake.set()
+
+    def _notify(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the server has stopped
+            self._loop.call_soon_threadsafe(self._wake.set)
+
+    async def send(self) -> None:
+        """Send what waits, until the viewer has gone or reads nothing any more."""
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            while self._messages:
+                text = json.dumps(self._messages.popleft())
+                with anyio.fail_after(SEND_S):
+                    await self.websocket.send_text(text)
+            if self._latest and self._sent - self._shown < AHEAD:
+                (frame, facts), self._latest = self._latest, None
+                if not self._sent - self._shown:
+                    self._heard = time.monotonic()  # it had nothing to read before
+                self._sent += 1
+                data = messages.frame_bytes(frame, facts, self._sent)
+                with anyio.fail_after(SEND_S):
+                    await self.websocket.send_bytes(data)
+
+
+class Server:
+    """The application of an engine.
+
+    Args:
+        model: a name for the model, shown on the page.
+        host: the address that it listens on.
+        token: what every request must carry, or None.
+        first: the key of the robot that a page opens with; None for the best known one.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        model: str,
+        host: str = LOOPBACK[0],
+        token: str | None = None,
+        first: str | None = None,
+    ) -> None:
+        self.engine, self.model, self.first = engine, model, first or FIRST
+        self.viewers = 0
+        self._page = files("hma_model.play").joinpath("page.html").read_text("utf-8")
+        self._saving = asyncio.Semaphore(1)
+        routes = [
+            Route("/", self.page),
+            Route("/save", self.save),
+            WebSocketRoute("/drive", self.drive),
+        ]
+        self.app = Guard(Starlette(routes=routes), host, token)
+
+    async def page(self, request: Request) -> Response:
+        """Return the page."""
+        nonce = secrets.token_urlsafe(16)
+        policy = (
+            f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self'; "
+            "img-src data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        )
+        headers = {
+            "Content-Security-Policy": policy,
+            "Cache-Control": "no-store",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+        }
+        return HTMLResponse(self._page.replace("NONCE", nonce), headers=headers)
+
+    async def save(self, request: Request) -> Response:
+        """Return what was driven in a session as a file."""
+        kind, name = request.query_params.get("kind", ""), request.query_params.get("session", "")
+        session = self.engine.sessions.get(name)
+        if session is None or kind not in KINDS:
+            return PlainTextResponse("there is no such session, or no such kind of file\n", 404)
+        frames = await self._in_engine(session.film)
+        if len(frames) < 2:
+            return PlainTextResponse("nothing was driven yet\n", 409)
+        tell = told_by(session, kind)
+        if self._saving.locked():
+            tell("waiting for another file", 0, len(frames))
+        async with self._saving:
+            try:
+                data = await asyncio.to_thread(film, kind, session.robot, frames, tell)
+            except HMAError as fault:
+                return PlainTextResponse(f"{fault}\n", 500)
+        media, suffix = KINDS[kind]
+        file = f"{session.robot.embodiment.id}-scene-{session.number}{suffix}"
+        headers = {"Content-Disposition": f'attachment; filename="{file}"', "Cache-Control": "no-store"}
+        return Response(data, media_type=media, headers=headers)
+
+    async def drive(self, websocket: WebSocket) -> None:
+        """Serve one viewer."""
+        await websocket.accept()
+        if self.viewers >= MOST_VIEWERS:
+            await websocket.close(1013, "too many pages are open; close one")
+            return
+        self.viewers += 1
+        connection = Connection(self, websocket)
+        try:
+            async with anyio.create_task_group() as tasks:
+
+                async def run(work: Callable[[], Awaitable[None]]) -> None:
+                    with contextlib.suppress(*_GONE):
+                        await work()
+                    tasks.cancel_scope.cancel()  # one has ended, so the other does
+
+                tasks.start_soon(run, connection.page.send)
+                tasks.start_soon(run, connection.receive)
+        finally:
+            self.viewers -= 1
+            connection.leave()
+        if reason := connection.fault.encode()[:120].decode(errors="ignore"):
+            with contextlib.suppress(*_GONE), anyio.fail_after(SEND_S):
+                await websocket.close(1008, reason)
+
+    async def _in_engine(self, function: Callable[[], T]) -> T:
+        return await asyncio.wrap_future(self.engine.call(function))
+
+
+class Connection:
+    """One websocket, and the session that it drives.
+
+    Attributes:
+        fault: why the page is no longer listened to; "" if it has left.
+    """
+
+    def __init__(self, server: Server, websocket: WebSocket) -> None:
+        self.server, self.engine, self.websocket = server, server.engine, websocket
+        self.page = Page(websocket)
+        self.session: Session | None = None
+        self.fault = ""
+        self._credit, self._filled = BURST, time.monotonic()
+        robots = [describe(robot) for robot in self.engine.robots.values()]
+        orders = list(self.engine.orders)
+        hello = {"model": server.model, "robots": robots, "orders": orders, "first": server.first}
+        self.page.tell({"kind": "hello", **hello})
+
+    async def receive(self) -> None:
+        """Take messages until the page leaves, or sends one that is not allowed."""
+        while True:
+            received = await self.websocket.receive()
+            if received["type"] == "websocket.disconnect":
+                return
+            try:
+                if received.get("text") is None:
+                    raise UsageError("message", "is bytes, not JSON")
+                message = messages.parse(received["text"])
+                self._charge(message)
+                await self._do(message)
+            except UsageError as problem:
+                self.fault = str(problem)
+                return
+
+    def _charge(self, message: messages.Message) -> None:
+        """Take a message off the credit, which time restores; raise UsageError if none is left."""
+        begins = isinstance(message, messages.Open | messages.Scene | messages.Sync)
+        now = time.monotonic()
+        self._credit = min(BURST, self._credit + RATE * (now - self._filled)) - (SCENE if begins else 1)
+        self._filled = now
+        if self._credit < 0:
+            raise UsageError("messages", "come faster than a person sends them")
+
+    def leave(self) -> None:
+        """Let the session stand still."""
+        if session := self.session:
+            self.engine.call(lambda: self.engine.detach(session.name, self.page))
+
+    async def _do(self, message: messages.Message) -> None:
+        if isinstance(message, messages.Seen):
+            self.page.seen(message.serial)
+            self.engine.wake()
+        elif isinstance(message, messages.Open | messages.Resume):
+            await self._enter(message)
+        elif self.session is None:
+            raise UsageError("message", "open a session first")
+        else:
+            self.engine.call(partial(self._change, self.session, message))
+
+    async def _enter(self, message: messages.Open | messages.Resume) -> None:
+        def enter() -> Session:
+            if isinstance(message, messages.Resume):
+                session = self.engine.attach(message.session, self.page)
+            else:
+                if self.session and self.session.name in self.engine.sessions:
+                    self.engine.close(self.session.name)
+                session = self.engine.open(message.robot, message.scene)
+                self.engine.attach(session.name, self.page)
+            self._show_all(session)
+            return session
+
+        try:
+            entered = await asyncio.wrap_future(self.engine.call(enter))
+        except HMAError as fault:
+            ended = isinstance(message, messages.Resume)
+            self.page.tell({"kind": "gone" if ended else "error", "text": str(fault)})
+            return
+        except Exception as fault:  # a bug of ours; the engine has logged it
+            text = f"stopped with {type(fault).__name__}: {fault}; the terminal has more"
+            self.page.tell({"kind": "error", "text": text})
+            return
+        if self.session and self.session.name != entered.name:
+            left = self.session.name
+            self.engine.call(lambda: self.engine.detach(left, self.page))
+        self.session = entered
+
+    def _show_all(self, session: Session) -> None:
+        self.page.tell(session.opened())
+        self.page.show(session.last(), {})
+
+    def _change(self, session: Session, message: messages.Message) -> None:
+        """Do what a message says, in the engine's thread."""
+        if session.name not in self.engine.sessions or session.viewer is not self.page:
+            return
+        session.touched = time.monotonic()
+        try:
+            match message:
+                case messages.Drive():
+                    self._hold(session, message)
+                    return
+                case messages.Run():
+                    session.paused, session.due, session.steps = not message.on, session.touched, 0
+                case messages.Step():
+                    session.paused, session.steps, session.due = True, 1, session.touched
+                case messages.Scene():
+                    session.begin(message.number)
+                    self._show_all(session)
+                    return
+                case messages.Sync():
+                    session.sync()
+                    self.page.show(session.last(), {})  # in the place of an older one that still waits
+                case messages.Clock():
+                    session.fast, session.due = message.fast, session.touched
+                case messages.Replay():
+                    session.replays, session.ended = message.on, False
+                case messages.Sample():
+                    way = Sampling(message.passes, round(message.temperature, 1), message.order)
+                    self.engine.change(session, way)
+            self.page.tell(session.status())
+        except HMAError as fault:
+            self.page.tell({"kind": "error", "text": str(fault)})
+
+    def _hold(self, session: Session, message: messages.Drive) -> None:
+        if len(message.command) != len(session.held):
+            fault = f"has {len(message.command)} values, this robot takes {len(session.held)}"
+            self.page.tell({"kind": "error", "text": f"command: {fault}"})
+            return
+        session.held, session.input = np.array(message.command, np.float32), message.input
+        if not session.warned:
+            ends = [(dim.low, dim.high) for dim in session.robot.dimensions]
+            rows = enumerate(zip(ends, message.command, strict=True))
+            beyond = [
+                i for i, ((low, high), value) in rows if abs(2 * value - low - high) > 1.05 * (high - low)
+            ]
+            session.warned = bool(beyond)
+            if beyond:
+                names = labels(session.robot)
+                said = ", ".join(f"{names[i]} {ends[i][0]:g} to {ends[i][1]:g}" for i in beyond)
+                text = f"the model knows only {said}; what it shows beyond is a guess. This is said once"
+                self.page.tell({"kind": "error", "text": f"command: {text}"})
+
+
+async def serve(
+    checkpoint: Checkpoint,
+    name: str,
+    robots: Mapping[str, Drivable],
+    tokenizer: "Tokenizer",
+    listener: socket.socket,
+    host: str,
+    token: str | None,
+    ready: Callable[[], None],
+    device: str = "cpu",
+    first: str | None = None,
+    **settings: Any,
+) -> None:
+    """Serve a checkpoint until the process is interrupted.
+
+    Args:
+        name: for the model, shown on the page.
+        robots: those that can be driven.
+        tokenizer: the checkpoint's.
+        listener: a socket that listens.
+        ready: called when the page can be opened.
+        device: of the network.
+        first: as of `Server`.
+        settings: of `World`.
+
+    Raises:
+        CheckpointError: the checkpoint is damaged.
+    """
+    from hma_model.checkpoint.io import load
+    from hma_model.worlds.world import World
+
+    names = sorted({robot.embodiment.id for robot in robots.values()})
+    model = load(checkpoint.folder, names, device)
+    confidence = ("confidence",) if checkpoint.config.kind == "discrete" else ()
+    engine = Engine(World(model, tokenizer, **settings), robots, orders=("random", *confidence))
+    engine.start()
+    try:
+        await run(Server(engine, name, host, token, first).app, listener, lambda server: ready())
+    finally:
+        engine.stop()
+
+
+async def run(app: ASGIApp, listener: socket.socket, ready: Callable[["uvicorn.Server"], None]) -> None:
+    """Serve an application at a socket that listens, until a signal or until `should_exit` is set."""
+    import uvicorn
+
+    settings = uvicorn.Config(
+        app,
+        log_level="warning",
+        access_log=False,
+        lifespan="off",
+        ws="websockets-sansio",
+        ws_max_size=messages.MOST_BYTES,
+        ws_per_message_deflate=False,
+        timeout_graceful_shutdown=2,
+    )
+    server = uvicorn.Server(settings)
+    serving = asyncio.create_task(server.serve(sockets=[listener]))
+    while not server.started and not serving.done():
+        await asyncio.sleep(0.02)
+    ready(server)
+    await serving

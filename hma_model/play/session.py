@@ -1,0 +1,287 @@
+"""Drive one robot in a world model, with what truly happens beside it.
+
+A session lives in the engine's thread; `hma_model.play.stepper` steps all sessions that are due together.
+
+H×W pixels, A action dims, K = stride * A values of a chunk.
+"""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.images import opencv
+from hma_data.errors import UsageError
+from hma_model.play.pads import describe
+from hma_model.worlds.scenes import Drivable, Floats, LabScene, Picture
+
+WINDOW = 8  # frames that a restart of the model is given
+KEPT = 3000  # frames to save
+DROP = 6.0  # dB: twice the tokenizer's own error
+LEAST_ROW = 3  # frames that are bad in a row before model and truth have parted; a second of them
+QUALITY = 92  # of JPEG
+
+
+class World(Protocol):
+    """The part of a world that the engine needs; the sampling is set before each step."""
+
+    unmask_steps: int
+    temperature: float
+    order: str
+
+    def open(
+        self, embodiment: str, frames: Picture, chunks: Floats | None = None, *, seed: int = 0
+    ) -> int: ...
+    def reset(
+        self, session: int, frames: Picture, chunks: Floats | None = None, *, seed: int | None = None
+    ) -> None: ...
+    def step(self, commands: Mapping[int, Floats]) -> Mapping[int, Picture]: ...
+    def picture(self, session: int) -> Picture: ...
+    def close(self, session: int) -> None: ...
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """The way in which a frame is decoded: passes, temperature, and the order random or confidence."""
+
+    passes: int
+    temperature: float
+    order: str
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame that was driven to: JPEG pictures of the model and of the truth, and the commands before it.
+
+    Attributes:
+        commands: (stride, A).
+        state: (S,) of the simulator after it, or None.
+        psnr: of the two pictures in dB, or None.
+        still: PSNR of a picture that stands still since the beginning or the last sync, or None.
+    """
+
+    number: int
+    model: bytes
+    true: bytes | None
+    commands: Floats
+    state: Floats | None
+    psnr: float | None
+    still: float | None = None
+
+
+class Viewer(Protocol):
+    """The receiver of a session's pictures; the engine's thread calls its methods, which return at once."""
+
+    @property
+    def stalled(self) -> bool:
+        """Return whether it has read nothing for a while."""
+
+    @property
+    def behind(self) -> int:
+        """Return how many frames it was given and has not shown yet."""
+
+    def show(self, frame: Frame, facts: dict[str, Any]) -> None:
+        """Show a frame; one that it has not sent yet is replaced."""
+
+    def tell(self, message: dict[str, Any]) -> None:
+        """Send a message."""
+
+
+class Session:
+    """A robot, its scene, its place in a world, and the frames so far.
+
+    Attributes:
+        row: the world's number for it.
+        viewer: who watches; without one the session stands still.
+        due: the time of the next step.
+        touched: when a person did something last.
+    """
+
+    def __init__(
+        self, name: str, robot: Drivable, number: int, world: World, sampling: Sampling, now: float
+    ) -> None:
+        self.name, self.robot, self._world, self.sampling = name, robot, world, sampling
+        self.viewer: Viewer | None = None
+        self.due = self.touched = now
+        self.paused, self.replays, self.fast = True, False, False
+        self.warned = False  # that commands are outside the range of the page
+        self.steps = 0  # single steps asked for
+        self.input = 0  # number of the newest input, by which the page measures latency
+        self._times: deque[float] = deque(maxlen=40)
+        self._begin(number)
+        self.row = world.open(robot.embodiment.id, *self._history())
+        with ExitStack() as undo:
+            undo.callback(world.close, self.row)
+            self._set_start()
+            undo.pop_all()
+
+    # -- scene and model
+
+    def begin(self, number: int) -> None:
+        """Begin another scene, or the same anew."""
+        self._begin(number)
+        self._world.reset(self.row, *self._history())
+        self._set_start()
+
+    def _begin(self, number: int) -> None:
+        self.number, self.scene = number, self.robot.scene(number)
+        prompt = self.scene.prompt
+        self._true: deque[Picture] = deque(prompt.frames, maxlen=WINDOW)
+        self._chunks: deque[Floats] = deque(prompt.chunks, maxlen=WINDOW - 1)
+        self.held = self.scene.command.copy()
+        self.frames: deque[Frame] = deque(maxlen=KEPT)
+        self.count, self.ended, self.steps = 0, False, 0
+        self.parted: int | None = None
+        self._bad = 0  # frames in a row in which the model is no better than a still
+
+    def _set_start(self) -> None:
+        """Take the prompt's last frame as the tokenizer shows it, which the model cannot surpass."""
+        true, shown = self._true[-1], self._world.picture(self.row)
+        self._best, self._still = psnr(shown, true), true
+        none = np.zeros((0, 0), np.float32)
+        self.start = self._last = Frame(0, jpeg(shown), jpeg(true), none, self._state, self._best, 60.0)
+
+    def sync(self) -> None:
+        """Restart the model from the true last frames.
+
+        Raises:
+            UsageError: nobody knows them.
+        """
+        if not self._true:
+            raise UsageError("sync", "the true frames are unknown here", "reset first, or drive a simulator")
+        self._world.reset(self.row, *self._history())
+        shown, true = self._world.picture(self.row), self._true[-1]
+        self._best, self._still = psnr(shown, true), true
+        self.parted, self._bad = None, 0
+        self._last = replace(self._last, model=jpeg(shown), true=jpeg(true), psnr=self._best, still=60.0)
+
+    def _history(self) -> tuple[Picture, Floats]:
+        """Return the true last frames, and the chunks between them."""
+        frames, chunks = list(self._true), list(self._chunks)
+        return np.stack(frames), np.stack(chunks[len(chunks) - len(frames) + 1 :])
+
+    # -- one step
+
+    def ready(self, now: float) -> bool:
+        """Check whether the next frame is due."""
+        if self.viewer is None or self.viewer.stalled or self.ended or now < self.due:
+            return False
+        return self.steps > 0 or (not self.paused and not (self.fast and self.viewer.behind > 1))
+
+    def next_chunk(self) -> Floats | None:
+        """Advance the truth, and return the chunk (K,) for the model; None at a recording's end."""
+        stride = self.robot.embodiment.stride
+        found = self.scene.advance(None if self.replays else np.tile(self.held, stride))
+        if found is None:
+            self.ended = True
+            return None
+        chunk, self._truth = found
+        self._chunks.append(chunk)
+        return chunk
+
+    def end(self) -> None:
+        """Give the place in the world back."""
+        self._world.close(self.row)
+
+    def take(self, picture: Picture, now: float, took: float) -> None:
+        """Take the model's picture (H, W, 3) of the step, which took so many seconds, and show it."""
+        self.steps = max(0, self.steps - 1)
+        self.count += 1
+        period = self.robot.embodiment.stride / self.robot.embodiment.rate_hz
+        self.due = now if self.fast else max(self.due + period, now)
+        self._times.append(now)
+        if self._truth is None:
+            self._true.clear()
+        else:
+            self._true.append(self._truth)
+        score = still = None
+        if self._truth is not None:
+            score, still = psnr(picture, self._truth), psnr(self._still, self._truth)
+            self._judge(score, still)
+        stride = self.robot.embodiment.stride
+        commands = self._chunks[-1].reshape(stride, -1)
+        true = None if self._truth is None else jpeg(self._truth)
+        frame = Frame(self.count, jpeg(picture), true, commands, self._state, score, still)
+        self.frames.append(frame)
+        self._last = frame
+        if self.replays:
+            self.touched, self.held = now, commands[-1].copy()
+        if self.viewer:
+            facts: dict[str, Any] = {
+                "ms": round(1000 * took, 1),
+                "rate": self._rate(now),
+                "input": self.input,
+            }
+            facts |= {"command": commands[-1].tolist(), "parted": self.parted}
+            self.viewer.show(frame, facts)
+
+    @property
+    def _state(self) -> Floats | None:
+        """Return the state (S,) of the simulator, if there is one."""
+        return self.scene.simulator.state if isinstance(self.scene, LabScene) else None
+
+    def _judge(self, score: float, still: float) -> None:
+        """Note the moment from which on, for a second, the model's pictures are no better than a still.
+
+        They must be much worse than the tokenizer's own too: a still is exact while nothing moves.
+        """
+        if self.parted is not None:
+            return
+        self._bad = self._bad + 1 if score <= still and score < self._best - DROP else 0
+        if self._bad == self.row_of_bad:
+            self.parted = self.count - self._bad + 1
+
+    @property
+    def row_of_bad(self) -> int:
+        """Return how many bad frames in a row it takes to say that model and truth have parted."""
+        return max(LEAST_ROW, round(self.robot.embodiment.rate_hz / self.robot.embodiment.stride))
+
+    def _rate(self, now: float) -> float:
+        """Return the frames a second of the last 2 s or so."""
+        recent = [time for time in self._times if now - time < 2.0]
+        return round((len(recent) - 1) / (now - recent[0]), 1) if len(recent) > 1 and now > recent[0] else 0.0
+
+    # -- what the page shows
+
+    def status(self) -> dict[str, Any]:
+        """Return the settings that the page shows, as plain values."""
+        return {
+            "kind": "status", "paused": self.paused, "replays": self.replays, "fast": self.fast,
+            "sampling": vars(self.sampling), "scene": self.number, "frame": self.count, "ended": self.ended,
+            "knows": bool(self._true), "parted": self.parted,
+        }  # fmt: skip
+
+    def opened(self) -> dict[str, Any]:
+        """Return all that a page needs to go on with the session, as plain values."""
+        scores = [[frame.number, frame.psnr, frame.still] for frame in list(self.frames)[-600:]]
+        about = {"session": self.name, "robot": describe(self.robot), "held": self.held.tolist()}
+        about |= {"input": self.input}
+        return self.status() | about | {"kind": "opened", "scores": scores}
+
+    def last(self) -> Frame:
+        """Return what is to be seen now: the newest frame, or that from which the model was restarted."""
+        return self._last
+
+    def film(self) -> list[Frame]:
+        """Return the frames that are kept, after the prompt's last one if they begin there."""
+        return [*([self.start] if self.count == len(self.frames) else []), *self.frames]
+
+
+def jpeg(picture: Picture) -> bytes:
+    """Return a picture (H, W, 3) RGB as a JPEG with colours at full size."""
+    cv2 = opencv()
+    settings = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+    settings += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    data: bytes = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), settings)[1].tobytes()
+    return data
+
+
+def psnr(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
+    """Return the peak signal-to-noise ratio of two pictures in dB, 60 at most."""
+    error = float(np.mean((one.astype(np.float32) - other.astype(np.float32)) ** 2))
+    return 60.0 if error < 0.065 else round(10 * math.log10(255**2 / error), 2)

@@ -1,0 +1,233 @@
+"""Step all sessions that are due together, in one thread that alone touches the model and the simulators.
+
+    engine = Engine(world, robots)
+    engine.start()
+    session = engine.call(lambda: engine.open("mover_04", 0)).result()
+    engine.call(lambda: engine.attach(session.name, viewer))
+
+Every session has its own clock. Sessions that are due at the same time, with the same sampling, share one
+pass of the model.
+"""
+
+import logging
+import queue
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from functools import partial
+from typing import Any
+
+from hma_data.errors import HMAError, UsageError
+from hma_model.play.session import Sampling, Session, Viewer, World
+from hma_model.worlds.scenes import Drivable, Floats
+
+MOST_SESSIONS, IDLE_S = 8, 300.0
+SLEEP_S = 1.0  # longest sleep between looks at idle sessions
+_log = logging.getLogger(__name__)
+
+
+class Engine:
+    """The thread and its sessions.
+
+    Args:
+        world: of the model; nobody else may use it.
+        robots: those that can be driven, by key.
+        orders: those in which the model can decode a frame.
+        most: sessions at a time.
+        idle_s: seconds after which a session in which nobody does anything is paused, or closed if nobody
+            watches it.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        robots: Mapping[str, Drivable],
+        *,
+        orders: Sequence[str] = ("random", "confidence"),
+        most: int = MOST_SESSIONS,
+        idle_s: float = IDLE_S,
+    ) -> None:
+        self.robots, self.orders, self.most, self.idle_s = robots, orders, most, idle_s
+        self._world, self._sampling = world, Sampling(world.unmask_steps, world.temperature, world.order)
+        self.sessions: dict[str, Session] = {}
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread after the step that it is in."""
+        self._jobs.put(None)
+        self._thread.join()
+
+    def call[T](self, function: Callable[[], T]) -> "Future[T]":
+        """Run a function in the thread, between two steps."""
+        future: Future[T] = Future()
+
+        def job() -> None:
+            try:
+                future.set_result(function())
+            except Exception as fault:
+                if not isinstance(fault, HMAError):
+                    _log.exception("a call failed")
+                future.set_exception(fault)
+
+        self._jobs.put(job)
+        return future
+
+    def wake(self) -> None:
+        """Look for sessions that are due."""
+        self._jobs.put(lambda: None)
+
+    # -- in the thread
+
+    def open(self, key: str, number: int) -> Session:
+        """Open a session of a robot in a scene; it is paused.
+
+        Raises:
+            UsageError: there is no such robot, or there are too many sessions.
+        """
+        robot = self._robot(key)
+        if len(self.sessions) >= self.most:
+            now = time.monotonic()
+            left = [one for one in self.sessions.values() if one.viewer is None or self._idle(one, now)]
+            if not left:
+                fault = f"all {self.most} places are taken"
+                raise UsageError("sessions", fault, "close another page, or try again in a few minutes")
+            said = "Closed: nothing was done here for a while, and another page needed the place."
+            self.close(min(left, key=lambda one: (one.viewer is not None, one.touched)).name, said)
+        session = Session(
+            secrets.token_urlsafe(18), robot, number, self._world, self._sampling, time.monotonic()
+        )
+        self.sessions[session.name] = session
+        return session
+
+    def attach(self, name: str, viewer: Viewer) -> Session:
+        """Let a viewer watch a session, in the place of any other.
+
+        Raises:
+            UsageError: there is no such session, or no longer.
+        """
+        session = self.sessions.get(name)
+        if session is None:
+            raise UsageError("session", "has ended", "open a new one")
+        if session.viewer is not None and session.viewer is not viewer:
+            session.viewer.tell({"kind": "closed", "text": "This robot is now driven from another page."})
+        session.viewer = viewer
+        session.touched = time.monotonic()
+        return session
+
+    def detach(self, name: str, viewer: Viewer) -> None:
+        """Let a session stand still that this viewer watched."""
+        session = self.sessions.get(name)
+        if session and session.viewer is viewer:
+            session.viewer = None
+
+    def change(self, session: Session, sampling: Sampling) -> None:
+        """Go on with another sampling.
+
+        Raises:
+            UsageError: the model cannot decode in that order.
+        """
+        if sampling.order not in self.orders:
+            raise UsageError(
+                "order", f"this model has no {sampling.order!r}", f"known: {', '.join(self.orders)}"
+            )
+        session.sampling = sampling
+
+    def close(self, name: str, reason: str = "") -> None:
+        """Close a session, and tell its viewer why."""
+        session = self.sessions.pop(name)
+        session.end()
+        if session.viewer and reason:
+            session.viewer.tell({"kind": "closed", "text": reason})
+
+    def _idle(self, session: Session, now: float) -> bool:
+        return now - session.touched > self.idle_s
+
+    def _rest(self, session: Session) -> None:
+        """Pause a session in which nobody does anything, or close it if nobody watches it."""
+        if session.viewer is None:
+            self.close(session.name)
+        elif not session.paused:
+            session.paused = True
+            session.viewer.tell(session.status())
+            text = f"Paused, because nothing was done for {self.idle_s / 60:.0f} minutes."
+            session.viewer.tell({"kind": "error", "text": text})
+
+    def _robot(self, key: str) -> Drivable:
+        if key not in self.robots:
+            raise UsageError("robot", f"there is no {key[:40]!r}", f"known: {', '.join(self.robots)}")
+        return self.robots[key]
+
+    def _run(self) -> None:
+        while True:
+            wait = self.step()
+            try:
+                job = self._jobs.get(timeout=wait)
+                while job is not None:
+                    job()
+                    job = self._jobs.get_nowait()
+                return
+            except queue.Empty:
+                continue
+
+    def step(self) -> float:
+        """Step the sessions that are due, and return the seconds until the next one is."""
+        now = time.monotonic()
+        for session in list(self.sessions.values()):
+            if self._idle(session, now):
+                self._rest(session)
+        due = [session for session in self.sessions.values() if session.ready(now)]
+        together: dict[Sampling, list[Session]] = {}
+        for session in due:
+            together.setdefault(session.sampling, []).append(session)
+        for sampling, group in together.items():
+            self._step_together(sampling, group)
+        if due:
+            return 0.0  # look at what came in meanwhile
+        waiting = [s.due - now for s in self.sessions.values() if s.viewer and (s.steps or not s.paused)]
+        return min([SLEEP_S, *(wait for wait in waiting if wait > 0)])
+
+    def _step_together(self, sampling: Sampling, sessions: list[Session]) -> None:
+        world = self._world
+        world.unmask_steps, world.temperature, world.order = vars(sampling).values()
+        begun = time.monotonic()
+        chunks: dict[int, Floats] = {}
+        rows: dict[int, Session] = {}
+        for session in sessions:
+            chunk = self._guarded(session, session.next_chunk)
+            if chunk is not None:
+                chunks[session.row], rows[session.row] = chunk, session
+            elif session.name in self.sessions and session.viewer:
+                session.viewer.tell(session.status())  # its recording has ended
+        if not chunks:
+            return
+        try:
+            pictures = world.step(chunks)
+        except Exception as fault:
+            _log.exception("a step of the model failed")
+            for session in rows.values():
+                self.close(session.name, f"The model failed: {_line(fault)}")
+            return
+        now = time.monotonic()
+        for row, session in rows.items():
+            self._guarded(session, partial(session.take, pictures[row], now, now - begun))
+
+    def _guarded(self, session: Session, function: Callable[[], Any]) -> Any:
+        """Call a function of a session; if it fails, close that session and no other."""
+        try:
+            return function()
+        except Exception as fault:
+            _log.exception("session of %s failed", session.robot.key)
+            self.close(session.name, f"The simulator failed: {_line(fault)}")
+            return None
+
+
+def _line(fault: Exception) -> str:
+    text = str(fault) if isinstance(fault, HMAError) else f"{type(fault).__name__}: {fault}"
+    return " ".join(text.split())[:300]

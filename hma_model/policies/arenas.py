@@ -1,0 +1,292 @@
+"""Let policies act in N scenes of a laboratory robot at once: in its simulator, or in the world model.
+
+Both begin with the same frames and are driven alike: a command each control step, and a new picture after
+every `stride` of them, as the environments of the world model show it.
+
+N scenes, S pixels a side, A action dims, K = stride · A, P parts, T chunks of an episode.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.images import resize
+from hma_data.errors import HMAError
+from hma_data.lab import FAMILY, truth
+from hma_data.lab.scripted import PUSHER, SeenState, State, seen_state, state_of
+from hma_data.lab.simulator import LabSimulator, simulated
+from hma_model.generation.commands import described
+from hma_model.worlds.scenes import Dimension, LabRobot, LabScene, Prompt
+
+if TYPE_CHECKING:
+    from hma_model.evaluation.probe import Probe
+    from hma_model.worlds.world import World
+
+Floats = NDArray[np.float32]
+Places = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+SEEDS = 100_000  # scenes of a seed; those of the next seed are others
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """N scenes of a laboratory robot, and what its commands are.
+
+    Attributes:
+        robot: with its simulator.
+        numbers: of the scenes.
+        seed: of the policies' random numbers.
+    """
+
+    robot: LabRobot
+    numbers: tuple[int, ...]
+    seed: int
+
+    @classmethod
+    def of(
+        cls, world: "World", embodiment: str, count: int, seed: int, *, simulator: bool = True
+    ) -> "Scenes":
+        """Return the first scenes of a seed.
+
+        Args:
+            simulator: whether the robot must have a simulator; `begin` needs it.
+
+        Raises:
+            HMAError: the model lacks the robot, or it is none of the laboratory.
+        """
+        found, commands = described(world.model, embodiment), world.commands(embodiment)
+        if simulator and not simulated(embodiment):
+            remedy = "choose a robot of the laboratory; hma play shows those of a checkpoint"
+            raise HMAError(embodiment, "has no true simulator to compare with", remedy)
+        space = world.model.embodiments[embodiment]
+        action = {"mean": space.mean, "std": space.std}
+        if commands.seen is not None:
+            action |= {"min": commands.seen[0], "max": commands.seen[1]}
+        numbers = tuple(range(seed * SEEDS, seed * SEEDS + count))
+        robot = found or (LabSimulator(embodiment).embodiment if simulated(embodiment) else None)
+        if robot is None:
+            raise HMAError(embodiment, "has no YAML, which describes its commands", "load a checkpoint")
+        return cls(LabRobot(robot, {"action": action}), numbers, seed)
+
+    @property
+    def name(self) -> str:
+        """Return the id of the robot."""
+        return self.robot.embodiment.id
+
+    @property
+    def stride(self) -> int:
+        """Return the control steps of a chunk."""
+        return self.robot.embodiment.stride
+
+    @property
+    def dimensions(self) -> tuple[Dimension, ...]:
+        """Return the values of a command."""
+        return self.robot.dimensions
+
+    def take(self, chosen: range) -> "Scenes":
+        """Return some of the scenes."""
+        return replace(self, numbers=tuple(self.numbers[i] for i in chosen))
+
+    def begin(self) -> list[LabScene]:
+        """Return the scenes after their prompts; each call gives new ones in the same state."""
+        return [self.robot.scene(number) for number in self.numbers]
+
+    def rng(self, what: int) -> list[np.random.Generator]:
+        """Return a generator for each scene, always the same for `what`."""
+        return [np.random.default_rng((self.seed, what, number)) for number in self.numbers]
+
+
+def shows_state(robot: str) -> bool:
+    """Check whether the state that a robot's recordings hold can be read off a picture: no velocities."""
+    return robot == PUSHER or FAMILY.fullmatch(robot) is not None
+
+
+class Arena(Protocol):
+    """A place where a policy acts."""
+
+    scenes: Scenes
+    prompts: Sequence[Prompt]  # of the scenes, at the rate of the model's frames
+    pictures: Picture  # (N, S, S, 3), the newest ones
+    held: Floats  # (N, A), the commands that leave the robot as it is after the prompt
+
+    @property
+    def fresh(self) -> bool:
+        """Return whether the pictures came with the last step."""
+
+    def states(self) -> list[State]:
+        """Return the state of each scene; for robots that are steerable."""
+
+    def observed(self) -> Floats | None:
+        """Return the robots' measurements of themselves (N, S'), as recorded; None if pictures tell none."""
+
+    def recorded(self) -> Floats:
+        """Return the next commands (N, A) of the recorder's own driver; call it once a step."""
+
+    def step(self, commands: Floats) -> None:
+        """Take a command (N, A)."""
+
+
+class TrueArena:
+    """The simulators.
+
+    Args:
+        scenes: to begin.
+        size: S of the pictures.
+        drawn: whether there are pictures; else they are those of the prompts.
+
+    Attributes:
+        prompts: of the scenes.
+        parts: the true places (N, P, 2) of the parts at each picture.
+        told: what `recorded` returned so far.
+    """
+
+    def __init__(self, scenes: Scenes, size: int, drawn: bool = True) -> None:
+        self.scenes, self._size, self._drawn, self._steps = scenes, size, drawn, 0
+        self._begun = scenes.begin()
+        self.prompts: Sequence[Prompt] = [scene.prompt for scene in self._begun]
+        self.held = np.stack([scene.command for scene in self._begun])
+        self.parts: list[Places] = []
+        self.told: list[Floats] = []
+        self._look()
+
+    @property
+    def fresh(self) -> bool:
+        return self._steps % self.scenes.stride == 0
+
+    def states(self) -> list[State]:
+        return [state_of(scene.simulator.simulation) for scene in self._begun]
+
+    def observed(self) -> Floats | None:
+        if not shows_state(self.scenes.name):
+            return None
+        return np.stack([scene.simulator.state for scene in self._begun])
+
+    def recorded(self) -> Floats:
+        self.told.append(np.stack([scene.simulator.recorded() for scene in self._begun]))
+        return self.told[-1]
+
+    def step(self, commands: Floats) -> None:
+        for scene, command in zip(self._begun, commands, strict=True):
+            scene.simulator.advance(command)
+        self._steps += 1
+        if self.fresh:
+            self._look()
+
+    def _look(self) -> None:
+        if self._drawn or not self.parts:
+            shown = np.stack([scene.simulator.picture() for scene in self._begun])
+            self.pictures: Picture = shown if shown.shape[1] == self._size else resize(shown, self._size)
+        self.parts.append(np.stack([truth.parts_of(s.simulator.simulation)[1] for s in self._begun]))
+
+
+class Beginning(Protocol):
+    """The first frames of episodes in the model, and the commands of the true ones."""
+
+    @property
+    def scenes(self) -> Scenes:
+        """Return the N scenes."""
+
+    @property
+    def prompts(self) -> Sequence[Prompt]:
+        """Return the prompt of each."""
+
+    @property
+    def held(self) -> Floats:
+        """Return the commands (N, A) that leave the robots as they are, as of `Arena`."""
+
+    @property
+    def told(self) -> Sequence[Floats]:
+        """Return the commands (N, A) of each step by the recorder's driver."""
+
+
+class ModelArena:
+    """The world model, as a gymnasium vector environment.
+
+    Args:
+        world: with the robot.
+        true: the simulators that acted in the same scenes, or other beginnings.
+        probe: reads places for policies that ask for a state.
+    """
+
+    def __init__(self, world: "World", true: Beginning, probe: "Probe | None") -> None:
+        from hma_model.worlds.env import WorldModelVectorEnv
+
+        scenes, prompts = true.scenes, true.prompts
+        self.prompts: Sequence[Prompt] = [
+            Prompt(world.shown(prompt.frames), prompt.chunks) for prompt in prompts
+        ]
+        self.scenes, self.held, self._told, self._probe, self._steps = scenes, true.held, true.told, probe, 0
+        self._env = WorldModelVectorEnv(
+            len(prompts), embodiment=scenes.name, world=world, horizon=None, autoreset_mode="Disabled"
+        )
+        for row, prompt in enumerate(prompts):
+            mask = np.arange(len(prompts)) == row
+            given = {"frames": prompt.frames, "chunks": prompt.chunks}
+            seed = [scenes.seed + scenes.numbers[row]] * len(prompts)
+            self.pictures, _ = self._env.reset(seed=seed, options={"prompt": given, "reset_mask": mask})
+        self._seen: list[SeenState] | None = None
+
+    def outside(self, commands: Floats) -> str:
+        """Say which of the commands (N, A) leave the range seen in training; "" for none.
+
+        The environment then says it no more.
+        """
+        said = self._env.episodes.commands.outside(commands)
+        self._env.episodes.warned |= bool(said)
+        return said
+
+    @property
+    def fresh(self) -> bool:
+        return self._steps % self.scenes.stride == 0
+
+    def states(self) -> list[State]:
+        """Return what the probe reads off the pictures, moved by the commands since the last one.
+
+        Raises:
+            HMAError: there is no probe.
+        """
+        if self._probe is None:
+            raise HMAError(self.scenes.name, "nothing reads its state off pictures", "give another policy")
+        if self._seen is None:
+            places = self._probe.read(self.pictures)
+            self._seen = [seen_state(self.scenes.name, self._probe.own, one) for one in places]
+        return [seen.state for seen in self._seen]
+
+    def observed(self) -> Floats | None:
+        if self._probe is None or not shows_state(self.scenes.name):
+            return None
+        return np.stack([state.pose for state in self.states()]).astype(np.float32)
+
+    def recorded(self) -> Floats:
+        """Return what the driver of the simulator commanded in the true episode."""
+        return self._told[self._steps]
+
+    def step(self, commands: Floats) -> None:
+        self.pictures, *_ = self._env.step(commands)
+        self._steps += 1
+        if self._seen is not None and self._probe is not None:
+            places = self._probe.read(self.pictures) if self.fresh else None
+            for row, seen in enumerate(self._seen):
+                seen.move(commands[row])
+                if places is not None:
+                    seen.see(places[row])
+
+    def stored(self) -> NDArray[Any]:
+        """Return the newest frames (N, …) as shards store them."""
+        return np.stack([self._env.world.stored(session) for session in self._sessions])
+
+    def uncertainty(self) -> NDArray[np.float64]:
+        """Return how unsure the model was of the newest frames (N,), if its world measures it."""
+        return np.array([self._env.world.uncertainty.get(session, 0.0) for session in self._sessions])
+
+    @property
+    def _sessions(self) -> list[int]:
+        return [drive.session for drive in self._env.drives if drive.session is not None]
+
+    def close(self) -> None:
+        """End the sessions."""
+        self._env.close()

@@ -1,0 +1,97 @@
+"""Define what a policy is, and check what one returns.
+
+A policy acts in N scenes at once. `Arena` gives it the newest pictures, and to those that ask for it a state.
+
+N scenes, A action dims.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from hma_data.errors import HMAError, UsageError
+from hma_model.policies.arenas import Arena, Floats
+
+if TYPE_CHECKING:
+    from hma_model.policies.judge import StateJudge
+
+
+class Policy(Protocol):
+    """A policy in N scenes."""
+
+    def begin(self, arena: Arena) -> None:
+        """Begin episodes in all scenes."""
+
+    def act(self, arena: Arena) -> Floats:
+        """Return the next commands (N, A)."""
+
+
+@runtime_checkable
+class Judged(Protocol):
+    """A policy that needs the judge of its success, and gets it before it begins."""
+
+    def judged(self, judge: "StateJudge") -> None:
+        """Take the judge."""
+
+
+def split_options(kind: str, words: str, known: Mapping[str, type]) -> tuple[str, dict[str, Any]]:
+    """Return what comes before the options in `WHAT,horizon=2,…`, and the options that are given.
+
+    Raises:
+        UsageError: an option is unknown, or its value is not of the type that `known` tells.
+    """
+    what, *parts = words.split(",")
+    while parts and "=" not in parts[0]:
+        what = f"{what},{parts.pop(0)}"  # a comma of a path
+    options = {}
+    for part in parts:
+        name, _, value = part.partition("=")
+        try:
+            options[name] = known[name](value)
+        except (KeyError, ValueError):
+            allowed = ", ".join(
+                f"{key}={'N' if type is int else type.__name__}" for key, type in known.items()
+            )
+            raise UsageError(
+                f"policy {kind}:{words}", f"{part!r} is unknown", f"allowed: {allowed}"
+            ) from None
+    return what, options
+
+
+def begin(name: str, policy: Policy, arena: Arena) -> None:
+    """Begin a policy's episodes; an HMAError names the policy if it raises."""
+    with _named_errors(name):
+        policy.begin(arena)
+
+
+def checked(name: str, policy: Policy, arena: Arena) -> Floats:
+    """Return the next commands (N, A) of a policy.
+
+    Raises:
+        HMAError: it raises, or returns another shape or values that are not finite.
+    """
+    where, width = f"policy {name}", len(arena.scenes.dimensions)
+    with _named_errors(name):
+        commands = np.asarray(policy.act(arena), np.float32)
+    if commands.shape != (len(arena.pictures), width):
+        names = ", ".join(dim.name for dim in arena.scenes.dimensions)
+        fault = f"returns commands of the shape {commands.shape[1:]}"
+        raise HMAError(where, fault, f"{arena.scenes.name} takes ({width},): {names}")
+    if not np.isfinite(commands).all():
+        raise HMAError(
+            where, "returns NaN or infinite values", "return a number for each value of the command"
+        )
+    return commands
+
+
+@contextmanager
+def _named_errors(name: str) -> Iterator[None]:
+    try:
+        yield
+    except HMAError:
+        raise
+    except Exception as fault:
+        remedy = "mend it; --debug shows where it happened"
+        raise HMAError(f"policy {name}", f"raised {type(fault).__name__}: {fault}", remedy) from fault

@@ -1,0 +1,89 @@
+"""Make policies from the words of a command: scripted, random, still, a function, one of lerobot, a model."""
+
+import importlib
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hma_data.errors import HMAError, UsageError
+from hma_data.lab import FAMILY
+from hma_model.policies.arenas import Scenes
+from hma_model.policies.base import Policy
+from hma_model.policies.scripted import Called, Random, Scripted, Still
+
+if TYPE_CHECKING:
+    from hma_model.worlds.world import World
+
+WAYS = (
+    "give scripted, scripted:noise=0.5, reach, random, still, hma:CHECKPOINT, plan:cem, "
+    "lerobot:FOLDER_OR_REPO, or MODULE:NAME of a Python function or class"
+)
+
+
+def read_policy(words: str, scenes: Scenes, world: "World | None" = None) -> Policy:
+    """Return the policy of words such as `scripted:noise=0.5`, for the robot of scenes.
+
+    Args:
+        words: as `hma policy-eval` takes them.
+        scenes: in which it is to act.
+        world: for policies that plan; networks act on its device.
+
+    Raises:
+        HMAError: there is no such policy, or it does not fit the robot.
+    """
+    device = "cpu" if world is None else str(world.model.device)
+    kind, _, rest = words.partition(":")
+    if kind == "lerobot" and rest:
+        from hma_model.policies.lerobot import LeRobotPolicy
+
+        return LeRobotPolicy(rest, scenes, device)
+    if kind == "hma" and rest:
+        from hma_model.policies.acting import read_acting
+
+        return read_acting(rest, scenes, device)
+    if kind == "plan" and rest:
+        from hma_model.policies.planning import read_planning
+
+        return read_planning(rest, scenes, world)
+    if words in ("random", "still"):
+        return Random() if words == "random" else Still()
+    if kind in ("scripted", "reach"):
+        if kind == "reach" and not FAMILY.fullmatch(scenes.name):
+            raise UsageError("policy reach", f"{scenes.name} has no driver that reaches", "give scripted")
+        return Scripted(_noise(words, kind, rest), kind == "reach")
+    if rest:
+        return Called(_named(words), f"policy {words}")
+    raise UsageError("policy", f"{words!r} is unknown", WAYS)
+
+
+def _noise(words: str, kind: str, rest: str) -> float:
+    name, _, value = rest.partition("=")
+    try:
+        share = float(value) if rest else 0.0
+    except ValueError:
+        share = np.nan
+    if (rest and name != "noise") or not 0 <= share <= 1:
+        raise UsageError("policy", f"{words!r} is unknown", f"give {kind}:noise=SHARE, from 0 to 1")
+    return share
+
+
+def _named(words: str) -> Any:
+    """Return the object that MODULE:NAME names; modules of the working folder are found."""
+    module, _, name = words.partition(":")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        found: Any = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+    except Exception as fault:
+        remedy = WAYS
+        if isinstance(fault, ModuleNotFoundError) and fault.name == module.partition(".")[0]:
+            remedy = f"run hma in the folder of {fault.name}.py, or install its package"
+        raise HMAError(
+            f"policy {words}", f"cannot be imported: {type(fault).__name__}: {fault}", remedy
+        ) from fault
+    finally:
+        sys.path.pop(0)
+    return found

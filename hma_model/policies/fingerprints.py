@@ -1,0 +1,116 @@
+"""Tell policies, models and judges from others of the same name by what they are made of.
+
+`hma policy-eval` keeps what came of finished policies. A fingerprint is in the name of each kept file, so a
+policy that was edited or trained again is scored again.
+"""
+
+import hashlib
+import json
+import pickle
+import sys
+import uuid
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from hma_data.errors import HMAError, OutputError
+from hma_data.storage.files import atomic_path, file_sha256
+from hma_model.checkpoint.folder import HEAD, STATS, STEM, YAML, Checkpoint
+from hma_model.policies.acting import OPTIONS
+from hma_model.policies.base import split_options
+
+if TYPE_CHECKING:
+    from hma_model.network.model import HMA
+    from hma_model.worlds.world import World
+
+SETTINGS = "settings.json"
+
+
+def policy_facts(words: str, embodiment: str) -> dict[str, str]:
+    """Return what may change under the words of a policy that was read: names and SHA-256 of its files.
+
+    Of `module:name` it is the module's own file: other files that it reads or imports are not looked at. A
+    repository of the hub is known by its words alone.
+
+    Args:
+        words: as `hma policy-eval` takes them.
+        embodiment: the robot.
+    """
+    kind, _, rest = words.partition(":")
+    if kind == "hma" and rest:
+        return _checkpoint_facts(split_options(kind, rest, OPTIONS)[0], embodiment)
+    if kind == "lerobot" and rest:
+        folder = Path(rest)
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        return {str(path.relative_to(folder)): file_sha256(path) for path in files}
+    source = getattr(sys.modules.get(kind), "__file__", None) if rest else None
+    return {"module": file_sha256(Path(source))} if source else {}
+
+
+def _checkpoint_facts(checkpoint: str, embodiment: str) -> dict[str, str]:
+    with suppress(HMAError):
+        kept = Checkpoint.open(checkpoint)
+        parts = {part: file_sha256(kept.path(embodiment, part)) for part in (STEM, HEAD, YAML, STATS)}
+        return {"trunk": kept.trunk_sha256} | parts
+    return {}  # of the hub or a store
+
+
+def world_facts(world: "World") -> dict[str, Any]:
+    """Return what changes the frames of a world, beside its checkpoint, unmask steps and temperature."""
+    facts = {"order": world.order, "sample_steps": world.sample_steps, "precision": world.precision}
+    in_memory = "origin" not in vars(world.model)
+    return facts | ({"weights": object_sha256(world.model.state_dict())} if in_memory else {})
+
+
+class _Digest:
+    """A file to pickle into, of which nothing but the SHA-256 is kept."""
+
+    def __init__(self) -> None:
+        self.sha256 = hashlib.sha256()
+
+    def write(self, data: Any) -> int:
+        self.sha256.update(data)
+        return memoryview(data).nbytes
+
+
+class _Pickler(pickle.Pickler):
+    """A pickler to the same bytes in every process: torch pickles equal tensors differently."""
+
+    def reducer_override(self, value: Any) -> Any:
+        if not isinstance(value, torch.Tensor):
+            return NotImplemented
+        values = value.detach().cpu().reshape(-1).view(torch.uint8).numpy()
+        return tuple, ((str(value.dtype), tuple(value.shape), values),)
+
+
+def object_sha256(value: Any) -> str:
+    """Return the SHA-256 of an object as pickled; of one that cannot be pickled, another one in each call."""
+    digest = _Digest()
+    try:
+        _Pickler(digest, protocol=5).dump(value)
+    except Exception:  # an object's own methods may raise anything
+        return uuid.uuid4().hex
+    return digest.sha256.hexdigest()
+
+
+def digests(world: "World", embodiment: str) -> dict[str, str]:
+    """Return what tells the checkpoint of a world from others."""
+    if "origin" not in vars(world.model):
+        return {"checkpoint": "in memory"}
+    kept = Checkpoint.open(vars(world.model)["origin"])
+    return {"checkpoint_sha256": kept.trunk_sha256, "stem_sha256": file_sha256(kept.path(embodiment, STEM))}
+
+
+def begun(folder: Path, name: str, made_by: dict[str, Any], model: "HMA") -> Path:
+    """Return the folder of finished work in an output; refuse that of other settings or another device."""
+    device = {} if model.device.type == "cpu" else {"device": model.device.type}
+    work, text = folder / name, json.dumps(made_by | device, indent=1)
+    work.mkdir(exist_ok=True)
+    path = work / SETTINGS
+    if any(work.glob("*.npz")) and path.exists() and path.read_text(encoding="utf-8") != text:
+        raise OutputError(folder, "was begun with other settings", "give the same ones, or another folder")
+    with atomic_path(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return work

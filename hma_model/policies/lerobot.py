@@ -1,0 +1,114 @@
+"""Let a policy of lerobot act: its own loader, its own processors before and after it.
+
+N scenes, S pixels a side, S' values of a state.
+"""
+
+import sys
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hma_data.errors import HMAError
+from hma_data.hub.repository import Repository
+from hma_data.lab import imported
+from hma_data.storage.paths import REPOSITORY
+from hma_model.policies.arenas import Arena, Floats, Scenes
+
+STATE, TASK = "observation.state", "task"
+
+
+class LeRobotPolicy:
+    """A policy of lerobot that sees one camera, and the robot's state where it is known.
+
+    Args:
+        source: its folder or hub repository.
+        scenes: of the robot.
+
+    Raises:
+        HMAError: it cannot be loaded, or it takes inputs that a world model does not give.
+    """
+
+    def __init__(self, source: str, scenes: Scenes, device: str = "cpu") -> None:
+        self.name = f"policy lerobot:{source}"
+        _require_there(source, self.name)
+        with imported("lerobot"):
+            from lerobot.configs.policies import PreTrainedConfig
+            from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+        try:
+            with redirect_stdout(sys.stderr):  # it prints what it loads
+                config = PreTrainedConfig.from_pretrained(source)
+                config.device, config.pretrained_path = device, source
+                self._policy: Any = get_policy_class(config.type).from_pretrained(source, config=config)
+                there = {"device_processor": {"device": device}}
+                self._before, self._after = make_pre_post_processors(
+                    config,
+                    source,
+                    preprocessor_overrides=there,
+                    postprocessor_overrides={"device_processor": {"device": "cpu"}},
+                )
+        except Exception as fault:
+            said = f"cannot be loaded: {type(fault).__name__}: {fault}"
+            raise HMAError(
+                self.name, said, "give a folder or repository that lerobot itself loads"
+            ) from fault
+        self._policy.eval()
+        self._check(config, scenes)
+
+    def _check(self, config: Any, scenes: Scenes) -> None:
+        """Refuse a policy with other inputs than one camera and a state, or another action."""
+        cameras = list(config.image_features)
+        others = [key for key in config.input_features if key not in (*cameras, STATE)]
+        if len(cameras) != 1 or others:
+            wanted = ", ".join([*cameras, *others]) or "no camera"
+            raise HMAError(self.name, f"takes {wanted}", "a world model gives the picture of one camera")
+        self._camera = cameras[0]
+        self._size = config.input_features[self._camera].shape[1:]
+        state, action = config.input_features.get(STATE), config.action_feature
+        self._state = None if state is None else int(state.shape[0])
+        if action.shape != (len(scenes.dimensions),):
+            fault = f"gives actions of {action.shape[0]} values"
+            raise HMAError(self.name, fault, f"{scenes.name} takes {len(scenes.dimensions)}")
+
+    def begin(self, arena: Arena) -> None:
+        if arena.pictures.shape[1] != arena.pictures.shape[2]:
+            fault = "takes one camera, and the pictures show several side by side"
+            raise HMAError(self.name, fault, "give a policy that sees the same cameras")
+        self._policy.reset()
+
+    def act(self, arena: Arena) -> Floats:
+        import torch
+        from torch.nn.functional import interpolate
+
+        pictures = torch.from_numpy(arena.pictures).permute(0, 3, 1, 2).float() / 255
+        if pictures.shape[2:] != self._size:
+            pictures = interpolate(pictures, tuple(self._size), mode="bilinear", antialias=True)
+        batch: dict[str, Any] = {self._camera: pictures, TASK: [arena.scenes.name] * len(pictures)}
+        if self._state is not None:
+            batch[STATE] = torch.from_numpy(self._observed(arena))
+        with torch.inference_mode():
+            action = self._after(self._policy.select_action(self._before(batch)))
+        return np.asarray(action.cpu(), np.float32)
+
+    def _observed(self, arena: Arena) -> Floats:
+        state = arena.observed()
+        if state is None or state.shape[1] != self._state:
+            have = "none" if state is None else f"one of {state.shape[1]}"
+            fault = (
+                f"takes a state of {self._state} values, and of {arena.scenes.name} the pictures tell {have}"
+            )
+            raise HMAError(self.name, fault, "give a policy that acts from pictures alone")
+        return state
+
+
+def _require_there(source: str, where: str) -> None:
+    """Raise HMAError if there is no such folder or repository; the loader asks the Hub even for a path."""
+    if Path(source).is_dir():
+        return
+    if not REPOSITORY.fullmatch(source):
+        raise HMAError(
+            where, "no such folder", "give the folder of a policy, or ORGANISATION/NAME on the Hub"
+        )
+    if "config.json" not in Repository(source, name=where).files():
+        raise HMAError(where, "has no config.json", "give a policy that lerobot has saved")

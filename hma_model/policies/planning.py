@@ -1,0 +1,239 @@
+"""Plan in a world model: commands are tried in it before the best are given (model-predictive control).
+
+    cost = Cost(load_world("embedded"), "rails_03", judge)
+    solver = CEMSolver(cost, num_samples=64)          # of stable-worldmodel; plan:cem on the command line
+
+`Cost` is what the solvers of stable-worldmodel call `Costable`: it imagines what candidates lead to, all side
+by side, and costs what the pictures show. That is how far a judge finds them from success, or how far the
+last one is from a picture of the goal.
+
+N scenes, C candidates of each, H frames ahead, S pixels a side, A action dims, K = stride · A.
+"""
+
+import contextlib
+import io
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hma_data.episodes.images import resize
+from hma_data.errors import HMAError, MissingDependencyError, UsageError, install_command
+from hma_model.policies.acting import Follower
+from hma_model.policies.arenas import Arena, Floats, Picture, Scenes
+from hma_model.policies.base import split_options
+from hma_model.worlds.world import World
+
+if TYPE_CHECKING:
+    from hma_model.policies.judge import StateJudge
+
+SOLVERS = {"cem": "CEMSolver", "icem": "ICEMSolver", "mppi": "MPPISolver"}
+OPTIONS: dict[str, type] = {
+    **dict.fromkeys(("horizon", "samples", "steps", "receding", "unmask_steps"), int), "temperature": float,
+}  # fmt: skip
+ROWS = 128  # that step in one pass; more cost memory and gain nothing
+COARSE = 32  # pixels a side at which pictures are compared with a goal
+ELITES = 8  # one candidate in so many is kept by CEM
+
+
+class Cost:
+    """The cost of commands in a world model.
+
+    Args:
+        world: in which candidates are tried.
+        embodiment: the robot.
+        judge: its score, negative, is the cost; without one, the distance from `info["goal"]`.
+
+    Raises:
+        HMAError: the model lacks the robot.
+    """
+
+    def __init__(self, world: World, embodiment: str, judge: "StateJudge | None" = None) -> None:
+        self.world, self.embodiment, self.judge = world, embodiment, judge
+        own = world.commands(embodiment)
+        space = world.model.embodiments[embodiment]
+        self._own, self._mean = own, np.array(space.mean, np.float32)
+        self._std = np.array(space.std, np.float32)
+        self.sessions: list[int] = []
+        self.first: Picture | None = None  # (N, S, S, 3) in which the judged episodes began
+
+    @property
+    def space(self) -> gymnasium.spaces.Box:
+        """Return the space of a candidate's action (A,), in standard deviations from the mean."""
+        scale = np.maximum(self._std, 1e-6)
+        low, high = (self._own.low - self._mean) / scale, (self._own.high - self._mean) / scale
+        return gymnasium.spaces.Box(low, high, dtype=np.float32)
+
+    def commands(self, candidates: NDArray[Any]) -> Floats:
+        """Return candidates (…, A), held for a chunk, or (…, K), as commands (…, stride, A)."""
+        width, stride = len(self._own.names), self._own.stride
+        held = candidates.shape[-1] == width
+        rows = candidates[..., None, :] if held else candidates.reshape(*candidates.shape[:-1], stride, width)
+        commands = self._own.clip(self._mean + self._std * rows).astype(np.float32)
+        return commands.repeat(stride, axis=-2) if held and stride > 1 else commands
+
+    def imagine(self, sessions: Sequence[int], candidates: NDArray[Any]) -> Picture:
+        """Return the pictures (N, C, H, S, S, 3) that candidates (N, C, H, A or K) lead to from sessions."""
+        count, tried, horizon = candidates.shape[:3]
+        commands = self.commands(candidates).reshape(count * tried, horizon, self._own.stride, -1)
+        world = self.world.fork(sessions, tried)
+        made = [world.step(dict(enumerate(commands[:, ahead]))) for ahead in range(horizon)]
+        pictures = np.stack([[one[row] for row in range(count * tried)] for one in made], axis=1)
+        return pictures.reshape(count, tried, *pictures.shape[1:])
+
+    @torch.no_grad()
+    def get_cost(self, info_dict: dict[str, Any], action_candidates: torch.Tensor) -> torch.Tensor:
+        """Return the costs (N, C) of candidates (N, C, H, A or K), in standard deviations from the mean.
+
+        Args:
+            info_dict: "scene" (N, C): numbers of `sessions`; or "pixels" (N, C, T, S', S', 3) uint8: pictures
+                to begin from, at the model's rate. Without a judge also "goal", one such picture.
+            action_candidates: of the commands.
+        """
+        if "scene" in info_dict:
+            scenes = info_dict["scene"][:, 0].tolist()
+        else:
+            shown = np.asarray(info_dict["pixels"][:, 0])
+            self.open([(one, None) for one in shown])
+            scenes = list(range(len(shown)))
+        sessions = [self.sessions[scene] for scene in scenes]
+        pictures = self.imagine(sessions, action_candidates.cpu().numpy())
+        if self.judge is None:
+            costs = goal_distance(pictures[:, :, -1], np.asarray(info_dict["goal"][:, 0]))
+        else:
+            assert self.first is not None
+            costs = self._judged(self.judge, self.first[scenes], pictures)
+        return torch.from_numpy(costs).to(action_candidates)
+
+    criterion = get_cost
+
+    def open(self, prompts: Sequence[tuple[Any, Any]]) -> None:
+        """Begin sessions with frames and chunks; those before end."""
+        for session in self.sessions:
+            self.world.close(session)
+        made = [self.world.open(self.embodiment, *prompt, seed=row) for row, prompt in enumerate(prompts)]
+        self.sessions = made
+        self.first = np.stack([self.world.picture(session) for session in made])
+
+    def _judged(self, judge: "StateJudge", first: Picture, pictures: Picture) -> NDArray[np.float64]:
+        """Return how far the judge finds imagined episodes (N, C, H, …) from a success; negative beyond."""
+        count, tried = pictures.shape[:2]
+        begun = np.broadcast_to(first[:, None, None], (count, tried, 1, *first.shape[1:]))
+        episodes = np.concatenate([begun, pictures], axis=2).reshape(count * tried, -1, *first.shape[1:])
+        return -judge.score(episodes).reshape(count, tried)
+
+
+def goal_distance(pictures: Picture, goals: Picture) -> NDArray[np.float64]:
+    """Return the mean squared distances (N, C) of pictures (N, C, S, S, 3) from goals (N, …, S', S', 3)."""
+    shape = pictures.shape[:2]
+    coarse = resize(pictures.reshape(-1, *pictures.shape[2:]), COARSE).astype(np.float64)
+    wanted = resize(goals.reshape(len(goals), -1, *goals.shape[-3:])[:, -1], COARSE).astype(np.float64)
+    squares = np.square(coarse.reshape(*shape, *coarse.shape[1:]) - wanted[:, None])
+    return np.asarray(squares.mean(axis=(2, 3, 4)))
+
+
+class Planning:
+    """Model-predictive control against the judge: plan, give the first chunks, look, and plan again.
+
+    Args:
+        world: whose model it plans in; the sessions are in a world of its own.
+        scenes: whose robot it has.
+        solver: a key of SOLVERS.
+        horizon: H.
+        samples: candidates of a round.
+        steps: rounds of a plan.
+        receding: frames until it plans again.
+        unmask_steps, temperature: of imagined frames.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        scenes: Scenes,
+        solver: str = "cem",
+        *,
+        horizon: int = 6,
+        samples: int = 32,
+        steps: int = 3,
+        receding: int = 2,
+        unmask_steps: int = 1,
+        temperature: float = 0.0,
+    ) -> None:
+        if min(horizon, samples, steps, receding) < 1 or receding > horizon:
+            fault = "has a number below 1, or looks less often than it plans ahead"
+            remedy = "give numbers of at least 1, and receding up to horizon"
+            raise UsageError(f"policy plan:{solver}", fault, remedy)
+        own = World(world.model, world.tokenizer, unmask_steps=unmask_steps, temperature=temperature)
+        self._follower = Follower(own, scenes, "policy plan")
+        self.cost = Cost(own, scenes.name)
+        self._kind, self._seed = solver, scenes.seed
+        self._sizes = horizon, samples, steps, receding
+
+    def judged(self, judge: "StateJudge") -> None:
+        """Take the judge whose success is planned for."""
+        self.cost.judge = judge
+
+    def begin(self, arena: Arena) -> None:
+        self._follower.begin(arena)
+        self.cost.sessions, self.cost.first = self._follower.sessions, arena.pictures
+        self._solver = self._made(len(arena.pictures))
+        self._ahead: list[Floats] = []
+        self._rest: torch.Tensor | None = None
+
+    def act(self, arena: Arena) -> Floats:
+        self._follower.look(arena)
+        if not self._ahead:
+            scenes = torch.arange(len(arena.pictures))
+            with contextlib.redirect_stdout(io.StringIO()):  # solvers print their time
+                actions = self._solver({"scene": scenes}, init_action=self._rest)["actions"]
+            receding = self._sizes[3]
+            self._rest = actions[:, receding:]
+            commands = self.cost.commands(actions[:, :receding].numpy())  # (N, receding, stride, A)
+            self._ahead = list(commands.reshape(len(commands), -1, commands.shape[-1]).swapaxes(0, 1))
+        return self._follower.take(self._ahead.pop(0))
+
+    def _made(self, count: int) -> Any:
+        horizon, samples, steps, receding = self._sizes
+        made, configured = solver_of(self._kind)
+        given: dict[str, Any] = {"topk": max(2, samples // ELITES)}
+        solver = made(
+            self.cost, batch_size=max(1, ROWS // samples), num_samples=samples, n_steps=steps,
+            seed=self._seed, **given,
+        )  # fmt: skip
+        one = self.cost.space
+        box = gymnasium.spaces.Box(np.tile(one.low, (count, 1)), np.tile(one.high, (count, 1)))
+        solver.configure(action_space=box, n_envs=count, config=configured(horizon, receding))
+        return solver
+
+
+def solver_of(kind: str) -> tuple[Any, Any]:
+    """Return a solver's class of stable-worldmodel, and the class of its settings.
+
+    Raises:
+        HMAError: there is no such solver, or stable-worldmodel is not installed.
+    """
+    if kind not in SOLVERS:
+        raise UsageError(f"policy plan:{kind}", "is no solver", f"choose from {', '.join(SOLVERS)}")
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "ale-py not found")  # solvers need no Atari games
+            from stable_worldmodel import policy, solver
+    except ImportError as fault:
+        said = f"stable-worldmodel cannot be imported ({fault})"
+        raise MissingDependencyError("policy plan", said, install_command("planning")) from fault
+    return getattr(solver, SOLVERS[kind]), policy.PlanConfig
+
+
+def read_planning(words: str, scenes: Scenes, world: World | None) -> Planning:
+    """Return the policy of words such as `cem,horizon=6,samples=32,steps=3,receding=2`."""
+    kind, options = split_options("plan", words, OPTIONS)
+    solver_of(kind)
+    if world is None:
+        raise HMAError(
+            f"policy plan:{words}", "has no world to plan in", "give it to hma policy-eval or augment"
+        )
+    return Planning(world, scenes, kind, **options)

@@ -1,0 +1,219 @@
+"""Show an evaluation of policies: as a table on a terminal, and as a page with pictures of episodes."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hma_data.console import print_lines, print_table, short_paths
+from hma_data.episodes.sheets import grid, png_bytes
+from hma_data.storage.files import atomic_path
+from hma_model.evaluation.agreement import Estimate
+from hma_model.evaluation.pages import COLOURS, MARKERS, Page, label_axes, svg_bytes
+from hma_model.policies.scores import WORK, Correlation, PolicyEvaluation, Scored
+
+COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same commands, sim.")
+GOOD = 0.75  # balanced accuracy; an interval that holds chance and this says nothing
+CHOSEN = 2  # episodes of each kind on the page
+KINDS = {  # (success in the simulator, in the model) -> title
+    (True, True): "Both say success",
+    (False, False): "Both say failure",
+    (True, False): "Success in the simulator only",
+    (False, True): "Success in the model only",
+}
+
+
+def renamed(found: PolicyEvaluation) -> tuple[PolicyEvaluation, list[tuple[str, str]]]:
+    """Return the evaluation under short names of the policies that are paths, and the pairs (short, full)."""
+    names = short_paths([one.policy for one in found.policies if "/" in one.policy])
+    policies = tuple(replace(one, policy=names.get(one.policy, one.policy)) for one in found.policies)
+    legend = [(short, name) for name, short in names.items() if short != name]
+    return replace(found, policies=policies), legend
+
+
+def table(found: PolicyEvaluation) -> list[list[Any]]:
+    """Return a row of COLUMNS for each policy."""
+    return [
+        [
+            row["policy"],
+            _rate(row, "true"),
+            _rate(row, "model"),
+            round(row["true_score"], 1),
+            round(row["model_score"], 1),
+            f"{row['episodes_alike']:.0%}",
+            _rate(row, "replayed"),
+        ]
+        for row in found.rows()
+    ]
+
+
+def _rate(row: dict[str, Any], name: str) -> str:
+    low, high = row[f"{name}_success_interval"]
+    return f"{row[f'{name}_success']:.0%} ({low:.0%}–{high:.0%})"
+
+
+def _below(cell: Any) -> Any:
+    """Return a cell with its interval below the value, which leaves room for the last columns."""
+    share, bracket, interval = cell.rpartition(" (") if isinstance(cell, str) else ("", "", "")
+    return f"{share}\n{interval.rstrip(')')}" if bracket else cell
+
+
+def sentences(found: PolicyEvaluation) -> list[str]:
+    """Return in words what the table means: the task, the judge, the correlations."""
+    share = "not known" if found.followed is None else f"{found.followed:.2f}"
+    scores = "the way it moved" if found.judge.task.name == "moved" else "minus the distance, 0 is best"
+    said = [
+        f"success: {found.judge.task.text}; shares with 95 % intervals over episodes; scores in px: {scores}",
+        "alike: episodes with the same outcome in both; same commands, sim.: the simulator, under the "
+        "commands that the policy gave in the model",
+        f"judge on held-out true episodes: {found.judge.held_out}",
+        f"judge on generated frames, against the simulator under the same commands: {found.generated}; "
+        f"correlation of the scores {share}",
+    ]
+    correlated = {"success rates": found.success, "mean scores": found.score}
+    missing = {one.pearson.reason for one in correlated.values()}
+    if len(missing) == 1 and (reason := missing.pop()):
+        said.append(f"correlations over policies are not computed: {reason}")
+    else:
+        said += [_correlation(what, one) for what, one in correlated.items()]
+    return [*said, *doubt(found)]
+
+
+def doubt(found: PolicyEvaluation) -> list[str]:
+    """Return the sentence that says why the model's success rates mean nothing, if they do."""
+    judged = found.generated
+    if judged.too_few:
+        why = f"there are too few {judged.too_few} to tell whether the judge is better than chance"
+    elif judged.better_than_chance:
+        return []
+    elif judged.high is not None and judged.high >= GOOD:
+        why = "the judge may be no better than chance; more episodes would tell"
+    else:
+        why = "the judge is no better than chance"
+    return [f"on generated frames {why}: the model's success rates mean nothing"]
+
+
+def _correlation(what: str, found: Correlation) -> str:
+    if found.pearson.reason:  # of the ranks it is the same
+        return f"{what} over policies: no correlation, {found.pearson.reason}"
+    return f"{what} over policies: Pearson {found.pearson}, ranks {found.spearman}"
+
+
+def show(found: PolicyEvaluation) -> None:
+    """Print the table and what it means."""
+    found, legend = renamed(found)
+    print_lines(legend)
+    print_table(list(COLUMNS), table(found))
+    for sentence in sentences(found):
+        print(sentence)
+
+
+def write_report(found: PolicyEvaluation, folder: Path) -> Path:
+    """Write results.json and report.html; return the path of the page. Finished policies are then removed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    page = folder / "report.html"
+    for path, text in ((folder / "results.json", json.dumps(found.to_json(), indent=1)), (page, html(found))):
+        with atomic_path(path) as part:
+            part.write_text(text, encoding="utf-8")
+    shutil.rmtree(folder / WORK, ignore_errors=True)
+    return page
+
+
+def html(found: PolicyEvaluation) -> str:
+    """Return the page."""
+    found, legend = renamed(found)
+    count = len(found.policies[0].true.scores)
+    lead = (
+        f"{found.embodiment} in {found.checkpoint} ({found.sampling}): {count} episodes of {found.frames} "
+        "frames a policy, from the same frames in the simulator and in the world model"
+    )
+    page = Page("Policies inside the world model", lead)
+    page.figures(
+        [
+            (
+                _value(found.success.pearson.value),
+                f"correlation of success rates{_ends(found.success.pearson)}",
+            ),
+            (
+                _value(found.success.spearman.value),
+                f"correlation of their ranks{_ends(found.success.spearman)}",
+            ),
+            (_value(found.judge.held_out.balanced), "judge's balanced accuracy on true episodes"),
+            (_value(found.generated.balanced), "and on generated ones; 0.5 is chance"),
+        ]
+    )
+    for sentence in doubt(found):  # before anybody reads the rates
+        page.section("Do not rely on the model's rates", sentence[:1].upper() + sentence[1:] + ".")
+    page.definitions(legend)
+    page.table(COLUMNS, [[_below(cell) for cell in row] for row in table(found)])
+    for sentence in [one for one in sentences(found) if one not in doubt(found)]:
+        page.text(sentence[:1].upper() + sentence[1:] + ".")
+    page.section("Success rates", "A policy is a point; bars are 95 % intervals over episodes.")
+    page.picture(_plot(found), "svg+xml", "Success in the simulator and in the model")
+    for kind, title in KINDS.items():
+        chosen = list(_chosen(found, kind))[:CHOSEN]
+        if chosen:
+            page.section(title)
+        for one, number in chosen:
+            page.picture(_strip(one, number), "png", _caption(one, number))
+    return page.html()
+
+
+def _value(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def _ends(found: Estimate) -> str:
+    if found.value is None:
+        return ""
+    if found.low is None:
+        return "; too few policies for an interval"
+    return f"; 95 %: {found.low:.2f} to {found.high:.2f}"
+
+
+def _chosen(found: PolicyEvaluation, kind: tuple[bool, bool]) -> Iterator[tuple[Scored, int]]:
+    """Yield episodes of a kind, of each policy one before any second one."""
+    there = [
+        np.flatnonzero((one.true.success == kind[0]) & (one.model.success == kind[1]))
+        for one in found.policies
+    ]
+    for turn in range(CHOSEN):
+        for one, numbers in zip(found.policies, there, strict=True):
+            if turn < len(numbers):
+                yield one, int(numbers[turn])
+
+
+def _caption(one: Scored, number: int) -> str:
+    return (
+        f"{one.policy}, episode {number}, frames {', '.join(map(str, one.shown))}: simulator above, scored "
+        f"{one.true.scores[number]:.1f} px, model below, judged {one.model.scores[number]:.1f} px"
+    )
+
+
+def _strip(one: Scored, number: int) -> bytes:
+    return png_bytes(grid([list(one.true_pictures[number]), list(one.model_pictures[number])]))
+
+
+def _plot(found: PolicyEvaluation) -> bytes:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.6, 4.4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="#999999", ls=":", lw=1)
+    for i, row in enumerate(found.rows()):
+        x, y = row["true_success"], row["model_success"]
+        ends = ((x, row["true_success_interval"]), (y, row["model_success_interval"]))
+        bars = [[[max(at - low, 0)], [max(high - at, 0)]] for at, (low, high) in ends]
+        look: dict[str, Any] = {
+            "color": COLOURS[i % len(COLOURS)],
+            "fmt": MARKERS[i // len(COLOURS) % len(MARKERS)],
+        }
+        axes.errorbar([x], [y], xerr=bars[0], yerr=bars[1], label=row["policy"], ms=7, lw=1, **look)
+    axes.set(xlim=(-0.05, 1.05), ylim=(-0.05, 1.05))
+    axes.legend(frameon=False, fontsize=9)
+    label_axes(axes, "success in the simulator", "success in the model")
+    return svg_bytes(figure)

@@ -1,0 +1,390 @@
+"""Score policies in the true simulator and inside the world model, and compare the two.
+
+    found = evaluate_policies("rails_03", ["scripted", "scripted:noise=0.5", "random", "still"])
+    found.success.spearman            # of the policies' success rates
+
+Every policy acts in the same scenes of a laboratory robot: once in its simulator, which knows the outcome,
+and once in the world model from the same frames, where a judge reads the outcome off the pictures. The
+commands that it gave in the model are also played to the simulator. So the judge's word on generated frames
+is compared with what truly comes of the same commands.
+
+With an output folder, what came of each policy lies in a folder of it until the page is written, so the same
+call continues. A policy that was changed in between is scored again.
+
+M policies, N episodes, T frames after the prompt, S pixels a side.
+"""
+
+import hashlib
+import json
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.conversion.output import locked
+from hma_data.errors import UsageError
+from hma_data.storage.files import atomic_path, kept_arrays
+from hma_data.storage.paths import StrPath, as_path
+from hma_model.evaluation.agreement import (
+    MIN_EPISODES,
+    Accuracy,
+    Bools,
+    Estimate,
+    accuracy,
+    correlations,
+    pearson,
+    share_interval,
+)
+from hma_model.generation.commands import OutsideRangeWarning
+from hma_model.policies.arenas import Arena, Floats, ModelArena, Picture, Scenes, TrueArena
+from hma_model.policies.base import Judged, Policy, begin, checked
+from hma_model.policies.catalog import read_policy
+from hma_model.policies.fingerprints import begun, digests, object_sha256, policy_facts, world_facts
+from hma_model.policies.judge import StateJudge, task_of, train_judge
+from hma_model.worlds.world import World, load_world
+
+Scores = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+EPISODES, FRAMES = 32, 40
+WORK = ".policies"  # folder of finished policies in an output
+OUTCOMES = ("true", "model", "replayed")
+SHOWN = 8  # pictures that are kept of an episode
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """Scores (N,) of a policy's episodes, and which are a success (N,)."""
+
+    scores: Scores
+    success: Bools
+
+
+@dataclass(frozen=True)
+class Scored:
+    """The results of one policy.
+
+    Attributes:
+        true: in the simulator.
+        model: in the world model, as judged.
+        replayed: in the simulator, under the commands that the policy gave in the model.
+        shown: frames of which pictures are kept.
+        true_pictures, model_pictures: (N, len(shown), S, S, 3).
+    """
+
+    policy: str
+    true: Outcomes
+    model: Outcomes
+    replayed: Outcomes
+    shown: tuple[int, ...]
+    true_pictures: Picture
+    model_pictures: Picture
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """The correlations over policies of a figure in the model with that in the simulator."""
+
+    pearson: Estimate
+    spearman: Estimate
+
+
+@dataclass(frozen=True)
+class PolicyEvaluation:
+    """Policies scored twice.
+
+    Attributes:
+        sampling: how the world drew its frames.
+        success, score: correlation over policies of the success rates, and of the mean scores.
+        generated: accuracy of the judge on generated frames, against the simulator under the same commands.
+        followed: how the scores of single episodes, as judged on generated frames, correlate with the true
+            ones under the same commands; None if they do not vary or are few.
+    """
+
+    embodiment: str
+    checkpoint: str
+    sampling: str
+    seed: int
+    frames: int
+    judge: StateJudge
+    policies: tuple[Scored, ...]
+    success: Correlation
+    score: Correlation
+    generated: Accuracy
+    followed: float | None
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the figures of each policy."""
+        rows = []
+        for one in self.policies:
+            row: dict[str, Any] = {"policy": one.policy}
+            for name in OUTCOMES:
+                outcomes: Outcomes = getattr(one, name)
+                good, count = int(outcomes.success.sum()), len(outcomes.success)
+                row |= {
+                    f"{name}_success": good / count,
+                    f"{name}_success_interval": share_interval(good, count),
+                    f"{name}_score": float(outcomes.scores.mean()),
+                }
+            agree = (one.true.success == one.model.success).mean()
+            rows.append(row | {"episodes_alike": float(agree)})
+        return rows
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures, and the outcome of each episode, as plain values."""
+        judge = {
+            "task": self.judge.task.name,
+            "success": self.judge.task.text,
+            "limit": self.judge.limit,
+            "held_out": asdict(self.judge.held_out),
+            "generated": asdict(self.generated) | {"score_correlation": self.followed},
+            "generated_better_than_chance": self.generated.better_than_chance,
+        }
+        episodes = {
+            one.policy: {
+                name: {"scores": value.scores.round(3).tolist(), "success": value.success.tolist()}
+                for name in OUTCOMES
+                for value in [getattr(one, name)]
+            }
+            for one in self.policies
+        }
+        return {
+            "embodiment": self.embodiment,
+            "checkpoint": self.checkpoint,
+            "sampling": self.sampling,
+            "seed": self.seed,
+            "frames": self.frames,
+            "episodes": len(self.policies[0].true.scores),
+            "judge": judge,
+            "policies": self.rows(),
+            "correlation": {"success": asdict(self.success), "score": asdict(self.score)},
+            "outcomes": episodes,
+        }
+
+
+def evaluate_policies(
+    embodiment: str,
+    policies: Sequence[str | tuple[str, Policy]],
+    *,
+    checkpoint: StrPath = "embedded",
+    episodes: int = EPISODES,
+    frames: int = FRAMES,
+    judge: str | StateJudge = "moved",
+    seed: int = 0,
+    out: StrPath | None = None,
+    world: World | None = None,
+    unmask_steps: int = 2,
+    temperature: float | None = None,
+    device: str = "cpu",
+    precision: str = "float32",
+    compile: bool = False,
+    on_progress: Progress | None = None,
+) -> PolicyEvaluation:
+    """Score policies in the simulator of a laboratory robot and inside a world model.
+
+    Args:
+        embodiment: a robot of the laboratory that the checkpoint has.
+        policies: words as `read_policy` takes them, or a name and a policy.
+        checkpoint: as `load_world` takes it.
+        episodes: N.
+        frames: T.
+        judge: words as `task_of` takes them, or a trained judge.
+        seed: of scenes, policies, judge and intervals; on one device, the same seed gives the same figures.
+        out: folder that keeps finished policies until `write_report` has written there; None keeps nothing.
+        world: a world instead of a checkpoint.
+        unmask_steps, temperature: of the world, as of `World`.
+        device: of the world made from the checkpoint, and of policies that are networks.
+        precision, compile: of that world, as of `World`.
+        on_progress: called with the frames done, and what is done.
+
+    Raises:
+        HMAError: a policy fails, the robot has no simulator, or the judge is no better than chance.
+        OutputError: the folder cannot be written, or was begun with other settings.
+    """
+    if not policies:
+        raise UsageError("policies", "none is given", "give at least one; a correlation takes three")
+    names = [one if isinstance(one, str) else one[0] for one in policies]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise UsageError(f"policy {twice}", "is given twice", "give each once")
+    folder = None if out is None else as_path(out)
+    with locked(folder) if folder else nullcontext():
+        tell = on_progress or (lambda done, words: None)
+        world = world or load_world(
+            checkpoint, device=device, unmask_steps=unmask_steps, temperature=temperature,
+            precision=precision, compile=compile,
+        )  # fmt: skip
+        sampling = f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}"
+        sampling += "" if world.precision == "float32" else f",precision={world.precision}"
+        scenes = Scenes.of(world, embodiment, episodes, seed)
+        made = [(one, read_policy(one, scenes, world)) if isinstance(one, str) else one for one in policies]
+        keys = [""] * len(made) if folder is None else _keys(policies, world, embodiment, judge)
+        for name, policy in made:  # what it returns is refused before minutes of work
+            if not isinstance(policy, Judged):
+                _try(name, policy, TrueArena(scenes.take(range(1)), world.picture_shape[0]))
+        if not isinstance(judge, StateJudge):
+            task = task_of(embodiment, judge)
+            judge = train_judge(
+                embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed, tell=partial(tell, 0)
+            )
+        for _, policy in made:
+            if isinstance(policy, Judged):
+                policy.judged(judge)
+        work = None
+        if folder:
+            facts = {"embodiment": embodiment, "episodes": episodes, "frames": frames, "seed": seed}
+            facts |= {"judge": asdict(judge.task), "sampling": sampling, **digests(world, embodiment)}
+            work = begun(folder, WORK, facts, world.model)
+        tell(0, "episodes")  # the clock of the time left starts here
+        scored: list[Scored] = []
+        for (name, policy), key in zip(made, keys, strict=True):
+            told = partial(_tell, tell, len(scored) * frames * episodes, name)
+            score = partial(score_policy, name, policy, world, scenes, judge, frames, told)
+            scored.append(_once(name, key, work, score))
+        success, scores = _matrices(scored, "success"), _matrices(scored, "scores")
+        return PolicyEvaluation(
+            embodiment,
+            str(checkpoint),
+            sampling,
+            seed,
+            frames,
+            judge,
+            tuple(scored),
+            Correlation(**correlations(success[0], success[1], seed)),
+            Correlation(**correlations(scores[0], scores[1], seed)),
+            accuracy(success[2].ravel() > 0, success[1].ravel() > 0),
+            _correlation(scores[1].ravel(), scores[2].ravel()),
+        )
+
+
+def _keys(
+    policies: Sequence[str | tuple[str, Policy]], world: World, embodiment: str, judge: str | StateJudge
+) -> list[str]:
+    """Return the name under which each policy's results are kept: another one for all that changes them.
+
+    The rest is in the settings of the folder of work, with which a judge of words always comes out the same.
+    """
+    shared = [world_facts(world), None if isinstance(judge, str) else object_sha256(judge)]
+    own = [
+        (one, policy_facts(one, embodiment)) if isinstance(one, str) else (one[0], object_sha256(one[1]))
+        for one in policies
+    ]
+    return [hashlib.sha256(json.dumps([one, shared]).encode()).hexdigest()[:32] for one in own]
+
+
+def _once(name: str, key: str, work: Path | None, score: Callable[[], Scored]) -> Scored:
+    """Return the results of a policy: those kept in a folder of work, else new ones, which are kept there."""
+    if work is None:
+        return score()
+    path = work / f"{key}.npz"
+    found = _kept(name, path)
+    if found is None:
+        found = score()
+        _keep(found, path)
+    return found
+
+
+def _try(name: str, policy: Policy, arena: Arena) -> None:
+    begin(name, policy, arena)
+    checked(name, policy, arena)
+
+
+def _tell(tell: Progress, begun: float, name: str, done: float, where: str) -> None:
+    tell(begun + done, f"{name}, {where}")
+
+
+def _correlation(one: Scores, other: Scores) -> float | None:
+    if len(one) < MIN_EPISODES:
+        return None
+    found = float(pearson(one, other))
+    return None if np.isnan(found) else found
+
+
+def score_policy(
+    name: str,
+    policy: Policy,
+    world: World,
+    scenes: Scenes,
+    judge: StateJudge,
+    frames: int,
+    tell: Progress = lambda done, where: None,
+) -> Scored:
+    """Return what comes of one policy in the simulator and in the model."""
+    size, limit = world.picture_shape[0], judge.task.limit
+    shown = tuple(sorted({round(frame) for frame in np.linspace(0, frames, SHOWN)}))
+    true = TrueArena(scenes, size)
+    true_pictures, _ = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
+    model = ModelArena(world, true, judge.probe)
+    try:
+        model_pictures, commands = run(name, policy, model, frames, lambda done: tell(done, "in the model"))
+    finally:
+        model.close()
+    again = TrueArena(scenes, size, drawn=False)
+    for command in commands:
+        again.step(command)
+    scores = [judge.true_score(np.stack(arena.parts, axis=1)) for arena in (true, again)]
+    read = judge.score(np.stack(model_pictures, axis=1))
+    return Scored(
+        name,
+        Outcomes(scores[0], scores[0] >= limit),
+        Outcomes(read, judge.success(read)),
+        Outcomes(scores[1], scores[1] >= limit),
+        shown,
+        np.stack([true_pictures[frame] for frame in shown], axis=1),
+        np.stack([model_pictures[frame] for frame in shown], axis=1),
+    )
+
+
+def run(
+    name: str, policy: Policy, arena: Arena, frames: int, tell: Callable[[float], None] = lambda done: None
+) -> tuple[list[Picture], list[Floats]]:
+    """Let a policy act for so many frames.
+
+    Returns:
+        The T + 1 pictures (N, S, S, 3), the last one of the prompt first; and all commands (N, A).
+
+    Raises:
+        HMAError: the policy fails.
+    """
+    pictures, commands, said = [arena.pictures], list[Floats](), ""
+    begin(name, policy, arena)
+    for _ in range(frames * arena.scenes.stride):
+        commands.append(checked(name, policy, arena))
+        if not said and isinstance(arena, ModelArena) and (said := arena.outside(commands[-1])):
+            guess = "what the model shows of such commands is a guess"
+            warnings.warn(f"policy {name}: {said}; {guess}", OutsideRangeWarning, stacklevel=2)
+        arena.step(commands[-1])
+        if arena.fresh:
+            pictures.append(arena.pictures)
+            tell((len(pictures) - 1) * len(arena.pictures))
+    return pictures, commands
+
+
+def _keep(one: Scored, path: Path) -> None:
+    outcomes = {name: getattr(one, name) for name in OUTCOMES}
+    arrays = {f"{name}_{key}": value for name in OUTCOMES for key, value in vars(outcomes[name]).items()}
+    shown = {"true_pictures": one.true_pictures, "model_pictures": one.model_pictures}
+    with atomic_path(path) as part, part.open("wb") as file:
+        np.savez(file, **(arrays | shown | {"shown": np.array(one.shown)}))
+
+
+def _kept(name: str, path: Path) -> Scored | None:
+    """Return the results of a policy that are kept in a file; None if there are none, or they are damaged."""
+    arrays = kept_arrays(path)
+    if arrays is None:
+        return None
+    outcomes: Any = {key: Outcomes(arrays[f"{key}_scores"], arrays[f"{key}_success"]) for key in OUTCOMES}
+    pictures: Any = {key: arrays[key] for key in ("true_pictures", "model_pictures")}
+    return Scored(name, shown=tuple(arrays["shown"].tolist()), **outcomes, **pictures)
+
+
+def _matrices(scored: Sequence[Scored], key: str) -> list[Scores]:
+    """Return "success" or "scores" in the simulator, in the model, and as replayed; (M, N) each."""
+    return [
+        np.stack([getattr(getattr(one, where), key) for one in scored]).astype(np.float64)
+        for where in OUTCOMES
+    ]

@@ -1,0 +1,108 @@
+"""Policies without a network: scripted, random, still, and those of a Python function.
+
+N scenes, S pixels a side, A action dims.
+"""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from hma_data.errors import UsageError
+from hma_data.lab.scripted import driver, reacher, steerable
+from hma_model.policies.arenas import Arena, Floats
+
+
+class Still:
+    """The commands that leave the robot as it is: no velocity, or the last target."""
+
+    def begin(self, arena: Arena) -> None:
+        pass
+
+    def act(self, arena: Arena) -> Floats:
+        return arena.held
+
+
+class Random:
+    """A uniform command in the range of training, another one for each chunk."""
+
+    def begin(self, arena: Arena) -> None:
+        self._rng = arena.scenes.rng(1)
+        self._low, self._high = (
+            np.array([getattr(dim, end) for dim in arena.scenes.dimensions]) for end in ("low", "high")
+        )
+
+    def act(self, arena: Arena) -> Floats:
+        if arena.fresh:
+            drawn = [rng.uniform(self._low, self._high) for rng in self._rng]
+            self._command = np.stack(drawn).astype(np.float32)
+        return self._command
+
+
+class Scripted:
+    """The manoeuvres of the recorder, or a reach for the nearest block; a share of the chunks is random.
+
+    They go by the robot's state: in the simulator by the true one, in the model by what a probe reads off its
+    pictures. Robots of which no state can be read so are driven by the simulator's own driver, and in the
+    model its commands are replayed.
+
+    Args:
+        noise: the share of chunks with random commands.
+        reach: go to the nearest block, rather than by random manoeuvres.
+    """
+
+    def __init__(self, noise: float = 0.0, reach: bool = False) -> None:
+        self.noise, self.reach, self._random = noise, reach, Random()
+
+    def begin(self, arena: Arena) -> None:
+        self._random.begin(arena)
+        self._coins = arena.scenes.rng(2)
+        self._drivers: list[Callable[..., Floats]] = []
+        if self.reach:
+            self._drivers = [reacher(arena.scenes.name) for _ in arena.pictures]
+        elif steerable(arena.scenes.name):
+            begun = zip(arena.states(), arena.scenes.rng(3), strict=True)
+            self._drivers = [driver(arena.scenes.name, state.pose, rng) for state, rng in begun]
+
+    def act(self, arena: Arena) -> Floats:
+        noisy = self._random.act(arena)
+        if arena.fresh:
+            self._thrown = np.array([coin.random() < self.noise for coin in self._coins])[:, None]
+        if self._drivers:
+            pairs = zip(self._drivers, arena.states(), strict=True)
+            commands = np.stack([drive(state) for drive, state in pairs])
+        else:
+            commands = arena.recorded()
+        return np.where(self._thrown, noisy, commands).astype(np.float32)
+
+
+class Called:
+    """A Python function from a picture (S, S, 3) to a command (A,), or a class or object of such.
+
+    Each scene has its own: an instance of a class, or a copy of an object, so that what it remembers belongs
+    to one episode. Its `reset()`, if there is one, is called when an episode begins.
+    """
+
+    def __init__(self, given: Any, where: str = "policy") -> None:
+        if not callable(given):
+            raise UsageError(where, f"is {given!r}, which cannot be called", "name a function or class")
+        self._given = given
+
+    def begin(self, arena: Arena) -> None:
+        made = (
+            self._given() if isinstance(self._given, type) else copy.deepcopy(self._given)
+            for _ in arena.pictures
+        )
+        self._functions = list(made)
+        for function in self._functions:
+            if hasattr(function, "reset"):
+                function.reset()
+
+    def act(self, arena: Arena) -> Floats:
+        pairs = zip(self._functions, arena.pictures, strict=True)
+        commands = [np.asarray(function(picture.copy())) for function, picture in pairs]
+        shapes = {command.shape for command in commands}
+        if len(shapes) > 1:
+            raise ValueError(f"it returned commands of the shapes {shapes}")
+        return np.stack(commands)

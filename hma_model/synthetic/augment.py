@@ -1,0 +1,459 @@
+"""Make synthetic episodes: the world model continues real frames under replayed, perturbed or other commands.
+
+Of the episodes made, the share is kept of which the model was least unsure, and of these, if a judge is
+given, the successes. `synthetic` writes them as a shard set of the model's own tokens.
+
+Finished batches lie in a folder of the output until the shards are written, so the same call continues.
+
+N episodes, P frames of a prompt, T generated frames, A action dims, K = stride · A.
+"""
+
+import hashlib
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.conversion.output import locked
+from hma_data.errors import HMAError, UsageError
+from hma_data.lab import truth
+from hma_data.lab.simulator import simulated
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.manifest import Manifest
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.windows import episode_pieces
+from hma_data.storage.files import atomic_path, kept_arrays
+from hma_data.storage.paths import StrPath, as_path
+from hma_model.evaluation.evaluate import cameras_for
+from hma_model.evaluation.probe import Probe, train_probe
+from hma_model.evaluation.recorded_state import EPISODES, Reader, recorded_reader, simulated_reader
+from hma_model.policies.arenas import Arena, Floats, ModelArena, Scenes, TrueArena
+from hma_model.policies.base import Judged, Policy
+from hma_model.policies.catalog import read_policy
+from hma_model.policies.fingerprints import begun, digests
+from hma_model.policies.judge import StateJudge, task_of, train_judge
+from hma_model.policies.scores import Progress, run
+from hma_model.synthetic.recorder import (
+    Made,
+    finished,
+    holds_dataset,
+    require_dataset,
+    write_as_lerobot,
+    write_shards,
+)
+from hma_model.worlds.images import seen_cameras
+from hma_model.worlds.prompts import default_frames, read_prompt
+from hma_model.worlds.scenes import Prompt
+from hma_model.worlds.world import World, load_world
+
+WORK = ".augment"
+BATCH = 16  # episodes that step in one pass
+MEASURES = {"discrete": "millinats", "continuous": "millilatents"}  # flags: thousandths of `uncertainty`
+DRAWS = 100  # of a beginning, until one is found whose commands are all known
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """The settings of synthetic episodes; all of them are in the plan of the shards.
+
+    Attributes:
+        embodiment: its id.
+        source: name of the shard set of the first frames; empty for the laboratory's simulator.
+        episodes: N that are made.
+        frames: T.
+        commands: `replay`, `perturb=SHARE`, or a policy as `read_policy` takes it.
+        keep: share of the episodes that is kept.
+        judge: the task whose successes are kept, as `task_of` takes it; empty for none.
+        seed: of everything.
+        unmask_steps, temperature, precision: as of `World`.
+    """
+
+    embodiment: str
+    source: str = ""
+    episodes: int = 64
+    frames: int = 40
+    commands: str = "replay"
+    keep: float = 0.5
+    judge: str = ""
+    seed: int = 0
+    unmask_steps: int = 2
+    temperature: float | None = None
+    precision: str = "float32"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.keep <= 1:
+            raise UsageError("--keep", f"is {self.keep:g}", "give a share above 0, at most 1")
+        if self.judge:
+            task_of(self.embodiment, self.judge)
+
+    @property
+    def recorded(self) -> bool:
+        """Check whether the commands are recorded ones, also with noise, rather than a policy's."""
+        return self.commands.partition("=")[0] in ("replay", "perturb")
+
+    @property
+    def looked_at(self) -> bool:
+        """Check whether a probe that was trained on the simulator's pictures looks at those of the model."""
+        stateful = self.commands.startswith(("scripted", "reach", "lerobot:")) and simulated(self.embodiment)
+        return bool(self.judge) or stateful
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Episodes of one pass: stored frames (n, P + T, …), chunks (n, P + T - 1, K), and what to choose by.
+
+    Of a policy's episodes P is one: what was commanded before is none of its own.
+
+    Attributes:
+        uncertainty: (n,) how unsure the model was of the generated frames, their mean; see `Rollout`.
+        success: (n,) as judged; all True without a judge.
+        groups: (n,) ids of the real episodes that they begin with.
+    """
+
+    stored: NDArray[Any]
+    chunks: Floats
+    uncertainty: NDArray[np.float64]
+    success: NDArray[np.bool_]
+    groups: NDArray[np.str_]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Real beginnings from shards; a `Beginning`."""
+
+    scenes: Scenes
+    prompts: Sequence[Prompt]
+    held: Floats
+    told: Sequence[Floats]
+    groups: Sequence[str]
+
+
+class Replay:
+    """The recorded commands, to which noise is added.
+
+    Args:
+        share: of the commands' standard deviation; the noise is held for a chunk.
+    """
+
+    def __init__(self, share: float, std: Sequence[float]) -> None:
+        self._std = share * np.asarray(std)
+
+    def begin(self, arena: Arena) -> None:
+        self._rng = arena.scenes.rng(4)
+        dims = arena.scenes.dimensions
+        self._low, self._high = np.array([dim.low for dim in dims]), np.array([dim.high for dim in dims])
+
+    def act(self, arena: Arena) -> Floats:
+        if arena.fresh:
+            self._noise = np.stack([rng.normal(0, self._std) for rng in self._rng])
+        commands = arena.recorded()
+        if not self._std.any():
+            return commands
+        return np.clip(commands + self._noise, self._low, self._high).astype(np.float32)
+
+
+def augment(
+    out: StrPath,
+    settings: Augmentation,
+    *,
+    checkpoint: StrPath = "embedded",
+    shards: StrPath | None = None,
+    lerobot: StrPath | None = None,
+    world: World | None = None,
+    device: str = "cpu",
+    compile: bool = False,
+    on_progress: Progress = lambda done, words: None,
+) -> Manifest:
+    """Make synthetic episodes, and write those that are kept as a shard set.
+
+    Args:
+        out: its folder.
+        settings: what to make.
+        checkpoint: as `load_world` takes it.
+        shards: shard set whose episodes give first frames and commands; by default the simulator does.
+        lerobot: folder for the same episodes as a LeRobotDataset v3.0; one that is finished is kept. Its
+            state is read off the pictures, if the shards or the simulator have one to learn it from.
+        world: a world instead of a checkpoint.
+        device: of the world made from the checkpoint, and of policies that are networks.
+        compile: of that world, as of `World`.
+        on_progress: called with the frames made, of `episodes` × `frames`, and what is done.
+
+    Raises:
+        HMAError: the robot, the shards or the policy do not fit, the folder holds something else, the judge
+            is no better than chance, or no episode is left.
+    """
+    folder = as_path(out)
+    if lerobot is not None:
+        require_dataset(as_path(lerobot))
+    world = world or load_world(
+        checkpoint, device=device, unmask_steps=settings.unmask_steps, temperature=settings.temperature,
+        precision=settings.precision, compile=compile,
+    )  # fmt: skip
+    if (views := world.model.config.views) > 1 and (shards is None or settings.looked_at):
+        fault = f"the laboratory's simulator shows one camera, and the model sees {views}"
+        remedy = "name shards with --from, and leave out --judge and policies that read the robot's state"
+        raise UsageError("augment", fault, remedy)
+    told = asdict(settings) | {"precision": world.precision}
+    if world.precision == "float32":  # plans of earlier versions do not name it
+        del told["precision"]
+    made_by = {"by": "hma augment", "synthetic": True} | told | digests(world, settings.embodiment)
+    begins = None if shards is None else ShardSet(shards)
+    if begins is not None:
+        made_by |= {"source_sha256": hashlib.sha256(begins.manifest.to_text().encode()).hexdigest()}
+    dataset = None if lerobot is None else as_path(lerobot)
+    with locked(folder):
+        done = dataset is None or holds_dataset(dataset, made_by)  # before anything is made
+        found = finished(folder, made_by)
+        if found is None:
+            maker = _Maker(world, settings, begins)
+            batches = maker.run(begun(folder, WORK, made_by, world.model), on_progress)
+            spec = world.tokenizer.spec
+            chosen = _chosen(batches, settings, MEASURES[spec.kind])
+            found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
+            shutil.rmtree(folder / WORK)
+        if dataset is not None and not done:
+            made = settings.episodes * settings.frames
+            kept = sum(split["frames"] for split in found.splits.values()) * found.frame_stride
+
+            def tell(at: int, words: str) -> None:
+                on_progress(made, f"LeRobot: {at:,} of {kept:,} frames, {words}")
+
+            stated = _stated(world, settings, begins, found.cameras, partial(on_progress, made))
+            write_as_lerobot(dataset, folder, world.tokenizer, stated, tell)
+    return found
+
+
+def _stated(
+    world: World,
+    settings: Augmentation,
+    shards: ShardSet | None,
+    cameras: Sequence[str],
+    tell: Callable[[str], None],
+) -> tuple[Embodiment, Reader] | None:
+    """Return the real robot, and what reads its state off pictures; None if no state is known."""
+    if shards is None:
+        robot = truth.embodiment(settings.embodiment)
+        if robot.state is None:
+            return None
+        return robot, simulated_reader(robot.id, world.tokenizer, robot.stride, settings.seed, tell)
+    if shards.embodiment.state is None or shards.manifest.splits["train"]["episodes"] < EPISODES:
+        return None
+    reader = recorded_reader(world.tokenizer, shards, tuple(cameras), settings.seed, tell)
+    return None if reader is None else (shards.embodiment, reader)
+
+
+class _Maker:
+    """A maker of batches of synthetic episodes."""
+
+    def __init__(self, world: World, settings: Augmentation, shards: ShardSet | None) -> None:
+        self.world, self.settings, self.shards = world, settings, shards
+        name = settings.embodiment
+        self.prompt_frames = default_frames(world.model)
+        self.scenes = Scenes.of(world, name, settings.episodes, settings.seed, simulator=shards is None)
+        self.robot: Embodiment = self.scenes.robot.embodiment
+        self.policy = self._policy(settings.commands)
+        self.judge: StateJudge | None = None
+        self.probe: Probe | None = None
+        self._long = [] if shards is None else self._long_enough(shards)
+        if shards is None:
+            self.cameras = [self.robot.primary_camera.name]
+        else:
+            self.cameras = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
+
+    def _policy(self, commands: str) -> Policy:
+        kind, _, number = commands.partition("=")
+        std = self.world.model.embodiments[self.robot.id].std
+        if not self.settings.recorded:
+            policy = read_policy(commands, self.scenes, self.world)
+            if isinstance(policy, Judged) and not self.settings.judge:
+                fault = f"{commands!r} plans for what a judge calls success"
+                raise UsageError("--commands", fault, "add --judge moved, or another task")
+            return policy
+        share = 0.0 if commands == "replay" else np.nan
+        if kind == "perturb":
+            with suppress(ValueError):
+                share = float(number)
+        if not 0 <= share < np.inf:
+            raise UsageError("--commands", f"{commands!r} is unknown", "give replay, or perturb=0.3")
+        return Replay(share, std)
+
+    def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:
+        """Return the pieces of episodes that are long enough: rows, where they begin, and the room to start.
+
+        `begin` and `room` are recorded frames. No episode starts before a pause and goes on after it.
+        """
+        if shards.embodiment.id != self.settings.embodiment:
+            fault = f"is of {shards.embodiment.id}, not of {self.settings.embodiment}"
+            raise UsageError(shards.folder, fault, "name shards of the robot")
+        every = shards.manifest.frame_stride
+        span = (self.prompt_frames + self.settings.frames - 1) * shards.embodiment.stride
+        found = [
+            row | {"begin": part.start * every, "room": len(part) * every - span}
+            for row in shards.episodes.to_pylist()
+            for part in episode_pieces(shards, row)
+            if len(part) * every > span
+        ]
+        if not found:
+            fault = f"has no episode of {self.prompt_frames} + {self.settings.frames} frames without a pause"
+            raise UsageError(shards.folder, fault, "give fewer --frames")
+        return found
+
+    def run(self, work: Path, on_progress: Progress) -> list[Batch]:
+        """Return all batches; those in the folder are not made again."""
+        count, frames = self.settings.episodes, self.settings.frames
+        batches = []
+        for begin in range(0, count, BATCH):
+            path = work / f"batch-{begin:06d}.npz"
+            arrays = kept_arrays(path)
+            if arrays is None or arrays.keys() != Batch.__annotations__.keys():  # or of an older release
+                self._train(on_progress)
+                on_progress(begin * frames, "")  # the clock of the time left starts here
+                numbers = range(begin, min(begin + BATCH, count))
+                batch = self._make(numbers, lambda at, b=begin: on_progress(b * frames + at, ""))  # type: ignore[misc]
+                arrays = vars(batch)
+                with atomic_path(path) as part, part.open("wb") as file:
+                    np.savez(file, **arrays)
+            batches.append(Batch(**arrays))
+            on_progress(min(begin + BATCH, count) * frames, "")
+        return batches
+
+    def _train(self, on_progress: Progress) -> None:
+        """Train the judge, or the probe alone, if they are asked for."""
+        settings = self.settings
+        if self.probe is not None or not settings.looked_at:
+            return
+        name, stride, tell = settings.embodiment, self.scenes.stride, partial(on_progress, 0)
+        self.probe = train_probe(name, self.world.tokenizer, stride, settings.seed, tell)
+        if settings.judge:
+            task, frames = task_of(name, settings.judge), settings.frames + 1
+            self.judge = train_judge(
+                name,
+                self.world.tokenizer,
+                stride,
+                frames,
+                task,
+                seed=settings.seed,
+                probe=self.probe,
+                tell=tell,
+            )
+            if isinstance(self.policy, Judged):
+                self.policy.judged(self.judge)
+
+    def _make(self, numbers: range, tell: Callable[[float], None]) -> Batch:
+        begun = self._simulated(numbers) if self.shards is None else self._recorded(self.shards, numbers)
+        arena = ModelArena(self.world, begun, self.probe)
+        kept, uncertainty = [], []
+
+        def look(done: float) -> None:
+            kept.append(arena.stored())
+            uncertainty.append(arena.uncertainty())
+            tell(done)
+
+        self.world.measure = True
+        try:
+            pictures, commands = run(self.settings.commands, self.policy, arena, self.settings.frames, look)
+        finally:
+            self.world.measure = False
+            arena.close()
+        count, width = len(numbers), self.robot.chunk_dim
+        own = np.stack(commands, axis=1).reshape(count, -1, width)
+        success: NDArray[np.bool_] = np.ones(count, np.bool_)
+        if self.judge is not None:
+            success = self.judge.success(self.judge.score(np.stack(pictures, axis=1)))
+        first = np.stack([self.world.encoded(self.robot.id, prompt.frames) for prompt in begun.prompts])
+        first, before = first.astype(kept[0].dtype), [prompt.chunks for prompt in begun.prompts]
+        if not self.settings.recorded:  # what was commanded before is none of the policy's
+            first, before = first[:, -1:], [chunks[:0] for chunks in before]
+        return Batch(
+            np.concatenate([first, np.stack(kept, axis=1)], axis=1),
+            np.concatenate([np.stack(before), own], axis=1),
+            np.stack(uncertainty).mean(axis=0),
+            success,
+            np.array(begun.groups),
+        )
+
+    def _simulated(self, numbers: range) -> Recorded:
+        """Return beginnings from the simulator, with the commands of its driver."""
+        scenes = self.scenes.take(numbers)
+        true = TrueArena(scenes, self.world.picture_shape[0], drawn=False)
+        for _ in range(self.settings.frames * scenes.stride):
+            true.step(true.recorded())
+        groups = [f"{scenes.name}/{number}" for number in scenes.numbers]
+        return Recorded(scenes, true.prompts, true.held, true.told, groups)
+
+    def _recorded(self, shards: ShardSet, numbers: range) -> Recorded:
+        """Return beginnings from episodes of shards, with their commands."""
+        scenes, known = self.scenes.take(numbers), self.prompt_frames
+        prompts, told, groups = [], [], []
+        for number in numbers:
+            row, frames, chunks = self._window(shards, number)
+            prompts.append(Prompt(frames[:known], chunks[: known - 1]))
+            told.append(np.nan_to_num(chunks[known - 1 :]).reshape(-1, len(scenes.dimensions)))
+            groups.append(str(row["group"] or row["id"]))
+        steps = list(np.stack(told, axis=1).astype(np.float32))
+        held = np.where([dim.kind == "rate" for dim in scenes.dimensions], 0, steps[0]).astype(np.float32)
+        return Recorded(scenes, prompts, held, steps, groups)
+
+    def _window(self, shards: ShardSet, number: int) -> tuple[dict[str, Any], NDArray[Any], Floats]:
+        """Return a row of an episode, and a window of it: frames (P + T, …) and chunks (P + T - 1, K).
+
+        The commands are known: those of the window, or for a policy's episodes those up to its first one.
+
+        Raises:
+            UsageError: there is hardly such a window.
+        """
+        rng = np.random.default_rng((self.settings.seed, 5, number))
+        length, every = self.prompt_frames + self.settings.frames, shards.manifest.frame_stride
+        needed = None if self.settings.recorded else self.prompt_frames
+        for draw in range(DRAWS):
+            row = self._long[(number + draw) % len(self._long)]
+            start = row["begin"] + int(rng.integers(row["room"])) // every * every
+            given = {"shards": shards.folder, "episode": row["episode_index"], "start": start}
+            frames, chunks = read_prompt(self.world.model, self.scenes.name, given | {"frames": length})
+            assert chunks is not None
+            if np.isfinite(chunks[:needed]).all():
+                return row, frames, chunks
+        fault = f"has hardly a window of {length} frames whose commands are all known"
+        raise UsageError(shards.folder, fault, "give fewer --frames, or shards with more of the commands")
+
+
+# -- what is kept
+
+
+def _chosen(batches: Sequence[Batch], settings: Augmentation, measure: str) -> list[Made]:
+    """Return the episodes of which the model was least unsure, without those that are judged failures.
+
+    `measure` is the name of the flag that says how unsure it was.
+    """
+    unsure = np.concatenate([batch.uncertainty for batch in batches])
+    success = np.concatenate([batch.success for batch in batches])
+    kept = np.zeros(len(unsure), np.bool_)
+    kept[np.argsort(unsure, kind="stable")[: max(1, round(settings.keep * len(unsure)))]] = True
+    if not (kept & success).any():
+        fault = f"none of the {kept.sum()} surest of {len(unsure)} episodes is judged a success"
+        raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")
+    every = zip(_each(batches, settings, measure), kept & success, strict=True)
+    return [one for one, chosen in every if chosen]
+
+
+def _each(batches: Sequence[Batch], settings: Augmentation, measure: str) -> Iterator[Made]:
+    """Yield all episodes, numbered through."""
+    number = 0
+    for batch in batches:
+        for stored, chunks, group, unsure in zip(
+            batch.stored, batch.chunks, batch.groups, batch.uncertainty, strict=True
+        ):
+            counts = {
+                "prompt_frames": len(stored) - settings.frames,
+                "generated_frames": settings.frames - 1,  # the last one has no commands after it
+                measure: round(1000 * float(unsure)),
+            }
+            judged = True if settings.judge else None
+            yield Made(f"synthetic_{number:06d}", stored, chunks, counts, str(group), judged)
+            number += 1

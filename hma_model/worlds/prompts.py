@@ -1,0 +1,278 @@
+"""Read the frames that a session starts from: shards, pictures, recordings, simulators.
+
+A prompt is pictures (P, H, W, 3) uint8, or tokens as a shard set stores them, at the rate of the model's
+frames, and the chunks (P - 1, K) between them, NaN where they are unknown.
+"""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hma_data.episodes.align import pauses, to_clip
+from hma_data.episodes.episode import Clip
+from hma_data.episodes.images import prepared
+from hma_data.errors import HMAError, UsageError
+from hma_data.lab import FAMILY, RECORDERS, record
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.manifest import MANIFEST
+from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.windows import episode_pieces, pieces
+from hma_data.sources.base import open_source
+from hma_data.storage.paths import StrPath, as_path
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.checkpoint.folder import require_tokenizer
+from hma_model.evaluation.evaluate import cameras_for
+from hma_model.generation.commands import card, described
+from hma_model.worlds.images import read_picture, recorded_cameras, seen_cameras, trained_cameras
+
+if TYPE_CHECKING:
+    from hma_model.network.model import HMA
+
+Prompt = tuple[NDArray[Any], NDArray[np.float32] | None]
+WAYS = (
+    "give a picture or pictures, a picture's file, a folder of shards or of a LeRobotDataset, an environment "
+    "with render(), or a mapping; hma_model.simulate.read_prompt describes them"
+)
+LEROBOT = "meta/info.json"
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a recording or shard set that a prompt takes.
+
+    Attributes:
+        episode: number or id; None for the first.
+        start: its first frame as recorded; None for the first from which on the frames cross no pause.
+        frames: P; None for half the model's window.
+    """
+
+    episode: int | str | None = None
+    start: int | None = None
+    frames: int | None = None
+
+    def number(self, ids: Sequence[str], where: StrPath) -> int:
+        """Return the number of the episode among those of the ids."""
+        found = ids.index(self.episode) if self.episode in ids else self.episode or 0
+        if isinstance(found, str) or not 0 <= found < len(ids):
+            remedy = f"give 0 to {len(ids) - 1}, or an id"
+            raise UsageError(where, f"has no episode {self.episode!r}", remedy)
+        return found
+
+    def rows(
+        self, model: "HMA", parts: Sequence[range], stride: int, frame_stride: int = 1
+    ) -> NDArray[np.int64]:
+        """Return the rows (P,) of the frames, `stride` apart, in one of the pieces of an episode.
+
+        Raises:
+            UsageError: they do not fit the episode, or cross a pause.
+        """
+        count = default_frames(model) if self.frames is None else self.frames
+        span, length = (count - 1) * stride, parts[-1].stop
+        if self.start is None:
+            start = next((part.start for part in parts if span < len(part)), 0)
+        else:
+            start = self.start // frame_stride
+        fault = f"from row {start} on do not fit an episode of {length} rows"
+        if start >= 0 and start + span < length:
+            part = next(part for part in parts if start in part)
+            fault = f"from row {start} on cross the pause after row {part.stop - 1}"
+            if 0 <= span < part.stop - start:
+                return np.arange(start, start + span + 1, stride)
+        apart = "" if stride == 1 else f", {stride} rows apart"
+        raise UsageError("prompt", f"{count} frames{apart}, {fault}", "choose another start or fewer frames")
+
+
+def default_frames(model: "HMA") -> int:
+    """Return P of a prompt from a recording: half the model's window, at least one."""
+    return max(1, model.config.frames // 2)
+
+
+def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int = 0) -> Prompt:
+    """Return the frames and chunks of a prompt.
+
+    Args:
+        model: whose embodiment is to be prompted.
+        embodiment: its id.
+        prompt: one of
+            None: what comes along, see `starting_window`;
+            pictures (H, W, 3) or (P, H, W, 3) uint8, or the str or path of a picture's file, or several;
+            the str or path of a shard set, or of a LeRobotDataset: the first frames of its first episode;
+            a mapping: "shards" or "lerobot": that folder, and if wanted "episode": number or id, "start": its
+            first frame as recorded, "frames": P; they may cross no pause;
+            a mapping: "frames": pictures at the model's rate, and "chunks": (P - 1, K);
+            a mapping: "frames": pictures at the control rate, T of them, and "actions": (T - 1, A);
+            an environment whose render() returns a picture.
+        seed: of a simulated prompt.
+
+    Raises:
+        HMAError: the prompt cannot be read.
+    """
+    if prompt is None:
+        return starting_window(model, embodiment, seed)
+    if isinstance(prompt, Mapping):
+        return _of_mapping(model, embodiment, prompt)
+    if hasattr(prompt, "render"):
+        prompt = prompt.render()
+    if isinstance(prompt, str | PathLike):
+        folder = as_path(prompt)
+        if (folder / MANIFEST).is_file():
+            return _of_shards(model, embodiment, folder, Part())
+        if (folder / LEROBOT).is_file():
+            return _of_lerobot(model, embodiment, folder, Part())
+        prompt = [folder]
+    if isinstance(prompt, Sequence) and prompt and isinstance(prompt[0], str | PathLike):
+        prompt = [read_picture(path, WAYS) for path in prompt]
+    try:
+        pictures = np.asarray(prompt)
+    except ValueError as fault:
+        raise HMAError("prompt", "its pictures differ in size", "give pictures of one size") from fault
+    return (pictures[None] if pictures.ndim in (2, 3) else pictures), None
+
+
+def starting_window(model: "HMA", embodiment: str, seed: int = 0) -> Prompt:
+    """Return a prompt that comes along: the first frames of an episode of a laboratory robot.
+
+    The robot is simulated: episode 0 of `hma_data.lab.record` with this seed.
+
+    Raises:
+        HMAError: the model lacks the embodiment, or it is no robot of the laboratory.
+    """
+    robot = described(model, embodiment)
+    if robot is None or not (embodiment in RECORDERS or FAMILY.fullmatch(embodiment)):
+        raise HMAError(f"prompt of {embodiment}", "none comes along: it is no robot of the laboratory", WAYS)
+    with tempfile.TemporaryDirectory() as folder:
+        return _of_recording(model, robot, record(embodiment, folder, 1, seed), Part())
+
+
+def _of_mapping(model: "HMA", embodiment: str, prompt: Mapping[str, Any]) -> Prompt:
+    given = dict(prompt)
+    for key, read in (("shards", _of_shards), ("lerobot", _of_lerobot)):
+        if key in given and not given.keys() - {key, *vars(Part())}:
+            return read(model, embodiment, given.pop(key), Part(**given))
+    if "frames" not in given or given.keys() - {"frames", "chunks", "actions"}:
+        raise HMAError("prompt", f"has the keys {', '.join(map(str, given))}", WAYS)
+    frames = np.asarray(given["frames"])
+    if "actions" in given:
+        return _strided(model, embodiment, frames, given["actions"])
+    return frames, None if given.get("chunks") is None else np.asarray(given["chunks"], np.float32)
+
+
+def _strided(model: "HMA", embodiment: str, frames: NDArray[Any], actions: ArrayLike) -> Prompt:
+    """Return every stride-th frame, the last one included, and the chunks between them."""
+    described(model, embodiment)
+    space, commands = model.embodiments[embodiment], np.asarray(actions, np.float32)
+    if commands.shape != (len(frames) - 1, space.action_dim):
+        fault = f"has actions of the shape {commands.shape} for {len(frames)} frames"
+        raise HMAError("prompt", fault, f"give ({len(frames) - 1}, {space.action_dim})")
+    steps = (len(frames) - 1) // space.stride
+    first = len(frames) - 1 - steps * space.stride
+    return frames[first :: space.stride], commands[first:].reshape(steps, space.chunk_dim)
+
+
+# -- episodes
+
+
+def _of_shards(model: "HMA", embodiment: str, folder: StrPath, part: Part) -> Prompt:
+    shards = ShardSet(folder)
+    require_tokenizer(model.config, shards.spec, shards.folder)
+    described(model, embodiment)
+    space, robot = model.embodiments[embodiment], shards.embodiment
+    if (robot.stride, robot.action_dim) != (space.stride, space.action_dim):
+        fault = f"is of {robot.id}, with {robot.stride} actions of {robot.action_dim} values in a chunk"
+        raise HMAError(shards.folder, fault, f"{embodiment} takes {space.stride} of {space.action_dim}")
+    rows = shards.episodes.to_pylist()
+    chosen = rows[part.number([row["id"] for row in rows], shards.folder)]
+    names = seen_cameras(cameras_for(model, shards), shards.manifest.cameras)
+    frames, columns = seen_frames(shards, EpisodeReader(shards, shards.columns(names)), chosen, names)
+    every = shards.manifest.frame_stride
+    at = part.rows(model, episode_pieces(shards, chosen), shards.row_stride, every)
+    chunks = _chunks(columns["action"], columns.get("action_known"), at, shards.row_stride)
+    return frames[at], chunks
+
+
+def seen_frames(
+    shards: ShardSet, reader: EpisodeReader, row: Mapping[str, Any], cameras: Sequence[str]
+) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:
+    """Return the frames (T, …) of an episode with the views of cameras stacked, and its columns.
+
+    Args:
+        shards: the set.
+        reader: of the cameras' columns of the set.
+        row: of episodes.parquet.
+        cameras: their names, see `seen_cameras`.
+    """
+    views = []
+    for name in cameras:
+        columns = reader.episode(row, name)
+        (stored,) = (columns[key] for key in columns if key in ("tokens", "latents"))
+        views.append(shards.tokens(stored))
+    return np.concatenate(views, axis=-2), columns
+
+
+def _of_lerobot(model: "HMA", embodiment: str, folder: StrPath, part: Part) -> Prompt:
+    robot = described(model, embodiment)
+    if robot is None:
+        raise HMAError(embodiment, "has no YAML, which says how its recordings are read", "load a checkpoint")
+    if robot.source.format != "lerobot":
+        robot = _as_lerobot(robot, folder)
+    return _of_recording(model, robot, as_path(folder), part)
+
+
+def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
+    """Return an embodiment that finds its action and its cameras, in their order, in a LeRobotDataset."""
+    keys = [key.key for key in open_source("lerobot").inspect(folder, 1).keys if key.kind == "camera"]
+    if len(keys) < len(robot.cameras):
+        raise HMAError(folder, f"has {len(keys)} cameras, {robot.id} has {len(robot.cameras)}", WAYS)
+    values, at, parts = robot.to_dict(), 0, []
+    for part in robot.action.components:
+        parts.append({"key": "action", "dims": part.dims, "slice": [at, at + part.dims]})
+        at += part.dims
+    cameras = [
+        {"name": camera.name, "key": key, "resize": camera.resize} for camera, key in zip(robot.cameras, keys)
+    ]
+    action = {"space": robot.action.space, "components": parts}
+    changed = {"action": action, "cameras": cameras, "source": {"format": "lerobot"}, "state": None}
+    kept = {key: value for key, value in values.items() if key not in ("state", "sync", "quality")}
+    return Embodiment.from_values({**kept, **changed}, f"{folder}, as {robot.id}")
+
+
+def _of_recording(model: "HMA", robot: Embodiment, recording: Path, part: Part) -> Prompt:
+    """Return frames of an episode of a recording, in the format that the robot's YAML names."""
+    source = open_source(robot.source.format)
+    ids = source.episode_ids(recording)
+    clip = to_clip(source.read(recording, ids[part.number(ids, recording)], robot), robot)
+    at = part.rows(model, pieces(pauses(clip.timestamps), len(clip), robot.stride), robot.stride)
+    return _pictures(model, robot, clip, at), _chunks(clip.actions, clip.action_known, at, robot.stride)
+
+
+def _chunks(
+    actions: NDArray[Any], known: NDArray[np.bool_] | None, at: NDArray[np.int64], stride: int
+) -> NDArray[np.float32]:
+    """Return the chunks (P - 1, K) between the rows (P,) of an episode's actions (T, ...)."""
+    spans = at[:-1, None] + np.arange(stride)
+    chunks = actions[spans].reshape(len(at) - 1, int(np.prod(actions.shape[1:])) * stride)
+    if known is not None:
+        chunks[~known[spans].all(axis=1)] = np.nan
+    return chunks
+
+
+def _pictures(model: "HMA", robot: Embodiment, clip: Clip, at: NDArray[np.int64]) -> NDArray[np.uint8]:
+    spec = TokenizerSpec.from_json(dict(model.config.tokenizer))
+    cameras = trained_cameras(card(model, robot.id))
+    views = [
+        prepared(
+            clip.episode.streams[name],
+            clip.frame_indices[name][at],
+            robot.camera(name),
+            spec.image_size,
+            spec.resize_filter,
+        )
+        for name in seen_cameras(cameras, recorded_cameras(robot))
+    ]
+    return np.concatenate(views, axis=2)

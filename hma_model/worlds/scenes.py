@@ -1,0 +1,397 @@
+"""Offer robots to drive, and scenes in which to begin.
+
+A scene gives the prompt of a world model, and then tells what truly happens under further commands. The
+laboratory's simulators know it for any commands; a recording knows it for its own commands alone; nobody
+knows it for a robot that begins from pictures.
+
+P frames of a prompt, H×W pixels, A action dims, K = stride * A values of a chunk.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.images import resize
+from hma_data.errors import UsageError
+from hma_data.lab.simulator import SIZE, LabSimulator, simulated
+from hma_data.loading.views import FIRST, Cameras
+from hma_data.registry.components import Component
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.windows import episode_pieces
+from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
+from hma_model.worlds.images import (
+    Picture,
+    fitted,
+    picture_shape,
+    recorded_cameras,
+    sample_picture,
+    seen_cameras,
+    trained_cameras,
+)
+
+if TYPE_CHECKING:
+    from hma_data.loading.dataset import WindowDataset
+    from hma_data.tokenizers.base import Tokenizer
+
+Floats = NDArray[np.float32]
+
+PROMPT = 4  # frames; two would show velocities, more also show what stands still
+LONGEST = 64  # frames of a window of a recording
+RETURNING = ("joint_velocity", "base_velocity", "joint_delta", "eef_delta")  # spaces whose rest is zero
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """One value of a command.
+
+    Attributes:
+        low, high: range to drive in.
+        kind: "rate" for a value that is zero at rest, "target" for one that stays where it was set, "switch"
+            for a target with two states.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    kind: str
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """Known frames (P, H, W, 3) uint8, and the chunks (P - 1, K) float32 between them; NaN is unknown."""
+
+    frames: Picture
+    chunks: Floats
+
+
+class Scene(Protocol):
+    """The scene of a robot, and what truly happens there."""
+
+    @property
+    def prompt(self) -> Prompt:
+        """Return the beginning."""
+
+    @property
+    def command(self) -> Floats:
+        """Return the command (A,) that leaves the robot as it is after the prompt."""
+
+    def advance(self, chunk: Floats | None) -> tuple[Floats, Picture | None] | None:
+        """Take the next chunk.
+
+        Args:
+            chunk: (K,) commands; None for the recorded ones.
+
+        Returns:
+            The chunk, and the true picture (H, W, 3) after it if it is known; None at a recording's end.
+        """
+
+
+class Drivable(Protocol):
+    """A robot with scenes to begin in.
+
+    Attributes:
+        key: tells it from others; letters, digits, `_`, `-`, `.` and `:`.
+        dimensions: A of them.
+        cameras: the names of those that its pictures show, side by side.
+    """
+
+    key: str
+    embodiment: Embodiment
+    dimensions: tuple[Dimension, ...]
+    cameras: list[str]
+
+    @property
+    def source(self) -> str:
+        """Return "simulator", "recordings" or "pictures"."""
+
+    def scene(self, number: int) -> Scene:
+        """Return the scene of that number; there is one for every number from 0 on."""
+
+
+# -- the laboratory
+
+
+class LabRobot:
+    """A robot of the laboratory, with its simulator; its pictures have `size` pixels a side."""
+
+    source = "simulator"
+
+    def __init__(self, embodiment: Embodiment, stats: Mapping[str, Any], size: int = SIZE) -> None:
+        self.key, self.embodiment, self.size = embodiment.id, embodiment, size
+        self.dimensions = dimensions(embodiment, stats)
+        self.cameras = [embodiment.primary_camera.name]
+
+    def scene(self, number: int) -> "LabScene":
+        return LabScene(self.embodiment, self.dimensions, number, self.size)
+
+
+class LabScene:
+    """A scene of a simulator, begun by the recorder's own driver."""
+
+    def __init__(
+        self, embodiment: Embodiment, dims: tuple[Dimension, ...], number: int, size: int = SIZE
+    ) -> None:
+        self.stride, self.width, self.size = embodiment.stride, embodiment.action_dim, size
+        self.simulator = LabSimulator(embodiment.id)
+        frames = [self._fitted(self.simulator.reset(seed=SEED, episode=number))]
+        chunks = []
+        for _ in range(PROMPT - 1):
+            chunk, frame = self.advance(None)
+            frames.append(frame)
+            chunks.append(chunk)
+        self.prompt = Prompt(np.stack(frames), np.stack(chunks))
+        held = self.prompt.chunks[-1][-self.width :]
+        self.command = np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
+
+    def advance(self, chunk: Floats | None) -> tuple[Floats, Picture]:
+        taken = []
+        for step in range(self.stride):
+            command = (
+                self.simulator.recorded()
+                if chunk is None
+                else chunk[step * self.width : (step + 1) * self.width]
+            )
+            self.simulator.advance(command)
+            taken.append(command)
+        return np.concatenate(taken).astype(np.float32), self._fitted(self.simulator.picture())
+
+    def _fitted(self, picture: Picture) -> Picture:
+        return picture if len(picture) == self.size else resize(picture[None], self.size)[0]
+
+
+SEED = 1_000_000  # of scenes; recordings for training have small seeds
+
+
+# -- recordings
+
+
+class RecordedRobot:
+    """A robot of a shard set; its scenes are windows of held-out episodes, or of all if none is held out."""
+
+    source = "recordings"
+
+    def __init__(
+        self, shards: ShardSet, tokenizer: Callable[[], "Tokenizer"], stats: Mapping[str, Any], cameras: Any
+    ) -> None:
+        self.embodiment = shards.embodiment
+        self.key = f"{self.embodiment.id}:recordings"
+        self.dimensions = dimensions(self.embodiment, stats)
+        self._shards, self._tokenizer, self._cameras = shards, tokenizer, cameras
+        self.cameras = seen_cameras(cameras, shards.manifest.cameras)
+
+    @cached_property
+    def _windows(self) -> "WindowDataset":
+        from hma_data.loading.dataset import WindowDataset
+
+        splits = self._shards.manifest.splits
+        split = "val" if splits.get("val", {}).get("episodes") else "train"
+        parts = [
+            len(part) // self._shards.row_stride
+            for row in self._shards.episodes.to_pylist()
+            if row["split"] == split
+            for part in episode_pieces(self._shards, row)
+        ]
+        lengths = sorted(length for length in parts if length > PROMPT)
+        if not lengths:
+            fault = f"has no episode longer than {PROMPT} frames without a pause"
+            raise UsageError(self._shards.folder, fault, "give other shards")
+        length = min(LONGEST, lengths[len(lengths) // 2])
+        return WindowDataset(self._shards, split, length, cameras=self._cameras)
+
+    def scene(self, number: int) -> "RecordedScene":
+        """Return one of the windows; those of numbers that follow one another lie apart."""
+        from hma_model.evaluation.evaluate import decode
+
+        windows = self._windows
+        batch = windows.batch([number * apart(len(windows)) % len(windows)])
+        stored = batch.latents if batch.tokens is None else batch.tokens
+        assert stored is not None
+        frames = decode(self._tokenizer(), stored)[0]
+        return RecordedScene(self.dimensions, frames, batch.actions[0].numpy().astype(np.float32))
+
+
+def apart(count: int) -> int:
+    """Return a step of about 0.382 of so many windows that comes to each of them once."""
+    step = 1 + round(0.382 * count)
+    while math.gcd(step, count) > 1:
+        step += 1
+    return step
+
+
+class RecordedScene:
+    """A window of a recording: frames (T, H, W, 3) and chunks (T, K)."""
+
+    def __init__(self, dims: tuple[Dimension, ...], frames: Picture, chunks: Floats) -> None:
+        self._frames, self._chunks, self._at = frames, chunks, PROMPT
+        self._followed = True  # whether all commands were the recorded ones
+        self.prompt = Prompt(frames[:PROMPT], chunks[: PROMPT - 1])
+        held = chunks[PROMPT - 2, -len(dims) :]
+        self.command = np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
+
+    def advance(self, chunk: Floats | None) -> tuple[Floats, Picture | None] | None:
+        if chunk is not None:
+            self._followed = False
+            return chunk, None
+        if self._at == len(self._frames):
+            return None
+        self._at += 1
+        return self._chunks[self._at - 2], self._frames[self._at - 1] if self._followed else None
+
+
+# -- pictures
+
+
+class PicturedRobot:
+    """A robot that begins from pictures (P, H, W, 3); from a single one it begins at rest.
+
+    The commands before several pictures are unknown, and so is the resting command of a robot with targets.
+    """
+
+    source = "pictures"
+
+    def __init__(
+        self,
+        embodiment: Embodiment,
+        stats: Mapping[str, Any],
+        pictures: Picture,
+        cameras: Cameras = FIRST,
+    ) -> None:
+        self.embodiment, self.key = embodiment, f"{embodiment.id}:pictures"
+        self.cameras = seen_cameras(cameras, recorded_cameras(embodiment))
+        self.dimensions = dims = dimensions(embodiment, stats)
+        means = stats["action"]["mean"]
+        rest = [{"rate": 0.0, "switch": dim.low}.get(dim.kind, mean) for dim, mean in zip(dims, means)]
+        self._command = np.array(rest, np.float32)
+        before = np.full_like(self._command, np.nan)
+        if len(pictures) == 1:
+            pictures = pictures.repeat(PROMPT, axis=0)
+            if all(dim.kind != "target" for dim in dims):
+                before = self._command
+        self._prompt = Prompt(pictures, np.tile(before, (len(pictures) - 1, embodiment.stride)))
+
+    def scene(self, number: int) -> "PicturedScene":
+        """Return the one scene that there is."""
+        return PicturedScene(self._prompt, self._command)
+
+
+@dataclass(frozen=True)
+class PicturedScene:
+    """Pictures, after which nobody knows what truly happens."""
+
+    prompt: Prompt
+    command: Floats
+
+    def advance(self, chunk: Floats | None) -> tuple[Floats, None] | None:
+        return None if chunk is None else (chunk, None)
+
+
+# -- what can be driven
+
+
+def drivable(
+    checkpoint: Checkpoint,
+    sets: Iterable[ShardSet],
+    tokenizer: Callable[[], "Tokenizer"],
+    pictures: Sequence[Picture] = (),
+) -> dict[str, Drivable]:
+    """Return the robots of a checkpoint that can be driven, by key.
+
+    A robot without simulator and shards begins from the first picture of its sample in the checkpoint.
+
+    Args:
+        sets: shard sets of its robots.
+        tokenizer: returns the checkpoint's, which decodes them.
+        pictures: (H, W, 3) of one size, in their order at the rate of the model's frames; every robot begins
+            from them too.
+
+    Raises:
+        UsageError: there is none, or the checkpoint lacks the robot of a shard set.
+        CheckpointError: the shard set has other tokens than the checkpoint was trained on.
+        HMAError: the pictures do not fit the model.
+    """
+    found: dict[str, Drivable] = {}
+    for shards in sets:
+        name = shards.embodiment.id
+        if name not in checkpoint.embodiments:
+            known = ", ".join(checkpoint.embodiments)
+            raise UsageError(
+                shards.folder, f"{checkpoint.name} does not know the robot {name}", f"known: {known}"
+            )
+        require_tokenizer(checkpoint.config, shards.spec, shards.folder)
+        cameras = trained_cameras(checkpoint.card(name))
+        robot = RecordedRobot(shards, tokenizer, checkpoint.stats(name), cameras)
+        found[robot.key] = robot
+    recorded = {robot.embodiment.id for robot in found.values()}
+    for name in checkpoint.embodiments:
+        embodiment, stats = checkpoint.embodiment(name), checkpoint.stats(name)
+        cameras = trained_cameras(checkpoint.card(name))
+        begun = list(pictures)
+        if simulated(name):
+            found[name] = LabRobot(embodiment, stats, picture_shape(checkpoint.config)[0])
+        elif not begun and name not in recorded and (sample := sample_picture(checkpoint, name)) is not None:
+            begun = [sample]
+        if begun:
+            shown = fitted(np.stack(begun), checkpoint.config, embodiment)
+            pictured = PicturedRobot(embodiment, stats, shown, cameras)
+            found[pictured.key] = pictured
+    if not found:
+        remedy = "give shards of it, hma play CHECKPOINT SHARDS, or a picture of it, --prompt PICTURE"
+        raise UsageError(checkpoint.folder, "no robot of it has a simulator to begin from", remedy)
+    return found
+
+
+def opening(robots: Mapping[str, Drivable], embodiment: str | None, source: str | None) -> str | None:
+    """Return the key of the robot that a page opens with; None lets the page choose.
+
+    Args:
+        robots: by key.
+        embodiment: its id, if a person named one.
+        source: where it begins if possible, as of `Drivable.source`.
+
+    Raises:
+        UsageError: there is no such robot.
+    """
+    own = [key for key, robot in robots.items() if embodiment in (None, robot.embodiment.id)]
+    if not own:
+        known = ", ".join(dict.fromkeys(robot.embodiment.id for robot in robots.values()))
+        raise UsageError("--embodiment", f"there is no robot {embodiment!r} to drive", f"known: {known}")
+    wished = [key for key in own if robots[key].source == source]
+    return (wished or own)[0] if embodiment or wished else None
+
+
+def trained_on(checkpoint: Checkpoint) -> list[ShardSet]:
+    """Return the shard sets of a training run whose robots have no simulator, as far as they are here.
+
+    Args:
+        checkpoint: one of the run's; of any other there are none.
+    """
+    return [one for one in checkpoint.shards() if not simulated(one.embodiment.id)]
+
+
+def dimensions(embodiment: Embodiment, stats: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    """Return the values of a robot's command, with the range of the commands seen in training."""
+    action = stats["action"]
+    mean, std = np.array(action["mean"]), np.array(action["std"])
+    low = np.array(action.get("min", mean - 2 * std))
+    high = np.array(action.get("max", mean + 2 * std))
+    parts = [part for part in embodiment.action.components for _ in range(part.dims)]
+    values = zip(embodiment.action.names(), parts, low.tolist(), high.tolist(), strict=True)
+    return tuple(_dimension(embodiment.action.space, *value) for value in values)
+
+
+def _dimension(space: str, name: str, part: Component, low: float, high: float) -> Dimension:
+    unit = part.unit or ""
+    if not part.normalize and part.range in ((0, 1), None) and (low, high) == (0, 1):
+        return Dimension(name, unit, 0.0, 1.0, "switch")
+    even = part.range is not None and part.range[0] == -part.range[1]
+    if unit.endswith("/s") or space in RETURNING or (space == "mixed" and even and unit != "rad"):
+        top = max(abs(low), abs(high))
+        return Dimension(name, unit, -top, top, "rate")
+    return Dimension(name, unit, low, high, "target")

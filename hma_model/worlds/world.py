@@ -1,0 +1,344 @@
+"""Keep sessions of a world model side by side, in pictures and commands.
+
+    world = load_world("embedded")
+    session = world.open("pusht_fast", *starting_window(world.model, "pusht_fast"))
+    pictures = world.step({session: commands})   # the picture that the commands lead to
+    commands = world.act([session])              # those of the model itself, if it was trained to act
+
+A session is a row of a rollout. Rows are added as sessions open, and used again as sessions close.
+
+P frames of a prompt, H×W pixels, S pixels a side of the tokenizer's pictures, V views side by side, A action
+dims, K = stride · A, n sessions of a step.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from hma_data.errors import HMAError
+from hma_data.storage.paths import StrPath
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.checkpoint.folder import require_tokenizer
+from hma_model.config import OBJECTIVES, POLICY
+from hma_model.evaluation.evaluate import decode
+from hma_model.generation.commands import Commands, described
+from hma_model.generation.engine import products_in
+from hma_model.generation.rollout import Rollout
+from hma_model.generation.state import Snapshot as Snapshot
+from hma_model.generation.unmask import Decoding, check, default_temperature
+from hma_model.worlds.images import Picture, fitted, picture_shape
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.config import HMAConfig
+    from hma_model.network.model import HMA
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Session:
+    row: int
+    embodiment: str
+    seed: int
+
+
+class World:
+    """Sessions of a world model. Not thread-safe.
+
+    Args:
+        model: in eval mode.
+        tokenizer: the tokenizer that the model was trained on.
+        unmask_steps, temperature, order, sample_steps: as in `HMA.generate`.
+        compile, precision: as in `Rollout`; compile is for a GPU.
+
+    Attributes:
+        unmask_steps, temperature, order, sample_steps: may be set between steps; they count for all sessions.
+        measure: set it to know how unsure the model is, see `uncertainty`; latents are then drawn twice.
+        uncertainty: session → that of the newest frame as of `Rollout`, if it is measured.
+        picture_shape: (S, V·S, 3) of every picture.
+    """
+
+    def __init__(
+        self,
+        model: "HMA",
+        tokenizer: "Tokenizer",
+        *,
+        unmask_steps: int = 2,
+        temperature: float | None = None,
+        order: str = "random",
+        sample_steps: int | None = None,
+        compile: bool = False,
+        precision: str = "float32",
+    ) -> None:
+        require_tokenizer(model.config, tokenizer.spec, "the model")
+        self.model, self.tokenizer, self.compile, self.precision = model, tokenizer, compile, precision
+        self.unmask_steps = unmask_steps
+        self.temperature = default_temperature(model.config) if temperature is None else temperature
+        self.order, self.sample_steps = order, sample_steps
+        self.measure, self.uncertainty = False, dict[int, float]()
+        products_in(precision, model.device, compile)  # checks that the device has them
+        self._decoding()
+        self.picture_shape = picture_shape(model.config)
+        self._rollout: Rollout | None = None
+        self._sessions: dict[int, _Session] = {}
+        self._opened = 0
+        self._commands: dict[str, Commands] = {}
+
+    @property
+    def sessions(self) -> dict[int, str]:
+        """Return the open sessions and their embodiments."""
+        return {number: one.embodiment for number, one in self._sessions.items()}
+
+    def commands(self, embodiment: str) -> Commands:
+        """Return what commands an embodiment takes; an HMAError says that the model lacks it."""
+        if embodiment not in self._commands:
+            self._commands[embodiment] = Commands.of(self.model, embodiment)
+        return self._commands[embodiment]
+
+    def open(
+        self, embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None = None, *, seed: int = 0
+    ) -> int:
+        """Open a session that starts from known frames, and return its number.
+
+        Args:
+            embodiment: an id of the model.
+            frames: pictures (P, H, W, 3) uint8 RGB, at the rate of the model's frames; another size is
+                resized as in a conversion. Or tokens or latents as stored, (P, h, w) or (P, c, h, w).
+            chunks: (P - 1, K) raw; chunk k holds the commands from frame k to k+1. NaN where they are
+                unknown. None: all are.
+            seed: of the session's random numbers.
+
+        Raises:
+            HMAError: the model lacks the embodiment, or frames or chunks do not fit.
+        """
+        prompt = self._prompt(embodiment, frames, chunks)
+        taken = {one.row for one in self._sessions.values()}
+        row = next(row for row in range(len(taken) + 1) if row not in taken)
+        self._reserve(row, embodiment)
+        session, self._opened = self._opened, self._opened + 1
+        self._sessions[session] = _Session(row, embodiment, seed)
+        self._begin(session, *prompt)
+        return session
+
+    def reset(
+        self, session: int, frames: NDArray[Any], chunks: ArrayLike | None = None, *, seed: int | None = None
+    ) -> None:
+        """Start a session anew, as `open` does; without a seed, with the one that it had."""
+        one = self._at(session)
+        prompt = self._prompt(one.embodiment, frames, chunks)
+        self._sessions[session] = replace(one, seed=one.seed if seed is None else seed)
+        self._begin(session, *prompt)
+
+    def close(self, session: int) -> None:
+        """End a session; its row is free for another."""
+        self._at(session)
+        del self._sessions[session]
+
+    def step(self, commands: Mapping[int, ArrayLike]) -> dict[int, Picture]:
+        """Generate the next picture of some sessions, in one pass.
+
+        Args:
+            commands: session → (K,) or (stride, A) raw commands from its newest picture to the next one. A
+                command of NaN is unknown, and then the whole chunk is.
+
+        Returns:
+            session → (S, V·S, 3) uint8 RGB.
+        """
+        if not commands:
+            return {}
+        order, rows = self._ordered(commands)
+        chunks, known = self._chunks(order, commands)
+        rollout = self._running()
+        rollout.decoding = self._decoding()
+        frames = rollout.step(chunks, known=known, rows=rows)
+        if self.measure:
+            self.uncertainty |= dict(zip(order, rollout.uncertainty.tolist()))
+        return dict(zip(order, decode(self.tokenizer, frames.unsqueeze(1))[:, 0]))
+
+    def act(self, sessions: Iterable[int]) -> dict[int, Floats]:
+        """Return the commands (stride, A) that the model itself gives after the newest pictures of sessions.
+
+        Raises:
+            HMAError: the model was not trained to act.
+        """
+        require_actor(self.model.config, "the model")
+        order, rows = self._ordered(sessions)
+        made = self._running().act(rows).numpy(force=True)
+        spaces = [self.model.embodiments[self._at(session).embodiment] for session in order]
+        return {
+            session: chunk[: space.chunk_dim].reshape(space.stride, space.action_dim)
+            for session, chunk, space in zip(order, made, spaces)
+        }
+
+    def observe(self, pictures: Mapping[int, Picture], commands: Mapping[int, ArrayLike]) -> None:
+        """Add the pictures that truly came next to sessions, in one pass.
+
+        Args:
+            pictures: session → (H, W, 3) uint8 RGB, all of one size.
+            commands: session → as in `step`, those that led to its picture.
+        """
+        order, rows = self._ordered(pictures)
+        chunks, known = self._chunks(order, commands)
+        stored = self._encoded(self._at(order[0]).embodiment, np.stack([pictures[one] for one in order]))
+        self._running().observe(torch.from_numpy(stored), chunks, known=known, rows=rows)
+
+    def picture(self, session: int) -> Picture:
+        """Return the newest picture of a session; after `open`, the last of its prompt."""
+        return decode(self.tokenizer, self._newest(session).unsqueeze(1))[0, 0]
+
+    def shown(self, frames: NDArray[Any]) -> Picture:
+        """Return the pictures (P, S, V·S, 3) of frames as a prompt takes them; pictures stay as they are."""
+        if frames.ndim == 4 and frames.dtype == np.uint8:
+            return frames
+        return decode(self.tokenizer, torch.from_numpy(np.asarray(frames)).unsqueeze(0))[0]
+
+    def encoded(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:
+        """Return the tokens (P, h, w) int64 or latents (P, c, h, w) float32 of frames as a prompt takes them.
+
+        Pictures are encoded, those of another size resized as in a conversion of the embodiment.
+        """
+        config = self.model.config
+        if len(frames) and frames.shape[1:] == config.frame_shape:
+            return frames.astype(np.int64 if config.kind == "discrete" else np.float32)
+        return self._encoded(embodiment, frames)
+
+    def stored(self, session: int) -> NDArray[Any]:
+        """Return the newest frame of a session as shards store it: tokens (h, w) or latents (c, h, w)."""
+        frame = self._newest(session)[0].cpu().numpy()
+        return frame.astype(self.tokenizer.spec.dtype)
+
+    def snapshot(self, session: int) -> Snapshot:
+        """Return a copy of a session's state."""
+        return self._running().snapshot([self._at(session).row])
+
+    def fork(self, sessions: Sequence[int], n: int) -> "World":
+        """Return a world in which each of some sessions is n times, with the same random numbers.
+
+        Its sessions are numbered from 0, those of one side by side.
+        """
+        rows = [self._at(session).row for session in sessions for _ in range(n)]
+        ones = [replace(self._at(session), row=0) for session in sessions for _ in range(n)]
+        other = World(
+            self.model, self.tokenizer, unmask_steps=self.unmask_steps, temperature=self.temperature,
+            order=self.order, sample_steps=self.sample_steps, compile=self.compile, precision=self.precision,
+        )  # fmt: skip
+        names = [one.embodiment for one in ones]
+        running = Rollout(self.model, names, len(ones), compile=self.compile, precision=self.precision)
+        kept, place = sorted(set(rows)), {row: i for i, row in enumerate(sorted(set(rows)))}
+        running.restore(range(len(rows)), self._running().snapshot(kept).take([place[row] for row in rows]))
+        other._rollout, other._opened = running, len(ones)
+        other._sessions = {number: replace(one, row=number) for number, one in enumerate(ones)}
+        return other
+
+    def restore(self, session: int, snapshot: Snapshot) -> None:
+        """Put a session into the state of a snapshot, of itself or of another session of the same model."""
+        one = self._at(session)
+        self._running().restore([one.row], snapshot)
+        self._sessions[session] = replace(one, embodiment=snapshot.embodiments[0])
+
+    # -- rows -----------------------------------------------------------------------------------------------
+
+    def _at(self, session: int) -> _Session:
+        if session not in self._sessions:
+            there = ", ".join(map(str, self._sessions)) or "none"
+            raise HMAError(f"session {session}", f"is not open; open are: {there}", "open one first")
+        return self._sessions[session]
+
+    def _ordered(self, sessions: Iterable[int]) -> tuple[list[int], list[int]]:
+        """Return sessions in the order of their rows, and these rows."""
+        order = sorted(sessions, key=lambda session: self._at(session).row)
+        return order, [self._at(session).row for session in order]
+
+    def _chunks(
+        self, order: Sequence[int], commands: Mapping[int, ArrayLike]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the commands of sessions as chunks (n, K), and which are known (n,)."""
+        read = [self.commands(self._at(one).embodiment).read(commands[one]) for one in order]
+        chunks = np.zeros((len(order), max(len(chunk) for chunk, _ in read)), np.float32)
+        for row, (chunk, _) in zip(chunks, read):
+            row[: len(chunk)] = chunk
+        return torch.from_numpy(chunks), torch.tensor([known for _, known in read])
+
+    def _newest(self, session: int) -> torch.Tensor:
+        return self._running().newest([self._at(session).row])
+
+    def _running(self) -> Rollout:
+        assert self._rollout is not None
+        return self._rollout
+
+    def _decoding(self) -> Decoding:
+        decoding = Decoding(
+            self.unmask_steps, self.temperature, self.order, self.sample_steps, measure=self.measure
+        )
+        check(decoding, self.model.config)
+        return decoding
+
+    def _reserve(self, row: int, embodiment: str) -> None:
+        """Make sure that the rollout has a row; rows double."""
+        before = self._rollout
+        if before is not None and row < before.batch:
+            return
+        batch = 1 if before is None else 2 * before.batch
+        self._rollout = Rollout(self.model, embodiment, batch, compile=self.compile, precision=self.precision)
+        if before is not None:
+            self._rollout.restore(range(before.batch), before.snapshot())
+
+    def _begin(self, session: int, frames: torch.Tensor, chunks: torch.Tensor, known: torch.Tensor) -> None:
+        one = self._at(session)
+        actions = chunks.unsqueeze(0) if len(chunks) else None
+        self._running().reset(
+            [one.row], frames.unsqueeze(0), actions, known.unsqueeze(0), [one.seed], [one.embodiment]
+        )
+
+    # -- prompts --------------------------------------------------------------------------------------------
+
+    def _prompt(
+        self, embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return stored frames (P, ...), chunks (P - 1, K), and which are known (P - 1,)."""
+        commands = self.commands(embodiment)
+        stored = self.encoded(embodiment, np.asarray(frames)[-self.model.config.frames :])
+        rows = [] if chunks is None else [commands.read(chunk) for chunk in np.asarray(chunks)]
+        if chunks is None:
+            rows = [(np.zeros(commands.stride * len(commands.names), np.float32), False)] * (len(stored) - 1)
+        elif len(rows) != len(frames) - 1:
+            fault = f"has {len(rows)} chunks for {len(frames)} frames"
+            raise HMAError("prompt", fault, f"give {len(frames) - 1}, one from each frame to the next")
+        rows = rows[len(rows) - len(stored) + 1 :]
+        known = torch.tensor([known for _, known in rows], dtype=torch.bool)
+        values = np.stack([chunk for chunk, _ in rows]) if rows else np.zeros((0, 1), np.float32)
+        return torch.from_numpy(stored), torch.from_numpy(values), known
+
+    def _encoded(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:
+        """Return pictures (n, H, W, 3) as the model stores them."""
+        config = self.model.config
+        frames = fitted(frames, config, described(self.model, embodiment))
+        views = [self.tokenizer.encode(view) for view in np.split(frames, config.views, axis=2)]
+        return np.concatenate(views, axis=-2).astype(np.int64 if config.kind == "discrete" else np.float32)
+
+
+def require_actor(config: "HMAConfig", where: str) -> None:
+    """Check that a model was trained to command; an HMAError says how that is done."""
+    trained = [OBJECTIVES[name] for name, weight in config.objectives.items() if weight > 0]
+    if not any(one.readout == POLICY for one in trained):
+        fault = f"was not trained to act, but for {', '.join(one.name for one in trained)}"
+        raise HMAError(where, fault, "train one with objectives={policy: 1.0} or {full: 1.0}")
+
+
+def load_world(checkpoint: StrPath = "embedded", *, device: str = "cpu", **settings: Any) -> World:
+    """Return a world of a checkpoint with all its embodiments, and of its tokenizer.
+
+    Args:
+        checkpoint: str or path of a checkpoint or training run, a URI, a hub repository, or `embedded`.
+        device: of the network and of the tokenizer.
+        settings: of `World`.
+    """
+    from hma_model.network.model import HMA
+
+    model = HMA.from_pretrained(checkpoint, device=device)
+    return World(model, get_tokenizer(model.config.tokenizer["name"], device=device), **settings)

@@ -1,0 +1,231 @@
+"""The engine of `hma play`: clocks, batches, the truth beside the model, and sessions that end."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hma_data.errors import UsageError
+from hma_data.lab.simulator import LabSimulator
+from hma_model.play.session import Sampling, Session
+from hma_model.play.stepper import Engine
+from hma_model.worlds.scenes import PROMPT, SEED
+from tests.model.true_world import TrueWorld, Watcher, lab_robots
+
+ROBOTS = ("mover_04", "arm3_04", "pendulum")
+
+
+class Bench:
+    """An engine that is stepped by hand."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.world = TrueWorld()
+        self.engine = Engine(self.world, lab_robots(*ROBOTS), **settings)
+
+    def open(self, robot: str = "mover_04", scene: int = 0) -> tuple[Session, Watcher]:
+        session, viewer = self.engine.open(robot, scene), Watcher()
+        self.engine.attach(session.name, viewer)
+        session.paused = False
+        return session, viewer
+
+    def step(self, count: int = 1) -> None:
+        for _ in range(count):
+            for session in self.engine.sessions.values():
+                session.due = 0.0
+            self.engine.step()
+
+
+def test_sessions_that_are_due_share_a_pass_and_hold_their_own_commands() -> None:
+    bench = Bench()
+    sessions = [bench.open(robot)[0] for robot in ROBOTS]
+    for number, session in enumerate(sessions):
+        session.held = np.full_like(session.held, 0.25 * (number + 1))
+    bench.step()
+    (chunks,) = bench.world.steps
+    for number, session in enumerate(sessions):
+        expected = np.full(session.robot.embodiment.chunk_dim, 0.25 * (number + 1), np.float32)
+        np.testing.assert_array_equal(chunks[session.row], expected)
+
+
+def test_a_session_steps_at_the_rate_of_its_robot_or_as_fast_as_it_can() -> None:
+    bench = Bench()
+    session, viewer = bench.open("mover_04")  # 10 frames a second
+    picture = bench.world.picture(session.row)
+    due = []
+    for now in (100.02, 100.15, 105.0):  # the third is late; what was missed is not made up for
+        session.due = due[-1] if due else 100.0
+        session.next_chunk()
+        session.take(picture, now, 0.0)
+        due.append(session.due)
+    assert due == pytest.approx([100.1, 100.2, 105.0])
+    assert not session.ready(104.9) and session.ready(105.0)
+    session.fast, session.due = True, 0.0
+    bench.engine.step()
+    bench.engine.step()
+    assert len(viewer.frames) == 5
+    viewer.behind = 2  # its page has not shown the last two
+    bench.engine.step()
+    assert len(viewer.frames) == 5
+
+
+def test_a_paused_session_makes_single_frames_and_one_without_viewer_none() -> None:
+    bench = Bench()
+    session, viewer = bench.open()
+    session.paused = True
+    bench.step(3)
+    session.steps = 1
+    bench.step(3)
+    assert [frame.number for frame in viewer.frames] == [1]
+    session.paused = False
+    bench.engine.detach(session.name, viewer)
+    bench.step(3)
+    assert session.count == 1
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_simulator_runs_beside_under_the_same_commands(robot: str) -> None:
+    bench = Bench()
+    session, viewer = bench.open(robot, scene=1)
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        session.held = rng.uniform([d.low for d in session.robot.dimensions]).astype(np.float32)
+        bench.step()
+    assert [frame.psnr for frame in viewer.frames] == [60.0] * 6  # the world is the simulator too
+    assert session.parted is None
+
+
+def test_replay_gives_the_commands_of_the_recorded_episode() -> None:
+    bench = Bench()
+    session, viewer = bench.open("arm3_04", scene=2)
+    session.replays = True
+    bench.step(5)
+    simulator = LabSimulator("arm3_04")
+    simulator.reset(SEED, 2)
+    commands = []
+    for _ in range((PROMPT - 1 + 5) * session.robot.embodiment.stride):
+        commands.append(simulator.recorded())
+        simulator.advance(commands[-1])
+    driven = np.concatenate([frame.commands for frame in viewer.frames])
+    np.testing.assert_array_equal(driven, commands[-len(driven) :])
+
+
+def test_they_part_when_for_a_second_a_still_is_as_near_to_the_truth_as_the_model() -> None:
+    bench = Bench()
+    session, _ = bench.open()
+    bench.step(7)
+    bench.world.blind.add(session.row)
+    assert session.row_of_bad == 10  # frames a second
+    bench.step(9)
+    assert session.parted is None
+    bench.step(2)
+    assert session.parted == 8
+    session.sync()
+    assert session.parted is None and session.status()["parted"] is None
+
+
+def test_a_model_that_is_wrong_but_nearer_to_the_truth_than_a_still_has_not_parted() -> None:
+    bench = Bench()
+    session, viewer = bench.open()
+    session._best = 80.0  # every picture of the model counts as wrong
+    session.held = np.array([60, 60], np.float32)
+    bench.step(15)
+    last = viewer.frames[-1]
+    assert session.parted is None and last.psnr == 60 and last.still is not None and last.still < 30
+
+
+def test_sync_restarts_the_model_from_the_true_frames_and_their_commands() -> None:
+    bench = Bench()
+    session, _ = bench.open()
+    bench.world.blind.add(session.row)
+    session.held = np.array([30, -20], np.float32)
+    bench.step(6)
+    session.sync()
+    frames, chunks = bench.world.begun[-1]
+    np.testing.assert_array_equal(frames[-1], bench.world.rows[session.row].picture())
+    np.testing.assert_array_equal(chunks[-6:], np.tile(session.held, (6, 1)))
+    assert len(frames) == len(chunks) + 1 and frames.max() > 0
+
+
+def test_sessions_of_another_sampling_have_a_pass_of_their_own() -> None:
+    bench = Bench(orders=("random",))
+    one, other, third = (bench.open()[0] for _ in range(3))
+    bench.engine.change(other, Sampling(4, 0.5, "random"))
+    bench.step()
+    assert bench.world.sampling == [(2, 0.0, "random"), (4, 0.5, "random")]
+    assert [set(step) for step in bench.world.steps] == [{one.row, third.row}, {other.row}]
+    with pytest.raises(UsageError, match="no 'confidence'"):
+        bench.engine.change(one, Sampling(2, 0.0, "confidence"))
+
+
+def test_a_new_scene_begins_anew_and_the_same_scene_is_the_same() -> None:
+    bench = Bench()
+    session, _ = bench.open()
+    first = session.start.model
+    bench.step(3)
+    session.begin(1)
+    assert session.count == 0 and session.start.model != first
+    session.begin(0)
+    assert session.start.model == first
+
+
+def test_an_idle_session_is_paused_and_keeps_its_frames_but_is_closed_if_nobody_watches() -> None:
+    bench = Bench(idle_s=60.0)
+    (idle, viewer), (busy, _), (left, away) = bench.open(), bench.open(), bench.open()
+    bench.step()
+    for session in (idle, left):
+        session.touched -= 61
+    bench.engine.detach(left.name, away)
+    bench.step(3)
+    assert list(bench.engine.sessions) == [idle.name, busy.name]
+    assert list(bench.world.rows) == [idle.row, busy.row]
+    assert idle.paused and len(idle.frames) == 1 and len(busy.frames) == 4
+    assert [told["kind"] for told in viewer.told] == ["status", "error"]
+    assert "nothing was done" in viewer.told[-1]["text"]
+
+
+def test_an_idle_session_gives_its_place_to_a_new_page() -> None:
+    bench = Bench(most=1, idle_s=60.0)
+    idle, viewer = bench.open()
+    idle.touched -= 61
+    bench.open()
+    assert idle.name not in bench.engine.sessions and "another page" in viewer.told[-1]["text"]
+
+
+def test_a_full_engine_refuses_and_gives_the_places_of_those_who_left() -> None:
+    bench = Bench(most=2)
+    (first, viewer), _ = bench.open(), bench.open()
+    with pytest.raises(UsageError, match="all 2 places are taken"):
+        bench.engine.open("mover_04", 0)
+    bench.engine.detach(first.name, viewer)
+    bench.open()
+    assert first.name not in bench.engine.sessions
+
+
+def test_a_session_that_fails_is_closed_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    (wrong, viewer), (right, other) = bench.open(), bench.open()
+    monkeypatch.setattr(wrong, "scene", None)
+    bench.step(2)
+    assert list(bench.engine.sessions) == [right.name]
+    assert "simulator failed" in viewer.told[-1]["text"] and len(other.frames) == 2
+
+
+def test_a_second_page_takes_over_and_tells_the_first() -> None:
+    bench = Bench()
+    session, first = bench.open()
+    second = Watcher()
+    bench.engine.attach(session.name, second)
+    bench.step()
+    assert "another page" in first.told[-1]["text"] and len(second.frames) == 1 and not first.frames
+
+
+def test_the_thread_runs_calls_and_hands_back_their_errors() -> None:
+    bench = Bench()
+    bench.engine.start()
+    try:
+        session = bench.engine.call(lambda: bench.engine.open("mover_04", 0)).result(10)
+        assert session.name in bench.engine.sessions
+        with pytest.raises(UsageError, match="no 'nobody'"):
+            bench.engine.call(lambda: bench.engine.open("nobody", 0)).result(10)
+    finally:
+        bench.engine.stop()

@@ -1,0 +1,118 @@
+"""A model acts in scenes: it commands what `predict_actions` says of all that it saw and did."""
+
+import numpy as np
+import pytest
+import torch
+
+from hma_data.errors import HMAError, UsageError
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.policies.acting import Acting
+from hma_model.policies.arenas import ModelArena, Scenes, TrueArena
+from hma_model.policies.base import begin, checked
+from hma_model.policies.catalog import read_policy
+from hma_model.simulate import World
+from tests.model.true_world import tiny_model
+
+ROBOT = "rails_03"
+
+
+def actor(*objectives: str) -> World:
+    return World(tiny_model(ROBOT, *objectives), get_tokenizer("fsq-8"), temperature=0.0)
+
+
+def test_it_commands_what_the_history_of_pictures_and_commands_says() -> None:
+    world = actor("policy")
+    arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
+    policy, stride = Acting(world, arena.scenes), arena.scenes.stride
+    frames = [np.stack([prompt.frames for prompt in arena.prompts])]
+    chunks = [np.stack([prompt.chunks for prompt in arena.prompts])]
+    begin("it", policy, arena)
+    for _ in range(4):
+        told = torch.from_numpy(np.concatenate([*chunks, np.zeros_like(chunks[0][:, :1])], axis=1))
+        shown = np.concatenate(frames, axis=1)
+        tokens = np.stack([world.tokenizer.encode(one) for one in shown]).astype(np.int64)
+        first = max(0, tokens.shape[1] - 20)
+        known = torch.ones(told.shape[:2], dtype=torch.bool)
+        wanted = world.model.predict_actions(
+            torch.from_numpy(tokens)[:, first:], ROBOT, told[:, first:], known[:, first:]
+        )[:, -1].numpy()
+        low, high = world.commands(ROBOT).low, world.commands(ROBOT).high
+        given = []
+        for _ in range(stride):
+            given.append(checked("it", policy, arena))
+            arena.step(given[-1])
+        made = np.stack(given, axis=1)
+        if world.commands(ROBOT).seen is not None:
+            wanted = np.clip(wanted.reshape(made.shape), low, high)
+        np.testing.assert_allclose(made.reshape(2, -1), wanted.reshape(2, -1), atol=1e-3)
+        frames.append(arena.pictures[:, None])
+        chunks.append(made.reshape(2, 1, -1))
+    assert not np.allclose(given[0], given[0][:1])  # the scenes differ, and so do the commands
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_with_a_short_memory_it_goes_by_the_newest_pictures_alone(memory: int) -> None:
+    world = actor("policy")
+    arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
+    policy, stride = Acting(world, arena.scenes, memory=memory), arena.scenes.stride
+    frames = np.stack([prompt.frames for prompt in arena.prompts])
+    chunks = np.stack([prompt.chunks for prompt in arena.prompts])
+    begin("it", policy, arena)
+    for _ in range(3):
+        tokens = np.stack([world.tokenizer.encode(one[-memory:]) for one in frames]).astype(np.int64)
+        told = np.concatenate([chunks, np.zeros_like(chunks[:, :1])], axis=1)[:, -memory:]
+        known = torch.ones(told.shape[:2], dtype=torch.bool)
+        wanted = world.model.predict_actions(torch.from_numpy(tokens), ROBOT, torch.from_numpy(told), known)
+        given = []
+        for _ in range(stride):
+            given.append(checked("it", policy, arena))
+            arena.step(given[-1])
+        made = np.stack(given, axis=1).reshape(2, -1)
+        low, high = (np.tile(end, stride) for end in (world.commands(ROBOT).low, world.commands(ROBOT).high))
+        said = wanted[:, -1].numpy()
+        said = np.clip(said, low, high) if world.commands(ROBOT).seen is not None else said
+        np.testing.assert_allclose(made, said, atol=1e-3)
+        frames = np.concatenate([frames, arena.pictures[:, None]], axis=1)
+        chunks = np.concatenate([chunks, made[:, None]], axis=1)
+
+
+def test_what_it_imagines_ahead_is_forgotten() -> None:
+    scenes = Scenes.of(actor("full"), ROBOT, 2, 0)
+    runs = []
+    for horizon in (1, 3):
+        world, arena = actor("full"), TrueArena(scenes, 128)
+        policy = Acting(world, scenes, horizon)
+        begin("it", policy, arena)
+        runs.append([])
+        for _ in range(3 * scenes.stride):
+            command = checked("it", policy, arena)
+            runs[-1].append(command)
+            arena.step(command * 0)
+            policy._follower._taken[-1] = command * 0  # both do the same, whatever they say
+    runs[0], runs[1] = ([np.stack(part) for part in np.array_split(one, 3)] for one in runs)
+    np.testing.assert_allclose(runs[0][0], runs[1][0], atol=1e-3)
+    assert not np.allclose(runs[0][1], runs[1][1], atol=1e-3)  # of an imagined picture, not of the true one
+
+
+def test_it_acts_in_a_world_model_too() -> None:
+    world = actor("full")
+    true = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
+    arena, policy = ModelArena(world, true, None), Acting(actor("full"), true.scenes)
+    begin("it", policy, arena)
+    for _ in range(2 * arena.scenes.stride):
+        arena.step(checked("it", policy, arena))
+    arena.close()
+
+
+def test_models_that_cannot_act_and_unknown_options_are_refused() -> None:
+    world, scenes = actor(), Scenes.of(actor(), ROBOT, 1, 0)
+    with pytest.raises(HMAError, match="was not trained to act, but for forward — train one"):
+        Acting(world, scenes)
+    with pytest.raises(UsageError, match="predicts no video to look ahead in"):
+        Acting(actor("policy"), scenes, horizon=2)
+    with pytest.raises(UsageError, match="horizon=0 is not allowed — give 1 or more"):
+        Acting(actor("full"), scenes, horizon=0)
+    with pytest.raises(UsageError, match="'speed=2' is unknown — allowed: horizon="):
+        read_policy("hma:runs/policy,speed=2", scenes)
+    with pytest.raises(HMAError, match="no/such run"):
+        read_policy("hma:no/such run", scenes)

@@ -1,0 +1,356 @@
+"""Policies scored twice: in a world without error both agree; faults of policies are one clear line."""
+
+import hashlib
+import json
+import re
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.lab import truth
+from hma_data.lab.simulator import LabSimulator
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.evaluation.agreement import Accuracy
+from hma_model.generation.commands import OutsideRangeWarning
+from hma_model.network.model import HMA
+from hma_model.policies import scores
+from hma_model.policies.arenas import ModelArena, Scenes, TrueArena
+from hma_model.policies.base import begin, checked
+from hma_model.policies.catalog import read_policy
+from hma_model.policies.judge import StateJudge, task_of
+from hma_model.policies.report import html, sentences, write_report
+from hma_model.policies.scores import WORK, PolicyEvaluation, Scored, evaluate_policies, score_policy
+from hma_model.policies.scripted import Called
+from hma_model.simulate import World
+from tests.model.true_world import TrueWorld
+
+ROBOT = "rails_03"
+POLICIES = ["scripted", "scripted:noise=0.5", "random", "still"]
+
+
+class KnownPlaces:
+    """A probe that knows the places in every picture that a simulator drew."""
+
+    own, loose, driven = np.array([0, 1]), np.array([2, 3]), 2
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.known: dict[bytes, np.ndarray] = {}
+        draw = LabSimulator.picture
+
+        def picture(simulator: LabSimulator) -> np.ndarray:
+            drawn = draw(simulator)
+            self.known[drawn.tobytes()] = truth.parts_of(simulator.simulation)[1]
+            return drawn
+
+        monkeypatch.setattr(LabSimulator, "picture", picture)
+
+    def read(self, pictures: np.ndarray) -> np.ndarray:
+        flat = pictures.reshape(-1, *pictures.shape[-3:])
+        blank = np.full((4, 2), 64.0)
+        found = np.stack([self.known.get(one.tobytes(), blank) for one in flat])
+        return found.reshape(*pictures.shape[:-3], *found.shape[1:])
+
+    def areas(self, pictures: np.ndarray) -> np.ndarray:
+        return np.ones((*pictures.shape[:-3], 4))
+
+    def __reduce__(self) -> Any:
+        return KnownPlaces, ()  # what it has seen so far makes no other judge of it
+
+
+@pytest.fixture
+def judge(monkeypatch: pytest.MonkeyPatch) -> StateJudge:
+    sure = Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24)
+    return StateJudge(ROBOT, task_of(ROBOT, "moved=2"), KnownPlaces(monkeypatch), 2.0, sure)  # type: ignore[arg-type]
+
+
+class FlawlessWorld(TrueWorld):
+    """Simulators in place of a model: its sessions do what truly happens."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__()
+        self.model, self.tokenizer, self.picture_shape = world.model, world.tokenizer, world.picture_shape
+        self.commands, self.shown, self.precision = world.commands, world.shown, world.precision
+
+
+def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJudge) -> None:
+    flawless: Any = FlawlessWorld(world)
+    found = evaluate_policies(ROBOT, POLICIES, world=flawless, judge=judge, episodes=4, frames=10)
+    for one in found.policies:
+        np.testing.assert_allclose(one.model.scores, one.replayed.scores, atol=1e-6)
+        if one.policy != "scripted":  # it steers by places, whose pose is found to a few digits
+            np.testing.assert_allclose(one.model.scores, one.true.scores, atol=1.0)
+    assert (found.policies[2].model.scores == found.policies[2].true.scores).all()
+    assert np.array_equal(found.policies[2].true_pictures, found.policies[2].model_pictures)
+    assert found.policies[3].true.scores.max() == 0 and found.policies[0].true.scores.max() > 2
+    assert found.generated.balanced == 1 and found.followed == pytest.approx(1)
+    (reason,) = [one for one in sentences(found) if "correlation" in one and "policies" in one]
+    assert found.success.pearson.value is None
+    assert reason == "correlations over policies are not computed: 4 of at least 8 episodes"
+
+
+def test_policies_of_gym_pusht_are_told_where_the_disc_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = HMA.from_pretrained("embedded", ["pusht_fast"])
+    world = FlawlessWorld(World(model, get_tokenizer(model.config.tokenizer["name"])))
+    probe: Any = KnownPlaces(monkeypatch)
+    true = TrueArena(Scenes.of(world, "pusht_fast", 2, 0), 128)  # type: ignore[arg-type]
+    arena = ModelArena(world, true, probe)  # type: ignore[arg-type]
+    for step in range(2 * arena.scenes.stride + 1):
+        told = arena.observed()
+        assert told is not None and told.shape == (2, 2)
+        near = 1 if arena.fresh else 25  # of 512 px; between pictures it is estimated
+        np.testing.assert_allclose(told, true.observed(), atol=near)
+        for one in (true, arena):
+            one.step(np.array([[100, 400], [250, 60 + 5 * step]], np.float32))
+    arena.close()
+
+
+@pytest.mark.slow
+def test_a_model_is_scored_and_the_report_written(world: World, judge: StateJudge, tmp_path: Path) -> None:
+    again, found = (
+        evaluate_policies(ROBOT, ["random", "still"], world=world, judge=judge, episodes=4, frames=4, seed=3)
+        for _ in range(2)
+    )
+    assert json.dumps(found.to_json()) == json.dumps(again.to_json())
+    assert len(found.to_json()["outcomes"]["random"]["model"]["scores"]) == 4
+    page = write_report(found, tmp_path / "out").read_text()
+    assert page == html(found) and page.count("<img") >= 2
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["policies"][0]["policy"] == "random"
+
+
+@pytest.mark.slow
+def test_an_interrupted_evaluation_continues_after_its_last_finished_policy(
+    world: World, judge: StateJudge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(out: Path | None, frames: int = 4) -> PolicyEvaluation:
+        given: Any = {"world": world, "judge": judge, "episodes": 4, "seed": 3, "out": out}
+        return evaluate_policies(ROBOT, ["random", "still"], frames=frames, **given)
+
+    def score(name: str, *given: Any) -> Scored:
+        begun.append(name)
+        if begun == ["random", "still"]:
+            raise KeyboardInterrupt
+        return score_policy(name, *given)
+
+    whole, begun, out = run(None), list[str](), tmp_path / "out"
+    monkeypatch.setattr(scores, "score_policy", score)
+    with pytest.raises(KeyboardInterrupt):
+        run(out)
+    with pytest.raises(OutputError, match="was begun with other settings"):
+        run(out, frames=5)
+    found = run(out)
+    assert begun == ["random", "still", "still"]
+    assert html(found) == html(whole) and found.to_json() == whole.to_json()
+    write_report(found, out)
+    assert sorted(path.name for path in out.iterdir()) == ["report.html", "results.json"]
+
+
+def test_shares_have_exact_intervals_and_too_few_successes_are_said(world: World, judge: StateJudge) -> None:
+    found = evaluate_policies(ROBOT, ["still"], world=world, judge=judge, episodes=8, frames=4)
+    (row,) = found.rows()
+    assert row["true_success"] == 0 and row["true_success_interval"] == pytest.approx((0, 0.369), abs=1e-3)
+    doubt = "there are too few successes to tell whether the judge is better"
+    assert doubt in sentences(found)[-1]
+    page = html(found)
+    assert page.count(doubt) == 1 and page.index(doubt) < page.index("<table")
+    for high, said in (
+        (0.6, "the judge is no better than chance"),
+        (0.9, "may be no better than chance; more"),
+    ):
+        generated = Accuracy(0.5, 0.4, high, share=0.5, count=32, successes=4)
+        assert said in sentences(replace(found, generated=generated))[-1]
+
+
+@pytest.mark.slow
+def test_a_policy_that_was_edited_is_scored_again(
+    world: World, judge: StateJudge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = list[str]()
+
+    def score(name: str, *given: Any) -> Scored:
+        begun.append(name)
+        return score_policy(name, *given)
+
+    def written(value: int) -> list[str]:
+        sys.modules.pop("mine", None)
+        (tmp_path / "mine.py").write_text(f"act = lambda picture: [{value}, 0]\n")
+        before = len(begun)
+        given: Any = {"world": world, "judge": judge, "episodes": 2, "frames": 4, "out": tmp_path / "out"}
+        evaluate_policies(ROBOT, ["mine:act", "still"], **given)
+        return begun[before:]
+
+    monkeypatch.setattr(scores, "score_policy", score)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    old = hashlib.sha256(b"still").hexdigest()[:16]
+    assert written(1) == ["mine:act", "still"]
+    (kept, _) = (tmp_path / "out" / WORK).glob("*.npz")
+    kept.rename(kept.with_name(f"{old}.npz"))  # as older releases named it
+    assert len(written(1)) == 1
+    assert written(2) == ["mine:act"] and written(1) == []
+    sys.modules.pop("mine")
+
+
+def test_both_arenas_begin_with_the_same_frames_and_numbers_follow_the_seed(world: World) -> None:
+    scenes = Scenes.of(world, ROBOT, 2, 1)
+    one, other = (TrueArena(scenes, 128) for _ in range(2))
+    assert np.array_equal(one.pictures, other.pictures)
+    assert not np.array_equal(one.pictures[0], one.pictures[1])
+    assert not np.array_equal(one.pictures, TrueArena(Scenes.of(world, ROBOT, 2, 2), 128).pictures)
+
+
+def test_a_random_command_is_held_for_a_chunk_and_stays_in_range(world: World) -> None:
+    arena = TrueArena(Scenes.of(world, ROBOT, 3, 0), 128)
+    policy = read_policy("random", arena.scenes)
+    begin("random", policy, arena)
+    commands = []
+    for _ in range(2 * arena.scenes.stride):
+        commands.append(checked("random", policy, arena))
+        arena.step(commands[-1])
+    chunks = np.array(commands).reshape(2, arena.scenes.stride, 3, -1)
+    assert (chunks == chunks[:, :1]).all() and (chunks[0] != chunks[1]).all()
+    high = np.array([dim.high for dim in arena.scenes.dimensions])
+    assert (np.abs(chunks) <= high).all()
+
+
+class Wild:
+    """A policy that commands what no robot was trained on."""
+
+    def __call__(self, picture: np.ndarray) -> list[float]:
+        return [900, 0]
+
+
+def test_a_policy_that_leaves_the_range_of_training_is_named_once(world: World, judge: StateJudge) -> None:
+    seen = replace(world.commands(ROBOT), seen=np.array([[-50, -50], [50, 50]], np.float32))
+    flawless: Any = FlawlessWorld(world)
+    flawless.commands = lambda name: seen
+    with pytest.warns(OutsideRangeWarning) as warned:
+        found = evaluate_policies(
+            ROBOT, [("wild", Called(Wild)), "still"], world=flawless, judge=judge, episodes=2, frames=4
+        )
+    (said,) = [str(one.message) for one in warned]
+    assert found.followed is None  # of four episodes it would say nothing
+    assert said.startswith("policy wild: rails_03: an action is outside") and "(action_0 -50 to 50)" in said
+
+
+class Counter:
+    """A policy with a memory: its command is the number of its calls in this episode."""
+
+    def __init__(self) -> None:
+        self.calls = -99
+
+    def reset(self) -> None:
+        self.calls = 0
+
+    def __call__(self, picture: np.ndarray) -> list[float]:
+        assert picture.shape == (128, 128, 3) and picture.dtype == np.uint8
+        self.calls += 1
+        return [self.calls, 0]
+
+
+SHARED = Counter()
+
+
+def short(picture: np.ndarray) -> np.ndarray:
+    return np.zeros(3)
+
+
+def nan(picture: np.ndarray) -> np.ndarray:
+    return np.array([0, np.nan])
+
+
+def broken(picture: np.ndarray) -> np.ndarray:
+    raise KeyError("left")
+
+
+@pytest.mark.parametrize("name", ["Counter", "SHARED"])
+def test_what_a_policy_remembers_belongs_to_one_episode(world: World, name: str) -> None:
+    arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
+    policy = read_policy(f"{__name__}:{name}", arena.scenes)
+    for _ in range(2):
+        begin(name, policy, arena)
+        for calls in (1, 2):
+            assert checked(name, policy, arena).tolist() == [[calls, 0]] * 2
+    assert SHARED.calls == -99
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("short", "returns commands of the shape (3,) — rails_03 takes (2,): "),
+        ("nan", "returns NaN or infinite values"),
+        ("broken", "raised KeyError: 'left'"),
+        ("missing", "cannot be imported: AttributeError"),
+        ("ROBOT", "is 'rails_03', which cannot be called — name a function or class"),
+    ],
+)
+def test_a_policy_that_fails_is_named_before_the_judge_is_trained(world: World, name: str, said: str) -> None:
+    with pytest.raises(HMAError, match=re.escape(said)) as fault:
+        evaluate_policies(ROBOT, [f"{__name__}:{name}"], world=world, episodes=2, frames=4)
+    assert name in str(fault.value) and "\n" not in str(fault.value)
+
+
+def test_a_module_that_is_not_there_is_said_with_where_it_is_looked_for(world: World) -> None:
+    with pytest.raises(HMAError, match="No module named 'nowhere' . run hma in the folder of nowhere.py"):
+        read_policy("nowhere:policy", Scenes.of(world, ROBOT, 1, 0))
+
+
+@pytest.mark.parametrize("words", ["fly", "scripted:noise=2", "scripted:speed=1"])
+def test_words_that_are_no_policy_are_refused(world: World, words: str) -> None:
+    with pytest.raises(UsageError, match="is unknown"):
+        read_policy(words, Scenes.of(world, ROBOT, 1, 0))
+
+
+def test_a_robot_without_a_simulator_is_refused() -> None:
+    from hma_model.cli import app
+    from tests.model.robots import make_model
+
+    with pytest.raises(HMAError, match="arm: has no true simulator"):
+        Scenes.of(_world_of(make_model({"arm": 2})), "arm", 1, 0)
+    assert "POLICY" in CliRunner().invoke(app, ["policy-eval", "--help"]).output
+
+
+def test_a_file_in_place_of_the_folder_is_refused_before_the_work(tmp_path: Path) -> None:
+    from hma_model.cli import app
+
+    (tmp_path / "a file").write_text("")
+    ran = CliRunner().invoke(app, ["policy-eval", ROBOT, "still", "--out", str(tmp_path / "a file")])
+    assert isinstance(ran.exception, OutputError) and "a file: cannot be written: " in str(ran.exception)
+
+
+def _world_of(model: HMA) -> World:
+    made = object.__new__(World)
+    made.model, made._commands = model, {}
+    return made
+
+
+@pytest.mark.slow
+def test_a_narrow_window_shows_the_last_columns(world: World, judge: StateJudge) -> None:
+    from playwright.sync_api import sync_playwright
+
+    if not (chromium := shutil.which("chromium")):
+        pytest.skip("no Chromium")
+    found = evaluate_policies(ROBOT, ["random", "still"], world=world, judge=judge, episodes=8, frames=4)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 500, "height": 900})
+        page.set_content(html(found))
+        table = page.locator(".scroll").first
+        assert table.evaluate("box => box.scrollWidth - box.clientWidth") == 0
+        browser.close()
+
+
+def test_policies_that_are_paths_go_by_short_names_with_a_legend(world: World, judge: StateJudge) -> None:
+    found = evaluate_policies(ROBOT, ["still"], world=world, judge=judge, episodes=8, frames=4)
+    names = ("hma:build/runs/of/a/policy/few,memory=1", "hma:build/runs/of/a/policy/many,memory=1")
+    (still,) = found.policies
+    page = html(replace(found, policies=(*(replace(still, policy=name) for name in names), still)))
+    for short, name in zip(("few,memory=1", "many,memory=1"), names, strict=True):
+        assert f"<dt>{short}</dt><dd>{name}</dd>" in page and page.count(name) == 1
+        assert page.index(name) < page.index("<table") < page.index(f">{short}<", page.index("<table"))

@@ -1,0 +1,479 @@
+"""Synthetic episodes: shards that verify and say what they are, replays, resumption, LeRobotDatasets."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
+from hma_data.conversion.rewrite import merge
+from hma_data.errors import HMAError, OutputError, ShardError, UsageError
+from hma_data.lab import family, record
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.schema import flag_counts, read_footer
+from hma_data.shards.verify import verify
+from hma_data.sources.base import open_source
+from hma_model.policies.acting import Acting
+from hma_model.policies.arenas import Scenes, TrueArena
+from hma_model.policies.scripted import Still
+from hma_model.simulate import World, load_world
+from hma_model.synthetic import augment as augment_module
+from hma_model.synthetic.augment import Augmentation, augment
+from hma_model.synthetic.recorder import Made, write_shards
+from tests.conftest import BlockTokenizer
+from tests.data import cameras as three
+from tests.model.shards import state_pauses
+from tests.model.true_world import BlockLatents, latent_model, trained_on
+
+ROBOT, FRAMES, KNOWN = "rails_03", 4, 2
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(augment_module, "BATCH", 2)
+
+
+@pytest.fixture
+def latents() -> World:
+    """A world of latents, whose pictures have half the size of the simulator's."""
+    return World(latent_model(ROBOT), BlockLatents())
+
+
+def asked(**given: Any) -> Augmentation:
+    return Augmentation(ROBOT, **{"episodes": 4, "frames": FRAMES, "keep": 1.0} | given)
+
+
+def episodes(folder: Path) -> list[dict[str, Any]]:
+    shards = ShardSet(folder)
+    reader = EpisodeReader(shards, shards.columns())
+    return [reader.episode(row, shards.manifest.cameras[0]) for row in shards.episodes.to_pylist()]
+
+
+def test_replayed_episodes_hold_the_recorders_commands_and_say_that_they_are_synthetic(
+    world: World, tmp_path: Path
+) -> None:
+    manifest = augment(tmp_path / "out", asked(), world=world)
+    assert verify(tmp_path / "out") == []
+    made_by = manifest.plan["made_by"]
+    assert made_by["synthetic"] is True and made_by["seed"] == 0 and made_by["checkpoint"] == "in memory"
+    for shard in manifest.shards:
+        assert read_footer(tmp_path / "out" / shard.path)[0].plan["made_by"] == made_by
+    true = TrueArena(Scenes.of(world, ROBOT, 4, 0), 128)
+    wanted = [true.recorded()]
+    for _ in range(FRAMES * true.scenes.stride - 1):
+        true.step(wanted[-1])
+        wanted.append(true.recorded())
+    commands = np.stack(wanted, axis=1).reshape(4, FRAMES, -1)
+    found = episodes(tmp_path / "out")
+    assert len(found) == 4
+    for number, columns in enumerate(found):
+        prompt = true.prompts[number]
+        known = len(prompt.frames)
+        np.testing.assert_array_equal(columns["action"][known - 1 :], commands[number])
+        np.testing.assert_array_equal(columns["action"][: known - 1], prompt.chunks)
+        stored = world.tokenizer.encode(prompt.frames)
+        np.testing.assert_array_equal(columns["tokens"][:known].reshape(stored.shape), stored)
+
+
+def test_the_plan_names_a_precision_that_changes_tokens(
+    world: World, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert "precision" not in augment(tmp_path / "whole", asked(), world=world).plan["made_by"]
+    monkeypatch.setattr(world, "precision", "bf16")
+    assert augment(tmp_path / "half", asked(), world=world).plan["made_by"]["precision"] == "bf16"
+
+
+@pytest.mark.slow
+def test_synthetic_episodes_merge_with_recorded_ones_and_the_whole_says_so(
+    world: World, tmp_path: Path
+) -> None:
+    recording, robot = record(ROBOT, tmp_path, 2), family.embodiment(ROBOT)
+    for frames in ("strided", "all"):
+        convert(robot, recording, world.tokenizer, tmp_path / frames, settings=Settings(frames=frames))
+    made = augment(tmp_path / "made", asked(), world=world)
+    whole = merge([tmp_path / "strided", tmp_path / "made"], tmp_path / "whole")
+    assert verify(tmp_path / "whole") == [] and robot.state is not None and whole.embodiment.state is None
+    assert whole.plan["made_by"]["synthetic"] is True and len(episodes(tmp_path / "whole")) == 6
+    flags = ShardSet(tmp_path / "whole").episodes["flags"].to_pylist()
+    assert sum("generated_frames" in text for text in flags) == len(episodes(tmp_path / "made")) == 4
+    again = merge([tmp_path / "strided", tmp_path / "strided"], tmp_path / "twice")
+    assert "synthetic" not in again.plan["made_by"] and again.embodiment.state is not None
+    assert made.frame_stride == whole.frame_stride > 1
+    with pytest.raises(ShardError, match="frame stride .* --frames strided"):
+        merge([tmp_path / "all", tmp_path / "made"], tmp_path / "mixed")
+
+
+@pytest.mark.slow
+def test_perturbed_commands_lie_around_the_recorded_ones(world: World, tmp_path: Path) -> None:
+    augment(tmp_path / "one", asked(), world=world)
+    augment(tmp_path / "other", asked(commands="perturb=0.2"), world=world)
+    pairs = zip(episodes(tmp_path / "one"), episodes(tmp_path / "other"), strict=True)
+    gaps = np.concatenate([(one["action"] - other["action"])[3:] for one, other in pairs])
+    assert 0 < np.abs(gaps).mean() < 0.5 * 30
+    augment(tmp_path / "still", asked(commands="still"), world=world)
+    still = episodes(tmp_path / "still")
+    assert not any(one["action"].any() for one in still)  # velocities; the recorder's before are left out
+    assert {len(one["action"]) for one in still} == {FRAMES}
+
+
+@pytest.mark.parametrize("kind", ["world", "latents"])
+def test_a_stopped_run_continues_and_gives_the_same_bytes(
+    kind: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    world = request.getfixturevalue(kind)
+    whole = augment(tmp_path / "whole", asked(), world=world)
+
+    def stop(done: float, words: str) -> None:
+        if done > 2 * FRAMES:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        augment(tmp_path / "cut", asked(), world=world, on_progress=stop)
+    assert [path.name for path in sorted((tmp_path / "cut/.augment").glob("*.npz"))] == ["batch-000000.npz"]
+    with pytest.raises(OutputError, match="was begun with other settings"):
+        augment(tmp_path / "cut", asked(seed=1), world=world)
+    told: list[float] = []
+    cut = augment(tmp_path / "cut", asked(), world=world, on_progress=lambda done, words: told.append(done))
+    assert told[0] == 2 * FRAMES  # the first batch was not made again
+    assert [shard.sha256 for shard in cut.shards] == [shard.sha256 for shard in whole.shards]
+    assert not (tmp_path / "cut/.augment").exists()
+    assert augment(tmp_path / "cut", asked(), world=world) == cut
+    with pytest.raises(OutputError, match="holds another shard set"):
+        augment(tmp_path / "cut", asked(seed=1), world=world)
+
+
+def test_the_first_frames_of_latents_are_the_simulators_at_their_own_size(
+    latents: World, tmp_path: Path
+) -> None:
+    augment(tmp_path / "out", asked(episodes=2), world=latents)
+    assert verify(tmp_path / "out") == []
+    true, shards = TrueArena(Scenes.of(latents, ROBOT, 2, 0), 64), ShardSet(tmp_path / "out")
+    reader = EpisodeReader(shards, shards.columns())
+    for row, prompt in zip(shards.episodes.to_pylist(), true.prompts, strict=True):
+        stored = reader.episode(row, shards.manifest.cameras[0])["latents"].reshape(-1, 3, 8, 8)
+        means = prompt.frames.reshape(-1, 8, 16, 8, 16, 3).astype(np.float32).mean(axis=(2, 4)) / 17
+        np.testing.assert_allclose(stored[: len(means)], means.transpose(0, 3, 1, 2), atol=0.06)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["world", "latents"])
+def test_the_surest_episodes_are_kept(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    world, measure = request.getfixturevalue(kind), {"world": "millinats", "latents": "millilatents"}[kind]
+    augment(tmp_path / "all", asked(), world=world)
+    augment(tmp_path / "half", asked(keep=0.5), world=world)
+    unsure = {}
+    for name in ("all", "half"):
+        rows = ShardSet(tmp_path / name).episodes.to_pylist()
+        unsure[name] = sorted(flag_counts(row["flags"])[measure] for row in rows)
+    assert unsure["half"] == unsure["all"][:2] and unsure["all"][0] < unsure["all"][-1]
+    with pytest.raises(UsageError, match="--keep: is 0"):
+        asked(keep=0.0)
+
+
+@pytest.mark.parametrize(
+    "words", ["perturb", "perturb=", "perturb=-1", "replay=0.3", "replay=", "perturb=inf"]
+)
+def test_noise_without_a_share_is_refused(words: str, world: World, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--commands: .* is unknown . give replay, or perturb=0.3"):
+        augment(tmp_path / "out", asked(commands=words), world=world)
+
+
+@pytest.mark.slow
+def test_first_frames_and_commands_come_from_shards(world: World, tmp_path: Path) -> None:
+    recording = record(ROBOT, tmp_path, 1)
+    convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "real")
+    augment(tmp_path / "out", asked(source="real", episodes=2), world=world, shards=tmp_path / "real")
+    assert verify(tmp_path / "out") == []
+    real, made = episodes(tmp_path / "real"), ShardSet(tmp_path / "out").episodes.to_pylist()
+    assert {row["group"] for row in made} == {"demo_0"}
+    stride = world.model.embodiments[ROBOT].stride
+    for columns in episodes(tmp_path / "out"):
+        tokens, length = real[0]["tokens"], len(columns["action"])
+        starts = [at for at, frame in enumerate(tokens) if np.array_equal(frame, columns["tokens"][0])]
+        rows = [real[0]["action"][at : at + length * stride].ravel() for at in starts]
+        assert any(np.array_equal(one, columns["action"].ravel()) for one in rows)
+    with pytest.raises(UsageError, match="has no episode of 2 \\+ 900 frames"):
+        augment(tmp_path / "no", asked(frames=900), world=world, shards=tmp_path / "real")
+
+
+@pytest.mark.slow
+def test_no_episode_continues_one_that_pauses(world: World, real: Path, tmp_path: Path) -> None:
+    stride = world.model.embodiments[ROBOT].stride
+    frames, (row,) = episodes(real)[0]["tokens"], ShardSet(real).episodes.to_pylist()
+    needed = (KNOWN + FRAMES - 1) * stride
+    last = row["length"] - needed - 4
+    state_pauses(real, {needed - 1: stride, last: stride})  # the first part is too short
+    augment(tmp_path / "out", asked(source="real", episodes=6), world=world, shards=real)
+    for columns in episodes(tmp_path / "out"):
+        prompt = columns["tokens"][:KNOWN]
+        starts = [
+            at
+            for at in range(len(frames) - stride)
+            if np.array_equal(frames[at], prompt[0]) and np.array_equal(frames[at + stride], prompt[1])
+        ]
+        assert any(needed <= at <= last - needed or last < at for at in starts)
+    state_pauses(real, dict.fromkeys(range(0, row["length"], needed), stride))
+    with pytest.raises(UsageError, match="has no episode of 2 \\+ 4 frames without a pause"):
+        augment(tmp_path / "no", asked(source="real"), world=world, shards=real)
+
+
+@pytest.fixture
+def real(world: World, tmp_path: Path) -> Path:
+    """One recorded episode, as shards of the world's tokenizer."""
+    recording = record(ROBOT, tmp_path, 1)
+    settings = Settings(val_fraction=0)
+    convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "real", settings=settings)
+    return tmp_path / "real"
+
+
+@pytest.mark.slow
+def test_episodes_of_the_same_beginning_differ(
+    world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    long_enough = augment_module._Maker._long_enough
+
+    def one_beginning(maker: Any, shards: ShardSet) -> list[dict[str, Any]]:
+        return [row | {"room": 1} for row in long_enough(maker, shards)]
+
+    monkeypatch.setattr(augment_module._Maker, "_long_enough", one_beginning)
+    augment(tmp_path / "out", asked(source="real"), world=world, shards=real)
+    made = [columns["tokens"].tobytes() for columns in episodes(tmp_path / "out")]
+    assert len(set(made)) == len(made) == 4
+
+
+@pytest.mark.slow
+def test_windows_with_unknown_commands_are_left_out(
+    world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, unknown = augment_module.read_prompt, [True]
+
+    def gaps(model: Any, name: str, prompt: Any) -> Any:
+        frames, chunks = read(model, name, prompt)
+        chunks = chunks.copy()
+        chunks[2, 0] = np.nan if all(unknown) or prompt["start"] % 2 else chunks[2, 0]
+        return frames, chunks
+
+    monkeypatch.setattr(augment_module, "read_prompt", gaps)
+    with pytest.raises(UsageError, match="hardly a window of 6 frames whose commands are all known"):
+        augment(tmp_path / "none", asked(source="real"), world=world, shards=real)
+    unknown.append(False)
+    augment(tmp_path / "out", asked(source="real"), world=world, shards=real)
+    assert verify(tmp_path / "out") == []
+    assert all(np.isfinite(columns["action"]).all() for columns in episodes(tmp_path / "out"))
+    augment(tmp_path / "still", asked(source="real", commands="still"), world=world, shards=real)
+
+
+@pytest.mark.slow
+def test_a_policy_of_pictures_acts_after_stored_frames(world: World, real: Path, tmp_path: Path) -> None:
+    seen = []
+
+    class Looks:
+        def begin(self, arena: Any) -> None:
+            seen.extend(prompt.frames for prompt in arena.prompts)
+
+        def act(self, arena: Any) -> Any:
+            return arena.held
+
+    maker = augment_module._Maker(world, asked(source="real", commands="still", episodes=2), ShardSet(real))
+    maker.policy = Looks()
+    maker._make(range(2), lambda done: None)
+    stored = maker._recorded(ShardSet(real), range(2)).prompts
+    for pictures, prompt in zip(seen, stored, strict=True):
+        assert pictures.dtype == np.uint8 and np.array_equal(pictures, world.tokenizer.decode(prompt.frames))
+
+
+@pytest.mark.slow
+def test_other_shards_of_the_same_name_are_not_the_same_job(world: World, real: Path, tmp_path: Path) -> None:
+    settings = asked(source="real", episodes=2)
+    augment(tmp_path / "out", settings, world=world, shards=real)
+    augment(tmp_path / "out", settings, world=world, shards=real)
+    recording = record(ROBOT, tmp_path / "again", 2)
+    convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "other" / "real")
+    with pytest.raises(OutputError, match="holds another shard set"):
+        augment(tmp_path / "out", settings, world=world, shards=tmp_path / "other" / "real")
+
+
+def test_episodes_of_several_cameras_hold_each_in_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording, tokenizer = three.write_hdf5(tmp_path / "three.hdf5"), BlockTokenizer()
+    taken = Settings(cameras=("all",))
+    convert(three.arm(), recording, tokenizer, tmp_path / "real", settings=taken)
+    real = ShardSet(tmp_path / "real")
+    world = World(trained_on(["side", "top"], real, tmp_path / "model", frames=4).model, tokenizer)
+    settings = Augmentation(real.embodiment.id, "real", episodes=2, frames=2, keep=1.0)
+    given: Any = {"world": world, "shards": real.folder, "lerobot": tmp_path / "dataset"}
+    augment(tmp_path / "out", settings, **given)
+    for wrong in ({"settings": replace(settings, judge="moved")}, {"shards": None}):
+        with pytest.raises(UsageError, match="simulator shows one camera, and the model sees 2"):
+            augment(tmp_path / "no", **({"settings": settings} | given | {"lerobot": None} | wrong))
+    one = World(trained_on("top", real, tmp_path / "one", "policy", 4).model, tokenizer)
+    monkeypatch.setattr(augment_module, "read_policy", lambda _, scenes, world: Acting(one, scenes, 1, "it"))
+    with pytest.raises(HMAError, match="it: sees 1 views, and the pictures show 2"):
+        augment(tmp_path / "no", replace(settings, commands="hma:it"), **(given | {"lerobot": None}))
+    made = ShardSet(tmp_path / "out")
+    assert made.manifest.cameras == ["side", "top"] and verify(made.folder) == []
+    reader = EpisodeReader(made, made.columns(made.manifest.cameras))
+    for row in made.episodes.to_pylist():
+        for name, red in (("side", 9), ("top", 1)):
+            first = reader.episode(row, name)["tokens"][0]
+            assert (first % 16 == red).all()
+    robot = Embodiment.load(tmp_path / "dataset" / "embodiment.yaml")
+    source, place = open_source("lerobot"), tmp_path / "dataset"
+    episode = source.read(place, source.episode_ids(place)[0], robot)
+    for name, red in (("side", 9), ("top", 1)):
+        assert abs(float(episode.streams[name].frames([0])[..., 0].mean()) - 17 * red) < 6
+
+
+def test_the_camera_that_is_shown_is_the_one_that_is_named(tmp_path: Path) -> None:
+    arm, tokenizer = three.arm(), BlockTokenizer()
+    pictures = np.zeros((4, 64, 64, 3), np.uint8)
+    made = Made("one", tokenizer.encode(pictures), np.zeros((3, arm.chunk_dim), np.float32), {}, "a")
+    given: Any = {"made_by": {"synthetic": True}, "cameras": ["wrist"]}
+    (tmp_path / "out").mkdir()
+    manifest = write_shards(tmp_path / "out", [made], tokenizer.spec, arm, **given)
+    assert manifest.cameras == ["wrist"] and verify(tmp_path / "out") == []
+
+
+@pytest.mark.slow
+def test_lerobot_loads_the_dataset(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    monkeypatch.setattr(augment_module, "_stated", lambda *_: None)
+    told: list[tuple[float, str]] = []
+
+    def tell(done: float, words: str) -> None:
+        told.append((done, words))
+
+    given: Any = {"world": world, "lerobot": tmp_path / "rails", "on_progress": tell}
+    augment(tmp_path / "out", asked(episodes=2), **given)
+    loaded = LeRobotDataset("lab/rails", root=tmp_path / "rails")
+    stride = world.model.embodiments[ROBOT].stride
+    columns = episodes(tmp_path / "out")
+    assert "observation.state" not in loaded.meta.features
+    assert loaded.num_episodes == 2 and len(loaded) == sum(len(one["action"]) for one in columns) * stride
+    written = [words for done, words in told if words.startswith("LeRobot") and done == 2 * FRAMES]
+    assert written[0].startswith(f"LeRobot: 0 of {len(loaded)} frames, ")
+    assert written[-1].startswith(f"LeRobot: {len(loaded)} of {len(loaded)} frames, ")
+    first, second = (world.tokenizer.decode(columns[0]["tokens"][at].reshape(1, 8, 8))[0] for at in (0, 1))
+    for at, shown in ((0, first), (stride - 1, first), (stride, second)):
+        stored = loaded[at]["observation.images.top"].permute(1, 2, 0).numpy() * 255
+        assert np.abs(stored - shown).mean() < 4 < np.abs(first.astype(float) - second).mean()
+    row = loaded[stride]
+    np.testing.assert_allclose(row["action"], columns[0]["action"][1][: len(row["action"])])
+    assert "synthetic" in row["task"]
+    assert json.loads((tmp_path / "rails/synthetic.json").read_text())["synthetic"] is True
+    with pytest.raises(OutputError, match="rails: holds another dataset"):
+        augment(tmp_path / "more", asked(), world=world, lerobot=tmp_path / "rails")
+    assert not list((tmp_path / "more").glob("*/*.parquet"))
+
+
+@pytest.mark.slow
+def test_a_policy_of_lerobot_trains_on_the_dataset_with_the_state_in_its_pictures(tmp_path: Path) -> None:
+    import torch
+    from lerobot.configs.types import FeatureType
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    world = load_world("embedded")
+    augment(tmp_path / "out", asked(), world=world, lerobot=tmp_path / "rails")
+    robot = Embodiment.load(tmp_path / "rails" / "embodiment.yaml")
+    said = robot.provenance["state"]
+    assert "read off the pictures, mean error slider_1 " in said and robot.state is not None
+    step = {"action": [row / robot.rate_hz for row in range(4)]}
+    loaded = LeRobotDataset("lab/rails", root=tmp_path / "rails", delta_timestamps=step)
+    assert loaded.meta.features["observation.state"]["names"] == robot.state.names()
+    true = TrueArena(Scenes.of(world, ROBOT, 4, 0), 128)
+    known, stride = len(true.prompts[0].frames), robot.stride
+    begins = loaded.meta.episodes["dataset_from_index"]
+    read = np.stack([loaded[begin + (known - 1) * stride]["observation.state"] for begin in begins])
+    seen = true.observed()
+    assert seen is not None and np.abs(read - seen).mean() < 0.2 * np.abs(seen - seen[::-1]).mean()
+    features = dataset_to_policy_features(loaded.meta.features)
+    outputs = {key: one for key, one in features.items() if one.type is FeatureType.ACTION}
+    config = ACTConfig(
+        input_features={key: one for key, one in features.items() if key not in outputs},
+        output_features=outputs, chunk_size=4, n_action_steps=4, dim_model=32, n_heads=2, dim_feedforward=32,
+        n_encoder_layers=1, n_vae_encoder_layers=1, pretrained_backbone_weights=None, device="cpu",
+    )  # fmt: skip
+    policy = ACTPolicy(config).train()
+    prepare, _ = make_pre_post_processors(config, dataset_stats=loaded.meta.stats)
+    batch = prepare(next(iter(torch.utils.data.DataLoader(loaded, batch_size=4))))
+    optimizer, losses = torch.optim.AdamW(policy.parameters(), lr=1e-3), []
+    for _ in range(6):
+        loss, _ = policy(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0]
+
+
+def test_the_same_call_keeps_a_finished_dataset_and_finishes_one_that_was_cut_off(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped, written, dataset = [True], list[Path](), tmp_path / "rails"
+    (tmp_path / ".rails.part").mkdir()  # of a process that was killed
+
+    def write(folder: Path, *_: Any) -> None:
+        folder.mkdir()
+        (folder / "meta").mkdir()
+        if stopped.pop():
+            raise KeyboardInterrupt
+        written.append(folder)
+
+    monkeypatch.setattr(recorder, "write_lerobot", write)
+    monkeypatch.setattr(augment_module, "_stated", lambda *_: None)
+    given: Any = {"world": world, "lerobot": dataset}
+    with pytest.raises(KeyboardInterrupt):
+        augment(tmp_path / "out", asked(episodes=2), **given)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+    stopped.append(False)
+    made = augment(tmp_path / "out", asked(episodes=2), **given)
+    before = {path: path.stat().st_mtime_ns for path in dataset.rglob("*")}
+    assert augment(tmp_path / "out", asked(episodes=2), **given) == made and len(written) == 1
+    assert before == {path: path.stat().st_mtime_ns for path in dataset.rglob("*")}
+    (dataset / "synthetic.json").unlink()
+    with pytest.raises(OutputError, match="rails: holds something else — remove it or choose another"):
+        augment(tmp_path / "out", asked(episodes=2), **given)
+
+
+def test_a_robot_without_simulator_needs_shards(tmp_path: Path) -> None:
+    from tests.model.robots import make_model
+
+    world = object.__new__(World)
+    world.model, world._commands, world.precision = make_model({"arm": 2}), {}, "float32"
+    with pytest.raises(HMAError, match="arm: has no true simulator"):
+        augment(tmp_path / "out", Augmentation("arm"), world=world)
+
+
+def test_a_policy_that_plans_gets_the_judge(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Planning(Still):
+        def judged(self, judge: Any) -> None:
+            self.judge = judge
+
+    class Judge:
+        def score(self, pictures: np.ndarray) -> np.ndarray:
+            return pictures[:, 0, 0, 0, 0]
+
+        def success(self, scores: np.ndarray) -> np.ndarray:
+            return np.ones(len(scores), np.bool_)
+
+    policy, judge = Planning(), Judge()
+    monkeypatch.setattr(augment_module, "read_policy", lambda *given: policy)
+    monkeypatch.setattr(augment_module, "train_probe", lambda *given: None)
+    monkeypatch.setattr(augment_module, "train_judge", lambda *given, **named: judge)
+    with pytest.raises(UsageError, match="'plan:cem' plans for what a judge calls success . add --judge"):
+        augment(tmp_path / "out", asked(commands="plan:cem"), world=world)
+    augment(tmp_path / "out", asked(commands="plan:cem", judge="moved", episodes=2), world=world)
+    assert policy.judge is judge and verify(tmp_path / "out") == []
