@@ -23,6 +23,7 @@ from hma_model.policies.arenas import Scenes, TrueArena
 from hma_model.policies.scripted import Still
 from hma_model.simulate import World, load_world
 from hma_model.synthetic import augment as augment_module
+from hma_model.synthetic import recorder
 from hma_model.synthetic.augment import Augmentation, augment
 from hma_model.synthetic.recorder import Made, write_shards
 from tests.conftest import BlockTokenizer

@@ -7,7 +7,7 @@ import pytest
 
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import truth
-from hma_model.evaluation import judge
+from hma_model.policies import judge
 from hma_model.policies.judge import best_limit, last_seen, moved, reached, task_of, train_judge
 
 SIDE = 8
