@@ -18,7 +18,8 @@ from hma_data.episodes.align import to_clip
 from hma_data.errors import SourceError, UsageError
 from hma_data.inspection.infer import from_inspection, infer
 from hma_data.registry.embodiment import Embodiment, find, problems
-from hma_data.sources.common.inspection import Inspection, KeyInfo, open_source
+from hma_data.sources.base import open_source
+from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.storage.yaml_io import parse_yaml
 from tests.command import ROOT, hma
 from tests.data import rlds_files
