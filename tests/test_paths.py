@@ -45,7 +45,8 @@ from hma_data.tokenizers.training.frames import films_of, read_films, recording_
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import Checkpoint, resolve, training_checkpoints
 from hma_model.demo.run import demo
-from hma_model.evaluation.evaluate import evaluate, unconditional_baseline, windows
+from hma_model.evaluation.evaluate import evaluate
+from hma_model.evaluation.losses import unconditional_baseline, windows
 from hma_model.evaluation.rollout_video import RolloutVideo, write_video
 from hma_model.hub import datasets as hub_data
 from hma_model.hub import listing as hub_list

@@ -37,8 +37,8 @@ from hma_model.demo.report import FINETUNED, SCRATCH, SHOWN, TAU, write_report
 from hma_model.demo.results import TIMINGS, Demo
 
 if TYPE_CHECKING:
-    from hma_model.evaluation.evaluate import Sampling
     from hma_model.evaluation.rollout_video import RolloutVideo
+    from hma_model.evaluation.rollouts import Sampling
     from hma_model.training.loop import TrainResult
 
 START, ROBOTS = EMBEDDED_NAME, HELD_OUT  # the trunk, and robots that it has not seen
@@ -217,8 +217,9 @@ def roll_out(made: Demo) -> None:
     The robots run in parallel, each in one thread, because a second thread speeds up small products little.
     """
     from hma_data.tokenizers.network import single_threads
-    from hma_model.evaluation.evaluate import default_prompt, evaluate
+    from hma_model.evaluation.evaluate import evaluate
     from hma_model.evaluation.rollout_video import lively_windows, rollout_video
+    from hma_model.evaluation.rollouts import default_prompt
     from hma_model.network.model import HMA
 
     def roll(robot: str) -> tuple[dict[str, Any], "RolloutVideo"]:

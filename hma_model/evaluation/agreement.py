@@ -6,12 +6,13 @@ few episodes and for shares of 0 and 1: a bootstrap would call these certain.
 M policies, N episodes, R resamples. All intervals hold 95 %.
 """
 
+import warnings
 from dataclasses import dataclass
 from functools import lru_cache
-from math import lgamma
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import stats
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -86,33 +87,22 @@ class Accuracy:
 
 def pearson(one: ArrayLike, other: ArrayLike) -> Floats:
     """Return the correlation over the last axis (…, M) of two series; NaN where one is constant."""
-    x, y = (values - values.mean(axis=-1, keepdims=True) for values in np.asarray([one, other], np.float64))
-    size = np.sqrt(np.square(x).sum(axis=-1) * np.square(y).sum(axis=-1))
-    constant = (np.ptp(x, axis=-1) < 1e-12) | (np.ptp(y, axis=-1) < 1e-12)
-    found: Floats = np.where(constant, np.nan, (x * y).sum(axis=-1) / np.where(constant, 1, size))
-    return found
-
-
-def ranks(values: ArrayLike) -> Floats:
-    """Return the ranks from 1 over the last axis (…, M); equal values share the mean of their ranks."""
-    array = np.asarray(values, np.float64)
-    below = (array[..., None, :] < array[..., None]).sum(axis=-1)
-    equal = (array[..., None, :] == array[..., None]).sum(axis=-1)
-    found: Floats = below + (equal + 1) / 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", (stats.ConstantInputWarning, stats.NearConstantInputWarning))
+        found: Floats = stats.pearsonr(np.asarray(one), np.asarray(other), axis=-1).statistic
     return found
 
 
 def spearman(one: ArrayLike, other: ArrayLike) -> Floats:
     """Return the correlation of the ranks over the last axis (…, M) of two series."""
-    return pearson(ranks(one), ranks(other))
+    return pearson(stats.rankdata(one, axis=-1), stats.rankdata(other, axis=-1))
 
 
 def correlations(one: Floats, other: Floats, seed: int = 0) -> dict[str, Estimate]:
     """Return how the means of two judgements of the same episodes correlate over policies.
 
-    A resample draws policies and episodes, the episodes jointly for all policies and both judgements, because
-    they share their beginnings. Resamples of fewer than three different policies, or of constant means, have
-    no correlation and are drawn out. Fewer than five policies have no interval.
+    A resample draws policies and episodes. The episodes are drawn jointly for all policies and both
+    judgements, because they share their beginnings. Fewer than five policies have no interval.
 
     Args:
         one, other: (M, N).
@@ -124,11 +114,12 @@ def correlations(one: Floats, other: Floats, seed: int = 0) -> dict[str, Estimat
     reason = _too_little(one, other)
     if reason:
         return dict.fromkeys(("pearson", "spearman"), Estimate(None, reason=reason))
-    rng, (policies, episodes) = np.random.default_rng(seed), one.shape
-    means = one.mean(axis=1), other.mean(axis=1)
     measures = {"pearson": pearson, "spearman": spearman}
+    means = one.mean(axis=1), other.mean(axis=1)
+    policies, episodes = one.shape
     if policies < FEW_POLICIES:
         return {name: Estimate(float(measure(*means))) for name, measure in measures.items()}
+    rng = np.random.default_rng(seed)
     rows = rng.integers(policies, size=(RESAMPLES, policies))
     rows = rows[[len(set(drawn)) >= MIN_POLICIES for drawn in rows.tolist()]]
     columns = rng.integers(episodes, size=(len(rows), episodes))
@@ -136,7 +127,10 @@ def correlations(one: Floats, other: Floats, seed: int = 0) -> dict[str, Estimat
     found = {}
     for name, measure in measures.items():
         spread = measure(*drawn)
-        low, high = np.nanpercentile(spread, (2.5, 97.5))
+        # A resample in which all policies are alike has no correlation. Dropping it would keep those in which
+        # one lucky episode parts them, so it widens the interval to both sides instead.
+        low = np.percentile(np.where(np.isnan(spread), -1, spread), 100 * TAIL)
+        high = np.percentile(np.where(np.isnan(spread), 1, spread), 100 * (1 - TAIL))
         found[name] = Estimate(float(measure(*means)), float(low), float(high))
     return found
 
@@ -177,21 +171,10 @@ def _balanced(right: tuple[int, int], each: tuple[int, int]) -> tuple[float, flo
     return middle, middle - float(below), middle + float(above)
 
 
+@lru_cache(maxsize=1024)
 def share_interval(successes: int, count: int) -> tuple[float, float]:
     """Return Clopper and Pearson's interval of a share: the shares under which the count is no surprise."""
-    return _lower_end(successes, count), 1 - _lower_end(count - successes, count)
-
-
-@lru_cache(maxsize=1024)
-def _lower_end(successes: int, count: int) -> float:
-    """Return the share under which so many successes, or more, have the chance TAIL; 0 for none."""
-    if not successes:
-        return 0.0
-    many = np.arange(successes, count + 1)
-    ways = np.array([lgamma(count + 1) - lgamma(one + 1) - lgamma(count - one + 1) for one in many])
-    low, high = 0.0, 1.0
-    for _ in range(50):  # halves the gap; far below what is printed
-        share = (low + high) / 2
-        chance = np.exp(ways + many * np.log(share) + (count - many) * np.log1p(-share)).sum()
-        low, high = (share, high) if chance < TAIL else (low, share)
-    return low
+    failures = count - successes
+    low = stats.beta.ppf(TAIL, successes, failures + 1) if successes else 0.0
+    high = stats.beta.ppf(1 - TAIL, successes + 1, failures) if failures else 1.0
+    return float(low), float(high)

@@ -26,11 +26,9 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import OBJECTIVES, token_words
-from hma_model.evaluation.commands import gaussian, shuffled, shuffled_actions, without_commands
+from hma_model.evaluation.actions import gaussian, shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, SHARE, ends_of, interval, rounded, summary
 from hma_model.evaluation.losses import (
-    Means,
-    digit_frequencies,
     masked_val_loss,
     no_window,
     opened,
@@ -47,26 +45,7 @@ if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
-__all__ = [
-    "Means",
-    "Pictures",
-    "Sampling",
-    "Settings",
-    "cameras_for",
-    "decode",
-    "default_prompt",
-    "digit_frequencies",
-    "evaluate",
-    "masked_val_loss",
-    "measure",
-    "rollout",
-    "shuffled",
-    "shuffled_actions",
-    "unconditional_baseline",
-    "validation_losses",
-    "verdict",
-    "windows",
-]  # fmt: skip
+__all__ = ["Settings", "cameras_for", "decode", "default_prompt", "evaluate", "measure", "verdict"]
 
 DRAWS = 5  # of other windows' actions, and of Gaussian ones
 FOLLOWS_DB = 0.5  # gain of the last frame's PSNR from which a model is said to follow its actions
@@ -196,7 +175,7 @@ def measure(
         raise no_window(shards, split, length)
     batches = list(windows(shards, split, length, settings.windows, settings.batch_size, cameras))
     if not model.config.sees_actions:  # it knows only how frames without commands go on
-        batches = [without_commands(batch) for batch in batches]
+        batches = [without_actions(batch) for batch in batches]
     episodes = _episodes(batches)
     table, by_window = _losses(model, shards, batches, episodes, cameras, draws, seed)
     on_frames(0)  # the losses are done: the clock of the time left starts here

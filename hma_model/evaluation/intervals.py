@@ -17,13 +17,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 Floats = NDArray[np.float64]
 Episodes = Sequence[int] | NDArray[Any] | None  # (N,) which windows belong together; None: none do
 RESAMPLES, LEVELS = 1000, (2.5, 97.5)
 ANY, NATURAL, SHARE = (-math.inf, math.inf), (0.0, math.inf), (0.0, 1.0)  # what values may be
-Z95 = 1.959964  # the 97.5 % quantile of the normal distribution, and of Student's t from 1 degree of freedom
-T95 = (12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
 def resampled_means(values: NDArray[Any], seed: int = 0, episodes: Episodes = None) -> Floats:
@@ -46,15 +45,7 @@ def resampled_means(values: NDArray[Any], seed: int = 0, episodes: Episodes = No
 @lru_cache(maxsize=64)
 def _stretch(count: int) -> float:
     """Return by how much the spread of resampled means is too small for that many to draw from."""
-    return students_t(count - 1) / Z95 * math.sqrt(count / (count - 1))
-
-
-def students_t(freedom: int) -> float:
-    """Return the 97.5 % quantile of Student's t: tabled up to 9 degrees of freedom, then within 0.003."""
-    if freedom <= len(T95):
-        return T95[freedom - 1]
-    first, second = (Z95**3 + Z95) / 4, (5 * Z95**5 + 16 * Z95**3 + 3 * Z95) / 96  # Fisher and Cornish 1960
-    return Z95 + first / freedom + second / freedom**2
+    return float(stats.t.ppf(0.975, count - 1) / stats.norm.ppf(0.975)) * math.sqrt(count / (count - 1))
 
 
 @lru_cache(maxsize=8)

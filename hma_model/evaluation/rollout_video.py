@@ -29,8 +29,9 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.evaluation.evaluate import Sampling, cameras_for, rollout, shuffled, windows
-from hma_model.evaluation.losses import no_window
+from hma_model.evaluation.actions import shuffled
+from hma_model.evaluation.losses import no_window, windows
+from hma_model.evaluation.rollouts import Sampling, cameras_for, rollout
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer

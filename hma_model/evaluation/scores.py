@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from hma_data.loading.dataset import Batch
-from hma_model.evaluation.commands import shuffled, without_commands
+from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import Episodes, interval, rounded, summary
 from hma_model.evaluation.metrics import psnr, ssim
 from hma_model.evaluation.perceptual import Judge
@@ -123,7 +123,7 @@ class Rolled:
         copied = true.predicted.copy()
         copied[:, first:] = copied[:, first - 1 : first]
         others = [roll(shuffled(batch, first - 1, seed, draw), truth=true.truth) for draw in range(draws)]
-        none = roll(without_commands(batch), truth=true.truth)
+        none = roll(without_actions(batch), truth=true.truth)
         self._keep("true", [true])
         self._keep("copy", [replace(true, predicted=copied, finite=np.ones_like(true.finite))])
         self._keep("shuffled", others)

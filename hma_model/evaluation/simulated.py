@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from hma_data.lab import truth
 from hma_data.loading.dataset import Batch
-from hma_model.evaluation.commands import shuffled, without_commands
+from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, interval, rounded, summary
 from hma_model.evaluation.metrics import perplexity, psnr, teacher_forced
 from hma_model.evaluation.probe import Probe, as_seen, state_errors, train_probe
@@ -81,7 +81,7 @@ def measure_state(
     ways = {
         "true": true.predicted[:, prompt:],
         "shuffled": roll(shuffled(batch, prompt - 1, seed), truth=true.truth).predicted[:, prompt:],
-        "none": roll(without_commands(batch), truth=true.truth).predicted[:, prompt:],
+        "none": roll(without_actions(batch), truth=true.truth).predicted[:, prompt:],
         "copy": copied,
         "reconstruction": true.truth[:, prompt:],
     }

@@ -76,8 +76,8 @@ def _shown(checkpoint: Path, shards: "ShardSet") -> tuple[bytes, bytes]:
     """Return a PNG of truth and predictions over a window, and a GIF of both with the commands."""
     from hma_data.episodes.sheets import gif_bytes, grid, png_bytes
     from hma_data.shards.preview import tokenizer_of
-    from hma_model.evaluation.evaluate import cameras_for, rollout
     from hma_model.evaluation.rollout_video import rollout_video
+    from hma_model.evaluation.rollouts import cameras_for, rollout
 
     model = checkpoints.load(checkpoint, [shards.embodiment.id])
     require_tokenizer(model.config, shards.spec, shards.folder)

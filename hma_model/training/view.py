@@ -68,7 +68,8 @@ def _figures(lines: list[dict[str, Any]]) -> dict[str, list[tuple[int, float]]]:
 def _rolled(out: Path, checkpoint: Checkpoint, shards: ShardSet, window: int) -> View:
     """Return a view of one window: the truth, the prediction, and that with other actions."""
     from hma_model.checkpoint.io import load
-    from hma_model.evaluation.evaluate import cameras_for, rollout, shuffled
+    from hma_model.evaluation.actions import shuffled
+    from hma_model.evaluation.rollouts import cameras_for, rollout
 
     robot, frames = shards.embodiment, checkpoint.config.frames
     model = load(checkpoint.folder, [robot.id]).eval()

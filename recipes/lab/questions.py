@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import stats
 from what_pays import append, read
 
 from hma_data.bench import recipe_module
@@ -33,7 +34,6 @@ from hma_data.console import run_script
 from hma_data.lab.family import TRUNK
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
-from hma_model.evaluation.intervals import T95
 
 quality = recipe_module("quality")
 FRAMES, PLAIN, PROMPT, recorded = quality.FRAMES, quality.PLAIN, quality.PROMPT, quality.recorded
@@ -189,8 +189,9 @@ def _baseline(shards: ShardSet, cpu_seconds: float, seed: int) -> tuple[Any, int
 def _scores(model: Any, shards: ShardSet, row: Row) -> dict[str, Any]:
     """Return the figures of a trained model; None where one is not measured."""
     from hma_data.tokenizers.base import get_tokenizer
-    from hma_model.evaluation.evaluate import masked_val_loss, rollout, windows
+    from hma_model.evaluation.losses import masked_val_loss, windows
     from hma_model.evaluation.perceptual import Networks
+    from hma_model.evaluation.rollouts import rollout
     from hma_model.evaluation.scores import Judge, Rolled, Scores
     from hma_model.evaluation.simulated import measure_state
 
@@ -237,7 +238,9 @@ def interval(values: list[float]) -> tuple[float, float | None]:
     """Return the mean of values and half its 95 % interval; None for a single value."""
     if len(values) < 2:
         return values[0], None
-    return statistics.mean(values), T95[len(values) - 2] * statistics.stdev(values) / len(values) ** 0.5
+    return statistics.mean(values), stats.t.ppf(0.975, len(values) - 1) * statistics.stdev(values) / len(
+        values
+    ) ** 0.5
 
 
 def summary(lines: list[dict[str, Any]]) -> dict[str, dict[str, tuple[float, float | None]]]:

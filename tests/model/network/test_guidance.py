@@ -49,7 +49,7 @@ def test_a_share_of_the_windows_drops_all_commands(monkeypatch):
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
 @pytest.mark.parametrize("changes", [{}, {"masked_input": "previous"}, {"time_position": "learned"}], ids=str)
-def test_guidance_of_nothing_is_the_rollout_without_commands(kind, changes):
+def test_guidance_of_nothing_is_the_rollout_without_actions(kind, changes):
     model = small_model(kind=kind, frames=4, **changes)
     batch = small_batch(model.config, NAMES, frames=7)
     prompt = (batch.tokens if kind == "discrete" else batch.latents)[:, :2]

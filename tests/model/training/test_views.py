@@ -11,8 +11,9 @@ from hma_data.conversion.plan import Settings
 from hma_data.errors import RecipeError, UsageError
 from hma_data.shards.reader import ShardSet
 from hma_model.config import HMAConfig
-from hma_model.evaluation.evaluate import cameras_for, decode, evaluate
+from hma_model.evaluation.evaluate import evaluate
 from hma_model.evaluation.rollout_video import rollout_video
+from hma_model.evaluation.rollouts import cameras_for, decode
 from hma_model.network.model import HMA
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe

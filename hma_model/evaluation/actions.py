@@ -56,6 +56,6 @@ def gaussian(batch: Batch, stats: Mapping[str, Any], seed: int = 0) -> Batch:
     return replace(batch, actions=drawn.flatten(2), action_mask=torch.ones_like(batch.action_mask))
 
 
-def without_commands(batch: Batch) -> Batch:
+def without_actions(batch: Batch) -> Batch:
     """Return the windows with all chunks unknown."""
     return replace(batch, action_mask=torch.zeros_like(batch.action_mask))
