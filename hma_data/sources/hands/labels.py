@@ -7,25 +7,23 @@
 - `egoexo4d_hand_pose`: Ego-Exo4D's ego_pose/<split>/hand/{automatic,annotation}/<take>.json: frame number ->
   joints of one camera in pixels. A take's videos lie in a folder with the take's name.
 
-Nothing is unpickled: the instructions of EPIC-KITCHENS's files are read one by one, and only a list of byte
-strings is accepted.
+EPIC-KITCHENS's pickles are read as plain values only; nothing in them runs.
 
 R rows of a table, one a hand.
 """
 
 import json
-import pickletools
 import re
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import HandsLayout
+from hma_data.sources.common.pickles import load_plain
 from hma_data.sources.common.places import first_bytes, local_path
 from hma_data.sources.hands.runs import SIDES, HandLabels, Video, labels_from_rows
 
@@ -215,14 +213,12 @@ class EpicHands:
 
     def of(self, video: Video) -> HandLabels | None:
         """See LabelSet."""
-        from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
-
         path = self._files.get(PurePosixPath(video.name).stem)
         if path is None:
             return None
         looked_at, rows = [], []
         try:
-            for message in _byte_strings(path.read_bytes(), path):
+            for message in load_plain(path.read_bytes()):
                 frame = _message_class().FromString(message)
                 index = frame.frame_number - self._layout.frame_offset
                 looked_at.append(index)
@@ -231,31 +227,12 @@ class EpicHands:
                         box = hand.bbox
                         centre = ((box.left + box.right) / 2, (box.top + box.bottom) / 2)
                         rows.append((index, hand.side, hand.score, *centre))
-        except (ValueError, DecodeError) as fault:
-            raise EpisodeError(path, f"is damaged: {fault}", "fetch the file again") from fault
+        except Exception as fault:  # damaged bytes make pickle and protobuf raise a dozen different types
+            remedy = "fetch the file again, or write its hands as a table and set labels: landmarks"
+            raise EpisodeError(path, f"cannot be read as a list of messages: {fault}", remedy) from fault
         table = np.array(rows, np.float64).reshape(-1, 5)
         frames, sides = table[:, :2].astype(np.int64).T
         return labels_from_rows(frames, sides, table[:, 2], {"center": table[:, 3:]}, looked_at)
-
-
-def _byte_strings(content: bytes, path: Path) -> Iterator[bytes]:
-    """Yield the byte strings of a pickled list by reading its instructions; nothing in it is run."""
-    kept: dict[int, Any] = {}  # the pickle's memo: values that later instructions refer to
-    last: Any = None
-    for instruction, given, _ in pickletools.genops(content):
-        name, value = instruction.name, cast(Any, given)
-        if name in ("SHORT_BINBYTES", "BINBYTES", "BINBYTES8"):
-            last = value
-            yield value
-        elif name == "EMPTY_LIST":
-            last = None
-        elif name in ("MEMOIZE", "BINPUT", "LONG_BINPUT"):
-            kept[len(kept) if value is None else value] = last
-        elif name in ("BINGET", "LONG_BINGET") and isinstance(kept.get(value), bytes):
-            yield kept[value]
-        elif name not in ("PROTO", "FRAME", "MARK", "APPEND", "APPENDS", "STOP"):
-            fault = f"holds more than byte strings ({name}), and is not opened"
-            raise EpisodeError(path, fault, "write its hands as a table, and set labels: landmarks")
 
 
 @cache

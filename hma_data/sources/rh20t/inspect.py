@@ -9,8 +9,7 @@ from hma_data.sources.common import checks
 from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.places import local_path, unfollowed
 from hma_data.sources.common.survey import Survey, sampled
-from hma_data.sources.rh20t.scenes import Scene, scenes
-from hma_data.sources.rh20t.source import TOLD, Film
+from hma_data.sources.rh20t.scenes import TOLD, Film, Scene, scenes
 
 LENGTHS = 1_000  # most scenes whose lengths are reported
 
@@ -68,18 +67,9 @@ def _look(name: str, scene: Scene, keys: dict[str, KeyInfo], survey: Survey, pai
             film = Film(scene, camera)
             table = film.file.table
             clock = survey.times(name, camera, film.timestamps, camera=True)
-            keys.setdefault(
-                camera,
-                KeyInfo(
-                    camera,
-                    "camera",
-                    (table.height, table.width, 3),
-                    "uint8",
-                    clock.hz,
-                    codec=table.codec,
-                    count=len(table),
-                ),
-            )
+            size = (table.height, table.width, 3)
+            info = KeyInfo(camera, "camera", size, "uint8", clock.hz, codec=table.codec, count=len(table))
+            keys.setdefault(camera, info)
             indices = checks.choose(len(film.timestamps), pairs, table.keys[: len(film.timestamps)])
             for run in checks.runs(indices):
                 survey.pictures(name, camera, film.frames(run), run, table.codec)

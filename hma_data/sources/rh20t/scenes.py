@@ -11,6 +11,7 @@ T samples, A values of a sample.
 """
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Floats
+from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError
+from hma_data.sources.common.pickles import read_dict
 from hma_data.sources.common.places import leaves, local_path, nothing_there
+from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.rh20t import SCENE
 from hma_data.storage.files import read_json
-from hma_data.storage.npy_dict import read_dict
 
 NEXT = "next"  # the ending of a key: the value of the next sample
 CAMERA, TABLES, FILM, STAMPS = "cam_", "transformed", "color.mp4", "timestamps.npy"
 TASKS = "task_description.json"
+TOLD = "task_description_english"  # the field of TASKS that gives the instruction by default
 DEPTH = 4  # folders below a uri in which scenes are looked for
 MAX_WIDTH = 4096  # values of a sample
 
@@ -164,6 +168,31 @@ class Scene:
         return self._tables[name]
 
 
+class Film:
+    """A camera's Stream: the frames of its film, at the times of its timestamps.npy.
+
+    Attributes:
+        timestamps: (T,) seconds since 1970.
+        lacking: times at the end for which the film has no frame.
+
+    Raises:
+        EpisodeError: the film or its times cannot be read, or the film is longer.
+    """
+
+    def __init__(self, scene: Scene, camera: str) -> None:
+        self.file = VideoFile(scene.film(camera))
+        stamps = scene.stamps(camera)
+        self.lacking = len(stamps) - len(self.file)
+        if self.lacking < 0:
+            fault = f"has {len(self.file)} frames, {STAMPS} beside it only {len(stamps)} times"
+            raise EpisodeError(self.file.path, fault)
+        self.timestamps: Floats = stamps[: len(self.file)].astype(np.float64) / 1e3
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See Stream."""
+        return self.file.frames(indices)
+
+
 def _rows(table: dict[Any, Any], serial: str, path: Path) -> list[tuple[int, Any]]:
     """Return the samples of a camera with their timestamps, by time."""
     if serial not in table:
@@ -196,12 +225,9 @@ def _is_numeric(value: Any) -> bool:
 
 def _numbers(value: Any, path: Path, key: str, lists: bool = False) -> NDArray[Any]:
     """Return a sample's numbers as an array; a list inside a list, which could be huge, is refused."""
-    if isinstance(value, np.ndarray):
-        found = value
-    elif _is_numeric(value):
-        found = np.asarray(value)
-    else:
+    if not isinstance(value, np.ndarray) and not _is_numeric(value):
         raise EpisodeError(path, f"{key} holds {type(value).__name__} values, not numbers")
+    found = np.asarray(value)
     if found.size > MAX_WIDTH and not lists:
         raise EpisodeError(path, f"{key} has {found.size:,} values a sample, more than {MAX_WIDTH:,}")
     return found

@@ -13,34 +13,23 @@ Source: see the module `scenes`.
 """
 
 import hashlib
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hma_data.episodes.episode import Episode, Floats, Signal
-from hma_data.episodes.images import Images
-from hma_data.errors import EpisodeError, SourceError
+from hma_data.episodes.episode import Episode, Signal
+from hma_data.errors import SourceError
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values
 from hma_data.sources.common.places import file_fingerprint
-from hma_data.sources.common.video_file import VideoFile
-from hma_data.sources.rh20t.scenes import FILM, STAMPS, TABLES, Scene, scenes
+from hma_data.sources.rh20t.inspect import inspect
+from hma_data.sources.rh20t.scenes import FILM, STAMPS, TABLES, TOLD, Film, Scene, scenes
 from hma_data.storage.paths import StrPath, as_text
 
-TOLD = "task_description_english"
 SUCCESS = 2  # the lowest rating of a task that was done
 STAMP_BYTES = 16  # of timestamps.npy for a frame, of colour and of depth, about
 _KEPT = ("rating", "calib_quality", "finish_time", "calib")
-
-
-def open() -> "Rh20tSource":
-    """Return the source."""
-    return Rh20tSource()
 
 
 class Rh20tSource:
@@ -51,8 +40,6 @@ class Rh20tSource:
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""
-        from hma_data.sources.rh20t.inspect import inspect
-
         return inspect(as_text(uri), episodes)
 
     def episode_ids(self, uri: StrPath) -> list[str]:
@@ -109,29 +96,7 @@ class Rh20tSource:
         return self._found[uri]
 
 
-class Film:
-    """A camera's Stream: the frames of its film, at the times of its timestamps.npy.
-
-    Attributes:
-        timestamps: (T,) seconds since 1970.
-        lacking: times at the end for which the film has no frame.
-
-    Raises:
-        EpisodeError: the film or its times cannot be read, or the film is longer.
-    """
-
-    def __init__(self, scene: Scene, camera: str) -> None:
-        self.file = VideoFile(scene.film(camera))
-        stamps = scene.stamps(camera)
-        self.lacking = len(stamps) - len(self.file)
-        if self.lacking < 0:
-            fault = f"has {len(self.file)} frames, {STAMPS} beside it only {len(stamps)} times"
-            raise EpisodeError(self.file.path, fault)
-        self.timestamps: Floats = stamps[: len(self.file)].astype(np.float64) / 1e3
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """See Stream."""
-        return self.file.frames(indices)
+open = Rh20tSource
 
 
 def _signals(scene: Scene, vector: Vector, camera: str) -> tuple[Signal, ...]:
