@@ -7,6 +7,7 @@ Files are opened lazily in each process. Only values in the file itself are read
 files are refused, and so are sizes that no recording has.
 """
 
+import json
 import os
 import re
 from collections import Counter, OrderedDict
@@ -38,6 +39,7 @@ MAX_ROW = 1 << 28  # values of a row: more than any picture has
 MAX_DEPTH = 4  # of the groups above the episodes
 LOOKED = 8  # most groups looked into to see whether they and their like are episodes
 MIN_ENCODED = 64  # bytes a row: no picture has fewer
+TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
 MAX_KEYS = 5_000  # datasets and groups of an episode that are listed
 _EPISODE_NAME = re.compile(r"(demo|episode|ep|traj|trajectory|rollout)[_-]?\d+")
 _PART = re.compile(  # of a robot or a scene; one episode holds several
@@ -494,3 +496,12 @@ def text(value: Any) -> str:
     if isinstance(value, bytes):
         value = value.decode("utf-8", errors="replace")
     return str(value).strip().strip('"').strip("\x00").strip() if isinstance(value, str) else ""
+
+
+def json_of(holder: Any, name: str) -> dict[str, Any]:
+    """Return the mapping that an attribute holds as JSON; empty where it holds none."""
+    try:
+        value = json.loads(text(holder.attrs.get(name)))
+    except (json.JSONDecodeError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}

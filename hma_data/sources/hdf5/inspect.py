@@ -18,19 +18,20 @@ from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.places import local_path, unfollowed
 from hma_data.sources.common.survey import MAX_VALUES, Survey, listed, sampled
 from hma_data.sources.hdf5.file import (
+    TEXT_KEYS,
     WHOLE_FILE,
     EpisodeFinder,
     EpisodeGroup,
     OpenFiles,
     explained,
     is_plausible,
+    json_of,
     numbers,
     rows,
     text,
     walk,
 )
 from hma_data.sources.hdf5.pictures import as_bytes, as_rgb, encoded, picture_kind, pixels_of
-from hma_data.sources.hdf5.source import TEXT_KEYS, json_of
 from hma_data.sources.hdf5.videos import is_video, video_keys, videos_beside
 
 LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared

@@ -10,10 +10,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.images import Images
+from hma_data.episodes.episode import Floats
+from hma_data.episodes.images import Images, decode_image
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import Hdf5Layout
-from hma_data.sources.hdf5.file import rows
+from hma_data.sources.hdf5.file import EpisodeFinder, EpisodeGroup, OpenFiles, dataset, explained, rows
 
 PIXELS = {"0-1": 1.0, "0-255": 255.0, "0-65535": 65535.0}
 LEAST_SIDE = 16  # pixels: a smaller array of other numbers than uint8 is not taken for pictures
@@ -114,3 +115,57 @@ def remedy_of(found: h5py.Dataset, layout: Hdf5Layout) -> str:
     if numbers and len(shape) == 4 and 3 in (shape[1], shape[3]) and not layout.pixels:
         return f"if they are colours, set source.layout.pixels to their range: {', '.join(PIXELS)}"
     return "expected (T, H, W, 3) uint8, or encoded pictures"
+
+
+class PictureRows:
+    """A camera's Stream: the pictures of one dataset, `rows` in all.
+
+    Args:
+        finder, files: of the source; the dataset is kept open in `files`.
+        place, key: the episode, and the dataset in it.
+        layout: of the source, from the YAML.
+        times: (T,) seconds of the frames; rows after the last one are not used.
+
+    Raises:
+        EpisodeError: the dataset is missing, or holds no colour pictures.
+    """
+
+    def __init__(
+        self,
+        finder: EpisodeFinder,
+        files: OpenFiles,
+        place: EpisodeGroup,
+        key: str,
+        layout: Hdf5Layout,
+        times: Floats,
+    ) -> None:
+        self.timestamps = times
+        self._finder, self._files, self._place = finder, files, place
+        self._key, self._layout, self._where = key, layout, f"{place} {key}"
+        found = dataset(finder.group(place), key, str(place))
+        self.rows = len(found)
+        self._kind = picture_kind(found, layout)
+        if self._kind is None:
+            fault = f"{key!r} holds {found.shape} {found.dtype}, not colour pictures"
+            raise EpisodeError(place, fault, remedy_of(found, layout))
+        if self._kind == "raw":
+            axes_of(found.shape, layout, self._where)
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See Stream."""
+        with explained(self._place):
+            group = self._finder.group(self._place)
+            found = rows(self._files.cached(self._place.file, group, self._key, str(self._place)), indices)
+        if self._kind == "raw":
+            return as_rgb(
+                as_bytes(found, self._layout, self._where), axes_of(found.shape, self._layout, self._where)
+            )
+        if not len(found):
+            return np.zeros((0, 1, 1, 3), np.uint8)
+        pictures = [
+            decode_image(encoded(row), f"{self._where}[{index}]")
+            for row, index in zip(found, indices, strict=True)
+        ]
+        if len({picture.shape for picture in pictures}) > 1:
+            raise EpisodeError(self._place, f"{self._key!r} has pictures of several sizes")
+        return np.stack(pictures)

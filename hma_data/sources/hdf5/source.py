@@ -21,8 +21,6 @@ T frames of an episode, n of them asked for, H×W pixels, C channels.
 """
 
 import hashlib
-import json
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,7 +30,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Episode, Floats, Signal, Stream, rate_times
-from hma_data.episodes.images import Images, decode_image
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.components import Hdf5Layout, Vector
 from hma_data.registry.embodiment import Embodiment
@@ -40,6 +37,7 @@ from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
 from hma_data.sources.common.checks import seconds_a_unit, seconds_of
 from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.hdf5.file import (
+    TEXT_KEYS,
     WHOLE_FILE,
     EpisodeFinder,
     EpisodeGroup,
@@ -47,18 +45,18 @@ from hma_data.sources.hdf5.file import (
     dataset,
     explained,
     is_elsewhere,
+    json_of,
     member,
     numbers,
-    rows,
     text,
     walk,
 )
-from hma_data.sources.hdf5.pictures import as_bytes, as_rgb, axes_of, encoded, picture_kind, remedy_of
+from hma_data.sources.hdf5.inspect import inspect
+from hma_data.sources.hdf5.pictures import PictureRows, picture_kind
 from hma_data.sources.hdf5.videos import SUFFIXES as VIDEO_SUFFIXES
 from hma_data.sources.hdf5.videos import VideoRows, is_video, video_fingerprints, video_path
 from hma_data.storage.paths import StrPath, as_text
 
-TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
 _SPLITS = {"train": "train"} | dict.fromkeys(("valid", "val", "validation"), "val")
 
 
@@ -72,11 +70,6 @@ def layout_of(embodiment: Embodiment | None) -> Hdf5Layout:
     return layout.model_copy(update={"episodes": pattern and (pattern.strip("/") or WHOLE_FILE)})
 
 
-def open() -> "Hdf5Source":
-    """Return the source."""
-    return Hdf5Source()
-
-
 class Hdf5Source:
     """A reader of HDF5 recordings; see the module."""
 
@@ -86,14 +79,10 @@ class Hdf5Source:
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""
-        from hma_data.sources.hdf5.inspect import inspect
-
         return inspect(as_text(uri), self._finder, self._files, episodes)
 
     def inspect_as(self, uri: StrPath, embodiment: Embodiment, episodes: int = SAMPLE) -> Inspection:
         """See LaidOut."""
-        from hma_data.sources.hdf5.inspect import inspect
-
         pattern = layout_of(embodiment).episodes
         return inspect(as_text(uri), self._finder, self._files, episodes, pattern)
 
@@ -174,7 +163,7 @@ class Hdf5Source:
 
     def _pictures(
         self, place: EpisodeGroup, group: h5py.Group, key: str, layout: Hdf5Layout, times: Floats
-    ) -> "PictureRows":
+    ) -> PictureRows:
         try:
             return PictureRows(self._finder, self._files, place, key, layout, times)
         except EpisodeError as fault:
@@ -207,6 +196,9 @@ class Hdf5Source:
                 for name, found in lists
                 if isinstance(found, h5py.Dataset) and found.ndim == 1
             }
+
+
+open = Hdf5Source
 
 
 def _split_of(demo: str, masks: dict[str, set[str]]) -> str | None:
@@ -307,69 +299,3 @@ def _metadata(group: h5py.Group) -> dict[str, Any]:
         if isinstance(plain, bool | int | float) or (isinstance(plain, str) and 0 < len(plain) <= 200):
             found[name] = plain
     return found
-
-
-def json_of(holder: Any, name: str) -> dict[str, Any]:
-    """Return the mapping that an attribute holds as JSON; empty where it holds none."""
-    try:
-        value = json.loads(text(holder.attrs.get(name)))
-    except (json.JSONDecodeError, RecursionError):
-        return {}
-    return value if isinstance(value, dict) else {}
-
-
-# -- pictures
-
-
-class PictureRows:
-    """A camera's Stream: the pictures of one dataset, `rows` in all.
-
-    Args:
-        finder, files: of the source; the dataset is kept open in `files`.
-        place, key: the episode, and the dataset in it.
-        layout: of the source, from the YAML.
-        times: (T,) seconds of the frames; rows after the last one are not used.
-
-    Raises:
-        EpisodeError: the dataset is missing, or holds no colour pictures.
-    """
-
-    def __init__(
-        self,
-        finder: EpisodeFinder,
-        files: OpenFiles,
-        place: EpisodeGroup,
-        key: str,
-        layout: Hdf5Layout,
-        times: Floats,
-    ) -> None:
-        self.timestamps = times
-        self._finder, self._files, self._place = finder, files, place
-        self._key, self._layout, self._where = key, layout, f"{place} {key}"
-        found = dataset(finder.group(place), key, str(place))
-        self.rows = len(found)
-        self._kind = picture_kind(found, layout)
-        if self._kind is None:
-            fault = f"{key!r} holds {found.shape} {found.dtype}, not colour pictures"
-            raise EpisodeError(place, fault, remedy_of(found, layout))
-        if self._kind == "raw":
-            axes_of(found.shape, layout, self._where)
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """See Stream."""
-        with explained(self._place):
-            group = self._finder.group(self._place)
-            found = rows(self._files.cached(self._place.file, group, self._key, str(self._place)), indices)
-        if self._kind == "raw":
-            return as_rgb(
-                as_bytes(found, self._layout, self._where), axes_of(found.shape, self._layout, self._where)
-            )
-        if not len(found):
-            return np.zeros((0, 1, 1, 3), np.uint8)
-        pictures = [
-            decode_image(encoded(row), f"{self._where}[{index}]")
-            for row, index in zip(found, indices, strict=True)
-        ]
-        if len({picture.shape for picture in pictures}) > 1:
-            raise EpisodeError(self._place, f"{self._key!r} has pictures of several sizes")
-        return np.stack(pictures)

@@ -12,8 +12,9 @@ from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.survey import MAX_VALUES, Survey, sampled
 from hma_data.sources.common.video_file import VideoFile, frame_table
+from hma_data.sources.lerobot.films import PAIRING, frames_of_rows
 from hma_data.sources.lerobot.metadata import Feature, Metadata, Span, episode_name
-from hma_data.sources.lerobot.source import PAIRING, Rows, StillPictures, frames_of_rows, rows_of, times_of
+from hma_data.sources.lerobot.rows import Rows, StillPictures, rows_of, times_of
 
 LENGTHS = 1_000  # most lengths in the inspection
 LOOKED_FOR = 20_000  # most episodes whose files are looked for, spread over all

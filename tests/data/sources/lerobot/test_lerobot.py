@@ -133,7 +133,7 @@ def test_task_and_success_are_the_episodes_own(whole: Path) -> None:
 
 
 def test_the_index_needs_no_decoding(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hma_data.sources.lerobot.source.VideoFile", None)
+    monkeypatch.setattr("hma_data.sources.lerobot.films.VideoFile", None)
     refs = open_source("lerobot").index(str(whole), embodiment())
     assert [(ref.id, ref.frames) for ref in refs] == [(f"episode_{i:06d}", n) for i, n in enumerate(LENGTHS)]
     assert len({ref.fingerprint for ref in refs}) == 3
@@ -274,7 +274,7 @@ def test_a_run_of_more_rows_than_any_recording_is_refused(
     copy: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = copy("v2")
-    monkeypatch.setattr("hma_data.sources.lerobot.source.MAX_VALUES", 1000)
+    monkeypatch.setattr("hma_data.sources.lerobot.rows.MAX_VALUES", 1000)
     path = folder / "data/chunk-000/episode_000000.parquet"
     pq.write_table(pa.table({"episode_index": np.zeros(1001, np.int64)}), path)
     with pytest.raises(EpisodeError, match=r"'episode_index' claims 1,001 values of 1,001 rows"):

@@ -1,0 +1,207 @@
+"""Read the rows of an episode from the parquet files of a LeRobotDataset, columns of pictures among them.
+
+T rows of an episode.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from hma_data.episodes.episode import Floats, rate_times
+from hma_data.episodes.images import Images, decode_image
+from hma_data.errors import EpisodeError
+from hma_data.sources.lerobot.metadata import Folder, Metadata, parquet_explained
+
+MAX_BYTES = 1 << 30  # of one column of a row group, as stored
+MAX_VALUES = 1 << 26  # of such a column: a run of equal values may be stored as one value
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows of one episode in a parquet file.
+
+    Attributes:
+        path: of the file.
+        columns: names of all columns of the file.
+        places: (T, 2) row group and row within it.
+    """
+
+    path: Path
+    columns: tuple[str, ...]
+    places: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def column(self, key: str) -> pa.Array:
+        """Return one column over the episode.
+
+        Raises:
+            EpisodeError: the file has no such column, or cannot be read.
+        """
+        self.check(key)
+        with parquet_explained(self.path, EpisodeError):
+            parts = [
+                _column_of_group(self.path, _changed(self.path), int(group), key).take(
+                    self.places[self.places[:, 0] == group, 1]
+                )
+                for group in np.unique(self.places[:, 0])
+            ]
+            return pa.concat_arrays(parts)
+
+    def check(self, key: str) -> None:
+        """Raise an EpisodeError where the file has no such column."""
+        if key not in self.columns:
+            raise EpisodeError(self.path, f"has no column {key!r}", f"it has {', '.join(self.columns)}")
+
+    def numbers(self, key: str) -> NDArray[Any]:
+        """Return a column of numbers, (T,) or (T, …).
+
+        Raises:
+            EpisodeError: values are missing, of several widths, or no numbers.
+        """
+        values, shape = self.column(key), [len(self)]
+        with parquet_explained(self.path, EpisodeError):
+            while _is_list(values.type):
+                self._complete(values, key)
+                widths = pc.unique(pc.list_value_length(values)).to_pylist()
+                if len(widths) != 1 or not widths[0]:
+                    raise EpisodeError(self.path, f"{key!r} holds lists of {sorted(widths)} values")
+                shape.append(widths[0])
+                values = values.flatten()
+            self._complete(values, key)
+            kind = values.type
+            if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+                raise EpisodeError(self.path, f"{key!r} holds {kind}, not numbers")
+            numbers: NDArray[Any] = values.to_numpy(zero_copy_only=False).reshape(shape)
+            return numbers
+
+    def _complete(self, values: pa.Array, key: str) -> None:
+        if values.null_count:
+            raise EpisodeError(self.path, f"{key!r} has {values.null_count} missing values")
+
+
+def rows_of(meta: Metadata, index: int) -> Rows:
+    """Return the rows of an episode, found by `episode_index`.
+
+    Raises:
+        EpisodeError: the file is missing or damaged, or has no such rows.
+    """
+    path = meta.folder.path(meta.data_path(index))
+    with parquet_explained(path, EpisodeError):
+        with pq.ParquetFile(path) as file:
+            columns = tuple(file.schema_arrow.names)
+            metadata = file.metadata
+        places = [np.zeros((0, 2), np.int64)]
+        for group in range(metadata.num_row_groups):
+            if not _may_hold(metadata.row_group(group), index):
+                continue
+            stored = _column_of_group(path, _changed(path), group, "episode_index")
+            within = np.flatnonzero(stored.to_numpy(zero_copy_only=False) == index)
+            places.append(np.stack([np.full(len(within), group), within], axis=1))
+        placed = np.concatenate(places)
+        if not len(placed):
+            raise EpisodeError(path, f"has no rows of episode {index}", "the dataset is not complete")
+        return Rows(path, columns, placed)
+
+
+def _may_hold(held: Any, index: int) -> bool:
+    """Check by its statistics whether a row group can hold rows of the episode."""
+    for i in range(held.num_columns):
+        column = held.column(i)
+        if column.path_in_schema == "episode_index" and column.statistics and column.statistics.has_min_max:
+            return bool(column.statistics.min <= index <= column.statistics.max)
+    return True
+
+
+@lru_cache(maxsize=8)  # version 3: the episodes of a file come one after the other
+def _column_of_group(path: Path, changed: int, group: int, key: str) -> pa.Array:
+    return _read(path, group, key)
+
+
+def _changed(path: Path) -> int:
+    return path.stat().st_mtime_ns
+
+
+def _read(path: Path, group: int, key: str) -> pa.Array:
+    """Return a whole column of a row group, if its size is plausible for a recording."""
+    with pq.ParquetFile(path) as file:
+        held = file.metadata.row_group(group)
+        columns = [held.column(i) for i in range(held.num_columns)]
+        parts = [item for item in columns if item.path_in_schema.startswith(key)]
+        size = max((item.total_uncompressed_size for item in parts), default=0)
+        values = max((item.num_values for item in parts), default=0)
+        if size > MAX_BYTES or max(values, held.num_rows) > MAX_VALUES:
+            fault = f"{key!r} claims {values:,} values of {held.num_rows:,} rows in {size:,} bytes"
+            raise EpisodeError(path, fault, "the file may be damaged")
+        column = file.read_row_group(group, [key], use_threads=False).column(key).combine_chunks()
+    column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    # Another library may have registered a type for matrices: its storage is plain lists.
+    return column.storage if isinstance(column, pa.ExtensionArray) else column
+
+
+def _is_list(kind: Any) -> bool:
+    return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))
+
+
+def times_of(rows: Rows, fps: float) -> Floats:
+    """Return the times (T,) of an episode's rows in seconds; at the rate where they state none."""
+    if "timestamp" not in rows.columns:
+        return rate_times(len(rows), fps)
+    times = rows.numbers("timestamp").reshape(len(rows), -1)[:, 0].astype(np.float64)
+    if not np.isfinite(times).all():
+        raise EpisodeError(rows.path, "has timestamps that are not finite")
+    return times
+
+
+class StillPictures:
+    """A Stream of pictures stored in a parquet column, as bytes or as the path of a file."""
+
+    def __init__(self, rows: Rows, key: str, timestamps: Floats, folder: Folder) -> None:
+        rows.check(key)
+        self.timestamps = timestamps
+        self._rows, self._key, self._folder = rows, key, folder
+        self._held: tuple[int, pa.Array] | None = None
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See Stream."""
+        pictures = [decode_image(self._bytes(int(index)), self._where(int(index))) for index in indices]
+        if len({picture.shape for picture in pictures}) > 1:
+            raise EpisodeError(self._rows.path, f"{self._key!r} has pictures of several sizes")
+        return np.stack(pictures) if pictures else np.zeros((0, 1, 1, 3), np.uint8)
+
+    def codec(self) -> str | None:
+        """Return png or jpeg, from the first picture; None for anything else."""
+        start = self._bytes(0)[:4]
+        return "png" if start == b"\x89PNG" else "jpeg" if start[:2] == b"\xff\xd8" else None
+
+    def _where(self, index: int) -> str:
+        return f"{self._rows.path} {self._key}[{index}]"
+
+    def _bytes(self, index: int) -> bytes:
+        group, within = (int(place) for place in self._rows.places[index])
+        with parquet_explained(self._rows.path, EpisodeError):
+            if self._held is None or self._held[0] != group:
+                self._held = group, _read(self._rows.path, group, self._key)
+            value = self._held[1][within].as_py()
+        if isinstance(value, dict):
+            value = value.get("bytes") or value.get("path")
+        if isinstance(value, str):
+            return self._file(value, self._where(index))
+        if not isinstance(value, bytes):
+            raise EpisodeError(self._where(index), "holds no picture")
+        return value
+
+    def _file(self, relative: str, where: str) -> bytes:
+        try:
+            return self._folder.path(relative).read_bytes()
+        except OSError as fault:
+            raise EpisodeError(where, f"its picture {relative!r} cannot be read: {fault.strerror}") from fault
