@@ -28,7 +28,6 @@ LAG_S = 0.2  # delay of the pusher's spring (k_v / k_p of the environment) behin
 SPEED = 300.0  # px/s of planned motion
 PLACED_PX = 4.0  # mean distance of the T's corners from the goal at which a driver that looks has done
 STARTS = ("near", "random", "near", "far", "near")
-PLAY = ("random", "near", "random", "far", "random")
 EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps; episodes are a minute apart
 
 
@@ -42,39 +41,26 @@ class Look(NamedTuple):
 
 
 FAST_LOOK = Look(128, "LightSlateGray", "RoyalBlue", "RoyalBlue")
-PLAY_LOOK = FAST_LOOK._replace(size=96)
 SLOW_LOOK = Look(96, "Peru", "Crimson", "DodgerBlue")
 FAST_STEPS, SLOW_TICKS = 80, 720
 CAMERA_TICKS, COMMAND_TICKS = 8, 20  # of pusht_slow: from one picture, and one command, to the next
 FAST_PERIOD_S = 0.1
-NOISE, HELD = (0.1, 0.25, 0.5, 0.75, 1.0), 4  # shares of random targets, and control steps that each is held
+HELD = 4  # control steps for which a random target is held
 LEAST_S, REST_S = 4.0, 0.6  # shortest episode, and time recorded after success
 
 
 def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
     """Record `pusht_fast` as a file of robomimic's layout, `pusht_slow` as a folder of MCAP files."""
     if robot == "pusht_fast":
-        _write_fast(part, (_fast_demo(seed, episode) for episode in episodes))
+        write_fast(part, (fast_demo(seed, episode) for episode in episodes))
     else:
         part.mkdir()
         for episode in episodes:
             _slow_bag(part / f"episode_{episode:04d}.mcap", seed, episode)
 
 
-def record_noisy(part: Path, episodes: Iterable[int], seed: int) -> None:
-    """Record `pusht_fast` with another share of NOISE of random targets in each episode, to HDF5.
-
-    So a world model also sees what bad policies do.
-    """
-    _write_fast(part, (_fast_demo(seed, n, NOISE[n // len(STARTS) % len(NOISE)]) for n in episodes))
-
-
-def record_play(part: Path, episodes: Iterable[int], seed: int) -> None:
-    """Record `pusht_fast` at 96 px, as gym-pusht's own recordings are, to HDF5; most episodes wander."""
-    _write_fast(part, (_fast_demo(seed, n, look=PLAY_LOOK, starts=PLAY) for n in episodes), PLAY_LOOK)
-
-
-def _write_fast(part: Path, demos: Iterable[Demo], look: Look = FAST_LOOK) -> None:
+def write_fast(part: Path, demos: Iterable[Demo], look: Look = FAST_LOOK) -> None:
+    """Write episodes of `pusht_fast` as a file of robomimic's layout."""
     kwargs = {"observation_width": look.size, "observation_height": look.size}
     env_args = {"env_name": "gym_pusht/PushT-v0", "type": 2, "env_kwargs": kwargs}
     write_hdf5(part, demos, env_args)
@@ -241,9 +227,10 @@ def tee() -> Tee:
     return Arena(FAST_LOOK, "far", np.random.default_rng(0)).tee
 
 
-def _fast_demo(
+def fast_demo(
     seed: int, episode: int, noise: float = 0.0, look: Look = FAST_LOOK, starts: tuple[str, ...] = STARTS
 ) -> Demo:
+    """Simulate an episode of `pusht_fast`; `noise` is the share of its targets that are random."""
     dice, target = np.random.default_rng((seed, 2, episode)), None
     robot = FastPusher(seed, episode, look, starts)
     arena, drive = robot.arena, robot.driver()

@@ -16,6 +16,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import google_crc32c
 import h5py
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from numpy.typing import NDArray
 from hma_data.lab import imported
 from hma_data.registry.embodiment import Embodiment
 from hma_data.registry.export import lerobot_features
-from hma_data.sources.rlds.records import masked_crc
 
 DISTRO = "jazzy"  # of ROS
 _CORE = "tensorflow_datasets.core.features"
@@ -198,7 +198,13 @@ def _varint(value: int) -> bytes:
 
 def _record(data: bytes) -> bytes:
     length = struct.pack("<Q", len(data))
-    return length + struct.pack("<I", masked_crc(length)) + data + struct.pack("<I", masked_crc(data))
+    return length + _masked_crc(length) + data + _masked_crc(data)
+
+
+def _masked_crc(data: bytes) -> bytes:
+    """Return TFRecord's checksum: CRC-32C rotated right by 15 bits, with a constant added."""
+    crc = google_crc32c.value(data)
+    return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)
 
 
 # -- LeRobot

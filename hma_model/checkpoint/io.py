@@ -102,36 +102,6 @@ def save(
     return Checkpoint.open(folder)
 
 
-def save_like(
-    model: "HMA",
-    folder: StrPath,
-    like: Checkpoint,
-    cards: Mapping[str, dict[str, Any]] | None = None,
-    half: bool = False,
-) -> Checkpoint:
-    """Write a model with the YAML, statistics and cards of a checkpoint of the same embodiments.
-
-    Args:
-        model: has exactly the embodiments of `like`.
-        folder: as of `save`.
-        like: the checkpoint.
-        cards: other cards than its own.
-        half: as of `save`.
-
-    Raises:
-        CheckpointError: as `save`.
-    """
-    robots = like.embodiments
-    return save(
-        model,
-        folder,
-        embodiment_yaml={name: like.embodiment(name).to_yaml() for name in robots},
-        stats={name: like.stats(name) for name in robots},
-        cards=cards or {name: like.card(name) for name in robots},
-        half=half,
-    )
-
-
 def load(folder: StrPath, embodiments: Iterable[str] | None = None, device: str = "cpu") -> "HMA":
     """Return the model of a checkpoint with the chosen embodiments; read nothing else.
 

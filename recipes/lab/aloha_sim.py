@@ -19,9 +19,9 @@ follow lines, and inverse kinematics give the joints.
 """
 
 import numpy as np
+import recorder
 
 from hma_data.console import run_script
-from hma_data.lab import recorder
 
 SIZE, SHADOWS = 128, 1024  # pixels: the side of the pictures, and of the map of shadows
 SIDES = ("left", "right")

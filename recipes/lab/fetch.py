@@ -21,9 +21,9 @@ The physics, the look and the success are the environment's; the camera is neare
 """
 
 import numpy as np
+import recorder
 
 from hma_data.console import run_script
-from hma_data.lab import recorder
 
 SIZE = 128  # pixels: the side of the pictures
 NEARER = {"distance": 1.25, "azimuth": 145.0, "elevation": -25.0, "lookat": np.array([1.3, 0.75, 0.5])}

@@ -26,9 +26,9 @@ by steps. The tasks take turns.
 import logging
 
 import numpy as np
+import recorder
 
 from hma_data.console import run_script
-from hma_data.lab import recorder
 
 SIZE = 128  # pixels: the side of the pictures
 TASKS = {"Lift": "lift the red cube", "Stack": "stack the red cube on the green one"}

@@ -16,12 +16,35 @@ ours was trained.
 """
 
 import argparse
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
 from hma_data.console import run_script
 from hma_data.lab import pusht
 from hma_data.storage.files import part_of
+
+NOISE = (0.1, 0.25, 0.5, 0.75, 1.0)  # shares of random targets
+PLAY_LOOK = pusht.FAST_LOOK._replace(size=96)
+PLAY_STARTS = ("random", "near", "random", "far", "random")
+
+
+def record_noisy(part: Path, episodes: Iterable[int], seed: int) -> None:
+    """Record each group of episodes with another share of random targets.
+
+    So a world model also sees what bad policies do.
+    """
+
+    def share(episode: int) -> float:
+        return NOISE[episode // len(pusht.STARTS) % len(NOISE)]
+
+    pusht.write_fast(part, (pusht.fast_demo(seed, episode, share(episode)) for episode in episodes))
+
+
+def record_play(part: Path, episodes: Iterable[int], seed: int) -> None:
+    """Record at 96 px, as gym-pusht's own recordings are; most episodes wander."""
+    demos = (pusht.fast_demo(seed, episode, look=PLAY_LOOK, starts=PLAY_STARTS) for episode in episodes)
+    pusht.write_fast(part, demos, PLAY_LOOK)
 
 
 def main() -> None:
@@ -36,8 +59,8 @@ def main() -> None:
     planned = partial(pusht.record, robot="pusht_fast")
     for name, record, count, seed in (
         ("planned", planned, given.planned, given.seed),
-        ("noisy", pusht.record_noisy, given.noisy, given.seed + 4),
-        ("play", pusht.record_play, given.play, given.seed + 8),
+        ("noisy", record_noisy, given.noisy, given.seed + 4),
+        ("play", record_play, given.play, given.seed + 8),
     ):
         file = given.out / name / "pusht_fast.hdf5"
         if count and not file.exists():

@@ -34,7 +34,7 @@ docs/results-log.md has the figures.
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -45,14 +45,22 @@ from hma_data.lab import family, record, whole
 from hma_data.lab.writers import LeRobotEpisode, write_lerobot
 
 ROBOT, SEED = "mover_04", 51
+REACH_S = 2.0  # of an episode
 CAMERA, SIDE = "observation.images.top", 64  # px of the pictures for lerobot, so that a CPU can train on them
+
+
+def record_reaching(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
+    """Record episodes in which the robot goes to the nearest block, to HDF5: what a policy can learn."""
+    body = family.Body.of(robot)
+    demos = (family.episode(body, seed, number, family.Reacher(body), REACH_S) for number in episodes)
+    family.write_file(part, body, demos)
 
 
 def reaches(count: int) -> Iterator[LeRobotEpisode]:
     """Yield the recorded reaches as episodes for lerobot."""
     body = family.Body.of(ROBOT)
     for number in range(count):
-        demo = family.episode(body, SEED, number, family.Reacher(body), family.REACH_S)
+        demo = family.episode(body, SEED, number, family.Reacher(body), REACH_S)
         pictures = [
             cv2.resize(one, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for one in demo.observations["image"]
         ]
@@ -73,7 +81,7 @@ def main() -> None:
     final = given.out / "reach.hdf5"
     if not final.exists():
         with whole(final) as part:
-            family.record_reaching(part, ROBOT, range(given.reaches), SEED)
+            record_reaching(part, ROBOT, range(given.reaches), SEED)
     print(f"{final}: {given.reaches} episodes")
     final = given.out / f"{ROBOT}.hdf5"
     if not final.exists():

@@ -25,9 +25,9 @@ down. A command is held for four steps of the environment; the experts move at 0
 import warnings
 
 import numpy as np
+import recorder
 
 from hma_data.console import run_script
-from hma_data.lab import recorder
 
 SIZE, SHADOWS = 128, 1024  # pixels: the side of the pictures, and of the map of shadows
 NEARER = (0.75, 0.075, 0.7)  # the camera's place, as for LeRobot's metaworld_mt50

@@ -8,9 +8,10 @@ The weights stay as they are. Only do this where most tokens stay the same; then
 import argparse
 from pathlib import Path
 
+from save_like import save_like
+
 from hma_data.console import run_script
 from hma_data.tokenizers.base import get_tokenizer
-from hma_model.checkpoint import io
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.network.model import HMA
 
@@ -27,7 +28,7 @@ def main() -> None:
     if (spec.grid, tuple(spec.factored or ())) != (model.config.grid, model.config.factored):
         parser.error(f"{given.tokenizer} has other tokens than {given.checkpoint}")
     model.config = model.config.replace(tokenizer=spec.to_json())
-    io.save_like(model, given.out, stored)
+    save_like(model, given.out, stored)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import argparse
 from pathlib import Path
 
 import torch
+from save_like import save_like
 from torch import Tensor
 
 from hma_data.console import run_script
@@ -42,7 +43,7 @@ def main() -> None:
     large.load_trunk(grown(small.trunk_state(), config.layers, given.layers), stored.trunk())
     for name in stored.embodiments:
         io.add_embodiment(large, stored, name)
-    io.save_like(large, given.out, stored)
+    save_like(large, given.out, stored)
 
 
 def sources(before: int, after: int) -> list[tuple[int, bool]]:

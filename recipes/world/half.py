@@ -7,6 +7,8 @@ import argparse
 import shutil
 from pathlib import Path
 
+from save_like import save_like
+
 from hma_data.console import run_script
 from hma_model.checkpoint import io
 from hma_model.checkpoint.folder import SHOWN, Checkpoint
@@ -20,7 +22,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     given = parser.parse_args()
     stored = Checkpoint.open(located(given.checkpoint)[0])
-    made = io.save_like(io.load(stored.folder), given.out, stored, half=True)
+    made = save_like(io.load(stored.folder), given.out, stored, half=True)
     for name in stored.embodiments:
         for part in SHOWN:
             shown = stored.folder / "embodiments" / name / part

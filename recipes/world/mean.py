@@ -11,10 +11,10 @@ import argparse
 from pathlib import Path
 
 import torch
+from save_like import save_like
 
 from hma_data.console import run_script
 from hma_data.shards.reader import ShardSet
-from hma_model.checkpoint import io
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.evaluation.losses import validation_losses, windows
 from hma_model.network.model import HMA
@@ -52,7 +52,7 @@ def main() -> None:
         losses, accuracy = (one.by_embodiment() for one in validation_losses(after.eval(), found))
         for name, loss in losses.items():
             cards[name]["metrics"] = {"val_loss": loss, "accuracy": accuracy[name]}
-    io.save_like(after, given.out, stored, cards)
+    save_like(after, given.out, stored, cards)
 
 
 if __name__ == "__main__":

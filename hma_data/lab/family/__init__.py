@@ -25,7 +25,8 @@ from hma_data.lab.family.world import World, start
 from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mcap
 from hma_data.registry.embodiment import Embodiment
 
-SECONDS, REACH_S, MOVED = 8.0, 2.0, 5.0  # of an episode; of a reach; for success
+SECONDS = 8.0  # of an episode
+MOVED = 5.0  # px that a block moves in a success
 TRUNK: tuple[str, ...] = (
     "arm1_02", "arm1_03", "arm2_02", "arm2_07", "arm2_12", "arm2_50", "arm3_01", "arm3_04",
     "arm3_08", "arm3_11", "arm4_01", "arm4_04", "mover_02", "mover_04", "mover_06", "mover_10",
@@ -47,7 +48,7 @@ def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
     """Record a robot as a file of robomimic's layout, or as a folder of MCAP files; see `hma_data.lab`."""
     body = Body.of(robot)
     if not _in_bags(robot):
-        _write_file(part, body, (episode(body, seed, number) for number in episodes))
+        write_file(part, body, (episode(body, seed, number) for number in episodes))
         return
     part.mkdir()
     for number in episodes:
@@ -157,15 +158,8 @@ def _write_bag(path: Path, body: Body, seed: int, number: int) -> None:
     write_mcap(path, messages, {"robot": body.name, **facts})
 
 
-def record_reaching(
-    part: Path, robot: str, episodes: Iterable[int], seed: int, seconds: float = REACH_S
-) -> None:
-    """Record episodes in which the robot goes to the nearest block, to HDF5: what a policy can learn."""
-    body = Body.of(robot)
-    _write_file(part, body, (episode(body, seed, n, Reacher(body), seconds) for n in episodes))
-
-
-def _write_file(part: Path, body: Body, demos: Iterable[Demo]) -> None:
+def write_file(part: Path, body: Body, demos: Iterable[Demo]) -> None:
+    """Write episodes as a file of robomimic's layout."""
     env_args = {"env_name": body.name, "type": 2, "env_kwargs": {"control_freq": body.hz}}
     write_hdf5(part, demos, env_args)
 

@@ -19,11 +19,14 @@ from rosbags.highlevel import AnyReader
 from hma_data.errors import MissingDependencyError, OutputError, UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
-from hma_data.lab.pusht import HELD, PLAY, SLOW_LOOK, Arena, record_noisy, record_play
+from hma_data.lab.pusht import HELD, SLOW_LOOK, Arena
 from hma_data.lab.tee_table import TeeTable
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.storage.paths import shipped
+
+sys.path.insert(0, str(shipped("recipes") / "lab"))
+from pushes import PLAY_STARTS, record_noisy, record_play  # type: ignore[import-not-found]
 
 EPISODES = 5
 
@@ -123,7 +126,7 @@ def test_play_is_recorded_at_the_size_of_gym_pusht(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "play.hdf5") as file:
         demos = [file[f"data/demo_{number}"] for number in range(2)]
         assert [demo["obs/image"].shape[1:] for demo in demos] == [(96, 96, 3)] * 2
-        assert [demo.attrs["start"] for demo in demos] == [*PLAY[:2]]
+        assert [demo.attrs["start"] for demo in demos] == [*PLAY_STARTS[:2]]
         assert '"observation_width": 96' in file["data"].attrs["env_args"]
 
 

@@ -13,14 +13,22 @@ import pytest
 
 from hma_data.conversion.job import convert
 from hma_data.errors import Interrupted, OutputError
-from hma_data.lab.formats import Recorded
-from hma_data.lab.recorder import STYLES, main, record_copy, record_episode, record_simulator
 from hma_data.registry.embodiment import find
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
 from hma_data.storage.paths import shipped
 from tests.conftest import BlockTokenizer
+
+sys.path.insert(0, str(shipped("recipes") / "lab"))
+from recorder import (  # type: ignore[import-not-found]
+    STYLES,
+    Recorded,
+    main,
+    record_copy,
+    record_episode,
+    record_simulator,
+)
 
 RECIPES = {"fetch": "Fetch", "panda": "Panda", "sawyer": "Sawyer", "aloha_sim": "Aloha"}
 EPISODES, SEED = 5, 3

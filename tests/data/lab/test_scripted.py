@@ -1,5 +1,7 @@
 """Drivers from a state: the recorder's own commands from the true one, and states found off places."""
 
+import sys
+
 import h5py
 import numpy as np
 import pytest
@@ -8,6 +10,10 @@ from hma_data.lab import family, planar_arm, pusht, truth
 from hma_data.lab.family.mechanisms import wrapped
 from hma_data.lab.scripted import driver, reacher, seen_state, state_of, steerable
 from hma_data.lab.simulator import LabSimulator
+from hma_data.storage.paths import shipped
+
+sys.path.insert(0, str(shipped("recipes") / "lab"))
+from reaching import record_reaching  # type: ignore[import-not-found]
 
 ROBOTS = ("rails_03", "arm2_07", "mover_10", "planar_arm")
 
@@ -98,7 +104,7 @@ def test_a_reach_ends_at_the_block_that_lay_nearest(robot: str) -> None:
 
 
 def test_recorded_reaches_are_those_of_the_driver(tmp_path) -> None:
-    family.record_reaching(tmp_path / "a.hdf5", "mover_04", range(2), 5)
+    record_reaching(tmp_path / "a.hdf5", "mover_04", range(2), 5)
     with h5py.File(tmp_path / "a.hdf5") as file:
         actions = file["data/demo_1/actions"][:]
     world, drive = family.start(family.Body.of("mover_04"), 5, 1)[0], reacher("mover_04")

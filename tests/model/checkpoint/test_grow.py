@@ -1,6 +1,7 @@
 """The recipe that gives a checkpoint more layers."""
 
 import runpy
+import sys
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from hma_model.checkpoint import io
 from hma_model.checkpoint.folder import Checkpoint
 from tests.model.robots import CONFIG, make_model, save
 
+sys.path.insert(0, str(shipped("recipes") / "world"))
 GROW = runpy.run_path(str(shipped("recipes") / "world" / "grow.py"))
 SHARED = {"shared_modulation": True, "modulation_out": "trunk"}
 

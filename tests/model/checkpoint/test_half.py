@@ -1,6 +1,7 @@
 """Checkpoints in float16."""
 
 import runpy
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from hma_model.checkpoint.folder import README, SAMPLE, STEM, TRUNK, Checkpoint
 from hma_model.network.model import HMA
 from tests.model.robots import make_model, save
 
+sys.path.insert(0, str(shipped("recipes") / "world"))
 HALF = runpy.run_path(str(shipped("recipes") / "world" / "half.py"))["main"]
 
 

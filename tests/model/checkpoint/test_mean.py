@@ -1,6 +1,7 @@
 """The recipe that averages two checkpoints."""
 
 import runpy
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from hma_model.checkpoint.folder import Checkpoint
 from hma_model.network.model import HMA
 from tests.model.robots import CONFIG, save, stats, yaml
 
+sys.path.insert(0, str(shipped("recipes") / "world"))
 MAIN = runpy.run_path(str(shipped("recipes") / "world" / "mean.py"))["main"]
 
 

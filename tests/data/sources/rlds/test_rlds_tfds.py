@@ -1,6 +1,7 @@
 """RLDS folders written by TensorFlow Datasets itself: what we read equals what it reads."""
 
 import json
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -9,11 +10,14 @@ import numpy as np
 import pytest
 
 from hma_data.errors import EpisodeError
-from hma_data.lab.formats import Recorded, as_rlds
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.sources.rlds.features import Steps
 from hma_data.sources.rlds.folder import open_folder
+from hma_data.storage.paths import shipped
+
+sys.path.insert(0, str(shipped("recipes") / "lab"))
+from recorder import Recorded, as_rlds  # type: ignore[import-not-found]
 
 pytestmark = pytest.mark.slow
 RLDS = open_source("rlds")
