@@ -1,6 +1,7 @@
 """Fixtures shared by all tests."""
 
 import os
+import shutil
 from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.cpu import take_ordinary_priority
 from hma_data.registry.embodiment import Embodiment
 from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
@@ -139,12 +142,34 @@ def toy_arm() -> Embodiment:
     return Embodiment.from_yaml(ARM_YAML)
 
 
-@pytest.fixture
-def toy_recording(tmp_path: Path) -> Path:
-    """Twelve episodes of 20 to 31 frames; the picture's brightness is episode and frame, the action too."""
-    path = tmp_path / "toy.hdf5"
+@pytest.fixture(scope="session")
+def toy_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve episodes of 20 to 31 frames; the image's brightness is episode and frame, the action too."""
+    path = tmp_path_factory.mktemp("toy") / "toy.hdf5"
     write_toy(path, range(20, 32))
     return path
+
+
+@pytest.fixture
+def toy_recording(toy_file: Path, tmp_path: Path) -> Path:
+    """A copy of that file, which a test may change."""
+    return Path(shutil.copy(toy_file, tmp_path))
+
+
+SMALL = Settings(val_fraction=0.2, shard_frames=60)  # several shards of each split
+
+
+def convert_toy(
+    arm: Embodiment, recording: Path | str, out: Path | str, settings: Settings = SMALL, **options: Any
+) -> Any:
+    """Convert a recording with the block tokenizer; returns what `convert` returns."""
+    return convert(arm, str(recording), BlockTokenizer(), out, settings=settings, **options)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of every file in a folder, by path."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def write_toy(path: Path, lengths: Iterable[int]) -> None:

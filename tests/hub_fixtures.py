@@ -1,6 +1,6 @@
 """Fixtures of the tests that speak to a hub: `pytest_plugins = ["tests.hub_fixtures"]`.
 
-A module that defines `token` or `source` itself gets the others made from its own.
+`published` needs the model's `source`. A module may define `token` or `source` itself.
 """
 
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.hub_server import Hub, connect, serve
-from tests.hub_state import REPO, ROBOTS, TOKEN
+from tests.hub_state import REPO, TOKEN
 
 
 @pytest.fixture
@@ -28,16 +28,6 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, token: str) -> Itera
         connect(monkeypatch, made, tmp_path / "cache", token)
         yield made
         close_session()
-
-
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A checkpoint of ROBOTS."""
-    from tests.model.robots import save
-
-    folder = tmp_path_factory.mktemp("source") / "model"
-    save(folder, ROBOTS)
-    return folder
 
 
 @pytest.fixture

@@ -1,9 +1,21 @@
-"""Settings that the tests of this folder share."""
+"""Fixtures of the model's tests: shards, a recipe, a run and a checkpoint that are made once in a session.
 
-from collections.abc import Iterator
+What a session shares is read only. `folder` is a copy that a test may change.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 import torch
+
+from hma_model.training.loop import TrainResult, train
+from hma_model.training.recipe import Recipe, make_recipe
+from tests.hub_state import ROBOTS
+from tests.model.robots import save
+from tests.model.runs import TINY
+from tests.model.shards import make_shards
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -13,3 +25,52 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def arm_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six episodes of a robot of two action dims; the last one is held out."""
+    return make_shards(tmp_path_factory.mktemp("shards") / "arm", "arm")
+
+
+@pytest.fixture(scope="session")
+def hand_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same of a robot of three action dims."""
+    return make_shards(tmp_path_factory.mktemp("shards") / "hand", "hand", dims=3, seed=1)
+
+
+@pytest.fixture(scope="session")
+def data(arm_shards: Path, hand_shards: Path) -> list[str]:
+    """Both shard sets, as a recipe names them."""
+    return [str(arm_shards), str(hand_shards)]
+
+
+@pytest.fixture
+def recipe(data: list[str]) -> Callable[..., Recipe]:
+    """Make a tiny recipe of the module's `data` with some keys changed."""
+
+    def changed(**changes: object) -> Recipe:
+        return make_recipe({**TINY, "data": data, **changes})
+
+    return changed
+
+
+@pytest.fixture(scope="session")
+def tiny_run(data: list[str], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
+    """Six steps on both robots."""
+    recipe = make_recipe({**TINY, "data": data, "model": {**TINY["model"], "mup": True, "base_width": 8}})
+    return train(recipe, out=tmp_path_factory.mktemp("tiny") / "run", show=False)
+
+
+@pytest.fixture(scope="session")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An untrained checkpoint of two robots, `arm` and `hand`."""
+    folder = tmp_path_factory.mktemp("source") / "model"
+    save(folder, ROBOTS)
+    return folder
+
+
+@pytest.fixture
+def folder(source: Path, tmp_path: Path) -> Path:
+    """A copy of that checkpoint."""
+    return Path(shutil.copytree(source, tmp_path / "model"))

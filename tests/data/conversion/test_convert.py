@@ -18,15 +18,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
-from tests.conftest import BlockTokenizer, write_toy
-
-SMALL = Settings(val_fraction=0.2, shard_frames=60)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
-    }
+from tests.conftest import SMALL, BlockTokenizer, contents, write_toy
 
 
 def run(

@@ -15,13 +15,13 @@ import pytest
 from hma_data.conversion.engines import Limits, Retry
 from hma_data.conversion.engines.ray import UV_ENVIRONMENT, import_ray
 from hma_data.conversion.job import convert
-from hma_data.conversion.plan import Settings
 from hma_data.errors import HMAError, MissingDependencyError, TokenizerError
+from tests.conftest import SMALL as SETTINGS
+from tests.conftest import contents
 from tests.data.conversion.test_engines import PLAIN, MakeWork, Unit
 
 on_a_cluster = pytest.mark.slow
 LIMITS = Limits(quiet_s=5, kills=4)
-SETTINGS = Settings(val_fraction=0.2, shard_frames=60)
 ROOT = Path(__file__).parents[3]
 
 
@@ -186,10 +186,6 @@ def whole(toy_arm, toy_recording, tmp_path: Path) -> dict[str, bytes]:
     return contents(tmp_path / "whole")
 
 
-def contents(out: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
-
-
 @on_a_cluster
 def test_the_bytes_are_those_of_the_local_engine(
     cluster, toy_arm, toy_recording, tmp_path: Path, whole: dict[str, bytes]
@@ -205,8 +201,7 @@ import ray
 import hma_data.conversion.job as conversion
 from hma_data.registry.embodiment import Embodiment
 from hma_data.conversion.engines import Limits
-from tests.conftest import ARM_YAML
-from tests.data.conversion.test_engine_ray import SETTINGS
+from tests.conftest import ARM_YAML, SMALL as SETTINGS
 from tests.data.conversion.test_ray_actor import Slow
 
 make_work = conversion.MakeWork

@@ -22,17 +22,13 @@ from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
 from hma_model.hub.datasets import push_data
 from tests.conftest import BlockTokenizer, write_toy
+from tests.conftest import convert_toy as run
 from tests.data.sources.lerobot.test_lerobot import embodiment as lerobot_robot
 from tests.data.sources.rlds.test_rlds import embodiment as rlds_robot
 from tests.data.sources.rlds.test_rlds import toy
 from tests.data.videos import make_v3
 
-SMALL = Settings(val_fraction=0.2, shard_frames=60)
 Change = Callable[[h5py.File], None]
-
-
-def run(robot: Embodiment, recording: Path, out: Path, settings: Settings = SMALL, extend=False) -> Summary:
-    return convert(robot, str(recording), BlockTokenizer(), out, settings=settings, extend=extend)
 
 
 def shards(folder: Path) -> dict[str, bytes]:

@@ -19,34 +19,16 @@ from hma_data.conversion import worker as shard_work
 from hma_data.conversion.engines import Limits
 from hma_data.conversion.job import convert, convert_share
 from hma_data.conversion.output import LOCK, Share, locked
-from hma_data.conversion.plan import Settings
 from hma_data.errors import HMAError, OutputError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.verify import verify
 from hma_data.sources.hdf5.source import Hdf5Source
 from tests.command import hma
-from tests.conftest import BlockTokenizer, write_toy
+from tests.conftest import SMALL, BlockTokenizer, contents, write_toy
+from tests.conftest import convert_toy as run
 
-SMALL = Settings(val_fraction=0.2, shard_frames=60)
 ROOT = Path(__file__).parents[3]
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
-    }
-
-
-def run(arm: Embodiment, recording: Path, out: Path, settings: Settings = SMALL, **options):
-    return convert(arm, str(recording), BlockTokenizer(), out, settings=settings, **options)
-
-
-@pytest.fixture
-def whole(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
-    """Return what an undisturbed run makes."""
-    run(toy_arm, toy_recording, tmp_path / "whole")
-    return contents(tmp_path / "whole")
 
 
 @pytest.mark.parametrize(

@@ -8,28 +8,21 @@ from pathlib import Path
 import pytest
 
 from hma_data.conversion import job
-from hma_data.conversion.job import convert, convert_share
+from hma_data.conversion.job import convert_share
 from hma_data.conversion.output import LOCK, Share
-from hma_data.conversion.plan import Settings
 from hma_data.conversion.report import Shared
 from hma_data.errors import OutputError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from tests.command import hma
-from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
-from tests.data.conversion.test_convert import contents
-
-SMALL = Settings(val_fraction=0.2, shard_frames=60)
+from tests.conftest import ARM_YAML, SMALL, BlockTokenizer, contents, write_toy
+from tests.conftest import convert_toy as run
 
 
 def robot(target_hz: float = 5, more: str = "") -> Embodiment:
     """The toy arm of 10 Hz with another rate for the model: stride 10 / target_hz."""
     return Embodiment.from_yaml(ARM_YAML.replace("target_hz: 5", f"target_hz: {target_hz}") + more)
-
-
-def run(arm: Embodiment, recording: Path, out: Path, settings: Settings = SMALL, **options):
-    return convert(arm, str(recording), BlockTokenizer(), out, settings=settings, **options)
 
 
 def shards(folder: Path) -> dict[str, tuple[bytes, int]]:

@@ -21,9 +21,8 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import flag_pauses
 from hma_data.shards.verify import verify
 from tests.command import hma
-from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.conftest import ARM_YAML, BlockTokenizer, contents, write_toy
 from tests.data import bag_files
-from tests.data.conversion.test_convert import contents
 from tests.data.episodes.test_align import STEADY, embodiment, episode
 
 TIMED_YAML = ARM_YAML.replace("{format: hdf5}", "{format: hdf5, layout: {timestamps: t}}")

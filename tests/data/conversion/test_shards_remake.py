@@ -22,7 +22,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import read_footer, to_arrow, to_numpy
 from hma_data.shards.stats import Stats
 from hma_data.shards.verify import verify
-from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.conftest import ARM_YAML, BlockTokenizer, contents, write_toy
 
 SMALL = Settings(val_fraction=0.3, shard_frames=40)
 
@@ -32,10 +32,6 @@ def make(folder: Path, lengths: list[int], settings: Settings = SMALL, yaml: str
     arm = Embodiment.from_yaml(yaml)
     convert(arm, str(folder.with_suffix(".hdf5")), BlockTokenizer(), folder, settings=settings)
     return folder
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def episodes(folder: Path) -> dict[str, tuple]:

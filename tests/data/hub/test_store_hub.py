@@ -20,12 +20,11 @@ from hma_data.shards.verify import verify
 from hma_data.storage import remote as store
 from hma_data.storage.files import cache_folder
 from hma_data.storage.remote import place
-from tests.conftest import BlockTokenizer
+from tests.conftest import SMALL, BlockTokenizer
 from tests.hub_server import Hub, Repository
 from tests.hub_state import EVERY
 
 pytest_plugins = ["tests.hub_fixtures"]
-SMALL = Settings(val_fraction=0.2, shard_frames=60)
 OUT = "hf://datasets/team/arm/sets/one"
 
 
@@ -55,13 +54,6 @@ def published(hub: Hub) -> dict[str, bytes]:
     return {
         name.removeprefix("sets/one/"): data for name, data in files.items() if name.startswith("sets/one/")
     }
-
-
-@pytest.fixture
-def whole(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
-    folder = tmp_path / "whole"
-    convert(toy_arm, str(toy_recording), BlockTokenizer(), folder, settings=SMALL)
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_a_repository_gets_the_bytes_that_a_folder_gets_in_few_commits(

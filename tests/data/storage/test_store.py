@@ -12,10 +12,7 @@ import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from hma_data.conversion.job import convert
-from hma_data.conversion.plan import Settings
 from hma_data.errors import ShardError, StorageAwayError, StorageError
-from hma_data.registry.embodiment import Embodiment
 from hma_data.shards import reader as shard_cache
 from hma_data.shards.preview import describe
 from hma_data.shards.reader import ShardSet
@@ -23,9 +20,6 @@ from hma_data.shards.verify import verify
 from hma_data.storage import remote as store
 from hma_data.storage.files import file_sha256
 from hma_data.storage.remote import RangeFile, RemotePath, place, put_bytes, put_file
-from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
-
-SMALL = Settings(val_fraction=0.2, shard_frames=60)
 
 
 def a_disk_with(monkeypatch: pytest.MonkeyPatch, free: int, total: int) -> None:
@@ -47,19 +41,10 @@ def bucket() -> RemotePath:
     return path
 
 
-@pytest.fixture(scope="module")
-def converted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("converted")
-    write_toy(folder / "toy.hdf5", range(20, 32))
-    robot = Embodiment.from_yaml(ARM_YAML)
-    convert(robot, folder / "toy.hdf5", BlockTokenizer(), folder / "set", settings=SMALL)
-    return folder / "set"
-
-
 @pytest.fixture
-def both(converted: Path, tmp_path: Path, bucket: RemotePath) -> tuple[Path, RemotePath]:
+def both(toy_set: Path, tmp_path: Path, bucket: RemotePath) -> tuple[Path, RemotePath]:
     """One shard set, here and copied into the store."""
-    shutil.copytree(converted, tmp_path / "set")
+    shutil.copytree(toy_set, tmp_path / "set")
     for path in (tmp_path / "set").rglob("*"):
         if path.is_file():
             put_file(path, bucket / "set" / path.relative_to(tmp_path / "set"))

@@ -14,7 +14,6 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from hma_data.conversion.job import convert, convert_share
 from hma_data.conversion.output import PLAN, Share
-from hma_data.conversion.plan import Settings
 from hma_data.conversion.report import Shared
 from hma_data.conversion.rewrite import merge, restat
 from hma_data.errors import MissingDependencyError, OutputError, ShardError, StorageAwayError, StorageError
@@ -23,9 +22,9 @@ from hma_data.shards.verify import verify
 from hma_data.storage import remote as store
 from hma_data.storage.files import cache_folder, remove_parts, upload_folder
 from hma_data.storage.remote import RemotePath, place, put_bytes
-from tests.conftest import BlockTokenizer, write_toy
-
-SMALL = Settings(val_fraction=0.2, shard_frames=60)
+from tests.conftest import SMALL, BlockTokenizer, write_toy
+from tests.conftest import contents as local
+from tests.conftest import convert_toy as run
 
 
 @pytest.fixture(autouse=True)
@@ -42,27 +41,8 @@ def out() -> RemotePath:
     return path
 
 
-def local(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
 def remote(folder: RemotePath) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in folder.listing()}
-
-
-def run(arm: Embodiment, recording: Path, out: Path, settings: Settings = SMALL, **options):
-    return convert(arm, str(recording), BlockTokenizer(), out, settings=settings, **options)
-
-
-@pytest.fixture
-def whole(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
-    """Return what a folder of this machine holds."""
-    run(toy_arm, toy_recording, tmp_path / "whole")
-    return local(tmp_path / "whole")
 
 
 # -- the same bytes

@@ -20,19 +20,18 @@ import pytest
 import torch
 
 from hma_data.conversion.job import convert
-from hma_data.conversion.plan import Settings
 from hma_data.errors import HMAError, OutputError, ShardError, StorageAwayError, StorageError
-from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.storage import remote as store
 from hma_data.storage.files import cache_folder
 from hma_data.storage.remote import RemotePath, place, put_file
-from tests.conftest import ARM_YAML, BlockTokenizer
+from tests.conftest import ARM_YAML, SMALL, BlockTokenizer
+from tests.conftest import contents as local
+from tests.conftest import convert_toy as run
 
 pytestmark = pytest.mark.slow
 
-SMALL = Settings(val_fraction=0.2, shard_frames=60)
 ROOT = Path(__file__).parents[3]
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
 
@@ -153,26 +152,8 @@ def out(proxy: Proxy, request: pytest.FixtureRequest) -> RemotePath:
     return path
 
 
-def local(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
 def remote(folder: RemotePath) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in folder.listing()}
-
-
-def run(arm: Embodiment, recording: Path, out: Path, **options):
-    return convert(arm, str(recording), BlockTokenizer(), out, settings=SMALL, **options)
-
-
-@pytest.fixture
-def whole(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
-    run(toy_arm, toy_recording, tmp_path / "whole")
-    return local(tmp_path / "whole")
 
 
 # -- the same bytes

@@ -61,8 +61,8 @@ class Oracle(HMA):
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    return make_shards(tmp_path_factory.mktemp("shards") / "arm", "arm")
+def data(arm_shards: Path) -> Path:
+    return arm_shards
 
 
 @pytest.fixture

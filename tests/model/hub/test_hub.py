@@ -25,9 +25,9 @@ MEMORY = "memory://hub/team/model"
 
 
 @pytest.fixture
-def source(tmp_path: Path) -> Path:
-    save(tmp_path / "model", ROBOTS)
-    return tmp_path / "model"
+def source(folder: Path) -> Path:
+    """A checkpoint that a test may damage."""
+    return folder
 
 
 @pytest.fixture(autouse=True)

@@ -23,12 +23,6 @@ from tests.model.robots import make_model, save
 ROBOTS = {"arm": 2, "hand": 3}
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    save(tmp_path / "model", ROBOTS)
-    return tmp_path / "model"
-
-
 def edit(path: Path, change) -> None:
     values = json.loads(path.read_text())
     change(values)

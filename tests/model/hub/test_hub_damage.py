@@ -1,6 +1,5 @@
 """Damaged checkpoints and places that cannot be used: one clear error each, before anything is made."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +16,6 @@ from tests.model.robots import save
 from tests.model.shards import make_shards
 
 pytest_plugins = ["tests.hub_fixtures"]
-
-
-@pytest.fixture
-def folder(source: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(source, tmp_path / "model"))
 
 
 def flip(path: Path, at: int = -5) -> None:

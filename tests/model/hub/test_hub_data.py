@@ -11,6 +11,7 @@ from hma_data.conversion import publish
 from hma_data.errors import HubError, ShardError
 from hma_data.shards.reader import ShardSet
 from hma_model.hub.datasets import pull_data, push_data
+from tests.conftest import contents
 from tests.hub_server import Hub
 from tests.hub_state import EVERY
 from tests.model.robots import yaml as yaml_of
@@ -23,10 +24,6 @@ REPO = "team/arm"
 @pytest.fixture
 def shards(tmp_path: Path) -> Path:
     return make_shards(tmp_path / "shards", "arm")
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def dataset(server: Hub):

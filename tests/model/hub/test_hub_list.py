@@ -36,12 +36,6 @@ class Flat:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    save(tmp_path / "model", ROBOTS)
-    return tmp_path / "model"
-
-
-@pytest.fixture
 def shelf(folder: Path, tmp_path: Path) -> Path:
     """A folder hub with a model of ours, one of the release, and something else."""
     hub.push(folder, tmp_path / "shelf/team/model")

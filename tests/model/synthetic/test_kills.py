@@ -7,13 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import contents
+
 pytestmark = pytest.mark.slow
 
 ROBOTS = ("rails_03", "mover_04")
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def run(words: list[str], folder: Path, until: str = "") -> None:

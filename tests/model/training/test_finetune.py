@@ -15,6 +15,7 @@ from hma_model.hub import publish as hub
 from hma_model.training.loop import TrainResult, finetune, train
 from hma_model.training.recipe import make_recipe
 from tests.command import fails, hma
+from tests.conftest import contents as files
 from tests.model.processes import run_command
 from tests.model.robots import SPEC
 from tests.model.runs import TINY, same, weights
@@ -26,23 +27,14 @@ SHORT = [
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def base(tmp_path_factory) -> TrainResult:
-    """A run on two robots."""
-    folder = tmp_path_factory.mktemp("base")
-    arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
-    data = [str(arm), str(hand)]
-    recipe = make_recipe({**TINY, "data": data, "model": {**TINY["model"], "mup": True, "base_width": 8}})
-    return train(recipe, out=folder / "run", show=False)
+@pytest.fixture
+def base(tiny_run: TrainResult) -> TrainResult:
+    return tiny_run
 
 
 @pytest.fixture
 def leg(tmp_path) -> Path:
     return make_shards(tmp_path / "leg", "leg", dims=4, seed=2)
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def tune(base, leg, out, *changes, freeze=True, **options) -> TrainResult:

@@ -25,7 +25,6 @@ from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
 from hma_model.training.report import write_report
 from tests.model.runs import TINY
-from tests.model.shards import make_shards
 
 SEEN = {"report": True, "pictures": 2, "track": ["tensorboard"]}
 
@@ -40,13 +39,6 @@ class Painter:
     def decode(self, tokens):
         grey = (tokens * 4).astype(np.uint8)
         return np.repeat(np.repeat(np.repeat(grey[..., None], 3, -1), 8, 1), 6, 2)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> list[str]:
-    folder = tmp_path_factory.mktemp("shards")
-    arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
-    return [str(arm), str(hand)]
 
 
 @pytest.fixture

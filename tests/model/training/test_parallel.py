@@ -24,14 +24,6 @@ from hma_model.training.parallel import ParallelModel, World, join, read_error, 
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import ROOT, errors, run_ranks
 from tests.model.runs import TINY, weights
-from tests.model.shards import make_shards
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> list[str]:
-    folder = tmp_path_factory.mktemp("shards")
-    arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
-    return [str(arm), str(hand)]
 
 
 @pytest.fixture(scope="module")

@@ -16,23 +16,14 @@ from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import resolve
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
-from hma_model.training.recipe import make_recipe
 from tests.model.processes import command, end, kill_at_write, run, start
 from tests.model.runs import TINY, same
 from tests.model.shards import make_shards
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> list[str]:
-    return [str(make_shards(tmp_path_factory.mktemp("shards") / "arm", "arm"))]
-
-
 @pytest.fixture
-def recipe(data):
-    def recipe(**changes):
-        return make_recipe({**TINY, "data": data, **changes})
-
-    return recipe
+def data(arm_shards: Path) -> list[str]:
+    return [str(arm_shards)]
 
 
 def train_quietly(recipe, out: Path) -> None:

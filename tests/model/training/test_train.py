@@ -28,29 +28,12 @@ from hma_model.checkpoint.folder import resolve
 from hma_model.network.model import HMA
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
-from hma_model.training.recipe import Recipe, make_recipe
+from hma_model.training.recipe import make_recipe
 from hma_model.training.resume import seed_for
 from hma_model.training.runtime import own_folder
 from tests.model.processes import run
 from tests.model.runs import TINY, same
 from tests.model.shards import make_shards
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> list[str]:
-    folder = tmp_path_factory.mktemp("shards")
-    return [
-        str(make_shards(folder / "arm", "arm")),
-        str(make_shards(folder / "hand", "hand", dims=3, episodes=3, seed=1)),
-    ]
-
-
-@pytest.fixture
-def recipe(data):
-    def recipe(**changes) -> Recipe:
-        return make_recipe({**TINY, "data": data, **changes})
-
-    return recipe
 
 
 def finite(folder: Path) -> bool:
@@ -95,7 +78,7 @@ def test_the_result_is_a_checkpoint_with_cards(recipe, tmp_path):
     opened = checkpoint.Checkpoint.open(result.checkpoint)
     assert set(checkpoint.load(result.checkpoint).embodiments) == {"arm", "hand"}
     card = opened.card("hand")
-    assert card["data"] == {"episodes": 2, "frames": 48}
+    assert card["data"] == {"episodes": 5, "frames": 120}
     assert card["metrics"]["val_loss"] > 0 and card["metrics"]["baseline_loss"] > 0
     assert card["training"] == {"steps": 6, "seed": 42}
 

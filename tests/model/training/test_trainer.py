@@ -13,25 +13,8 @@ from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.optim import Average
 from hma_model.training.parallel import World
-from hma_model.training.recipe import make_recipe
 from hma_model.training.run import Run
 from tests.model.runs import TINY, same, weights
-from tests.model.shards import make_shards
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> list[str]:
-    folder = tmp_path_factory.mktemp("shards")
-    arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
-    return [str(arm), str(hand)]
-
-
-@pytest.fixture
-def recipe(data):
-    def recipe(**changes):
-        return make_recipe({**TINY, "data": data, **changes})
-
-    return recipe
 
 
 def losses(recipe, out, **changes) -> list[float]:
