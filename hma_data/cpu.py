@@ -9,8 +9,7 @@ before it sleeps. Sleeping at once (OMP_WAIT_POLICY=PASSIVE) costs one wake-up p
 products. Spinning long takes the core from the thread that is waited for, where other processes use the
 machine too. So the loop is short. It is not made longer where the machine is quiet at the start: the gain is
 small, and what comes later would find long loops. Generation uses one thread where a second brings next to
-nothing (`hma_model.generation.engine`). `hma bench waiting` compares the choices; figures are in
-docs/results-log.md.
+nothing (`hma_model.generation.engine`). `hma bench waiting` compares the choices.
 """
 
 import os

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-FIRST = "rails_03"  # the robot that a page opens with: it follows its commands longest (docs/results-log.md)
+FIRST = "rails_03"  # the robot that a page opens with: it follows its commands longest (docs/results.md)
 MOST_VIEWERS = 32
 RATE, BURST = 200.0, 400.0  # messages of a viewer a second, and at once
 SCENE = 20.0  # messages that one counts as which begins a scene: all other sessions wait for it

@@ -11,7 +11,7 @@
 
 The noisy part has episodes in which 10 to 100 % of the commands are random: a model that has seen good
 pushes alone is kind to bad policies. `--play N` records a third part, in pictures of 96 px, in which most
-episodes wander: gym-pusht as people record it themselves. docs/results-log.md has the figures, and how
+episodes wander: gym-pusht as people record it themselves. docs/results.md has the figures, and how
 ours was trained.
 """
 

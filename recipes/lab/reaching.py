@@ -30,7 +30,7 @@ on which lerobot trains policies of its own, which are better or worse by the st
     hma policy-eval mover_04 lerobot:runs/diffusion/checkpoints/00{05,10,20,30,40}00/pretrained_model \
         reach still --judge reached --frames 20 --episodes 64 --out policies
 
-docs/results-log.md has the figures.
+docs/results.md has the figures.
 """
 
 import argparse

@@ -56,7 +56,7 @@ ROBOTS = {
 
 def test_the_embedded_trunk_is_the_one_of_the_recipe() -> None:
     # `hma train world`, carried over to the present fsq-lab, trained on in six parts, the last two averaged,
-    # and trained on in a seventh, on a GPU: see docs/results-log.md
+    # and trained on in a seventh, on a GPU: see docs/results.md
     own = folder.Checkpoint.open("embedded")
     own.trunk()
     assert own.trunk_sha256 == "0dbaf3ccf33b191e75fce74be7d36d0a0af175063303d57488ff5c8df70d1634"
