@@ -105,7 +105,7 @@ def test_a_ctrl_c_says_what_is_kept(arm: Path, tmp_path: Path, monkeypatch: pyte
         (tmp_path / "o" / "train" / "shard-00000.parquet").touch()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("hma_data.conversion.job.convert", stopped)
+    monkeypatch.setattr("hma_data.conversion.job.Conversion.run", stopped)
     source, out = str(tmp_path / "toy.hdf5"), str(tmp_path / "o")
     done = hma("convert", "-e", str(arm), "--source", source, "--out", out)
     fails(done, 130, "interrupted: 1 finished shard", "run the same command again to continue")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data.conversion.job import convert, convert_share, plan_conversion
+from hma_data.conversion.job import Conversion, convert, plan_conversion
 from hma_data.conversion.output import Share
 from hma_data.conversion.plan import Settings, estimate
 from hma_data.conversion.rewrite import merge, restat, split
@@ -149,7 +149,7 @@ def converted(made: Made, given: Given, out: Path) -> Any:
     source = given(made.hdf5)
     convert(made.arm, source, BlockTokenizer(), given(out / "set"), settings=settings)
     share = Share(0, 1)
-    convert_share(made.arm, source, BlockTokenizer(), given(out / "shared"), share, settings=settings)
+    Conversion(made.arm, source, BlockTokenizer(), given(out / "shared"), settings=settings).run_share(share)
     plan, uri = plan_conversion(made.arm, source, BlockTokenizer().spec, settings)
     estimated = estimate(plan, given(made.hdf5), made.arm, BlockTokenizer(), 1)
     return content(out), plan.facts, uri, estimated.bytes

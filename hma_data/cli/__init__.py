@@ -7,18 +7,18 @@ import sys
 from typing import Annotated
 
 import typer
-from typer import Argument, Exit, Option
+from typer import Argument, Exit
 
 from hma_data.cli.convert import convert
 from hma_data.cli.inspect import doctor, inspect
 from hma_data.cli.mixture import mixture
+from hma_data.cli.options import Json
 from hma_data.cli.registry import registry_app
 from hma_data.cli.shards import shards_app
 from hma_data.cli.tokenizer import tokenizer_app
 from hma_data.console import human_count, print_json, print_table
 
 DATA = "Recordings and shards"  # the panel of `hma --help`
-Json = Annotated[bool, Option("--json", help="Print JSON.")]
 
 
 def mount(app: typer.Typer) -> None:

@@ -1,23 +1,17 @@
 """Run `hma inspect` (what is in a recording) and `hma doctor` (what in it will hurt training)."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
-from hma_data.cli.complete import robots
+from hma_data.cli.options import Episodes, FailOn, Json, robot_option
 from hma_data.console import human_count, human_number, print_json, print_lines, print_table
 
 if TYPE_CHECKING:
     from hma_data.inspection.folder import Found
 
-Json = Annotated[bool, Option("--json", help="Print JSON.")]
-Episodes = Annotated[int, Option("--episodes", min=1, help="Number of episodes to look into.")]
-FailOn = Annotated[
-    Literal["info", "warn", "error", "never"],
-    Option("--fail-on", help="Exit with 1 if there is a finding of this severity or worse."),
-]
 COLUMNS = ["key", "shape", "dtype", "Hz", "jitter ms", "skew ms", "count", "values"]
 NO_JITTER_MS = 0.001  # a smaller jitter comes from rounded stamps
 
@@ -25,13 +19,7 @@ NO_JITTER_MS = 0.001  # a smaller jitter comes from rounded stamps
 def inspect(
     uri: Annotated[str, Argument(help="A recording (file, folder or URI), or a folder of several.")],
     embodiment: Annotated[
-        str | None,
-        Option(
-            "--embodiment",
-            "-e",
-            help="Check whether this robot fits: a registry id, or a YAML file.",
-            autocompletion=robots,
-        ),
+        str | None, robot_option("Check whether this robot fits: a registry id, or a YAML file.")
     ] = None,
     episodes: Episodes = 20,
     fail_on: FailOn = "error",
@@ -142,10 +130,7 @@ def _print_checks(report: dict[str, Any]) -> None:
 
 def doctor(
     target: Annotated[str, Argument(help="A recording, or the folder of a shard set.")],
-    embodiment: Annotated[
-        str | None,
-        Option("--embodiment", "-e", help="Look into the episodes as this robot's.", autocompletion=robots),
-    ] = None,
+    embodiment: Annotated[str | None, robot_option("Look into the episodes as this robot's.")] = None,
     episodes: Episodes = 20,
     fail_on: FailOn = "error",
     json: Json = False,

@@ -1,10 +1,12 @@
 """Run `hma mixture`: show how often each embodiment is drawn, as a table and a plot."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
 
+from hma_data.cli.options import Json
 from hma_data.cli.shards import refuse_early
 from hma_data.console import print_json, print_table
 from hma_data.errors import UsageError
@@ -13,9 +15,8 @@ if TYPE_CHECKING:
     from hma_data.loading.mixture import Mixture
     from hma_data.shards.windows import WindowIndex
 
-
 Pairs = list[str] | None
-SHARES = "Other shares than the temperature's"
+_share = partial(Option, rich_help_panel="Other shares than the temperature's")
 
 
 def mixture(
@@ -28,32 +29,21 @@ def mixture(
     short: Annotated[Literal["drop", "pad"], Option(help="What to do with short episodes.")] = "drop",
     weight: Annotated[
         Pairs,
-        Option(
+        _share(
             metavar="NAME=FACTOR",
             help="Multiply the probability of an embodiment or group; repeat it for more.",
-            rich_help_panel=SHARES,
         ),
     ] = None,
     group: Annotated[
-        Pairs,
-        Option(
-            metavar="ID=GROUP",
-            help="Put an embodiment into a group; groups get equal shares.",
-            rich_help_panel=SHARES,
-        ),
+        Pairs, _share(metavar="ID=GROUP", help="Put an embodiment into a group; groups get equal shares.")
     ] = None,
-    cap: Annotated[
-        Pairs,
-        Option(metavar="ID=SHARE", help="Largest probability of an embodiment.", rich_help_panel=SHARES),
-    ] = None,
-    max_epochs: Annotated[
-        float | None, Option(help="Largest number of passes over one set.", rich_help_panel=SHARES)
-    ] = None,
+    cap: Annotated[Pairs, _share(metavar="ID=SHARE", help="Largest probability of an embodiment.")] = None,
+    max_epochs: Annotated[float | None, _share(help="Largest number of passes over one set.")] = None,
     samples: Annotated[
         int | None, Option(min=1, help="Planned draws; default: the number of windows.")
     ] = None,
     plot: Annotated[Path | None, Option(help="PNG, SVG or PDF to draw.")] = None,
-    json: Annotated[bool, Option("--json", help="Print JSON.")] = False,
+    json: Json = False,
 ) -> None:
     """Show how often each embodiment is drawn when a model trains on several shard sets.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
-from hma_data.cli.complete import robots
+from hma_data.cli.options import Json, robots
 from hma_data.console import human_count, print_json, print_table
 from hma_data.registry import FORMATS
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from hma_data.registry.catalog import Entry
 
 registry_app = typer.Typer(no_args_is_help=True, help="Look at embodiments, check and write their YAML.")
-Json = Annotated[bool, Option("--json", help="Print JSON.")]
 Id = Annotated[str, Argument(help="Registry id, or a YAML file.", autocompletion=robots)]
 Out = Annotated[Path | None, Option(help="File to write; default: print.")]
 SCHEMA = "embodiment.schema.json"  # the first line of a YAML names it for editors

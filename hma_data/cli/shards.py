@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
+from hma_data.cli.options import Folder, Json, Weights, choice_option
 from hma_data.console import (
     Update,
     human_bytes,
@@ -25,11 +26,8 @@ shards_app = typer.Typer(
     no_args_is_help=True, help="Look at shard sets, verify them, and make new sets from them."
 )
 
-Folder = Annotated[Path, Argument(help="A shard set.")]
 Workers = Annotated[int | None, Option(min=1, help="Threads; default: one a core.")]
 Out = Annotated[Path, Option(help="Folder of the new shard set.")]
-Camera = Annotated[str | None, Option(help="Camera to take; default: the first.")]
-Json = Annotated[bool, Option("--json", help="Print JSON.")]
 
 
 def _in(update: Update) -> Callable[[int, int], None]:
@@ -154,13 +152,9 @@ def shards_preview(
     out: Annotated[Path | None, Option(help="Folder for sheet.png and preview.mp4.")] = None,
     episodes: Annotated[int, Option(min=1, help="Number of episodes to show.")] = 4,
     camera: Annotated[str | None, Option(help="Camera to show; default: all of the set.")] = None,
-    weights: Annotated[str | None, Option(help="The tokenizer's weights, if not the usual ones.")] = None,
-    only: Annotated[
-        list[str] | None, Option(help="Episode to show: id, glob or @FILE of ids; repeat it for more.")
-    ] = None,
-    exclude: Annotated[
-        list[str] | None, Option(help="Episode not to show: id, glob or @FILE of ids; repeat it for more.")
-    ] = None,
+    weights: Weights = None,
+    only: Annotated[list[str] | None, choice_option("Episode to show")] = None,
+    exclude: Annotated[list[str] | None, choice_option("Episode not to show")] = None,
 ) -> None:
     """Write a contact sheet and a video decoded from the tokens, with the actions drawn.
 
@@ -268,7 +262,7 @@ def shards_export(
     out: Annotated[Path, Option(help="New folder; each split gets a folder in it.")],
     to: Annotated[Literal["memmap"], Option(help="memmap: the layout of the paper's code.")] = "memmap",
     split: Annotated[str | None, Option(help="Only this split, straight into --out.")] = None,
-    camera: Camera = None,
+    camera: Annotated[str | None, Option(help="Camera to take; default: the first.")] = None,
 ) -> None:
     """Export flat files as the paper's code reads them: video.bin, actions, segment_ids.bin, metadata.json.
 

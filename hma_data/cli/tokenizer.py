@@ -6,12 +6,11 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from hma_data.cli.complete import tokenizers
+from hma_data.cli.options import Json, robot_option, tokenizers
 from hma_data.console import human_bytes, interruptible, print_json, print_table
 from hma_data.errors import MissingDependencyError, RecipeError, UsageError
 
 tokenizer_app = typer.Typer(no_args_is_help=True, help="List, train and measure tokenizers.")
-Json = Annotated[bool, Option("--json", help="Print JSON.")]
 Device = Annotated[str, Option(help="Where the network runs: cpu, cuda, mps.")]
 
 
@@ -92,9 +91,7 @@ def tokenizer_train(
 def tokenizer_eval(
     tokenizer: Annotated[str, Argument(help="Name of the tokenizer.", autocompletion=tokenizers)],
     data: Annotated[list[str], Argument(help="Pictures, videos, folders of them, recordings, shard sets.")],
-    embodiment: Annotated[
-        str | None, Option("--embodiment", "-e", help="DATA are recordings of this robot: id or YAML.")
-    ] = None,
+    embodiment: Annotated[str | None, robot_option("DATA are recordings of this robot: id or YAML.")] = None,
     weights: Annotated[str | None, Option(help="Its weights, if not the usual ones.")] = None,
     frames: Annotated[int, Option(min=1, help="Frames of each video or episode, evenly spaced.")] = 64,
     lpips: Annotated[

@@ -9,9 +9,9 @@ the job goes on.
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -60,11 +60,13 @@ from hma_data.storage.remote import parquet_file, place
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.shapes import get_spec
 
+OnProgress = Callable[[Progress], None]
+
 
 def plan_conversion(
     embodiment: Embodiment, source: StrPath | None, tokenizer: TokenizerSpec, settings: Settings
 ) -> tuple[Plan, str]:
-    """Return the plan of a conversion and the URI it reads; see `convert`."""
+    """Return the plan of a conversion and the URI it reads; see `Conversion`."""
     uri = embodiment.source.uri if source is None else as_text(source)
     if source is not None and not (uri or "").strip():
         raise UsageError("--source", "is empty", "name a recording, or leave it out to take the YAML's")
@@ -96,27 +98,28 @@ def convert(
     tokenizer: str | Tokenizer,
     out: StrPath,
     *,
-    settings: Settings | None = None,
-    workers: int = 0,
-    engine: Literal["local", "ray"] = "local",
-    weights: StrPath | None = None,
-    device: str = "cpu",
-    limits: Limits = LIMITS,
-    max_quarantine: float = 0.01,
-    overwrite: bool = False,
-    extend: bool = False,
-    resources: Resources = RESOURCES,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
+    on_progress: OnProgress = lambda progress: None,
+    **options: Any,
 ) -> Summary:
     """Convert a recording into the shard set `out`; running it again continues.
 
-    Args:
+    The arguments are the fields of `Conversion`; `on_progress` is that of `Conversion.run`.
+    """
+    return Conversion(embodiment, source, tokenizer, out, **options).run(on_progress)
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """A conversion of a recording into a shard set, with everything that the user chooses.
+
+    Attributes:
         embodiment: the robot.
         source: str or path of the recording, or its URI; None takes the one in the embodiment's YAML.
         tokenizer: name, see `get_tokenizer`; or one that is open already, for work in this process.
+        out: str or path of the folder, or its URI.
+        settings: what the plan, and so every byte, depends on.
         workers: processes, which may crash or hang without ending the job; 0 works in this one. Each imports
             the script that calls this, so the call must stand under `if __name__ == "__main__":`.
-        out: str or path of the folder, or its URI.
         engine: what runs the workers: this machine, or a Ray cluster.
         weights, device: of the tokenizer; the weights as str or path.
         limits: when a worker counts as hanging, and how often it may be lost.
@@ -124,133 +127,122 @@ def convert(
         overwrite: delete what `out` holds, if it is a shard set.
         extend: add the episodes that a finished set in `out` does not have yet.
         resources: what a worker reserves with engine="ray".
-        on_progress: called about once for every batch of frames.
-
-    Raises:
-        OutputError: `out` holds something else, or another job is writing it.
-        SourceError: the recording cannot be read, or not one of its episodes can be used.
-        HMAError: the embodiment or the tokenizer cannot be used; or a script converts with workers outside of
-            `if __name__ == "__main__":`.
     """
-    end_worker_that_starts_workers(workers)
-    begun, out = time.monotonic(), place(out)
-    hub = HubOutput.of(out)
-    folder = hub.staging if hub else out
-    conversion = _Conversion(
-        embodiment,
-        source,
-        tokenizer,
-        folder,
-        settings or Settings(),
-        workers,
-        weights,
-        device,
-        limits,
-        engine,
-        resources,
-    )
-    with locked(folder):
-        if overwrite:
-            clear(folder)
-        plan, base = conversion.plan(extend)
-        if hub and hub.prepare() and not overwrite:
-            refuse_other(out, plan)
-        done, made = conversion.make(plan, base, None, on_progress)
-        manifest = conversion.finish(plan, base, bool(made))
-        flags = flag_totals(parquet_file(folder / EPISODES).read(columns=["flags"])["flags"])
-        reasons = refusal_reasons(folder)
-        if not any(split["episodes"] for split in manifest.splits.values()):
-            clear(folder)
-            worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
-            told = "; ".join(f"{count} × {reason}" for reason, count in worst)
-            raise SourceError(conversion.uri, f"gave no usable episode, so nothing was written: {told}")
-        warning = rate_warning(folder, out) if OFF_RATE in flags else ""
-        notes = training_notes(folder, out, plan)
-        if hub:
-            hub.upload()
-    episodes = sum(split["episodes"] for split in manifest.splits.values())
-    too_many = manifest.quarantined > max_quarantine * (episodes + manifest.quarantined)
-    seconds = time.monotonic() - begun
-    more = conversion.pictures, conversion.left_out, conversion.changed, warning, notes
-    return Summary(out, manifest, done, made, seconds, reasons, flags, too_many, *more)
-
-
-def convert_share(
-    embodiment: Embodiment,
-    source: StrPath | None,
-    tokenizer: str | Tokenizer,
-    out: StrPath,
-    share: Share,
-    *,
-    settings: Settings | None = None,
-    workers: int = 0,
-    weights: StrPath | None = None,
-    device: str = "cpu",
-    limits: Limits = LIMITS,
-    extend: bool = False,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
-) -> Shared:
-    """Run one share of a conversion, for an array of jobs that write one folder which all of them see.
-
-    The bytes are those that `convert` alone would write. The arguments are those of `convert`.
-    """
-    end_worker_that_starts_workers(workers)
-    begun, out = time.monotonic(), place(out)
-    conversion = _Conversion(
-        embodiment, source, tokenizer, out, settings or Settings(), workers, weights, device, limits
-    )
-    with locked(out, share):
-        plan, base = conversion.plan(extend)
-        done, made = conversion.make(plan, base, share, on_progress)
-    missing, warning = len({unit.name for unit in plan.units} - shard_sizes(out).keys()), ""
-    if not missing:
-        with suppress(OutputError), locked(out):  # others are still writing: the last of them finishes
-            missing = len(plan.units) - len(finished_shards(out, plan, base, shared=False))
-            if not missing:
-                # A journal shows that some share has made shards since the manifest was written.
-                conversion.finish(plan, base, bool(made or known_hashes(out)))
-                warning = rate_warning(out, out)
-    return Shared(out, done, made, missing, time.monotonic() - begun, conversion.changed, warning)
-
-
-@dataclass
-class _Conversion:
-    """The common part of `convert` and `convert_share`."""
 
     embodiment: Embodiment
     source: StrPath | None
     tokenizer: str | Tokenizer
-    out: Path
-    settings: Settings
-    workers: int
-    weights: StrPath | None
-    device: str
-    limits: Limits
-    engine: str = "local"
+    out: StrPath
+    settings: Settings = field(default_factory=Settings)
+    workers: int = 0
+    engine: Literal["local", "ray"] = "local"
+    weights: StrPath | None = None
+    device: str = "cpu"
+    limits: Limits = LIMITS
+    max_quarantine: float = 0.01
+    overwrite: bool = False
+    extend: bool = False
     resources: Resources = RESOURCES
 
-    def __post_init__(self) -> None:
-        if not isinstance(self.tokenizer, str) or str(self.out).startswith("memory:"):
+    def run(self, on_progress: OnProgress = lambda progress: None) -> Summary:
+        """Make the shard set; running it again continues.
+
+        Args:
+            on_progress: called about once for every batch of frames.
+
+        Raises:
+            OutputError: `out` holds something else, or another job is writing it.
+            SourceError: the recording cannot be read, or not one of its episodes can be used.
+            HMAError: the embodiment or the tokenizer cannot be used; or a script converts with workers
+                outside of `if __name__ == "__main__":`.
+        """
+        end_worker_that_starts_workers(self.workers)
+        begun, out = time.monotonic(), place(self.out)
+        hub = HubOutput.of(out)
+        folder = hub.staging if hub else out
+        run = _Run(self, folder)
+        with locked(folder):
+            if self.overwrite:
+                clear(folder)
+            plan, base = run.plan()
+            if hub and hub.prepare() and not self.overwrite:
+                refuse_other(out, plan)
+            kept, made = run.make(plan, base, None, on_progress)
+            manifest = run.finish(plan, base, bool(made))
+            reasons = refusal_reasons(folder)
+            episodes = sum(split["episodes"] for split in manifest.splits.values())
+            if not episodes:
+                clear(folder)
+                worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
+                told = "; ".join(f"{count} × {reason}" for reason, count in worst)
+                raise SourceError(run.uri, f"gave no usable episode, so nothing was written: {told}")
+            flags = flag_totals(parquet_file(folder / EPISODES).read(columns=["flags"])["flags"])
+            warning = rate_warning(folder, out) if OFF_RATE in flags else ""
+            notes = training_notes(folder, out, plan)
+            if hub:
+                hub.upload()
+        return Summary(
+            out=out,
+            manifest=manifest,
+            kept_shards=kept,
+            made_shards=made,
+            seconds=time.monotonic() - begun,
+            reasons=reasons,
+            flags=flags,
+            too_many=manifest.quarantined > self.max_quarantine * (episodes + manifest.quarantined),
+            pictures=run.pictures,
+            left_out=run.whole.left_out,
+            changed=run.changed,
+            warning=warning,
+            notes=notes,
+        )
+
+    def run_share(self, share: Share, on_progress: OnProgress = lambda progress: None) -> Shared:
+        """Make one share of the shards, for an array of jobs that write one folder which all of them see.
+
+        The bytes are those that `run` alone would write. The share that ends last finishes the set.
+        """
+        end_worker_that_starts_workers(self.workers)
+        begun, out = time.monotonic(), place(self.out)
+        run = _Run(self, out)
+        with locked(out, share):
+            plan, base = run.plan()
+            kept, made = run.make(plan, base, share, on_progress)
+        missing = len({unit.name for unit in plan.units} - shard_sizes(out).keys())
+        warning = ""
+        if not missing:
+            with suppress(OutputError), locked(out):  # others are still writing: the last of them finishes
+                missing = len(plan.units) - len(finished_shards(out, plan, base, shared=False))
+                if not missing:
+                    # A journal shows that some share has made shards since the manifest was written.
+                    run.finish(plan, base, bool(made or known_hashes(out)))
+                    warning = rate_warning(out, out)
+        return Shared(out, kept, made, missing, time.monotonic() - begun, run.changed, warning)
+
+
+class _Run:
+    """A conversion that runs: its tokenizer, its plan and what it has learned so far."""
+
+    def __init__(self, given: Conversion, folder: Path) -> None:
+        self.given, self.folder = given, folder
+        self.workers = given.workers
+        if not isinstance(given.tokenizer, str) or str(folder).startswith("memory:"):
             self.workers = 0  # no other process sees them
         self._opened: Tokenizer | None = None
-        if not isinstance(self.tokenizer, str):
-            self._opened = self.tokenizer
-        elif not self.workers and self.engine == "local":
-            self._opened = get_tokenizer(self.tokenizer, weights=self.weights, device=self.device)
+        tokenizer = given.tokenizer
+        if not isinstance(tokenizer, str):
+            self._opened = tokenizer
+        elif not self.workers and given.engine == "local":
+            self._opened = get_tokenizer(tokenizer, weights=given.weights, device=given.device)
         else:  # workers open it; this process stays light, and may have no such device
-            self._spec = get_spec(self.tokenizer, weights=self.weights)
+            self._spec = get_spec(tokenizer, weights=given.weights)
         if self._opened is not None:
             self._spec = self._opened.spec
-        self._whole, self.uri = plan_conversion(self.embodiment, self.source, self._spec, self.settings)
+        self.whole, self.uri = plan_conversion(given.embodiment, given.source, self._spec, given.settings)
         self.pictures: dict[str, tuple[int, int]] = {}
         self.changed = ""
 
-    @property
-    def left_out(self) -> int:
-        """Return the number of episodes that `only` and `exclude` leave out."""
-        return self._whole.left_out
-
-    def plan(self, extend: bool) -> tuple[Plan, Manifest | None]:
+    def plan(self) -> tuple[Plan, Manifest | None]:
         """Return the plan, and the manifest it extends or None.
 
         A set that was extended before can be continued without `extend`.
@@ -258,44 +250,48 @@ class _Conversion:
         Raises:
             OutputError: the rows of a strided set are of another stride, or `extended` refuses the set.
         """
-        base = base_manifest(self.out)
+        given = self.given
+        base = base_manifest(self.folder)
         if base is not None:
             self._check_stride(base)
-        if base is None or not (extend or "extends" in base.plan):
-            return self._whole, None
-        source = open_source(self.embodiment.source.format)
+        if base is None or not (given.extend or "extends" in base.plan):
+            return self.whole, None
+        source = open_source(given.embodiment.source.format)
 
         def content(ref: EpisodeRef) -> str:
-            return content_of(source, self.uri, ref.id, self.embodiment, self._whole.facts)
+            return content_of(source, self.uri, ref.id, given.embodiment, self.whole.facts)
 
-        plan = extended(self.out, base, self._whole, self.settings.shard_frames, content)
-        if plan.units and not extend:
+        plan = extended(self.folder, base, self.whole, given.settings.shard_frames, content)
+        if plan.units and not given.extend:
             fault = f"lacks {plan.episodes:,} episodes that the recording has now"
-            raise OutputError(self.out, fault, "--extend adds them")
+            raise OutputError(self.folder, fault, "--extend adds them")
         return plan, base
 
     def _check_stride(self, base: Manifest) -> None:
         """Refuse another stride for a strided set; its rows hold the action chunks of one stride."""
-        if self.settings.frames != "strided" or base.plan.get("frames") != "strided":
+        embodiment = self.given.embodiment
+        if self.given.settings.frames != "strided" or base.plan.get("frames") != "strided":
             return
-        stride, same = base.frame_stride, base.plan.get("embodiment_hash") == self.embodiment.digest
-        if not same or stride == self.embodiment.stride:
+        if base.plan.get("embodiment_hash") != embodiment.digest:
             return  # what else differs is told where the plans are compared
-        fault = (
-            f"has rows of stride {stride} (--frames strided), the YAML gives stride {self.embodiment.stride}"
-        )
-        remedy = f"set stride: {stride} in the YAML, choose another --out, or --overwrite to start anew"
-        raise OutputError(self.out, fault, remedy)
+        stride = base.frame_stride
+        if stride != embodiment.stride:
+            fault = (
+                f"has rows of stride {stride} (--frames strided), the YAML gives stride {embodiment.stride}"
+            )
+            remedy = f"set stride: {stride} in the YAML, choose another --out, or --overwrite to start anew"
+            raise OutputError(self.folder, fault, remedy)
 
     def make(
-        self, plan: Plan, base: Manifest | None, share: Share | None, on_progress: Callable[[Progress], None]
+        self, plan: Plan, base: Manifest | None, share: Share | None, on_progress: OnProgress
     ) -> tuple[int, int]:
         """Make the shards that are missing; return how many shards were kept and how many were made."""
-        mine = plan.units[share.index :: share.count] if share else plan.units
-        there = finished_shards(self.out, plan, base, share is not None)
+        tasks = share.count if share else 1
+        mine = plan.units[share.index :: tasks] if share else plan.units
+        there = finished_shards(self.folder, plan, base, shared=share is not None)
         todo = [unit for unit in mine if unit.name not in there]
         kept = [unit for unit in mine if unit.name in there]
-        layout = RowLayout.of_plan(plan.facts, self.embodiment)
+        layout = RowLayout.of_plan(plan.facts, self.given.embodiment)
         progress = Progress(
             episodes=sum(len(unit) for unit in kept),
             frames=_encoded(kept, layout),
@@ -304,37 +300,39 @@ class _Conversion:
             total_frames=_encoded(mine, layout),
             pictures=self.pictures,
         )
-        if todo or (plan.units and not mine):  # a share may have no shard at all
-            tasks = share.count if share else 1
-            if line := idle_workers(plan, len(todo), self.workers, tasks, bool(there)):
-                progress.notices.append(line)
+        idle = idle_workers(plan, len(todo), self.workers, tasks, bool(there))
+        has_none = bool(plan.units) and not mine  # a share may have no shard at all
+        if idle and (todo or has_none):
+            progress.notices.append(idle)
         on_progress(progress)
         if todo:
-            with Journal(self.out, share) as journal:
-                for made in self._run(todo, plan, Counter(progress, on_progress)):
+            with Journal(self.folder, share) as journal:
+                for made in self._made(todo, plan, Counter(progress, on_progress)):
                     journal.add(made)
                     on_progress(progress)
         return progress.kept_shards, len(todo)
 
-    def _run(self, todo: list[ShardUnit], plan: Plan, on_event: Counter) -> Iterator[Made]:
+    def _made(self, todo: list[ShardUnit], plan: Plan, on_event: Counter) -> Iterator[Made]:
+        given = self.given
+        weights = None if given.weights is None else as_text(given.weights)
         job = Job(
-            self.uri,
-            self.embodiment,
-            self._spec.name,
-            None if self.weights is None else as_text(self.weights),
-            self.device,
-            self.out.absolute(),
-            plan.facts,
+            source=self.uri,
+            embodiment=given.embodiment,
+            tokenizer=self._spec.name,
+            weights=weights,
+            device=given.device,
+            out=self.folder.absolute(),
+            facts=plan.facts,
         )
-        if self.engine == "ray":
+        if given.engine == "ray":
             from hma_data.conversion.engines.ray import run as run_ray
 
-            cpus, gpus = self.resources.cpus, self.resources.gpus
+            gpus = given.resources.gpus
             if gpus is None:
-                gpus = 1.0 if self.device.startswith("cuda") else 0.0
-            return run_ray(todo, MakeWork(job), self.workers, on_event, self.limits, cpus, gpus)
-        make_work = MakeWork(job, self._opened)
-        return run_local(todo, make_work, self.workers, on_event, self.limits)
+                gpus = 1.0 if given.device.startswith("cuda") else 0.0
+            cpus = given.resources.cpus
+            return run_ray(todo, MakeWork(job), self.workers, on_event, given.limits, cpus, gpus)
+        return run_local(todo, MakeWork(job, self._opened), self.workers, on_event, given.limits)
 
     def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Manifest:
         """Return the manifest; write it and the other files derived from footers, unless nothing changed.
@@ -343,28 +341,21 @@ class _Conversion:
             changed: True where shards may have been made. A finished set is written anew too where the YAML
                 has changed: its shards stay, and readers take target_hz and stride from the manifest.
         """
-        out = self.out
-        remove_parts(out)  # of workers that died
-        before = Manifest.load(out) if (out / MANIFEST).is_file() else None
+        folder, embodiment = self.folder, self.given.embodiment
+        remove_parts(folder)  # of workers that died
+        before = Manifest.load(folder) if (folder / MANIFEST).is_file() else None
         kept = base.shards if base else ()
         if before is not None:
-            self.changed = yaml_change(before.embodiment, self.embodiment)
-            if not changed and not damaged_files(out, before):
+            self.changed = yaml_change(before.embodiment, embodiment)
+            if not changed and not damaged_files(folder, before):
                 if not self.changed and before.plan["hash"] == plan.facts["hash"]:
-                    remove_notes(out)
+                    remove_notes(folder)
                     return before
                 kept = before.shards  # their hashes are known
         names = list(dict.fromkeys([*(shard.path for shard in kept), *(unit.name for unit in plan.units)]))
-        manifest = finish(
-            out,
-            names,
-            self.embodiment,
-            self._spec,
-            plan.facts,
-            self.uri,
-            hashes={**{shard.path: shard.sha256 for shard in kept}, **known_hashes(out)},
-        )
-        remove_notes(out)
+        known = {shard.path: shard.sha256 for shard in kept} | known_hashes(folder)
+        manifest = finish(folder, names, embodiment, self._spec, plan.facts, self.uri, hashes=known)
+        remove_notes(folder)
         return manifest
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 from typer.core import TyperGroup
 
 from hma_data import __version__
@@ -36,6 +37,7 @@ from hma_model.cli.options import (
     UnmaskSteps,
     camera_names,
     device_name,
+    kept,
     require_checkpoint,
 )
 from hma_model.cli.play import play
@@ -73,7 +75,7 @@ def _print_version(asked: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
+        bool, Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
     pass
@@ -143,16 +145,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option("--out", help="Folder for everything the demo makes.")] = Path(
-        "hma-demo"
-    ),
-    episodes: Annotated[
-        int, typer.Option("--episodes", min=4, help="Episodes of each of the two robots.")
-    ] = 32,
-    steps: Annotated[
-        int | None, typer.Option("--steps", min=1, help="Steps of each training at most.")
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of recording and training.")] = 0,
+    out: Annotated[Path, Option(help="Folder for everything the demo makes.")] = Path("hma-demo"),
+    episodes: Annotated[int, Option(min=4, help="Episodes of each of the two robots.")] = 32,
+    steps: Annotated[int | None, Option(min=1, help="Steps of each training at most.")] = None,
+    seed: Annotated[int, Option(min=0, help="Seed of recording and training.")] = 0,
 ) -> None:
     """Show a world model two new robots: record, convert, finetune, publish, roll out, report.
 
@@ -162,7 +158,7 @@ def demo(
     """
     from hma_model.demo.run import demo as run
 
-    with interruptible(lambda: f"finished steps are kept in {out}; run the same command again to continue"):
+    with interruptible(lambda: kept("steps", out)):
         report = run(out, episodes=episodes, steps=steps, seed=seed)
     print(f"open {report}")
 
@@ -180,21 +176,20 @@ app.command("evaluate", rich_help_panel=MODELS)(evaluate)
 def generate(
     checkpoint: Checkpoint,
     data: Data,
-    out: Annotated[Path, typer.Option("--out", help="The video: .mp4, .webp or .gif.")],
+    out: Annotated[Path, Option(help="The video: .mp4, .webp or .gif.")],
     split: Split = "val",
-    window: Annotated[int, typer.Option("--window", min=0, help="Number of the window to start at.")] = 0,
+    window: Annotated[int, Option(min=0, help="Number of the window to start at.")] = 0,
     frames: Annotated[
-        int | None,
-        typer.Option("--frames", min=1, help="Frames to predict; by default to the end of the window."),
+        int | None, Option(min=1, help="Frames to predict; by default to the end of the window.")
     ] = None,
-    prompt: Annotated[int, typer.Option("--prompt", min=1, help="Number of true frames to start from.")] = 2,
+    prompt: Annotated[int, Option(min=1, help="Number of true frames to start from.")] = 2,
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
     temperature: Temperature = None,
     precision: Precision = "float32",
     compile: Compile = False,
     device: Device = "auto",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollout.")] = 0,
+    seed: Annotated[int, Option(min=0, help="Seed of the rollout.")] = 0,
     cameras: Cameras = None,
 ) -> None:
     """Write a video: the truth, and beside it what the model predicts from a few frames and the actions.

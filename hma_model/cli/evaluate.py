@@ -8,7 +8,7 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from hma_data.console import interruptible, print_lines, print_table
 from hma_model.cli.options import (
@@ -22,6 +22,7 @@ from hma_model.cli.options import (
     UnmaskSteps,
     camera_names,
     device_name,
+    kept,
     require_checkpoint,
 )
 
@@ -45,56 +46,48 @@ ROLLOUTS = ("true", "shuffled", "none", "copy")
 HIDDEN = ("checkpoint", "data", "seconds_a_frame", "sees_actions", "merge")  # of the readable form
 MEASURES = {"lpips": "LPIPS", "fid": "FID", "fvd": "FVD", "fvd_videogpt": "FVD (VideoGPT)"}
 DIGITS = {"ssim": 3, "lpips": 3}  # of the figures of rollouts; the others have two
-LPIPS_HELP = "Weights of LPIPS, with their hash."
 
 
 def evaluate(
     checkpoint: Checkpoint,
-    data: Annotated[list[Path], typer.Argument(help="Shard sets.")],
+    data: Annotated[list[Path], Argument(help="Shard sets.")],
     beside: Annotated[
-        list[str] | None, typer.Option("--beside", help="Another checkpoint to compare; repeat for more.")
+        list[str] | None, Option(help="Another checkpoint to compare; repeat for more.")
     ] = None,
     split: Split = "val",
-    windows: Annotated[int, typer.Option("--windows", min=1, help="Number of windows, evenly spaced.")] = 64,
-    frames: Annotated[
-        int | None, typer.Option("--frames", min=2, help="Frames of a window; by default the model's.")
-    ] = None,
-    prompt: Annotated[
-        int | None, typer.Option("--prompt", min=1, help="Number of true frames to start from.")
-    ] = None,
+    windows: Annotated[int, Option(min=1, help="Number of windows, evenly spaced.")] = 64,
+    frames: Annotated[int | None, Option(min=2, help="Frames of a window; by default the model's.")] = None,
+    prompt: Annotated[int | None, Option(min=1, help="Number of true frames to start from.")] = None,
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
     precision: Precision = "float32",
     compile: Compile = False,
     device: Device = "auto",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollouts.")] = 0,
+    seed: Annotated[int, Option(min=0, help="Seed of the rollouts.")] = 0,
     cameras: Cameras = None,
     paper: Annotated[
-        bool, typer.Option("--paper", help="Also follow the paper's protocol: Gaussian actions, true past.")
+        bool, Option("--paper", help="Also follow the paper's protocol: Gaussian actions, true past.")
     ] = False,
     state: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--state",
             help="Measure what the robot does in the pictures, against its recorded or simulated state.",
         ),
     ] = False,
     episodes: Annotated[
-        int, typer.Option("--episodes", min=2, help="Episodes that --state simulates of a laboratory robot.")
+        int, Option(min=2, help="Episodes that --state simulates of a laboratory robot.")
     ] = 32,
-    lpips: Annotated[str | None, typer.Option("--lpips", metavar="FILE#SHA256", help=LPIPS_HELP)] = None,
-    fid: Annotated[
-        str | None, typer.Option("--fid", metavar="FILE#SHA256", help="Weights of FID's Inception.")
+    lpips: Annotated[
+        str | None, Option(metavar="FILE#SHA256", help="Weights of LPIPS, with their hash.")
     ] = None,
+    fid: Annotated[str | None, Option(metavar="FILE#SHA256", help="Weights of FID's Inception.")] = None,
     fvd: Annotated[
-        list[str] | None,
-        typer.Option("--fvd", metavar="FILE#SHA256", help="Weights of FVD's I3D; repeat for two."),
+        list[str] | None, Option(metavar="FILE#SHA256", help="Weights of FVD's I3D; repeat for two.")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for results.json, results.md and report.html.")
-    ] = None,
+    out: Annotated[Path | None, Option(help="Folder for results.json, results.md and report.html.")] = None,
     json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object a line, for each checkpoint and set.")
+        bool, Option("--json", help="Print one JSON object a line, for each checkpoint and set.")
     ] = False,
 ) -> None:
     """Measure how well rollouts predict: with the true actions, another window's, none, and beside a copy.
@@ -110,7 +103,7 @@ def evaluate(
         ShardSet(folder)  # it and the checkpoints are refused before torch is imported
     for name in checkpoints:
         require_checkpoint(name)
-    with interruptible(lambda: _kept(out)):
+    with interruptible(lambda: kept("parts", out)):
         from hma_model.evaluation.perceptual import open_networks
         from hma_model.evaluation.suite import Settings, evaluate_all
 
@@ -135,12 +128,6 @@ def evaluate(
         _print_table(parts)
     if out is not None and not json:
         print(f"open {page}")
-
-
-def _kept(out: Path | None) -> str:
-    if out is None:
-        return "nothing is kept; with --out, finished parts are"
-    return f"finished parts are kept in {out}; run the same command again to continue"
 
 
 def _print_one(part: "Part") -> None:

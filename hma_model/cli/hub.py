@@ -6,29 +6,30 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
+from hma_data.cli.options import Folder, Json
 from hma_data.console import human_bytes, human_count, print_json, print_lines, print_table
 
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Embodiments = Annotated[
-    list[str] | None, typer.Option("--embodiment", "-e", help="Only this robot; repeat for more.")
+    list[str] | None, Option("--embodiment", "-e", help="Only this robot; repeat for more.")
 ]
-Revision = Annotated[str | None, typer.Option("--revision", help="Branch, tag or commit.")]
-Private = Annotated[bool, typer.Option("--private", help="Create a new repository as a private one.")]
+Saved = Annotated[Path, Argument(help="A checkpoint, or a run's folder.")]
+Revision = Annotated[str | None, Option("--revision", help="Branch, tag or commit.")]
+Private = Annotated[bool, Option("--private", help="Create a new repository as a private one.")]
 hub_app = typer.Typer(no_args_is_help=True, help="Publish and pull checkpoints, one robot at a time.")
 
 
 @hub_app.command("push")
 def push(
-    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint, or a run's folder.")],
-    target: Annotated[str, typer.Argument(help="A folder, or org/name on the hub.")],
+    checkpoint: Saved,
+    target: Annotated[str, Argument(help="A folder, or org/name on the hub.")],
     embodiment: Embodiments = None,
     sample: Annotated[
-        list[Path] | None,
-        typer.Option("--sample", help="Shard set to roll out for the card's film; default: the run's."),
+        list[Path] | None, Option(help="Shard set to roll out for the card's film; default: the run's.")
     ] = None,
     film: Annotated[
-        bool, typer.Option("--film/--no-film", help="Make a film for the card if the run's shards are here.")
+        bool, Option("--film/--no-film", help="Make a film for the card if the run's shards are here.")
     ] = True,
     private: Private = False,
 ) -> None:
@@ -85,9 +86,9 @@ def _add_films(checkpoint: Path, sample: list[Path] | None, embodiments: list[st
 
 @hub_app.command("pull")
 def pull(
-    source: Annotated[str, typer.Argument(help="A folder, or org/name on the hub.")],
+    source: Annotated[str, Argument(help="A folder, or org/name on the hub.")],
     embodiment: Embodiments = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder; by default the local cache.")] = None,
+    out: Annotated[Path | None, Option(help="Folder; by default the local cache.")] = None,
     revision: Revision = None,
 ) -> None:
     """Fetch the trunk and only the chosen robots.
@@ -101,7 +102,7 @@ def pull(
 
 @hub_app.command("list")
 def listing(
-    source: Annotated[str, typer.Argument(help="A folder with one checkpoint or many, or org/name.")],
+    source: Annotated[str, Argument(help="A folder with one checkpoint or many, or org/name.")],
     revision: Revision = None,
     json: Json = False,
 ) -> None:
@@ -130,8 +131,8 @@ def listing(
 
 @hub_app.command("push-data")
 def push_data(
-    folder: Annotated[Path, typer.Argument(help="A shard set.")],
-    target: Annotated[str, typer.Argument(help="org/name of a dataset on the hub, or a folder.")],
+    folder: Folder,
+    target: Annotated[str, Argument(help="org/name of a dataset on the hub, or a folder.")],
     private: Private = False,
 ) -> None:
     """Publish a shard set as a dataset; run it again to continue after an interruption.
@@ -145,8 +146,8 @@ def push_data(
 
 @hub_app.command("pull-data")
 def pull_data(
-    source: Annotated[str, typer.Argument(help="org/name of a dataset on the hub, or a folder.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the shard set.")],
+    source: Annotated[str, Argument(help="org/name of a dataset on the hub, or a folder.")],
+    out: Annotated[Path, Option(help="Folder of the shard set.")],
     revision: Revision = None,
 ) -> None:
     """Fetch a published shard set; run it again to continue after an interruption.
@@ -160,13 +161,11 @@ def pull_data(
 
 @hub_app.command("import")
 def import_released(
-    source: Annotated[str, typer.Argument(help="A released checkpoint: a folder, or org/name on the hub.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the new checkpoint.")],
+    source: Annotated[str, Argument(help="A released checkpoint: a folder, or org/name on the hub.")],
+    out: Annotated[Path, Option(help="Folder of the new checkpoint.")],
     embodiment: Embodiments = None,
-    grid: Annotated[
-        tuple[int, int] | None, typer.Option("--grid", help="Height and width, if not square.")
-    ] = None,
-    tokenizer: Annotated[str | None, typer.Option("--tokenizer", help="By default the paper's.")] = None,
+    grid: Annotated[tuple[int, int] | None, Option(help="Height and width, if not square.")] = None,
+    tokenizer: Annotated[str | None, Option(help="By default the paper's.")] = None,
     revision: Revision = None,
     json: Json = False,
 ) -> None:
@@ -187,8 +186,8 @@ def import_released(
 
 @hub_app.command("export")
 def export_released(
-    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint, or a run's folder.")],
-    out: Annotated[Path, typer.Option("--out", help="A new folder: config.json, model.safetensors.")],
+    checkpoint: Saved,
+    out: Annotated[Path, Option(help="A new folder: config.json, model.safetensors.")],
     embodiment: Embodiments = None,
 ) -> None:
     """Write a checkpoint in the layout of the paper's release, for its code to read.

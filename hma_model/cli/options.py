@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 from hma_data.errors import HMAError, UsageError
 
@@ -15,42 +15,50 @@ def embedded_robots(incomplete: str) -> list[str]:
 
 
 Checkpoint = Annotated[
-    str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
+    str, Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
 ]
-Data = Annotated[Path, typer.Argument(help="A shard set.")]
-Split = Annotated[Literal["train", "val"], typer.Option("--split", help="Split to take windows from.")]
+OfCheckpoint = Annotated[str, Option("--checkpoint", help="A checkpoint, a run's folder, or a hub repo.")]
+Data = Annotated[Path, Argument(help="A shard set.")]
+Split = Annotated[Literal["train", "val"], Option("--split", help="Split to take windows from.")]
 UnmaskSteps = Annotated[
-    int, typer.Option("--unmask-steps", min=1, help="Passes in which a discrete model decodes a frame.")
+    int, Option("--unmask-steps", min=1, help="Passes in which a discrete model decodes a frame.")
 ]
 Temperature = Annotated[
     float | None,
-    typer.Option("--temperature", min=0, help="0 takes the likeliest token; default 0.5, of latents 0."),
+    Option("--temperature", min=0, help="0 takes the likeliest token; default 0.5, of latents 0."),
 ]
 SampleSteps = Annotated[
-    int | None,
-    typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own."),
+    int | None, Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own.")
 ]
 Precision = Annotated[
     Literal["float32", "bf16", "int8"],
-    typer.Option(
+    Option(
         "--precision",
         help="Of the products in rollouts; bf16 and int8 want a processor that has them, bf16 also a GPU.",
     ),
 ]
 Compile = Annotated[
-    bool,
-    typer.Option("--compile", help="Compile the trunk for rollouts; pays on a GPU, after a minute or more."),
+    bool, Option("--compile", help="Compile the trunk for rollouts; pays on a GPU, after a minute or more.")
 ]
 Device = Annotated[
-    str,
-    typer.Option("--device", help="Of model and tokenizer: auto (a GPU if there is one), cpu, cuda or mps."),
+    str, Option("--device", help="Of model and tokenizer: auto (a GPU if there is one), cpu, cuda or mps.")
 ]
 Cameras = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--cameras", metavar="NAME[,NAME…]", help="Cameras to show the model; default: those of its training."
     ),
 ]
+
+
+Seed = Annotated[int, Option(min=0, help="Seed of everything.")]
+
+
+def kept(what: str, out: Path | None) -> str:
+    """Return what a Ctrl-C leaves in the folder of --out, and how to go on."""
+    if out is None:
+        return f"nothing is kept; with --out, finished {what} are"
+    return f"finished {what} are kept in {out}; run the same command again to continue"
 
 
 def device_name(device: str) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import quote
 
-import typer
+from typer import Argument, Option
 
 from hma_data.errors import UsageError
 from hma_model.cli.options import Compile, Device, Precision, device_name, embedded_robots, require_checkpoint
@@ -19,37 +19,30 @@ from hma_model.cli.options import Compile, Device, Precision, device_name, embed
 def play(
     checkpoint: Annotated[
         str,
-        typer.Argument(
+        Argument(
             help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]); by default the one that "
             "comes along."
         ),
     ] = "embedded",
     data: Annotated[
-        list[Path] | None, typer.Argument(help="Shard sets, whose held-out episodes give more scenes.")
+        list[Path] | None, Argument(help="Shard sets, whose held-out episodes give more scenes.")
     ] = None,
     prompt: Annotated[
-        list[Path] | None,
-        typer.Option("--prompt", help="A picture to begin from; repeat it for several, in their order."),
+        list[Path] | None, Option(help="A picture to begin from; repeat it for several, in their order.")
     ] = None,
     embodiment: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "-e", "--embodiment", help="The robot that the page opens with.", autocompletion=embedded_robots
         ),
     ] = None,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one.")] = 0,
-    host: Annotated[
-        str, typer.Option("--host", help="Address to listen on; any but loopback needs a token.")
-    ] = "127.0.0.1",
-    token: Annotated[
-        str | None, typer.Option("--token", help="What the address must carry; made up with --host.")
-    ] = None,
+    port: Annotated[int, Option(min=0, max=65535, help="0 takes a free one.")] = 0,
+    host: Annotated[str, Option(help="Address to listen on; any but loopback needs a token.")] = "127.0.0.1",
+    token: Annotated[str | None, Option(help="What the address must carry; made up with --host.")] = None,
     device: Device = "auto",
     precision: Precision = "float32",
     compile: Compile = False,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
-    ] = True,
+    browser: Annotated[bool, Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
 ) -> None:
     """Drive robots in a world model, in the browser, beside their true simulators.
 

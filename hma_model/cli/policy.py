@@ -3,51 +3,50 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
+from hma_data.cli.options import Json
 from hma_data.console import human_count, interruptible, print_json, progress
-from hma_model.cli.hub import Json
 from hma_model.cli.options import (
     Compile,
     Device,
+    OfCheckpoint,
     Precision,
+    Seed,
     Temperature,
     UnmaskSteps,
     device_name,
     embedded_robots,
+    kept,
 )
 
 
 def policy_eval(
     embodiment: Annotated[
         str,
-        typer.Argument(
-            help="A robot of the laboratory that the checkpoint has.", autocompletion=embedded_robots
-        ),
+        Argument(help="A robot of the laboratory that the checkpoint has.", autocompletion=embedded_robots),
     ],
     policies: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             metavar="POLICY…",
             help="scripted, reach, either with :noise=SHARE, random, still, hma:CHECKPOINT, plan:cem, "
             "lerobot:FOLDER_OR_REPO, or MODULE:NAME of a Python function or class: picture to command.",
         ),
     ],
-    checkpoint: Annotated[
-        str, typer.Option("--checkpoint", help="A checkpoint, a run's folder, or a hub repo.")
-    ] = "embedded",
-    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes of each policy.")] = 32,
-    frames: Annotated[int, typer.Option("--frames", min=4, help="Frames of an episode.")] = 40,
+    checkpoint: OfCheckpoint = "embedded",
+    episodes: Annotated[int, Option(min=1, help="Episodes of each policy.")] = 32,
+    frames: Annotated[int, Option(min=4, help="Frames of an episode.")] = 40,
     judge: Annotated[
-        str, typer.Option("--judge", help="What success is: moved, reached, placed, or with px: moved=8.")
+        str, Option(help="What success is: moved, reached, placed, or with px: moved=8.")
     ] = "moved",
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
     precision: Precision = "float32",
     compile: Compile = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
+    seed: Seed = 0,
     device: Device = "auto",
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for the page and the figures.")] = None,
+    out: Annotated[Path | None, Option(help="Folder for the page and the figures.")] = None,
     json: Json = False,
 ) -> None:
     """Score policies in a robot's simulator and inside the world model, and compare the two.
@@ -60,15 +59,24 @@ def policy_eval(
     from hma_model.policies.scores import evaluate_policies
 
     there = device_name(device)
-    words = "nothing is kept; with --out, finished policies are"
-    if out:
-        words = f"finished policies are kept in {out}; run the same command again to continue"
-    with interruptible(lambda: words), progress("policies", len(policies) * episodes * frames) as update:
+    whole = len(policies) * episodes * frames
+    with interruptible(lambda: kept("policies", out)), progress("policies", whole) as update:
         found = evaluate_policies(
-            embodiment, policies, checkpoint=checkpoint, episodes=episodes, frames=frames, judge=judge,
-            seed=seed, out=out, unmask_steps=unmask_steps, temperature=temperature, device=there,
-            precision=precision, compile=compile, on_progress=update,
-        )  # fmt: skip
+            embodiment,
+            policies,
+            checkpoint=checkpoint,
+            episodes=episodes,
+            frames=frames,
+            judge=judge,
+            seed=seed,
+            out=out,
+            unmask_steps=unmask_steps,
+            temperature=temperature,
+            device=there,
+            precision=precision,
+            compile=compile,
+            on_progress=update,
+        )
     page = write_report(found, out) if out else None
     if json:
         print_json(found.to_json())
@@ -80,45 +88,28 @@ def policy_eval(
 
 def augment(
     embodiment: Annotated[
-        str, typer.Argument(help="A robot that the checkpoint has.", autocompletion=embedded_robots)
+        str, Argument(help="A robot that the checkpoint has.", autocompletion=embedded_robots)
     ],
-    out: Annotated[Path, typer.Argument(help="Folder for the shard set.")],
-    checkpoint: Annotated[
-        str, typer.Option("--checkpoint", help="A checkpoint, a run's folder, or a hub repo.")
-    ] = "embedded",
+    out: Annotated[Path, Argument(help="Folder for the shard set.")],
+    checkpoint: OfCheckpoint = "embedded",
     source: Annotated[
-        Path | None,
-        typer.Option("--from", help="Shard set of first frames and commands; else the simulator's."),
+        Path | None, Option("--from", help="Shard set of first frames and commands; else the simulator's.")
     ] = None,
-    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes to make.")] = 64,
+    episodes: Annotated[int, Option(min=1, help="Episodes to make.")] = 64,
     frames: Annotated[
-        int,
-        typer.Option(
-            "--frames",
-            min=4,
-            help="Frames to generate of each; the last, without commands, is not stored.",
-        ),
+        int, Option(min=4, help="Frames to generate of each; the last, without commands, is not stored.")
     ] = 40,
     commands: Annotated[
-        str,
-        typer.Option(
-            "--commands", help="replay, perturb=SHARE of their spread, or a policy as of hma policy-eval."
-        ),
+        str, Option(help="replay, perturb=SHARE of their spread, or a policy as of hma policy-eval.")
     ] = "replay",
-    keep: Annotated[
-        float, typer.Option("--keep", help="Share to keep: the episodes of which the model is surest.")
-    ] = 0.5,
-    judge: Annotated[
-        str, typer.Option("--judge", help="Keep only successes at this: moved, reached, placed, moved=PX.")
-    ] = "",
-    lerobot: Annotated[
-        Path | None, typer.Option("--lerobot", help="Folder for them as a LeRobotDataset v3.0 as well.")
-    ] = None,
+    keep: Annotated[float, Option(help="Share to keep: the episodes of which the model is surest.")] = 0.5,
+    judge: Annotated[str, Option(help="Keep only successes at this: moved, reached, placed, moved=PX.")] = "",
+    lerobot: Annotated[Path | None, Option(help="Folder for them as a LeRobotDataset v3.0 as well.")] = None,
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
     precision: Precision = "float32",
     compile: Compile = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
+    seed: Seed = 0,
     device: Device = "auto",
     json: Json = False,
 ) -> None:
@@ -138,8 +129,8 @@ def augment(
         embodiment, name, episodes, frames, commands, keep, judge, seed, unmask_steps, temperature, precision
     )
     finished = (out / MANIFEST).is_file() and (lerobot is None or (lerobot / FACTS).is_file())
-    words = f"finished batches are kept in {out}; run the same command again to continue"
-    with interruptible(lambda: words), progress("episodes", episodes * frames) as update:
+    whole = episodes * frames
+    with interruptible(lambda: kept("batches", out)), progress("episodes", whole) as update:
         made = run(
             out,
             settings,
@@ -150,13 +141,13 @@ def augment(
             compile=compile,
             on_progress=update,
         )
-    kept = sum(split["episodes"] for split in made.splits.values())
+    count = sum(split["episodes"] for split in made.splits.values())
     if json:
-        print_json({"out": str(out), "made": episodes, "kept": kept, "plan": made.plan})
+        print_json({"out": str(out), "made": episodes, "kept": count, "plan": made.plan})
         return
     before = "finished already: " if finished else ""
     begun = len(set(ShardSet(out).episodes["group"].to_pylist()))
-    said = f"kept {human_count(kept, 'episode')} of {episodes} in {out}"
+    said = f"kept {human_count(count, 'episode')} of {episodes} in {out}"
     print(f"{before}{said}, begun in {human_count(begun, 'real one')}; synthetic: true in every file")
     if lerobot:
         print(f"the same as a LeRobotDataset: {lerobot}")
@@ -166,17 +157,14 @@ def augment(
 
 
 def label_actions(
-    film: Annotated[str, typer.Argument(help="A shard set, or a folder of video files.")],
-    checkpoint: Annotated[str, typer.Option("--checkpoint", help="A run with the objective `inverse`.")],
+    film: Annotated[str, Argument(help="A shard set, or a folder of video files.")],
+    checkpoint: Annotated[str, Option(help="A run with the objective `inverse`.")],
     embodiment: Annotated[
-        str, typer.Option("-e", "--embodiment", help="The robot of the checkpoint whose commands they are.")
+        str, Option("-e", "--embodiment", help="The robot of the checkpoint whose commands they are.")
     ],
-    out: Annotated[Path, typer.Option("--out", help="Folder for the labelled shards.")],
+    out: Annotated[Path, Option(help="Folder for the labelled shards.")],
     check: Annotated[
-        str | None,
-        typer.Option(
-            "--check", help="Labelled shards for the error; else those that the training run held out."
-        ),
+        str | None, Option(help="Labelled shards for the error; else those that the training run held out.")
     ] = None,
     device: Device = "auto",
     json: Json = False,
@@ -189,8 +177,7 @@ def label_actions(
     from hma_model.synthetic.labels import label_actions as run
 
     there = device_name(device)
-    words = f"finished episodes are kept in {out}; run the same command again to continue"
-    with interruptible(lambda: words), progress("film", unit="episodes") as update:
+    with interruptible(lambda: kept("episodes", out)), progress("film", unit="episodes") as update:
         made = run(
             film, out, embodiment, checkpoint=checkpoint, check=check, device=there, on_progress=update
         )
@@ -203,7 +190,7 @@ def label_actions(
         said = "does not vary there" if share is None else f"{share:.0%} of the variance explained"
         worse = "; no better than the mean: do not use it" if share is not None and share <= 0 else ""
         print(f"  {name}: RMSE {rmse:.3g}, {said}{worse}")
-    kept = human_count(sum(split["episodes"] for split in splits), "episode")
-    print(f"{kept} in {out}; inferred_actions: true in every file")
+    made_of = human_count(sum(split["episodes"] for split in splits), "episode")
+    print(f"{made_of} in {out}; inferred_actions: true in every file")
     if made.manifest.quarantined:
         print(f"{made.manifest.quarantined} in quarantine; {out / QUARANTINE} has the reasons")

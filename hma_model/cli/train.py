@@ -5,20 +5,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from hma_data.cli.complete import recipes
+from hma_data.cli.options import Json, recipes
 from hma_data.cli.shards import refuse_early
 from hma_data.console import human_seconds, interruptible, print_json
 
 if TYPE_CHECKING:
     from hma_model.training.loop import TrainResult
 
-Overrides = Annotated[
-    list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Dotted overrides of the recipe.")
-]
-Out = Annotated[Path | None, typer.Option("--out", help="The run's folder.")]
-Force = Annotated[bool, typer.Option("--force", help="Resume although the recipe or the shards changed.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Overrides = Annotated[list[str] | None, Argument(metavar="KEY=VALUE", help="Dotted overrides of the recipe.")]
+Out = Annotated[Path | None, Option("--out", help="The run's folder.")]
+Force = Annotated[bool, Option("--force", help="Resume although the recipe or the shards changed.")]
 MODELS = "Models"  # the panel of `hma --help`
 STOPPED = "the run's checkpoints are kept; the same command continues from the newest"
 
@@ -30,7 +28,7 @@ def mount(app: typer.Typer) -> None:
 
 
 def train(
-    recipe: Annotated[str, typer.Argument(help="A recipe: name or YAML file.", autocompletion=recipes)],
+    recipe: Annotated[str, Argument(help="A recipe: name or YAML file.", autocompletion=recipes)],
     overrides: Overrides = None,
     out: Out = None,
     force: Force = False,
@@ -68,23 +66,18 @@ def _refuse_early(recipe: str, overrides: list[str]) -> None:
 
 def finetune(
     source: Annotated[
-        str, typer.Option("--from", help="A checkpoint, a run's folder, a URI, or ORG/NAME[@REVISION].")
+        str, Option("--from", help="A checkpoint, a run's folder, a URI, or ORG/NAME[@REVISION].")
     ],
-    data: Annotated[
-        list[Path], typer.Option("--data", help="A shard set; more may follow it, or repeat --data.")
-    ],
+    data: Annotated[list[Path], Option(help="A shard set; more may follow it, or repeat --data.")],
     overrides: Annotated[
         list[str] | None,
-        typer.Argument(metavar="SHARDS|KEY=VALUE", help="More shard sets; overrides of the recipe."),
+        Argument(metavar="SHARDS|KEY=VALUE", help="More shard sets; overrides of the recipe."),
     ] = None,
     freeze_trunk: Annotated[
-        bool, typer.Option("--freeze-trunk", help="Train stems and heads; keep the trunk as it is.")
+        bool, Option("--freeze-trunk", help="Train stems and heads; keep the trunk as it is.")
     ] = False,
     recipe: Annotated[
-        str | None,
-        typer.Option(
-            "--recipe", help="Name or YAML file; finetune_tiny for the embedded model, else finetune."
-        ),
+        str | None, Option(help="Name or YAML file; finetune_tiny for the embedded model, else finetune.")
     ] = None,
     out: Out = None,
     force: Force = False,

@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
-from hma_data.cli.complete import robots
+from hma_data.cli.options import robot_option
 from hma_data.errors import UsageError
 from hma_model.cli.play import has_display
 
@@ -14,28 +14,18 @@ if TYPE_CHECKING:
 
 
 def view(
-    place: Annotated[str, typer.Argument(help="A recording (with -e), a shard set, or a training run.")],
+    place: Annotated[str, Argument(help="A recording (with -e), a shard set, or a training run.")],
     data: Annotated[
-        list[Path] | None, typer.Argument(help="Of a run: shard sets, if those of its recipe were moved.")
+        list[Path] | None, Argument(help="Of a run: shard sets, if those of its recipe were moved.")
     ] = None,
     embodiment: Annotated[
-        str | None,
-        typer.Option(
-            "--embodiment",
-            "-e",
-            help="Robot of a recording: a registry id, or a YAML file.",
-            autocompletion=robots,
-        ),
+        str | None, robot_option("Robot of a recording: a registry id, or a YAML file.")
     ] = None,
     episode: Annotated[
-        int, typer.Option("--episode", min=0, help="Number of the episode; of a run, of the held-out window.")
+        int, Option(min=0, help="Number of the episode; of a run, of the held-out window.")
     ] = 0,
-    tokenizer: Annotated[
-        str | None, typer.Option("--tokenizer", help="Of a recording: show its decoded tokens too.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="The .rrd file; by default the viewer opens.")
-    ] = None,
+    tokenizer: Annotated[str | None, Option(help="Of a recording: show its decoded tokens too.")] = None,
+    out: Annotated[Path | None, Option(help="The .rrd file; by default the viewer opens.")] = None,
 ) -> None:
     """Show an episode in Rerun: cameras, decoded tokens, actions, states and skew on one clock.
 

@@ -17,7 +17,7 @@ import pytest
 
 from hma_data.conversion import worker as shard_work
 from hma_data.conversion.engines import Limits
-from hma_data.conversion.job import convert, convert_share
+from hma_data.conversion.job import Conversion, convert
 from hma_data.conversion.output import LOCK, Share, locked
 from hma_data.errors import HMAError, OutputError
 from hma_data.registry.embodiment import Embodiment
@@ -72,14 +72,9 @@ def test_shares_in_any_order_make_what_one_job_makes(
     order = list(range(count))
     random.Random(count).shuffle(order)
     for index in order:
-        done = convert_share(
-            toy_arm,
-            str(toy_recording),
-            BlockTokenizer(),
-            tmp_path / "out",
-            Share(index, count),
-            settings=SMALL,
-        )
+        done = Conversion(
+            toy_arm, str(toy_recording), BlockTokenizer(), tmp_path / "out", settings=SMALL
+        ).run_share(Share(index, count))
         assert (done.missing == 0) == (index == order[-1])
     assert contents(tmp_path / "out") == whole
 
@@ -87,14 +82,8 @@ def test_shares_in_any_order_make_what_one_job_makes(
 def test_shares_run_side_by_side_and_one_of_them_finishes(
     toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
 ) -> None:
-    threads = [
-        threading.Thread(
-            target=convert_share,
-            args=(toy_arm, str(toy_recording), BlockTokenizer(), tmp_path / "out", Share(i, 3)),
-            kwargs={"settings": SMALL},
-        )
-        for i in range(3)
-    ]
+    job = Conversion(toy_arm, toy_recording, BlockTokenizer(), tmp_path / "out", settings=SMALL)
+    threads = [threading.Thread(target=job.run_share, args=(Share(i, 3),)) for i in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hma_data.conversion import job
-from hma_data.conversion.job import convert_share
+from hma_data.conversion.job import Conversion
 from hma_data.conversion.output import LOCK, Share
 from hma_data.conversion.report import Shared
 from hma_data.errors import OutputError
@@ -89,7 +89,9 @@ def test_rows_of_another_stride_are_refused_and_nothing_is_touched(toy_recording
         with pytest.raises(OutputError, match=said):
             run(robot(1), toy_recording, out, settings, **options)
     with pytest.raises(OutputError, match=said):
-        convert_share(robot(1), str(toy_recording), BlockTokenizer(), out, Share(0, 2), settings=settings)
+        Conversion(robot(1), str(toy_recording), BlockTokenizer(), out, settings=settings).run_share(
+            Share(0, 2)
+        )
     (out / LOCK).unlink()  # which shares leave; it locks nothing
     assert contents(out) == before
     kept = run(robot(1, "stride: 2\n"), toy_recording, out, settings)
@@ -113,7 +115,7 @@ def test_shares_that_find_a_finished_set_bring_the_stride_once(toy_recording, tm
     def work(index: int) -> None:
         source, share = str(toy_recording), Share(index, 3)
         with suppress(OutputError):  # one that begins while another writes the manifest
-            done.append(convert_share(robot(5), source, BlockTokenizer(), out, share, settings=SMALL))
+            done.append(Conversion(robot(5), source, BlockTokenizer(), out, settings=SMALL).run_share(share))
 
     threads = [threading.Thread(target=work, args=(index,)) for index in range(3)]
     for thread in threads:
@@ -128,7 +130,7 @@ def test_a_share_of_a_finished_set_writes_nothing_where_nothing_has_changed(toy_
     out, source = tmp_path / "out", str(toy_recording)
     run(robot(), toy_recording, out)
     before = (out / "manifest.json").stat().st_mtime_ns
-    again = convert_share(robot(), source, BlockTokenizer(), out, Share(0, 2), settings=SMALL)
+    again = Conversion(robot(), source, BlockTokenizer(), out, settings=SMALL).run_share(Share(0, 2))
     assert (again.made_shards, again.missing, again.changed) == (0, 0, "")
     assert (out / "manifest.json").stat().st_mtime_ns == before
 

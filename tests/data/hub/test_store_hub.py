@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hma_data.conversion import publish
-from hma_data.conversion.job import convert, convert_share
+from hma_data.conversion.job import Conversion, convert
 from hma_data.conversion.output import Share
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.publish import HubOutput
@@ -252,4 +252,6 @@ def test_what_a_hub_cannot_take_is_told(toy_arm, toy_recording, hub) -> None:
     with pytest.raises(OutputError, match="names no dataset of the hub"):
         run(toy_arm, toy_recording, out="hf://team/arm")
     with pytest.raises(OutputError, match="takes whole conversions only"):
-        convert_share(toy_arm, str(toy_recording), BlockTokenizer(), Path(OUT), Share(0, 2), settings=SMALL)
+        Conversion(toy_arm, str(toy_recording), BlockTokenizer(), Path(OUT), settings=SMALL).run_share(
+            Share(0, 2)
+        )

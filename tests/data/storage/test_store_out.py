@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from hma_data.conversion.job import convert, convert_share
+from hma_data.conversion.job import Conversion, convert
 from hma_data.conversion.output import PLAN, Share
 from hma_data.conversion.report import Shared
 from hma_data.conversion.rewrite import merge, restat
@@ -83,7 +83,9 @@ def test_shares_write_into_one_store(toy_arm, toy_recording, out, whole) -> None
 
         def work(share: Share = share) -> None:
             done.append(
-                convert_share(toy_arm, str(toy_recording), BlockTokenizer(), out, share, settings=SMALL)
+                Conversion(toy_arm, str(toy_recording), BlockTokenizer(), out, settings=SMALL).run_share(
+                    share
+                )
             )
 
         threads.append(threading.Thread(target=work))

@@ -1,0 +1,56 @@
+"""Define the arguments and options that several verbs share.
+
+The Tab key completes robots, tokenizers and recipes by the functions here; paths are the shell's own work.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from typer import Argument, Option
+
+
+def robots(incomplete: str) -> list[str]:
+    """Return the ids of the registry that begin so."""
+    from hma_data.registry.catalog import file_id, registry_files
+
+    return _begun(map(file_id, registry_files()), incomplete)
+
+
+def tokenizers(incomplete: str) -> list[str]:
+    """Return the names of tokenizers, those of installed packages too, that begin so."""
+    from hma_data.plugins import TOKENIZER_GROUP, installed
+    from hma_data.tokenizers.catalog import CATALOG
+
+    return _begun([*CATALOG, *installed(TOKENIZER_GROUP)], incomplete)
+
+
+def recipes(incomplete: str) -> list[str]:
+    """Return the names of shipped recipes of training that begin so."""
+    from hma_data.storage.paths import shipped
+
+    return _begun((path.stem for path in (shipped("recipes") / "train").glob("*.yaml")), incomplete)
+
+
+def _begun(names: Iterable[str], incomplete: str) -> list[str]:
+    return sorted({name for name in names if name.startswith(incomplete)})
+
+
+def robot_option(text: str) -> Any:
+    """Return the option --embodiment, -e with its help."""
+    return Option("--embodiment", "-e", help=text, autocompletion=robots)
+
+
+def choice_option(text: str, **options: Any) -> Any:
+    """Return an option that chooses episodes, with its help."""
+    return Option(help=f"{text}: id, glob or @FILE of ids; repeat it for more.", **options)
+
+
+Json = Annotated[bool, Option("--json", help="Print JSON.")]
+Folder = Annotated[Path, Argument(help="A shard set.")]
+Weights = Annotated[str | None, Option(help="The tokenizer's weights, if not the usual ones.")]
+Episodes = Annotated[int, Option(min=1, help="Number of episodes to look into.")]
+FailOn = Annotated[
+    Literal["info", "warn", "error", "never"],
+    Option(help="Exit with 1 if there is a finding of this severity or worse."),
+]
