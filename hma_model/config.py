@@ -295,7 +295,6 @@ class HMAConfig:
     def from_json(cls, source: str | Mapping[str, Any], where: str = "model") -> Self:
         """Read the dictionary of `to_json`, or its text; a RecipeError names an unknown field."""
         values = json.loads(source) if isinstance(source, str) else dict(source)
-        values.setdefault("diffusion_target", "noise")  # the only one before it became a field
         unknown = sorted(set(values) - {f.name for f in dataclasses.fields(cls)})
         if unknown:
             names = ", ".join(f.name for f in dataclasses.fields(cls))

@@ -103,8 +103,8 @@ def extended(
 
 
 def _contents(known: pa.Table, ids: pa.ChunkedArray) -> dict[str, str]:
-    """Return id -> hash of the content, of these ids; sets of older releases have none."""
-    if not len(ids) or "content" not in known.column_names:
+    """Return id -> hash of the content, of these ids."""
+    if not len(ids):
         return {}
     some = known.filter(pc.is_in(known["id"], ids.combine_chunks()))
     return dict(zip(some["id"].to_pylist(), some["content"].to_pylist()))

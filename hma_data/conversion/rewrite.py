@@ -134,7 +134,7 @@ class _Job:
 
 def _make_shard(job: _Job, plan: Plan, out: Path, unit: ShardUnit, refused: Sequence[Refused]) -> None:
     readers = [EpisodeReader(shards, shards.columns()) for shards in job.sets]
-    layout = replace(job.sets[0].manifest.layout, embodiment=job.embodiment, camera_rows=False)
+    layout = replace(job.sets[0].manifest.layout, embodiment=job.embodiment)
     stats = layout.empty_stats()
     rows: list[EpisodeRow] = []
     with ShardWriter(out / unit.name, layout.schema, layout.tokenizer) as writer:
@@ -324,7 +324,7 @@ def _check_out(out: StrPath, folders: Sequence[StrPath]) -> None:
 
 def _stateless(shards: ShardSet) -> Embodiment:
     values = {key: value for key, value in shards.embodiment.to_dict().items() if key != "state"}
-    return Embodiment.from_values(values, f"embodiment {shards.embodiment.id}", stored=True)
+    return Embodiment.from_values(values, f"embodiment {shards.embodiment.id}")
 
 
 def _check_alike(first: ShardSet, other: ShardSet) -> None:

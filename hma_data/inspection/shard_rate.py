@@ -1,6 +1,6 @@
 """Find the episodes of a shard set whose grid has another rate than its embodiment states, or has pauses.
 
-A conversion flags them; see `hma_data.episodes.align.rate_flags`. Sets of older releases have no such flag.
+A conversion flags them; see `hma_data.episodes.align.rate_flags`.
 """
 
 from collections.abc import Iterator

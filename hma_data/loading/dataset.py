@@ -129,7 +129,7 @@ class WindowDataset(Dataset[Batch]):
         last = index.last_rows(numbers) if index.padded_episodes else None
         group = np.searchsorted(index.edges, first, side="right") - 1
         over = np.minimum(first + index.span - 1, index.last_rows(numbers)) >= index.edges[group + 1]
-        camera, view = self._decoder.views.taken(by_number(numbers), index.cameras(numbers))
+        camera, view = self._decoder.views.taken(by_number(numbers))
         samples, cuts = [], []  # a window may continue in the next row group
         for key in np.unique(2 * group + over):
             chosen = np.flatnonzero(2 * group + over == key)
@@ -401,7 +401,7 @@ class MixtureDataset(IterableDataset[Batch]):
             "lanes": self.lanes,
             "pools": self._pools,
             "seed": self.seed,
-            **({} if self._cameras == FIRST else {"cameras": self._cameras}),  # older states lack the key
+            "cameras": self._cameras,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -413,7 +413,7 @@ class MixtureDataset(IterableDataset[Batch]):
         Raises:
             UsageError: the state is of another mixture.
         """
-        for key, mine in ({"cameras": None} | self._identity()).items():
+        for key, mine in self._identity().items():
             if state.get(key) != mine:
                 raise UsageError(
                     "sampler state",

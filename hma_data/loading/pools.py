@@ -167,7 +167,7 @@ class WindowSequence:
         self._rows = None  # free the last pool before the next is decoded
         index = self._decoder.index
         units = self._units[order[number * self._pool : (number + 1) * self._pool]]
-        loaded, firsts, lasts, cameras, offset = [], [], [], [], 0
+        loaded, firsts, lasts, offset = [], [], [], 0
         for group in np.unique(units[:, 0]).tolist():
             rows = self._decoder.rows(group)
             chosen = np.zeros(self._parts, np.bool_)
@@ -177,7 +177,6 @@ class WindowSequence:
             shift = offset - index.edges[group]
             firsts.append(index.first_rows(windows) + shift)
             lasts.append(index.last_rows(windows) + shift)
-            cameras.append(index.cameras(windows))
             loaded.append(rows)
             offset += len(rows)
         first = np.concatenate(firsts)
@@ -185,7 +184,7 @@ class WindowSequence:
         self._first = first[mixed]
         self._last = np.concatenate(lasts)[mixed] if index.padded_episodes else None
         draws = np.random.default_rng([*self._entropy, epoch, number, 1]).integers(0, 2**31, len(first))
-        self._camera, self._view = self._decoder.views.taken(draws, np.concatenate(cameras)[mixed])
+        self._camera, self._view = self._decoder.views.taken(draws)
         if self._earlier:
             rng = np.random.default_rng([*self._entropy, epoch, number, 2])
             self._draws = rng.integers(0, 2**31, len(first))

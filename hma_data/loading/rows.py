@@ -166,7 +166,7 @@ class Decoder:
         self.shards, self.split = shards, split
         self.views = Views.of(shards, cameras)
         _check_stride(shards)
-        self.index = WindowIndex.of(shards, split, frames, stride, short, self.views.numbers)
+        self.index = WindowIndex.of(shards, split, frames, stride, short)
         width = token_column(shards.spec)[1] * len(self.views.columns)
         robot = shards.embodiment
         action_width = robot.action_dim * shards.manifest.frame_stride

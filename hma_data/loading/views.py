@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import ShardError, UsageError
+from hma_data.errors import UsageError
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import Ints
 from hma_data.tokenizers.base import TokenizerSpec
@@ -36,14 +36,12 @@ class Views:
     Attributes:
         numbers: their indices among the cameras of the set.
         drawn: whether a window takes one of them, drawn; otherwise it takes all, stacked.
-        columns: the columns that hold their frames; one column where cameras have rows of their own.
-        rows: whether cameras have rows of their own, as in sets of older releases.
+        columns: the columns that hold their frames.
     """
 
     numbers: tuple[int, ...]
     drawn: bool
     columns: tuple[str, ...]
-    rows: bool
 
     @classmethod
     def of(cls, shards: ShardSet, cameras: Cameras) -> "Views":
@@ -51,7 +49,6 @@ class Views:
 
         Raises:
             UsageError: the set lacks one of them, or none or one twice is named.
-            ShardError: several are to be stacked, and the set has a row for each camera.
         """
         layout, robot = shards.manifest.layout, shards.embodiment.id
         names: Sequence[str] = [cameras] if isinstance(cameras, str) else cameras
@@ -68,22 +65,16 @@ class Views:
         if not names or len(set(names)) < len(names):
             raise UsageError("cameras", f"{list(names)!r} names no camera, or one twice", "name each once")
         drawn = cameras == DRAWN and len(names) > 1
-        if layout.camera_rows and len(names) > 1 and not drawn:
-            fault = "has a row for each camera, as older releases wrote it, so its views cannot be stacked"
-            raise ShardError(shards.folder, fault, "convert the recordings again, or use hma shards merge")
-        columns = tuple(dict.fromkeys(layout.token_columns[name] for name in names))
+        columns = tuple(layout.token_columns[name] for name in names)
         numbers = tuple(layout.cameras.index(name) for name in names)
-        return cls(numbers, drawn, columns, layout.camera_rows)
+        return cls(numbers, drawn, columns)
 
-    def taken(self, draws: Ints, of_rows: Ints) -> tuple[Ints, Ints | None]:
+    def taken(self, draws: Ints) -> tuple[Ints, Ints | None]:
         """Return the camera (n,) of each window, and which of the columns (n,) it takes; None for all.
 
         Args:
             draws: (n,) a random number of at least 0 for each window.
-            of_rows: (n,) the camera whose rows each window has, see `WindowIndex.cameras`.
         """
-        if self.rows:
-            return of_rows, None
         if not self.drawn:
             return np.full(len(draws), self.numbers[0]), None
         view = draws % len(self.numbers)

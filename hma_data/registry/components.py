@@ -428,7 +428,7 @@ class SourceSpec(SpecModel):
     @classmethod
     def _keys_of_the_format(cls, value: dict[str, str] | None, info: ValidationInfo) -> Any:
         known = LAYOUTS.get(info.data.get("format", ""))
-        if known and value and not (info.context and info.context["stored"]):
+        if known and value:
             known.model_validate(value)
         return value
 

@@ -137,8 +137,7 @@ class Embodiment(SpecModel):
         if sync and sync.action_shift and value.format in WITHOUT_STEPS:
             said = WITHOUT_STEPS[value.format]
             raise ValueError(f"{said} instead of steps, which sync.action_shift counts")
-        stored = info.context and info.context["stored"]
-        if sync and sync.rate_hz and value.format in ONE_INDEX and not stored:
+        if sync and sync.rate_hz and value.format in ONE_INDEX:
             raise ValueError(
                 f"frames of format {value.format} are not resampled to sync.rate_hz, which is for bags and "
                 "videos of hands; remove it: frequency_hz states the recording's rate, target_hz what the "
@@ -254,36 +253,34 @@ class Embodiment(SpecModel):
         return write_yaml(self.to_dict())
 
     @classmethod
-    def from_yaml(cls, text: str, where: str = "embodiment.yaml", *, stored: bool = False) -> "Embodiment":
+    def from_yaml(cls, text: str, where: str = "embodiment.yaml") -> "Embodiment":
         """Return the embodiment of a YAML text; see `load`."""
-        return cls.from_values(parse_yaml(text, where), where, stored=stored)
+        return cls.from_values(parse_yaml(text, where), where)
 
     @classmethod
-    def load(cls, path: StrPath, *, stored: bool = False) -> "Embodiment":
+    def load(cls, path: StrPath) -> "Embodiment":
         """Return the embodiment of a YAML file.
 
         Args:
             path: str or path of the YAML.
-            stored: the YAML lies in shards or a checkpoint; keys of `source.layout`, and a `sync.rate_hz`,
-                that older releases ignored are no error.
 
         Raises:
             RegistryError: the file has problems; the error lists them all, each with YAML path, value and
                 what is allowed.
         """
         file = as_path(path)
-        return cls.from_values(read_yaml(file), str(file), stored=stored)
+        return cls.from_values(read_yaml(file), str(file))
 
     @classmethod
-    def from_values(cls, values: Any, where: str, *, stored: bool = False) -> "Embodiment":
+    def from_values(cls, values: Any, where: str) -> "Embodiment":
         """Return the embodiment of a YAML's plain values; see `load`."""
-        found = problems(values, stored)
+        found = problems(values)
         if found and all(": still TODO" in problem for problem in found):
             said = f"still to be answered: {', '.join(path for path, _ in todos(values))}"
             raise RegistryError(where, said, "write answers in place of the TODOs in the file")
         if found:
             raise RegistryError(where, "; ".join(found), "hma registry schema prints what is allowed")
-        return cls.model_validate(values, context={"stored": stored})
+        return cls.model_validate(values)
 
 
 @dataclass(frozen=True)
@@ -302,13 +299,13 @@ class Problem:
         return text + (f"; allowed: {self.allowed}" if self.allowed else "")
 
 
-def problems(values: Any, stored: bool = False) -> list[str]:
+def problems(values: Any) -> list[str]:
     """Return all problems of a YAML's plain values, one line each; empty when it is valid."""
-    return [str(problem) for problem in find_problems(values, stored)]
+    return [str(problem) for problem in find_problems(values)]
 
 
-def find_problems(values: Any, stored: bool = False) -> list[Problem]:
-    """Return all problems of a YAML's plain values; for `stored`, see `Embodiment.load`."""
+def find_problems(values: Any) -> list[Problem]:
+    """Return all problems of a YAML's plain values."""
     if not isinstance(values, dict):
         said = {"NoneType": "is empty", "list": "is a list"}.get(type(values).__name__, "is a single value")
         return [
@@ -317,9 +314,8 @@ def find_problems(values: Any, stored: bool = False) -> list[Problem]:
     questions = todos(values)
     found = [Problem(path, f"still {TODO}: {text}") for path, text in questions]
     try:
-        robot = Embodiment.model_validate(values, context={"stored": stored})
-        if not stored:
-            found += _rate_problem(robot)
+        robot = Embodiment.model_validate(values)
+        found += _rate_problem(robot)
     except ValidationError as fault:
         asked = {path for path, _ in questions}
         for item in fault.errors(include_url=False):

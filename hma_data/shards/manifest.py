@@ -184,7 +184,7 @@ class Manifest:
             check_version(values, path)
             manifest = cls(
                 plan=values["plan"],
-                embodiment=Embodiment.from_values(values["embodiment"], str(path), stored=True),
+                embodiment=Embodiment.from_values(values["embodiment"], str(path)),
                 tokenizer=TokenizerSpec.from_json(values["tokenizer"]),
                 shards=tuple(
                     ShardFile(**{**s, "row_groups": tuple(s["row_groups"])}) for s in values["shards"]
@@ -236,7 +236,7 @@ def stored_embodiment(folder: Path) -> Embodiment:
     """
     path = folder / EMBODIMENT
     text = path.read_text(encoding="utf-8", errors="replace")
-    return Embodiment.from_yaml(text, str(path), stored=True)
+    return Embodiment.from_yaml(text, str(path))
 
 
 def seal_problem(text: bytes) -> str:
@@ -304,9 +304,7 @@ class Gathered:
         columns = [  # one after the other: taking from many chunks is slow
             table[column.name].combine_chunks().take(order).cast(column.type) for column in _EPISODE_SCHEMA
         ]
-        table = pa.table(columns, schema=_EPISODE_SCHEMA)
-        known = pc.any(pc.not_equal(table["content"], "")).as_py()
-        return table if known else table.drop_columns("content")  # sets of older releases lack this column
+        return pa.table(columns, schema=_EPISODE_SCHEMA)
 
     def quarantine(self) -> str:
         """Return the text of quarantine.jsonl, in order of the ids."""

@@ -42,14 +42,11 @@ SPARE, SPARE_BYTES = 0.1, 5 * 10**9  # free space to leave: a tenth of the disk,
 class EpisodeIndex:
     """The places of a split's episodes, in arrays of one length.
 
-    A set whose cameras have rows of their own has an entry for each episode and camera.
-
     Attributes:
         episode_index: number of the episode in the plan.
         shard: index into `ShardSet.shards(split)`.
         start: first row in the shard.
         length: number of rows.
-        camera: index of the camera whose rows these are; 0 where the rows hold all cameras.
         pauses: (P, 3) the jumps of time: entry of these arrays, its row before the jump, and how many
             recorded steps it lasts.
     """
@@ -58,7 +55,6 @@ class EpisodeIndex:
     shard: Ints
     start: Ints
     length: Ints
-    camera: Ints
     pauses: Ints = field(default_factory=lambda: np.zeros((0, 3), np.int64))
 
 
@@ -155,7 +151,6 @@ class ShardSet:
 
     def index(self, split: str) -> EpisodeIndex:
         """Return the split's episodes, in row order."""
-        cameras = self.manifest.layout.rows_a_frame
         columns = ["episode_index", "split", "shard", "row_start", "length", "flags"]
         table = self._episodes(columns, read_dictionary=["split", "shard", "flags"])
         splits, names, flags = (_words(table[name]) for name in ("split", "shard", "flags"))
@@ -165,11 +160,8 @@ class ShardSet:
         start, length, index = (
             to_numpy(table[name]).astype(np.int64)[mine] for name in ("row_start", "length", "episode_index")
         )
-        starts = (start[:, None] + np.arange(cameras) * length[:, None]).ravel()
-        number = np.tile(np.arange(cameras), len(index))
-        pauses = _pauses(flags[0][mine], flags[1], self.manifest.frame_stride, cameras)
-        index, shard, length = (np.repeat(values, cameras) for values in (index, shard, length))
-        return EpisodeIndex(index, shard, starts, length, number, pauses)
+        pauses = _pauses(flags[0][mine], flags[1], self.manifest.frame_stride)
+        return EpisodeIndex(index, shard, start, length, pauses)
 
     def read(self, shard: str, row_groups: Sequence[int], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Read columns of some row groups of a shard, (N,) or (N, width) each.
@@ -206,7 +198,7 @@ class ShardSet:
     def episode_rows(
         self, episode_index: int, columns: Sequence[str] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Read all rows of one episode; in sets of older releases, cameras one after the other.
+        """Read all rows of one episode.
 
         Raises:
             ShardError: there is no such episode.
@@ -255,9 +247,8 @@ class EpisodeReader:
         Returns:
             the columns; the frames of the camera are in the first token column.
         """
-        layout, length = self._set.manifest.layout, row["length"]
-        start = row["row_start"] + (layout.cameras.index(camera) * length if layout.camera_rows else 0)
-        values = self.rows(row["shard"], start, length)
+        layout = self._set.manifest.layout
+        values = self.rows(row["shard"], row["row_start"], row["length"])
         columns = {*layout.token_columns.values()}
         kept = {name: column for name, column in values.items() if name not in columns}
         return {token_column(layout.tokenizer)[0]: values[layout.token_columns[camera]], **kept}
@@ -281,14 +272,13 @@ class EpisodeReader:
         return {name: np.concatenate([part[name] for part in parts]) for name in self._columns}
 
 
-def _pauses(flags: Ints, words: Sequence[str], frame_stride: int, cameras: int) -> Ints:
-    """Return `EpisodeIndex.pauses` from the word (N,) of each episode; an episode has `cameras` entries."""
+def _pauses(flags: Ints, words: Sequence[str], frame_stride: int) -> Ints:
+    """Return `EpisodeIndex.pauses` from the word (N,) of each episode."""
     of_word = {i: pauses for i, word in enumerate(words) if (pauses := flag_pauses(word))}
     found = [
-        (episode * cameras + camera, frame // frame_stride, steps)
+        (episode, frame // frame_stride, steps)
         for episode in np.flatnonzero(np.isin(flags, list(of_word))).tolist()
         for frame, steps in of_word[int(flags[episode])].items()
-        for camera in range(cameras)
     ]
     return np.array(found, np.int64).reshape(-1, 3)
 

@@ -48,7 +48,7 @@ class EpisodeRow:
         split: train or val.
         shard: path of its shard below the shard set.
         row_start: number of its first row in the shard.
-        rows: its rows in the shard: its frames; in sets of older releases, frames times cameras.
+        rows: its rows in the shard.
         length: frames.
         skew_p50_ms, skew_p95_ms, skew_max_ms: skew of the stream that was moved furthest.
         skew: stream -> [p50, p95, max] in ms, as JSON.
@@ -271,21 +271,18 @@ def arrow_schema(
     state_width: int,
     further: Sequence[str] = (),
     masks: Sequence[str] = (),
-    camera_rows: bool = False,
 ) -> pa.Schema:
     """Return the columns of a shard; no value is ever null.
 
     Args:
         further: names of the columns of the cameras after the first.
         masks: see `mask_columns`.
-        camera_rows: whether each camera has rows of its own, as in sets of older releases.
     """
     name, width = token_column(spec)
     columns = {
         "episode_index": pa.int32(),
         "frame_index": pa.int32(),
         "timestamp": pa.float64(),
-        "camera": pa.string() if camera_rows else None,
         **{column: _vector(_STORED[spec.dtype], width) for column in (name, *further)},
         "action": _vector(pa.float32(), action_width),
         "state": _vector(pa.float32(), state_width) if state_width else None,
@@ -302,35 +299,24 @@ class RowLayout:
         embodiment, tokenizer: what the set was made with.
         cameras: names, the first one's frames in the first token column.
         frame_stride: recorded steps a row: 1, or the embodiment's stride where only the model's grid is kept.
-        camera_rows: whether each camera has rows of its own, one camera after the other within an episode;
-            older releases wrote several cameras so. Now each camera has a column.
     """
 
     embodiment: Embodiment
     tokenizer: TokenizerSpec
     cameras: tuple[str, ...]
     frame_stride: int
-    camera_rows: bool = False
 
     @classmethod
     def of_plan(cls, plan: dict[str, Any], embodiment: Embodiment) -> "RowLayout":
         """Return the layout that the facts of a plan state."""
         tokenizer, cameras = TokenizerSpec.from_json(plan["tokenizer"]), tuple(plan["cameras"])
-        rows = len(cameras) > 1 and not plan.get("camera_columns")
-        return cls(embodiment, tokenizer, cameras, int(plan["frame_stride"]), rows)
+        return cls(embodiment, tokenizer, cameras, int(plan["frame_stride"]))
 
     @property
     def token_columns(self) -> dict[str, str]:
         """Return camera -> the column of its frames."""
         first = token_column(self.tokenizer)[0]
-        if self.camera_rows:
-            return dict.fromkeys(self.cameras, first)
         return {name: f"{first}_{name}" if i else first for i, name in enumerate(self.cameras)}
-
-    @property
-    def rows_a_frame(self) -> int:
-        """Return the number of rows for each frame: 1, or the number of cameras in sets of older releases."""
-        return len(self.cameras) if self.camera_rows else 1
 
     @property
     def strided(self) -> bool:
@@ -355,9 +341,8 @@ class RowLayout:
             self.tokenizer,
             self.widths["action"] * self.frame_stride,
             self.widths.get("state", 0),
-            () if self.camera_rows else [*self.token_columns.values()][1:],
+            [*self.token_columns.values()][1:],
             mask_columns(self.embodiment),
-            self.camera_rows,
         )
 
     def kept(self, length: int) -> NDArray[np.int64]:

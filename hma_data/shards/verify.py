@@ -180,9 +180,8 @@ def _footer_problems(
     starts = np.cumsum([0, *rows])
     if (begun != starts[:-1]).any() or starts[-1] != shard.rows:
         found.append("its episodes do not follow one another row by row")
-    each = manifest.layout.rows_a_frame
-    if ((rows != length * each) | (length < 1)).any():
-        found.append(f"an episode does not have {each} rows for each frame")
+    if ((rows != length) | (length < 1)).any():
+        found.append("an episode does not have one row for each frame")
     expected, actual = manifest.layout.schema, pq.read_schema(parquet_input(path))
     if not actual.equals(expected, check_metadata=False):
         wrong = [f"{column.name} {column.type}" for column in actual if column not in list(expected)]
@@ -223,18 +222,13 @@ def _read_rows(path: Path, manifest: Manifest) -> tuple[dict[str, NDArray[Any]],
 def _row_problems(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Manifest) -> list[str]:
     """Check rows against the footer: whole episodes, frames that count up, zeros where nothing is known."""
     found: list[str] = []
-    each = manifest.layout.rows_a_frame
     length = to_numpy(footer.table["length"])
-    episodes = np.repeat(to_numpy(footer.table["episode_index"]), length * each)
-    counting = [np.tile(np.arange(n), each) for n in length] or [np.zeros(0)]
+    episodes = np.repeat(to_numpy(footer.table["episode_index"]), length)
+    counting = [np.arange(n) for n in length] or [np.zeros(0)]
     if not np.array_equal(columns["episode_index"], episodes):
         found.append("column episode_index is not what its footer says")
     if not np.array_equal(columns["frame_index"], np.concatenate(counting)):
         found.append("column frame_index does not count up from 0 in every episode")
-    if manifest.layout.camera_rows:
-        names = [camera for n in length for camera in np.repeat(manifest.cameras, n)]
-        if columns["camera"].tolist() != names:
-            found.append(f"column camera is not {', '.join(manifest.cameras)} in turn")
     if (np.diff(columns["timestamp"])[np.diff(columns["frame_index"]) > 0] < 0).any():
         found.append("timestamps go back within an episode")
     for name, mask in KNOWN.items():

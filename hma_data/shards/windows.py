@@ -11,7 +11,7 @@ the missing frames repeat its last row and are masked. Attention is causal in ti
 real frame change no prediction before them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -59,7 +59,6 @@ class WindowIndex:
     groups: Ints
     _starts: Ints  # (N,) first row of each piece that has windows
     _lengths: Ints  # (N,) rows of each piece
-    _cameras: NDArray[np.int16]  # (N,) index of the camera whose rows these are; 0 where rows hold them all
     _before: Ints  # (N+1,) number of windows before each piece
 
     @classmethod
@@ -70,7 +69,6 @@ class WindowIndex:
         frames: int,
         row_stride: int | None = None,
         short: Short = "drop",
-        cameras: Sequence[int] = (0,),
     ) -> "WindowIndex":
         """Return the index of a split.
 
@@ -79,37 +77,33 @@ class WindowIndex:
             row_stride: rows between frames; None takes the embodiment's.
             short: "drop" or "pad" for pieces shorter than a window; a piece of a single frame is always
                 dropped.
-            cameras: indices of the cameras whose rows have windows, in a set whose cameras have rows of
-                their own. In other sets a window has all cameras.
         """
         stride = row_stride or shards.row_stride
         span = frames * stride
         edges, groups = _row_groups(shards.row_groups(split))
         episodes = shards.index(split)
         owner, starts, lengths = _pieces(shards, split, episodes, stride * shards.manifest.frame_stride)
-        wanted = np.isin(episodes.camera, cameras) | (not shards.manifest.layout.camera_rows)
-        windows = np.where(wanted[owner], np.maximum(0, lengths - span + 1), 0)
-        padded = wanted[owner] & (windows == 0) & (lengths > stride) & (short == "pad")
+        windows = np.maximum(0, lengths - span + 1)
+        padded = (windows == 0) & (lengths > stride) & (short == "pad")
         windows[padded] = 1
         order = np.argsort(starts, kind="stable")
         keep = order[windows[order] > 0]
         before = np.concatenate([[0], np.cumsum(windows[keep])]).astype(np.int64)
-        used = np.zeros(len(wanted), np.bool_)
+        used = np.zeros(len(episodes.length), np.bool_)
         used[owner[keep]] = True
         index = cls(
             frames=frames,
             row_stride=stride,
             span=span,
             count=int(before[-1]),
-            short_episodes=int((wanted & ~used).sum()),
+            short_episodes=int((~used).sum()),
             padded_episodes=int(padded.sum()),
-            divided_episodes=len(np.unique(owner[1:][(np.diff(owner) == 0) & wanted[owner[1:]]])),
+            divided_episodes=len(np.unique(owner[1:][np.diff(owner) == 0])),
             unit_first=np.zeros(0, np.int64),
             edges=edges,
             groups=groups,
             _starts=starts[keep],
             _lengths=lengths[keep],
-            _cameras=episodes.camera[owner[keep]].astype(np.int16),
             _before=before,
         )
         object.__setattr__(index, "unit_first", index._windows_before(edges))
@@ -140,10 +134,6 @@ class WindowIndex:
         """Return the last row of each window's piece; beyond it the window is padded."""
         at = self._piece(windows)
         return self._starts[at] + self._lengths[at] - 1
-
-    def cameras(self, windows: Ints) -> Ints:
-        """Return the index of the camera whose rows each window has; 0 where rows hold all cameras."""
-        return self._cameras[self._piece(windows)].astype(np.int64)
 
     def units(self) -> Ints:
         """Return the row groups in which at least one window starts."""

@@ -9,16 +9,14 @@
 Every card and every stem holds the SHA-256 of the trunk, and the digests of the tokenizer and of the
 statistics that the stem was trained on. Parts that do not belong together are therefore refused.
 
-Files of older format versions are converted when they are read. A release that raises `FORMAT_VERSION` adds
-a step to `STEPS` and a test.
+Files of another `FORMAT_VERSION` are refused.
 """
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +31,6 @@ if TYPE_CHECKING:
     from hma_data.shards.reader import ShardSet
     from hma_data.tokenizers.base import TokenizerSpec
 
-Values = dict[str, Any]
 LIBRARY, FORMAT_VERSION = "hma-toolkit", 1
 CONFIG, TRUNK, README, TRAINING = "config.json", "trunk.safetensors", "README.md", "training"
 STEM, HEAD, YAML, STATS, CARD = (
@@ -42,13 +39,9 @@ STEM, HEAD, YAML, STATS, CARD = (
 PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card is last: its presence means that the others are there
 SAMPLE, FILM = "sample.png", "sample.gif"  # optional, shown in the model card
 SHOWN = (SAMPLE, FILM)
-COPIES = "readout.copy."  # the beginning of the names of a readout's weights of copies
 EMBEDDED, EMBEDDED_NAME = Path(__file__).parents[1] / "embedded", "embedded"  # comes along with the package
 _APART = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was cut short: do it again"
-
-# version -> what converts a file's content to the next version, as `converted` calls it
-STEPS: dict[int, Callable[[str, Values], Values]] = {}
 
 
 @dataclass(frozen=True)
@@ -72,7 +65,6 @@ class Checkpoint:
         embodiments: ids present, sorted.
         trunk_sha256: of the trunk, as config.json states it.
         tokenizer: digest of its spec.
-        format_version: of config.json and trunk.
     """
 
     folder: Path
@@ -80,7 +72,6 @@ class Checkpoint:
     embodiments: tuple[str, ...]
     trunk_sha256: str
     tokenizer: str
-    format_version: int
 
     @classmethod
     def open(cls, folder: StrPath) -> "Checkpoint":
@@ -94,12 +85,11 @@ class Checkpoint:
         """
         folder = resolve(folder)
         values = read_json(inside(folder, CONFIG))
-        config = _of_trunk(parse_config(values, folder / CONFIG), folder / TRUNK)
+        config = parse_config(values, folder / CONFIG)
         home = folder / "embodiments"
         found = sorted(path.name for path in home.iterdir()) if home.is_dir() else []
         present = tuple(name for name in found if (home / name / CARD).is_file())
-        trunk, version = str(values.get("trunk_sha256")), int(values["format_version"])
-        return cls(folder, config, present, trunk, digest(values.get("tokenizer") or {}), version)
+        return cls(folder, config, present, str(values.get("trunk_sha256")), digest(values["tokenizer"]))
 
     @property
     def name(self) -> str:
@@ -134,12 +124,12 @@ class Checkpoint:
         """Return card.json of an embodiment."""
         path = self.path(embodiment, CARD)
         values = read_json(path)
-        found = values.get("format_version", FORMAT_VERSION)
-        return converted("card", values, found, path) | {"format_version": FORMAT_VERSION}
+        _require_version(values, path)
+        return values
 
     def embodiment(self, embodiment: str) -> Embodiment:
         """Return the embodiment as it was at training."""
-        return Embodiment.load(self.path(embodiment, YAML), stored=True)
+        return Embodiment.load(self.path(embodiment, YAML))
 
     def stats(self, embodiment: str) -> dict[str, Any]:
         """Return stats.json of an embodiment: at least {"action": {"mean": [...], "std": [...]}}."""
@@ -181,36 +171,16 @@ class Checkpoint:
                 raise CheckpointError(path, f"is not the file that {CARD} names", _CUT_SHORT)
 
 
-def converted(part: str, values: Values, version: object, where: object) -> Values:
-    """Return the content of a file of a format version as the newest version has it.
-
-    Args:
-        part: config, card, trunk, stem or head.
-        values: plain values of JSON, or tensors by name; they do not change.
-
-    Raises:
-        CheckpointError: this release does not know the version.
-    """
-    oldest = min(STEPS, default=FORMAT_VERSION)
-    if not isinstance(version, int) or not oldest <= version <= FORMAT_VERSION:
-        read = str(FORMAT_VERSION) if oldest == FORMAT_VERSION else f"{oldest} to {FORMAT_VERSION}"
-        fault = f"has format_version {version!r}, this release reads {read}"
-        raise CheckpointError(where, fault, "update hma-toolkit, or save the checkpoint again")
-    for step in range(version, FORMAT_VERSION):
-        values = STEPS[step](part, deepcopy(values))
-    return values
-
-
 def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
-    """Return the network's config, read from the values of config.json of any format version.
+    """Return the network's config, read from the values of config.json.
 
     Raises:
-        CheckpointError: the values are of another library or an unknown version, or are not valid.
+        CheckpointError: the values are of another library or format version, or are not valid.
     """
     if values.get("library") != LIBRARY:
         remedy = "give a checkpoint of hma train; hma hub import converts one of the paper's release"
         raise CheckpointError(where, f"is not of {LIBRARY}: library is {values.get('library')!r}", remedy)
-    values = converted("config", values, values.get("format_version"), where)
+    _require_version(values, where)
     model, tokenizer = values.get("model"), values.get("tokenizer")
     if not isinstance(model, dict) or not isinstance(tokenizer, dict):
         raise CheckpointError(where, "lacks its 'model' or 'tokenizer'", "pull or save the checkpoint again")
@@ -218,6 +188,13 @@ def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
         return HMAConfig.from_json({**model, "tokenizer": tokenizer}, str(where))
     except (HMAError, TypeError, ValueError) as fault:
         raise CheckpointError(where, f"does not describe a model: {fault}", "update or save again") from fault
+
+
+def _require_version(values: Mapping[str, Any], where: object) -> None:
+    found = values.get("format_version")
+    if found != FORMAT_VERSION:
+        fault = f"has format_version {found!r}, this release reads {FORMAT_VERSION}"
+        raise CheckpointError(where, fault, "update hma-toolkit, or save the checkpoint again")
 
 
 def resolve(folder: StrPath) -> Path:
@@ -248,32 +225,17 @@ def training_checkpoints(run: StrPath) -> list[Path]:
     return sorted(path for path in (as_path(run) / "checkpoints").glob("step-*") if (path / CONFIG).is_file())
 
 
-def _of_trunk(config: HMAConfig, trunk: Path) -> HMAConfig:
-    """Return the config without `copy_previous` if a trunk of latents has no weights for it.
-
-    Until 2026-11-25 it was stated for latents and had no effect.
-    """
-    if config.kind != "continuous" or not config.copy_previous or not trunk.is_file():
-        return config
-    return replace(config, copy_previous=any(name.startswith(COPIES) for name in _read_header(trunk)[1]))
-
-
 def read_metadata(path: Path) -> dict[str, str]:
     """Read the metadata in the header of a safetensors file.
 
     Raises:
         CheckpointError: the file is damaged, truncated or of another format.
     """
-    return _read_header(path)[0]
-
-
-def _read_header(path: Path) -> tuple[dict[str, str], list[str]]:
-    """Return the metadata of a safetensors file and the names of its tensors; raise as `read_metadata`."""
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(path, framework="np") as file:  # the header alone needs no torch
-            return file.metadata() or {}, list(file.keys())
+            return file.metadata() or {}
     except (SafetensorError, OSError) as fault:
         reason = unreadable(path, f"is not whole safetensors: {fault}", "pull or save it again")
         raise CheckpointError(path, *reason) from fault

@@ -212,7 +212,7 @@ def _write_embodiment(model: "HMA", home: Path, trunk: str, given: dict[str, Any
     metadata = {"format": "pt", "format_version": str(FORMAT_VERSION), "embodiment": home.name, **links}
     write_tensors(home / STEM, model.stem_state(home.name), metadata, half)
     write_tensors(home / HEAD, model.head_state(home.name), metadata, half)
-    robot = Embodiment.load(home / YAML, stored=True)
+    robot = Embodiment.load(home / YAML)
     unstated = robot.frequency_hz == "unknown" and not robot.sync.rate_hz
     facts = {
         "format_version": FORMAT_VERSION,
@@ -239,7 +239,7 @@ def _check_parts(
         raise CheckpointError(folder, f"no embodiment YAML was given for {', '.join(unnamed)}")
     for name in yaml:
         check_id(name, folder)
-        found = Embodiment.from_yaml(yaml[name], f"{folder}: {name}", stored=True).id
+        found = Embodiment.from_yaml(yaml[name], f"{folder}: {name}").id
         if found != name:
             raise CheckpointError(folder, f"the YAML given for {name!r} has id {found!r}")
         action_stats(stats.get(name, {}), f"{folder}: statistics of {name}")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from hma_data.errors import CheckpointError
 from hma_data.storage.kinds import unreadable
-from hma_model.checkpoint.folder import FORMAT_VERSION, Checkpoint, converted, read_metadata
+from hma_model.checkpoint.folder import Checkpoint
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -81,14 +81,14 @@ def write_tensors(
 
 
 def trunk(checkpoint: Checkpoint) -> State:
-    """Read the trunk's tensors, in the newest format version.
+    """Read the trunk's tensors.
 
     Raises:
         CheckpointError: the file is damaged, is another trunk than config.json names, or does not fit its
             network.
     """
     path = checkpoint.trunk()
-    state: State = converted("trunk", read_tensors(path), checkpoint.format_version, path)
+    state = read_tensors(path)
     _require_values(path, state)
     _require_network(checkpoint.config, state, checkpoint.folder)
     return state
@@ -106,8 +106,7 @@ def embodiment(checkpoint: Checkpoint, name: str, space: "ActionSpace") -> tuple
         if space.chunk_dim > path.stat().st_size:
             fault = f"is too small for chunks of {space.chunk_dim:,} values, which embodiment.yaml asks for"
             raise CheckpointError(path, fault, "pull the embodiment again")
-        version = read_metadata(path).get("format_version", str(FORMAT_VERSION))
-        state = converted(part, read_tensors(path), int(version) if version.isdecimal() else version, path)
+        state = read_tensors(path)
         _require_values(path, state)
         states.append(state)
     return states[0], states[1]

@@ -15,7 +15,6 @@ from hma_model.checkpoint.folder import (
     LIBRARY,
     PARTS,
     TRUNK,
-    converted,
     digest,
     parse_config,
 )  # fmt: skip
@@ -79,7 +78,6 @@ def _ours(
     facts = _facts(where, LIBRARY, size, _tokenizer_problems(values.get("tokenizer")))
     try:
         parse_config(values, f"{where}/{CONFIG}")
-        values = converted("config", values, values["format_version"], where)
     except HMAError as fault:
         facts["problems"].append(f"{fault.fault}: {fault.remedy}")
     facts |= {key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")}

@@ -32,7 +32,6 @@ from hma_model.checkpoint.folder import (
     YAML,
     Checkpoint,
     check_id,
-    converted,
     inside,
     parse_config,
     resolve,
@@ -361,9 +360,9 @@ def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
     values = json_object(store.read(CONFIG), f"{store.name}: {CONFIG}", HubError)
     try:
         parse_config(values, f"{store.name}: {CONFIG}")
-        return converted("config", values, values["format_version"], store.name)
     except CheckpointError as fault:
         raise HubError(fault.where, fault.fault, fault.remedy) from fault
+    return values
 
 
 def embodiment_ids(files: Iterable[str]) -> list[str]:

@@ -27,7 +27,7 @@ from hma_model.checkpoint.weights import read_tensors, write_tensors
 from hma_model.config import HMAConfig
 from hma_model.network.model import HMA
 from hma_model.network.states import check_fit, module_key
-from hma_model.training.recipe import Recipe, differences
+from hma_model.training.recipe import differences
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -62,8 +62,7 @@ class State:
 
     def require_same(self, recipe: dict[str, Any], data: dict[str, str], where: object) -> None:
         """Raise RecipeError with the differences unless recipe and shards are those of the run."""
-        before = {**Recipe().identity(), **self.recipe}  # keys added by later releases had their defaults
-        changed = differences(before, recipe) + differences(self.data, data, "data")
+        changed = differences(self.recipe, recipe) + differences(self.data, data, "data")
         if changed:
             fault = f"was started with another recipe or other shards: {'; '.join(changed)}"
             remedy = "train into another folder, undo the change, or accept it with --force"
@@ -119,11 +118,11 @@ def require_version(path: Path) -> None:
     """Raise OtherVersionError unless this release can resume a run from the checkpoint in a folder."""
     state = path / TRAINING / STATE
     for file, key, own in ((path / CONFIG, "format_version", FORMAT_VERSION), (state, "version", VERSION)):
-        found = read_json(file).get(key, own)  # older releases wrote none
+        found = read_json(file).get(key)
         if found != own:
             fault = f"is of {key} {found}, this release resumes from {own}"
-            remedy = "update hma-toolkit, or start" if found > own else "start"
-            raise OtherVersionError(file, fault, f"{remedy} a new run from its weights with start={path}")
+            remedy = f"update hma-toolkit, or start a new run from its weights with start={path}"
+            raise OtherVersionError(file, fault, remedy)
 
 
 @dataclass(frozen=True)
@@ -164,13 +163,10 @@ def read_training_state(checkpoint: Checkpoint, embodiments: Iterable[str]) -> T
     """
     path = inside(checkpoint.folder, f"{TRAINING}/{STATE}")
     values = read_json(path)
-    stated = values.pop("sha256", None)  # an older release wrote neither this nor the files' hashes
-    if stated is not None and stated != _digest(values):
+    if values.pop("sha256", None) != _digest(values):
         raise CheckpointError(path, "has changed since it was written", "delete this checkpoint")
-    files = values.pop("files", None)
-    if files is None:
-        files = {name: "" for name in (OPTIMIZER, WEIGHTS) if (path.parent / name).is_file()}
-    values.pop("version", None)
+    files = values.pop("files")
+    del values["version"]
     try:
         state = State(**values)
     except TypeError as fault:
@@ -185,6 +181,6 @@ def read_training_state(checkpoint: Checkpoint, embodiments: Iterable[str]) -> T
 
 def _own_file(checkpoint: Checkpoint, name: str, hashes: Mapping[str, str]) -> "dict[str, Tensor]":
     path = inside(checkpoint.folder, f"{TRAINING}/{name}")
-    if hashes.get(name) and hashes[name] != file_sha256(path):
+    if hashes.get(name) != file_sha256(path):
         raise CheckpointError(path, f"is not the file that {STATE} names", "delete this checkpoint")
     return read_tensors(path)

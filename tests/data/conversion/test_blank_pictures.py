@@ -1,15 +1,11 @@
 """Black, frozen and repeating cameras: refused or flagged at conversion, and found in shards that exist."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 import pytest
 from skimage import data as skimage_data
 
@@ -20,14 +16,12 @@ from hma_data.conversion.report import Summary
 from hma_data.episodes.images import PictureCheck, resize
 from hma_data.errors import SourceError
 from hma_data.inspection.inspect import examine
-from hma_data.inspection.shard_pictures import shard_picture_findings
 from hma_data.registry.embodiment import Embodiment, problems
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import get_tokenizer
 from tests.command import hma
 from tests.conftest import ARM_YAML, BlockTokenizer
 from tests.data import bag_files, videos
-from tests.data.conversion.test_cameras import OLDER
 from tests.data.sources.lerobot.test_lerobot import embodiment as lerobot_arm
 
 KINDS = ("good", "black", "frozen", "repeated")
@@ -229,22 +223,6 @@ def test_doctor_finds_black_and_frozen_episodes_of_each_camera(old_shards: Path)
     assert found["blank", "side"]["numbers"]["episodes"] == sorted(KINDS)
     assert found["blank", "side"]["message"].startswith("camera side shows one colour")
     assert ("still", "side") not in found
-
-
-def test_doctor_looks_at_each_camera_where_it_has_rows_of_its_own(tmp_path: Path) -> None:
-    shutil.copytree(OLDER / "two_cameras", tmp_path / "set")
-    shard = tmp_path / "set" / "train" / "shard-00000.parquet"
-    table = pq.read_table(shard)
-    frozen = pc.and_(pc.equal(table["camera"], "side"), pc.equal(table["episode_index"], 1))
-    tokens = [
-        [0] * 64 if still else row
-        for still, row in zip(frozen.to_pylist(), table["tokens"].to_pylist(), strict=True)
-    ]
-    place = table.schema.get_field_index("tokens")
-    table = table.set_column(place, table.field("tokens"), pa.array(tokens, table.field("tokens").type))
-    pq.write_table(table, shard)
-    (found,) = shard_picture_findings(ShardSet(tmp_path / "set"))
-    assert (found.check, found.key, found.numbers["episodes"]) == ("still", "side", ["demo_1"])
 
 
 def test_without_the_tokenizer_doctor_still_names_what_never_changes(tmp_path, block_tokenizer) -> None:

@@ -1,7 +1,6 @@
 """Several cameras: each is a column of the same rows, and says what its own conversion would say."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import merge, split
 from hma_data.episodes.images import describe_resize
-from hma_data.errors import OutputError, RegistryError
+from hma_data.errors import RegistryError
 from hma_data.registry.components import Camera
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.memmap import export
@@ -28,7 +27,7 @@ from tests.command import hma
 from tests.conftest import BlockTokenizer, write_toy
 from tests.data.cameras import LENGTHS, SIZES, arm, write_dataset, write_hdf5
 
-OLDER = Path(__file__).parents[1] / "shards" / "older"
+ONE_CAMERA = Path(__file__).parents[1] / "shards" / "one_camera"  # written from `write_toy`
 EVERY = Settings(val_fraction=0.3, cameras=("all",))
 
 
@@ -155,48 +154,19 @@ def test_preview_and_export_show_the_cameras(made: Path, tmp_path: Path) -> None
     assert json.loads((tmp_path / "flat/metadata.json").read_text())["camera"] == "wrist"
 
 
-# -- sets of older releases
-
-
-def test_a_set_whose_cameras_have_rows_is_still_read(tmp_path: Path) -> None:
-    """`older` was written by the release before this one, from `write_toy` with 9, 11 and 10 frames."""
-    older = OLDER / "two_cameras"
-    write_toy(tmp_path / "toy.hdf5", [9, 11, 10])
-    assert verify(older) == []
-    merge([older], tmp_path / "new")
-    assert verify(tmp_path / "new") == []
-    with h5py.File(tmp_path / "toy.hdf5") as file:
-        for camera, key in (("top", "obs/image"), ("side", "obs/side")):
-            for folder in (older, tmp_path / "new"):
-                for number, ours in enumerate(frames(folder, camera)):
-                    np.testing.assert_array_equal(ours, file[f"data/demo_{number}/{key}"][()])
-    shown = preview(older, tmp_path / "seen", episodes=1, tokenizer=BlockTokenizer())
-    assert shown.sheet.is_file()
-
-
-def test_a_set_of_one_camera_is_as_before(toy_arm, block_tokenizer: Tokenizer, tmp_path: Path) -> None:
-    older = OLDER / "one_camera"
+def test_a_set_of_one_camera_has_the_rows_that_it_had(
+    toy_arm, block_tokenizer: Tokenizer, tmp_path: Path
+) -> None:
     write_toy(tmp_path / "toy.hdf5", [9, 11, 10])
     out = tmp_path / "set"
     convert(toy_arm, tmp_path / "toy.hdf5", block_tokenizer, out, settings=Settings(val_fraction=0.3))
-    for shard in Manifest.load(older).shards:  # their bytes differ only with another pyarrow
-        ours, theirs = pq.read_table(out / shard.path), pq.read_table(older / shard.path)
+    for shard in Manifest.load(ONE_CAMERA).shards:  # their bytes differ only with another pyarrow
+        ours, theirs = pq.read_table(out / shard.path), pq.read_table(ONE_CAMERA / shard.path)
         assert ours.equals(theirs)
-        plans = [read_footer(folder / shard.path)[0].plan for folder in (out, older)]
+        plans = [read_footer(folder / shard.path)[0].plan for folder in (out, ONE_CAMERA)]
         for plan in plans:
             del plan["recording"], plan["hash"]  # of the file's bytes
         assert plans[0] == plans[1]
-
-
-def test_an_older_set_of_several_cameras_cannot_be_extended(tmp_path: Path) -> None:
-    shutil.copytree(OLDER / "two_cameras", tmp_path / "set")
-    write_toy(tmp_path / "toy.hdf5", [9, 11, 10])
-    settings = Settings(val_fraction=0.3, cameras=("top", "side"))
-    robot = ShardSet(tmp_path / "set").embodiment
-    with pytest.raises(OutputError, match="columns of the cameras"):
-        convert(
-            robot, tmp_path / "toy.hdf5", BlockTokenizer(), tmp_path / "set", settings=settings, extend=True
-        )
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,11 @@ import torch
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
-from hma_data.errors import ShardError, UsageError
+from hma_data.errors import UsageError
 from hma_data.loading.dataset import MixtureDataset, WindowDataset, open_sets
 from tests.conftest import BlockTokenizer
 from tests.data.cameras import SIZES, arm, write_hdf5
-from tests.data.conversion.test_cameras import OLDER
+from tests.data.conversion.test_cameras import ONE_CAMERA
 
 NAMES = list(SIZES)
 FRAMES = 3
@@ -98,19 +98,7 @@ def test_short_episodes_are_padded_with_every_view(made: Path) -> None:
 
 
 def test_a_set_with_fewer_cameras_is_one_clear_error(made: Path) -> None:
-    older = OLDER / "one_camera"
     with pytest.raises(UsageError, match=r"toy_arm has the cameras top in .*, not side — .*--cameras all"):
-        open_sets([older], ["top", "side"])
+        open_sets([ONE_CAMERA], ["top", "side"])
     with pytest.raises(UsageError, match="three_hdf5 has the cameras top, wrist, side in .*, not nose"):
         WindowDataset(made, "train", FRAMES, cameras="nose")
-
-
-def test_a_set_whose_cameras_have_rows_gives_one_or_a_drawn_one() -> None:
-    older = OLDER / "two_cameras"
-    first, side, drawn = (every(older, cameras) for cameras in ("first", "side", "drawn"))
-    assert set(first.camera.tolist()) == {0}
-    assert set(side.camera.tolist()) == {1}
-    assert torch.equal(first.tokens % 16, side.tokens // 256)  # side is top with its colours in reverse
-    assert len(drawn) == len(first) + len(side)
-    with pytest.raises(ShardError, match="shards merge"):
-        every(older, ["top", "side"])

@@ -12,25 +12,18 @@ from hma_data.shards.reader import EpisodeIndex
 from hma_data.shards.windows import WindowIndex, pieces
 
 
-def fake(lengths: list[int], stride: int = 1, cameras: int = 1, group: int = 7, shards: int = 1) -> Any:
+def fake(lengths: list[int], stride: int = 1, group: int = 7, shards: int = 1) -> Any:
     """A set of these episodes, in row groups of `group` rows; episodes are dealt out among the shards."""
     shard = np.sort(np.arange(len(lengths)) % shards)
-    size = np.array(lengths, np.int64) * cameras
+    size = np.array(lengths, np.int64)
     sums = [int(size[shard == i].sum()) for i in range(shards)]
     starts = np.concatenate([np.cumsum(size[shard == i]) - size[shard == i] for i in range(shards)])
-    offsets = np.arange(cameras) * np.array(lengths)[:, None]
-    index = EpisodeIndex(
-        np.repeat(np.arange(len(lengths)), cameras),
-        np.repeat(shard, cameras).astype(np.int64),
-        (starts[:, None] + offsets).ravel().astype(np.int64),
-        np.repeat(np.array(lengths, np.int64), cameras),
-        np.tile(np.arange(cameras), len(lengths)),
-    )
+    index = EpisodeIndex(np.arange(len(lengths)), shard.astype(np.int64), starts.astype(np.int64), size)
     groups = [tuple(min(group, rows - at) for at in range(0, rows, group)) for rows in sums]
     return SimpleNamespace(
         folder="a set",
         row_stride=stride,
-        manifest=SimpleNamespace(layout=SimpleNamespace(camera_rows=cameras > 1), frame_stride=1),
+        manifest=SimpleNamespace(frame_stride=1),
         row_groups=lambda split: groups,
         index=lambda split: index,
     )
@@ -39,15 +32,16 @@ def fake(lengths: list[int], stride: int = 1, cameras: int = 1, group: int = 7, 
 LENGTHS = st.lists(st.integers(1, 30), min_size=1, max_size=20)
 
 
-@given(LENGTHS, st.integers(1, 6), st.integers(1, 3), st.integers(1, 2), st.integers(1, 3))
+@given(LENGTHS, st.integers(1, 6), st.integers(1, 3), st.integers(1, 3))
 @settings(max_examples=80, deadline=None)
-def test_window_arithmetic_equals_counting(
-    lengths: list[int], frames: int, stride: int, cameras: int, shards: int
-) -> None:
-    last = range(cameras - 1, cameras)  # of a set whose cameras have rows of their own
-    for wanted in (range(cameras), last):
-        made = fake(lengths, stride, cameras, shards=shards)
-        check_index(WindowIndex.of(made, "train", frames, cameras=wanted), lengths, cameras, wanted)
+def test_window_arithmetic_equals_counting(lengths: list[int], frames: int, stride: int, shards: int) -> None:
+    index, starts, row = WindowIndex.of(fake(lengths, stride, shards=shards), "train", frames), [], 0
+    for length in lengths:
+        starts += list(range(row, row + max(0, length - index.span + 1)))
+        row += length
+    assert index.count == len(starts)
+    np.testing.assert_array_equal(index.first_rows(np.arange(len(starts))), starts)
+    np.testing.assert_array_equal(index.unit_first, [sum(s < edge for s in starts) for edge in index.edges])
 
 
 def test_a_pause_as_long_as_a_step_divides_an_episode_into_pieces() -> None:
@@ -92,21 +86,6 @@ def test_the_pieces_of_one_episode_are_those_of_the_window_index(
     assert windows.first_rows(np.arange(windows.count)).tolist() == first
 
 
-def check_index(index: WindowIndex, lengths: list[int], cameras: int, wanted: range) -> None:
-    starts, seen, row = [], [], 0
-    for length in lengths:
-        for camera in range(cameras):
-            found = range(row, row + max(0, length - index.span + 1) * (camera in wanted))
-            starts += list(found)
-            seen += [camera] * len(found)
-            row += length
-    every = np.arange(len(starts))
-    assert index.count == len(starts)
-    np.testing.assert_array_equal(index.first_rows(every), starts)
-    np.testing.assert_array_equal(index.cameras(every), seen)
-    np.testing.assert_array_equal(index.unit_first, [sum(s < edge for s in starts) for edge in index.edges])
-
-
 @given(LENGTHS, st.integers(1, 6), st.integers(1, 3))
 @settings(max_examples=60, deadline=None)
 def test_a_row_group_reaches_as_far_as_its_windows_and_no_further(
@@ -143,7 +122,7 @@ def test_a_split_without_shards_has_no_windows() -> None:
     nothing = fake([5])
     nothing.row_groups, nothing.index = (
         lambda split: [],
-        lambda split: EpisodeIndex(empty, empty, empty, empty, empty),
+        lambda split: EpisodeIndex(empty, empty, empty, empty),
     )
     index = WindowIndex.of(nothing, "val", 4)
     assert index.count == 0 and len(index.units()) == 0

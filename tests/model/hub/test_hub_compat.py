@@ -11,9 +11,7 @@ from safetensors.torch import load_file, save_file
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.storage.files import file_sha256
-from hma_model.checkpoint import folder as layout
 from hma_model.checkpoint import io as checkpoint
-from hma_model.checkpoint.io import Checkpoint
 from hma_model.checkpoint.weights import read_metadata
 from hma_model.hub import publish as hub
 from hma_model.hub.listing import survey
@@ -43,77 +41,6 @@ def rewrite(path: Path, rename, **metadata: str) -> None:
     """A safetensors file with other names and metadata."""
     facts = read_metadata(path) | metadata
     save_file({rename(name): value for name, value in load_file(path).items()}, path, facts)
-
-
-# -- older versions
-
-
-@pytest.fixture
-def version_0(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A checkpoint as a version 0 might have been: other names in config, card and tensors; and its step."""
-    config = json.loads((folder / "config.json").read_text())
-    config["format_version"] = 0
-    config["network"] = config.pop("model")
-    config["network"]["depth"] = config["network"].pop("layers")
-    rewrite(folder / "trunk.safetensors", lambda name: name.replace("trunk.", "body."))
-    config["trunk_sha256"] = trunk = file_sha256(folder / "trunk.safetensors")
-    (folder / "config.json").write_text(json.dumps(config))
-    for name in ROBOTS:
-        home = folder / "embodiments" / name
-        for part in ("stem", "head"):
-            path = home / f"{part}.safetensors"
-            rewrite(path, lambda key: f"old.{key}", format_version="0", trunk_sha256=trunk)
-        card = json.loads((home / "card.json").read_text())
-        card |= {"format_version": 0, "trunk_sha256": trunk, "scores": card.pop("metrics")}
-        card["files"] |= {p: file_sha256(home / p) for p in ("stem.safetensors", "head.safetensors")}
-        (home / "card.json").write_text(json.dumps(card))
-
-    def to_1(part, values):
-        if part == "config":
-            model = values.pop("network")
-            return {**values, "model": {"layers": model.pop("depth"), **model}}
-        if part == "card":
-            return {**values, "metrics": values.pop("scores")}
-        return {
-            (name.replace("body.", "trunk.") if part == "trunk" else name.removeprefix("old.")): value
-            for name, value in values.items()
-        }
-
-    monkeypatch.setitem(layout.STEPS, 0, to_1)
-    return folder
-
-
-def test_an_older_version_is_read_as_if_it_were_the_newest(version_0, tmp_path):
-    old = checkpoint.load(version_0)
-    new = save(tmp_path / "new", ROBOTS)
-    assert all(torch.equal(value, new.state_dict()[name]) for name, value in old.state_dict().items())
-    assert Checkpoint.open(version_0).card("arm")["metrics"] == {"val_loss": 1.5}
-
-
-def test_an_older_version_is_pulled_listed_and_pushed(version_0, tmp_path):
-    hub.push(version_0, tmp_path / "hub", ["arm"])
-    assert list(HMA.from_pretrained(str(tmp_path / "hub")).embodiments) == ["arm"]
-    (facts,) = survey(tmp_path / "hub")
-    assert not any("format_version" in problem for problem in facts["problems"])
-
-
-def test_a_new_embodiment_joins_an_older_hub(version_0, tmp_path):
-    old = checkpoint.load(version_0, [])
-    old.add_embodiment(make_model({"leg": 4}).embodiments["leg"])
-    hub.push(version_0, tmp_path / "hub", ["arm"])
-    save(tmp_path / "leg", {"leg": 4}, model=old, base=Checkpoint.open(version_0))
-    hub.push(tmp_path / "leg", tmp_path / "hub", ["leg"])
-    assert list(HMA.from_pretrained(str(tmp_path / "hub")).embodiments) == ["arm", "leg"]
-
-
-def test_without_its_step_an_older_version_is_refused(version_0, monkeypatch):
-    monkeypatch.delitem(layout.STEPS, 0)
-    with pytest.raises(CheckpointError, match="has format_version 0, this release reads 1"):
-        checkpoint.load(version_0)
-
-
-def test_every_version_from_the_first_to_the_newest_has_its_step():
-    assert sorted(layout.STEPS) == list(range(1, layout.FORMAT_VERSION))
 
 
 # -- parts that do not belong together, each with an error of its own
