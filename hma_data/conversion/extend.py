@@ -129,7 +129,7 @@ def _refuse_changed(
 
     def is_changed(ref: EpisodeRef) -> bool:
         try:
-            return not contents.get(ref.id) or content(ref) != contents[ref.id]
+            return content(ref) != contents[ref.id]
         except EpisodeError as fault:
             log.info("%s", fault)
             return True
@@ -137,8 +137,9 @@ def _refuse_changed(
     if refs:
         log.info("%s: a file has changed; %s known episodes are read again", out, f"{len(refs):,}")
     if changed := [ref.id for ref in refs if is_changed(ref)]:
-        what = "were recorded anew" if contents.get(changed[0]) else "cannot be compared with changed files"
-        fault = f"cannot be extended: {len(changed):,} of its episodes {what}, first {changed[0]!r}"
+        fault = (
+            f"cannot be extended: {len(changed):,} of its episodes were recorded anew, first {changed[0]!r}"
+        )
         raise OutputError(out, fault, "--overwrite to start anew, or give the new episodes other names")
 
 

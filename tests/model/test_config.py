@@ -23,12 +23,6 @@ def test_json_roundtrip_keeps_every_field() -> None:
     assert HMAConfig.from_json(config.to_json()) == config
 
 
-def test_a_configuration_of_before_there_was_a_choice_predicts_the_noise() -> None:
-    values = HMAConfig(kind="continuous").to_json()
-    assert values.pop("diffusion_target") == "velocity"
-    assert HMAConfig.from_json(values).diffusion_target == "noise"
-
-
 def test_defaults_are_the_paper_size() -> None:
     config = HMAConfig()
     assert (config.layers, config.width, config.heads, config.frames) == (32, 256, 8, 12)

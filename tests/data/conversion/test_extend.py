@@ -9,11 +9,11 @@ import h5py
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.conversion.extend import Content, content_of
+from hma_data.conversion.extend import content_of
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.report import Summary
-from hma_data.conversion.rewrite import merge, restat
+from hma_data.conversion.rewrite import merge
 from hma_data.errors import OutputError
 from hma_data.inspection.inspect import examine
 from hma_data.registry.embodiment import Embodiment
@@ -129,26 +129,6 @@ def test_a_known_episode_that_cannot_be_read_any_more_is_refused_by_its_name(
         del file["data/demo_2/obs"]
     with pytest.raises(OutputError, match="1 of its episodes were recorded anew, first 'demo_2'"):
         run(toy_arm, recording, tmp_path / "out", extend=True)
-
-
-def test_a_set_written_before_contents_were_noted_is_as_it_was(
-    toy_arm: Embodiment, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    with monkeypatch.context() as before:
-        before.setattr(Content, "text", lambda self: "")
-        run(toy_arm, recording, out)
-    episodes = (out / EPISODES).read_bytes()
-    assert "content" not in pq.read_schema(out / EPISODES).names and verify(out) == []
-    (out / EPISODES).unlink()
-    restat(out)
-    assert (out / EPISODES).read_bytes() == episodes
-    assert run(toy_arm, recording, out).made_shards == 0
-    grow(recording, [23], 3)
-    with pytest.raises(
-        OutputError, match="3 of its episodes cannot be compared with changed files, first 'demo_0'"
-    ):
-        run(toy_arm, recording, out, extend=True)
 
 
 # -- what is kept must be there

@@ -12,11 +12,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from hma_data.errors import CheckpointError
-from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint import io as checkpoint
-from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
-from hma_model.checkpoint.weights import read_metadata
-from hma_model.config import HMAConfig
+from hma_model.checkpoint.folder import Checkpoint, read_metadata, require_tokenizer
 from tests.model.robots import CONFIG, SPEC, edit_card, make_model, save, yaml
 from tests.model.robots import stats as stats_of
 
@@ -222,20 +219,6 @@ def test_metrics_of_the_card_are_in_the_readme(folder):
 
 def test_the_config_comes_back(folder):
     assert Checkpoint.open(folder).config == CONFIG
-
-
-@pytest.mark.parametrize("copies", [False, True])
-def test_a_trunk_of_latents_copies_only_if_it_has_the_weights(tmp_path, copies):
-    spec = TokenizerSpec("raw", 1, "continuous", 16, (4, 4), channels=2, dtype="float16")
-    config = HMAConfig(
-        kind="continuous", layers=1, width=16, heads=2, frames=4, grid=(4, 4), channels=2, patch=2,
-        diffusion_width=16, diffusion_depth=1, copy_previous=copies, tokenizer=spec.to_json(),
-    )  # fmt: skip
-    save(tmp_path, {"arm": 2}, model=make_model({"arm": 2}, config=config))
-    stated = json.loads((tmp_path / "config.json").read_text())
-    edit_json(tmp_path / "config.json", model={**stated["model"], "copy_previous": True})
-    assert Checkpoint.open(tmp_path).config.copy_previous == copies
-    assert checkpoint.load(tmp_path).config == config
 
 
 def test_a_hostile_card_stays_in_its_cell(folder):

@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.storage.files import file_sha256
 from hma_model.checkpoint import io as checkpoint
-from hma_model.checkpoint.weights import read_metadata
+from hma_model.checkpoint.folder import read_metadata
 from hma_model.hub import publish as hub
 from hma_model.hub.listing import survey
 from hma_model.network.model import HMA

@@ -8,7 +8,8 @@ import torch
 
 from hma_data.errors import CheckpointError, RecipeError, UsageError
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model.checkpoint.weights import read_metadata, read_tensors, write_tensors
+from hma_model.checkpoint.folder import read_metadata
+from hma_model.checkpoint.weights import read_tensors, write_tensors
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
 from tests.model.robots import SPEC
