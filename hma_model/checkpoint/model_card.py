@@ -10,6 +10,7 @@ from typing import Any
 
 from hma_data.storage.paths import REPOSITORY
 from hma_data.storage.yaml_io import write_yaml
+from hma_data.tables import Table
 from hma_data.tokenizers.catalog import other_weights
 from hma_model.config import token_words
 
@@ -86,7 +87,7 @@ def _about(config: Mapping[str, Any]) -> str:
 def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
     if not cards:
         return "None yet."
-    rows = [_HEADINGS, ["---"] * len(_HEADINGS)]
+    rows = []
     for name in sorted(cards):
         card = cards[name]
         rows.append([
@@ -99,7 +100,7 @@ def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
             _pairs(card.get("metrics")),
             line(card.get("license")) or "not stated",
         ])  # fmt: skip
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return Table(_HEADINGS, rows).markdown()
 
 
 def _words(config: Mapping[str, Any], cards: Mapping[str, Mapping[str, Any]]) -> str:

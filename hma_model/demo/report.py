@@ -22,7 +22,8 @@ from hma_data.sources.base import open_source
 from hma_data.storage.files import write_atomic
 from hma_model.config import token_words
 from hma_model.demo.results import Demo
-from hma_model.evaluation.pages import Page, held_out_losses, psnr_over_horizon
+from hma_model.evaluation.pages import Page
+from hma_model.evaluation.plots import held_out_losses, psnr_over_horizon
 from hma_model.training.logging import read_metrics
 
 if TYPE_CHECKING:

@@ -18,7 +18,8 @@ from hma_data.console import human_count
 from hma_data.storage.files import to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.evaluate import verdict
-from hma_model.evaluation.pages import Page, over_horizon
+from hma_model.evaluation.pages import Page
+from hma_model.evaluation.plots import over_horizon
 from hma_model.evaluation.showcase import Showcase, choose
 from hma_model.evaluation.suite import RESULTS, Part
 from hma_model.evaluation.tables import WORDS, absences, markdown, renamed, results, rows, value

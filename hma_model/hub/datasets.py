@@ -13,6 +13,7 @@ from hma_data.shards.manifest import BESIDE, EPISODES, FINDER, MANIFEST, SHARD_N
 from hma_data.storage.files import file_sha256, write_atomic
 from hma_data.storage.paths import REPOSITORY, StrPath, as_address, as_path
 from hma_data.storage.yaml_io import write_yaml
+from hma_data.tables import Table
 from hma_data.tokenizers.catalog import other_weights
 from hma_model.checkpoint.model_card import licence, line, number
 from hma_model.hub.publish import Store, open_store
@@ -233,9 +234,9 @@ def _facts(manifest: Manifest) -> str:
 
 
 def _table(manifest: Manifest) -> str:
-    rows = ["| split | episodes | frames | shards | MB |", "|---|---|---|---|---|"]
+    rows = []
     for split, counts in manifest.splits.items():
         size = sum(shard.bytes for shard in manifest.shards if shard.split == split) / 1e6
-        counted = " | ".join(f"{counts[key]:,}" for key in ("episodes", "frames", "shards"))
-        rows.append(f"| {line(split)} | {counted} | {size:,.1f} |")
-    return "\n".join(rows)
+        counted = [counts[key] for key in ("episodes", "frames", "shards")]
+        rows.append([line(split), *counted, f"{size:,.1f}"])
+    return Table(["split", "episodes", "frames", "shards", "MB"], rows).markdown()

@@ -13,7 +13,8 @@ from hma_data.console import print_lines, print_table, short_paths
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.storage.files import atomic_path
 from hma_model.evaluation.agreement import Estimate
-from hma_model.evaluation.pages import COLOURS, MARKERS, Page, label_axes, svg_bytes
+from hma_model.evaluation.pages import Page
+from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
 from hma_model.policies.scores import WORK, Correlation, PolicyEvaluation, Scored
 
 COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same commands, sim.")

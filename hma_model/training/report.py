@@ -13,7 +13,8 @@ from hma_data.storage.files import read_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import Checkpoint, training_checkpoints
 from hma_model.config import OBJECTIVES, token_words
-from hma_model.evaluation.pages import Page, course, loss_curves
+from hma_model.evaluation.pages import Page
+from hma_model.evaluation.plots import course, loss_curves
 from hma_model.evaluation.rollout_video import SHEETS
 from hma_model.training.logging import read_metrics
 from hma_model.training.runtime import ENVIRONMENT, RECIPE

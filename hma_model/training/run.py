@@ -23,7 +23,7 @@ from hma_data.storage.paths import addressed, is_repository
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import Checkpoint, action_stats, training_checkpoints
 from hma_model.config import OBJECTIVES, ActionSpace, HMAConfig
-from hma_model.evaluation import evaluate
+from hma_model.evaluation import losses as held_out
 from hma_model.evaluation.metrics import perplexity
 from hma_model.evaluation.rollout_video import newest_sheets, write_sheets
 from hma_model.network.model import HMA
@@ -158,7 +158,7 @@ class Run:
             return
         drawn = zip(self.train_data.mixture.p, self.sets.values())
         given: Any = {"cameras": self.recipe.cameras, "factored": self.model.config.factored}
-        shares = [[p * d for d in evaluate.digit_frequencies(s, **given)] for p, s in drawn]
+        shares = [[p * d for d in held_out.digit_frequencies(s, **given)] for p, s in drawn]
         digits = [sum(digit) for digit in zip(*shares)]
         bias = np.log(np.concatenate(digits * self.model.config.merge**2))
         own = self.model.token_readout.linear.bias
@@ -316,7 +316,7 @@ class Run:
         with self._autocast(), torch.compiler.set_stance("force_eager"):
             drawn = "forward" if video else self.objective.name
             batches = self._held_out_batches()
-            losses, accuracy = evaluate.validation_losses(model, batches, recipe.seed, drawn)
+            losses, accuracy = held_out.validation_losses(model, batches, recipe.seed, drawn)
             facts: dict[str, Any] = {
                 "step": self.step,
                 "objective": self.objective.name,
@@ -327,7 +327,7 @@ class Run:
             if video and model.config.kind == "discrete":
                 if self._baseline is None:
                     batches = self._held_out_batches()
-                    self._baseline = evaluate.unconditional_baseline(
+                    self._baseline = held_out.unconditional_baseline(
                         self.sets, batches, recipe.cameras, model.config.factored, model.config.merge
                     )
                 facts["perplexity"] = perplexity(facts["loss"])
@@ -342,7 +342,7 @@ class Run:
     def _held_out_batches(self) -> Iterator[Batch]:
         recipe = self.recipe
         for shards in self.held_out.values():
-            yield from evaluate.windows(
+            yield from held_out.windows(
                 shards, "val", recipe.frames, recipe.eval_windows, recipe.batch_size, recipe.cameras
             )
 

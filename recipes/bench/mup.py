@@ -136,7 +136,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw the loss over the learning rate: one curve a width, its best rate ringed; muP on the left."""
     from matplotlib.figure import Figure
 
-    from hma_model.evaluation.pages import COLOURS, MARKERS, STYLES, label_axes, svg_bytes
+    from hma_model.evaluation.plots import COLOURS, MARKERS, STYLES, label_axes, svg_bytes
 
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)

@@ -294,7 +294,7 @@ def plot(question: str, lines: list[dict[str, Any]]) -> bytes:
     """Return an SVG of the gain and of the last frame's PSNR of each row, with intervals."""
     from matplotlib.figure import Figure
 
-    from hma_model.evaluation.pages import label_axes, svg_bytes
+    from hma_model.evaluation.plots import label_axes, svg_bytes
 
     rows = summary(lines)
     figure = Figure(figsize=(7.2, 1.2 + 0.35 * len(rows)), layout="constrained")
