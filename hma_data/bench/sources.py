@@ -257,7 +257,7 @@ def _mcap(folder: Path, episodes: int, length: int, seed: int) -> Path:
 
 
 def _lerobot(size: tuple[int, int], folder: Path, episodes: int, length: int, seed: int) -> Path:
-    from hma_data.lab.writers import LeRobotEpisode, write_lerobot
+    from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 
     def made() -> Iterator[LeRobotEpisode]:
         for i in range(episodes):

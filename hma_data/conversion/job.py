@@ -28,7 +28,6 @@ from hma_data.conversion.output import (
     clear,
     finished_shards,
     known_hashes,
-    locked,
     refuse_other,
     remove_notes,
 )
@@ -54,6 +53,7 @@ from hma_data.sources.base import EpisodeRef, open_source
 from hma_data.sources.common.choice import chosen_ids, ids_for_robot
 from hma_data.sources.detect import of_another_format, require_utf8
 from hma_data.storage.files import remove_parts
+from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.records import Records
 from hma_data.storage.remote import parquet_file, place
@@ -205,7 +205,7 @@ class Conversion:
         end_worker_that_starts_workers(self.workers)
         begun, out = time.monotonic(), place(self.out)
         run = _Run(self, out)
-        with locked(out, share):
+        with locked(out, share.name):
             plan, base = run.plan()
             kept, made = run.make(plan, base, share, on_progress)
         missing = len({unit.name for unit in plan.units} - shard_sizes(out).keys())

@@ -3,13 +3,12 @@
 The folder is locked while the conversion runs. A folder of a store is claimed for the plan instead.
 """
 
-import fcntl
 import json
 import shutil
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -30,9 +29,10 @@ from hma_data.shards.manifest import (
 )
 from hma_data.shards.schema import PLAN_HASH, Footer, read_metadata
 from hma_data.storage.files import PART, remove_parts
+from hma_data.storage.locks import LOCK
 from hma_data.storage.remote import RemotePath, create_bytes, is_remote, put_bytes
 
-LOCK, JOURNAL, PLAN = WORKING
+_, JOURNAL, PLAN = WORKING
 READERS, JOURNAL_S = 16, 20.0  # in a store: footers read at a time, seconds between writes of a journal
 OURS = {*SPLITS, MANIFEST, EPISODES, EMBODIMENT, QUARANTINE}
 
@@ -48,59 +48,6 @@ class Share:
     def name(self) -> str:
         """Return the name of the share, for files that each share has of its own."""
         return f"{self.index}-of-{self.count}"
-
-
-# -- locks
-
-
-@contextmanager
-def locked(out: Path, share: Share | None = None) -> Iterator[None]:
-    """Let only one job write a folder, or a share of it; the kernel releases the lock when the process ends.
-
-    A store has no such lock. There, jobs of one plan write the same bytes, and `finished_shards` refuses
-    another plan.
-
-    Raises:
-        OutputError: another job is writing, or the folder cannot be written.
-    """
-    if isinstance(out, RemotePath):
-        if out.scheme == "hf":
-            remedy = "write a folder, then upload it"
-            raise OutputError(out, "is a repository of the hub, which takes whole conversions only", remedy)
-        yield
-        return
-    with ExitStack() as held:
-        try:
-            made = not out.exists()
-            out.mkdir(parents=True, exist_ok=True)
-            held.enter_context(_lock(out / LOCK, fcntl.LOCK_SH if share else fcntl.LOCK_EX))
-            if share:
-                held.enter_context(_lock(out / f"{LOCK}-{share.name}", fcntl.LOCK_EX))
-        except BlockingIOError as fault:
-            what = f"share {share.name} of it" if share else "it"
-            remedy = "wait for it, or choose another --out"
-            raise OutputError(out, f"another job is writing {what}", remedy) from fault
-        except OSError as fault:
-            reason = fault.strerror or str(fault)
-            raise OutputError(out, f"cannot be written: {reason}", "choose another --out") from fault
-        try:
-            yield
-        finally:
-            if made and all(item.name.startswith(LOCK) for item in out.iterdir()):
-                shutil.rmtree(out, ignore_errors=True)
-
-
-@contextmanager
-def _lock(path: Path, kind: int) -> Iterator[None]:
-    with path.open("a") as file:
-        fcntl.flock(file, kind | fcntl.LOCK_NB)
-        if not path.exists():  # its last owner deleted it between the two calls above
-            raise BlockingIOError
-        try:
-            yield
-        finally:
-            if kind == fcntl.LOCK_EX:
-                path.unlink(missing_ok=True)
 
 
 # -- what is there

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from hma_data.conversion.extend import hashes
-from hma_data.conversion.output import finished_shards, locked, remove_notes
+from hma_data.conversion.output import finished_shards, remove_notes
 from hma_data.conversion.plan import Plan, Settings, ShardUnit, make_plan
 from hma_data.errors import HMAError, ShardError, UsageError
 from hma_data.registry.embodiment import Embodiment
@@ -53,6 +53,7 @@ from hma_data.shards.schema import (
 from hma_data.shards.verify import REMAKE, check_rows
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
+from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath
 from hma_data.storage.records import Records
 from hma_data.storage.remote import parquet_input, place

@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.lab import imported
-from hma_data.lab.writers import Demo, LeRobotEpisode, write_hdf5, write_lerobot
+from hma_data.lab.writers import Demo, write_hdf5
 from hma_data.registry.embodiment import find
+from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 
 if TYPE_CHECKING:
     import pymunk

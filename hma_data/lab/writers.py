@@ -1,4 +1,4 @@
-"""Write recordings in four formats, as their own recorders write them.
+"""Write recordings as HDF5, RLDS and MCAP, as their own recorders write them.
 
 Episodes are read one by one, so that only one is in memory.
 
@@ -8,11 +8,9 @@ T frames of an episode, A action dims, S state dims.
 import json
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, reduce
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +18,6 @@ import google_crc32c
 import h5py
 import numpy as np
 from numpy.typing import NDArray
-
-from hma_data.lab import imported
-from hma_data.registry.embodiment import Embodiment
-from hma_data.registry.export import lerobot_features
 
 DISTRO = "jazzy"  # of ROS
 _CORE = "tensorflow_datasets.core.features"
@@ -205,98 +199,6 @@ def _masked_crc(data: bytes) -> bytes:
     """Return TFRecord's checksum: CRC-32C rotated right by 15 bits, with a constant added."""
     crc = google_crc32c.value(data)
     return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)
-
-
-# -- LeRobot
-
-
-@dataclass(frozen=True)
-class LeRobotEpisode:
-    """One episode of T frames for LeRobot."""
-
-    pictures: Mapping[str, Sequence[NDArray[np.uint8]] | NDArray[np.uint8]]  # camera -> T/hold of (H, W, 3)
-    action: NDArray[np.float32]  # (T, A), the command issued at each frame
-    state: NDArray[np.float32] | None  # (T, S), seen at each frame
-    task: str  # in words
-    further: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # other features -> (T, values)
-    hold: int = 1  # frames for which a picture stands
-
-
-def write_lerobot(
-    folder: Path,
-    embodiment: Embodiment,
-    episodes: Iterable[LeRobotEpisode],
-    on_progress: Callable[[int, str], None] = lambda done, words: None,
-) -> None:
-    """Write a LeRobotDataset v3.0 with lerobot's own writer; videos are H.264.
-
-    The features are those that `hma registry export --to lerobot-features` prints for the embodiment, and
-    the further ones of the first episode.
-
-    Args:
-        folder: folder to make.
-        embodiment: one with a whole number of frames a second.
-        episodes: at least one; each has the embodiment's cameras and widths, and the same further features.
-        on_progress: called with the frames written so far, and what is done.
-
-    Raises:
-        MissingDependencyError: lerobot cannot be imported.
-    """
-    assert embodiment.frequency_hz
-    on_progress(0, "loading lerobot")  # its imports take seconds
-    with imported("lerobot"):
-        from lerobot.configs.video import RGBEncoderConfig
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    rest = iter(episodes)
-    first = next(rest)
-    further = {
-        key: {"dtype": str(values.dtype), "shape": values.shape[1:], "names": None}
-        for key, values in first.further.items()
-    }
-    writer = LeRobotDataset.create(
-        f"lab/{embodiment.id}",
-        int(embodiment.frequency_hz),
-        lerobot_features(embodiment) | further,
-        root=folder,
-        robot_type=embodiment.robot,
-        video_backend="pyav",
-        rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=18),
-        encoder_threads=1,  # the output bytes depend on the number of threads
-    )
-    done = 0
-    on_progress(done, "writing frames")
-    with _quiet():
-        try:
-            for episode in chain([first], rest):
-                for row, action in enumerate(episode.action):
-                    values: dict[str, Any] = {"action": action, "task": episode.task}
-                    values |= {key: shown[row // episode.hold] for key, shown in episode.pictures.items()}
-                    values |= {key: array[row] for key, array in episode.further.items()}
-                    if episode.state is not None:
-                        values["observation.state"] = episode.state[row]
-                    writer.add_frame(values)
-                    done += 1
-                    on_progress(done, "writing frames")
-                on_progress(done, "encoding videos")
-                writer.save_episode(parallel_encoding=False)  # otherwise it forks this process, once a camera
-        finally:
-            writer.finalize()  # after a failure too; else it would write to a removed folder when collected
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Hide FFmpeg's report on each video and the progress bar of `datasets`."""
-    import av.logging
-    import datasets
-
-    datasets.disable_progress_bars()
-    av.logging.set_libav_level(av.logging.ERROR)
-    try:
-        yield
-    finally:
-        datasets.enable_progress_bars()
-        av.logging.set_libav_level(av.logging.INFO)
 
 
 # -- MCAP

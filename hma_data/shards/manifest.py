@@ -35,6 +35,7 @@ from hma_data.shards.schema import (
 from hma_data.shards.stats import Stats
 from hma_data.storage.files import atomic_path, file_sha256, parse_json, write_atomic
 from hma_data.storage.kinds import misplaced
+from hma_data.storage.locks import LOCK
 from hma_data.storage.paths import StrPath
 from hma_data.storage.records import schema_of
 from hma_data.storage.remote import RemotePath, place
@@ -43,7 +44,7 @@ from hma_data.tokenizers.base import TokenizerSpec
 MANIFEST, EPISODES = "manifest.json", "episodes.parquet"
 QUARANTINE, EMBODIMENT = "quarantine.jsonl", "embodiment.yaml"
 SPLITS = ("train", "val")
-WORKING = (".lock", ".journal", ".plan")  # names of what a conversion keeps in the folder begin with these
+WORKING = (LOCK, ".journal", ".plan")  # names of what a conversion keeps in the folder begin with these
 FINDER = ".DS_Store"  # macOS writes it into any folder that somebody looks at
 BESIDE = {"README.md", ".gitattributes", FINDER}  # not of the set: a hub adds the first two
 HASHERS = 4  # threads; hashing releases the interpreter lock

@@ -189,7 +189,7 @@ def _rolled(
     """Continue prompts (B, P, …) under chunks (B, T, K); return the pictures (B, W, S, S, 3) of frames."""
     import torch
 
-    from hma_model.evaluation.rollouts import decode
+    from hma_model.generation.decode import decode
     from hma_model.generation.rollout import Rollout
 
     discrete, begin = model.config.kind == "discrete", stored.shape[1] - 1

@@ -193,7 +193,7 @@ class Frames:
 
     def _show(self, frames: "torch.Tensor") -> Any:
         """Return the pictures of frames if they are to be decoded."""
-        from hma_model.evaluation.rollouts import decode
+        from hma_model.generation.decode import decode
 
         return frames if self.tokenizer is None else decode(self.tokenizer, frames.unsqueeze(1))
 

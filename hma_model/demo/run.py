@@ -219,7 +219,7 @@ def roll_out(made: Demo) -> None:
     from hma_data.tokenizers.network import single_threads
     from hma_model.evaluation.evaluate import evaluate
     from hma_model.evaluation.rollout_video import lively_windows, rollout_video
-    from hma_model.evaluation.rollouts import default_prompt
+    from hma_model.generation.decode import default_prompt
     from hma_model.network.model import HMA
 
     def roll(robot: str) -> tuple[dict[str, Any], "RolloutVideo"]:

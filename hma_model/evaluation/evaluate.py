@@ -38,14 +38,15 @@ from hma_model.evaluation.losses import (
 )
 from hma_model.evaluation.metrics import masked_scores, perplexity, teacher_forced
 from hma_model.evaluation.perceptual import Judge, Networks
-from hma_model.evaluation.rollouts import Pictures, Sampling, cameras_for, decode, default_prompt, rollout
+from hma_model.evaluation.rollouts import Pictures, Sampling, rollout
 from hma_model.evaluation.scores import ROLLOUTS, Rolled, Scores, counted
+from hma_model.generation.decode import cameras_for, default_prompt
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
-__all__ = ["Settings", "cameras_for", "decode", "default_prompt", "evaluate", "measure", "verdict"]
+__all__ = ["Settings", "evaluate", "measure", "verdict"]
 
 DRAWS = 5  # of other windows' actions, and of Gaussian ones
 FOLLOWS_DB = 0.5  # gain of the last frame's PSNR from which a model is said to follow its actions

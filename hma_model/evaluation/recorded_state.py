@@ -37,7 +37,7 @@ from hma_model.evaluation.probe import (
     shown_episodes,
     train,
 )
-from hma_model.evaluation.rollouts import decode
+from hma_model.generation.decode import decode
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer

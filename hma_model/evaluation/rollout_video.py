@@ -31,7 +31,8 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.actions import shuffled
 from hma_model.evaluation.losses import no_window, windows
-from hma_model.evaluation.rollouts import Sampling, cameras_for, rollout
+from hma_model.evaluation.rollouts import Sampling, rollout
+from hma_model.generation.decode import cameras_for
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer

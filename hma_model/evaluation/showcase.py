@@ -19,7 +19,7 @@ from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
 from hma_model.evaluation.losses import windows
-from hma_model.evaluation.rollouts import decode
+from hma_model.generation.decode import decode
 
 if TYPE_CHECKING:
     from hma_model.evaluation.suite import Part

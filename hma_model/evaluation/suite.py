@@ -37,8 +37,8 @@ from hma_model.evaluation.evaluate import Settings, measure
 from hma_model.evaluation.losses import no_window
 from hma_model.evaluation.perceptual import Networks
 from hma_model.evaluation.recorded_state import measure_recorded_state
-from hma_model.evaluation.rollouts import cameras_for, default_prompt
 from hma_model.evaluation.simulated import measure_state
+from hma_model.generation.decode import cameras_for, default_prompt
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer

@@ -77,7 +77,8 @@ def _shown(checkpoint: Path, shards: "ShardSet") -> tuple[bytes, bytes]:
     from hma_data.episodes.sheets import gif_bytes, grid, png_bytes
     from hma_data.shards.preview import tokenizer_of
     from hma_model.evaluation.rollout_video import rollout_video
-    from hma_model.evaluation.rollouts import cameras_for, rollout
+    from hma_model.evaluation.rollouts import rollout
+    from hma_model.generation.decode import cameras_for
 
     model = checkpoints.load(checkpoint, [shards.embodiment.id])
     require_tokenizer(model.config, shards.spec, shards.folder)

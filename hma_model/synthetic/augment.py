@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.conversion.output import locked
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import truth
 from hma_data.lab.simulator import simulated
@@ -29,10 +28,11 @@ from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
 from hma_data.storage.files import atomic_path, kept_arrays
+from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.evaluation.evaluate import cameras_for
 from hma_model.evaluation.probe import Probe, train_probe
 from hma_model.evaluation.recorded_state import EPISODES, Reader, recorded_reader, simulated_reader
+from hma_model.generation.decode import cameras_for
 from hma_model.policies.arenas import Arena, Floats, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy
 from hma_model.policies.catalog import read_policy

@@ -24,7 +24,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hma_data.conversion.output import locked
 from hma_data.errors import EpisodeError, HMAError, OutputError, UsageError
 from hma_data.loading.views import Cameras, Views, view_count
 from hma_data.registry.embodiment import Embodiment
@@ -34,6 +33,7 @@ from hma_data.shards.schema import Refused
 from hma_data.shards.windows import episode_pieces
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.storage.files import atomic_path, file_sha256, kept_arrays
+from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.config import INVERSE, OBJECTIVES

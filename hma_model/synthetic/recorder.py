@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from hma_data.conversion.plan import Plan, Settings, make_plan
 from hma_data.errors import OutputError
-from hma_data.lab.writers import LeRobotEpisode, write_lerobot
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST, Manifest, finish
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, flags_text
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
+from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 from hma_data.storage.files import read_json, sync_folder
 from hma_model.evaluation.recorded_state import Reader
 from hma_model.play.save import embodiment_of

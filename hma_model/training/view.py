@@ -69,7 +69,8 @@ def _rolled(out: Path, checkpoint: Checkpoint, shards: ShardSet, window: int) ->
     """Return a view of one window: the truth, the prediction, and that with other actions."""
     from hma_model.checkpoint.io import load
     from hma_model.evaluation.actions import shuffled
-    from hma_model.evaluation.rollouts import cameras_for, rollout
+    from hma_model.evaluation.rollouts import rollout
+    from hma_model.generation.decode import cameras_for
 
     robot, frames = shards.embodiment, checkpoint.config.frames
     model = load(checkpoint.folder, [robot.id]).eval()

@@ -27,8 +27,8 @@ from hma_data.sources.base import open_source
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.evaluation.evaluate import cameras_for
 from hma_model.generation.commands import card, described
+from hma_model.generation.decode import cameras_for
 from hma_model.worlds.images import read_picture, recorded_cameras, seen_cameras, trained_cameras
 
 if TYPE_CHECKING:

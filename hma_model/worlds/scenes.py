@@ -207,7 +207,7 @@ class RecordedRobot:
 
     def scene(self, number: int) -> "RecordedScene":
         """Return one of the windows; those of numbers that follow one another lie apart."""
-        from hma_model.evaluation.evaluate import decode
+        from hma_model.generation.decode import decode
 
         windows = self._windows
         batch = windows.batch([number * apart(len(windows)) % len(windows)])

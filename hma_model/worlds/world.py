@@ -24,8 +24,8 @@ from hma_data.storage.paths import StrPath
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import OBJECTIVES, POLICY
-from hma_model.evaluation.evaluate import decode
 from hma_model.generation.commands import Commands, described
+from hma_model.generation.decode import decode
 from hma_model.generation.engine import products_in
 from hma_model.generation.rollout import Rollout
 from hma_model.generation.state import Snapshot as Snapshot

@@ -42,7 +42,7 @@ import numpy as np
 
 from hma_data.console import run_script
 from hma_data.lab import family, record, whole
-from hma_data.lab.writers import LeRobotEpisode, write_lerobot
+from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 
 ROBOT, SEED = "mover_04", 51
 REACH_S = 2.0  # of an episode

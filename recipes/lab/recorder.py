@@ -38,16 +38,15 @@ from hma_data.errors import HMAError, MissingDependencyError, OutputError, Usage
 from hma_data.lab import whole
 from hma_data.lab.writers import (
     Demo,
-    LeRobotEpisode,
     Message,
     RldsEpisode,
     ros_value,
     write_hdf5,
-    write_lerobot,
     write_mcap,
     write_rlds,
 )
 from hma_data.registry.embodiment import Embodiment, find
+from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 from hma_data.storage.files import atomic_path
 
 Floats = NDArray[np.float64]

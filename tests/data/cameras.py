@@ -5,8 +5,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from hma_data.lab.writers import LeRobotEpisode, write_lerobot
 from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 
 SIZES = {"top": (64, 64), "wrist": (32, 32), "side": (64, 96)}
 LENGTHS = (9, 8, 10)

@@ -11,13 +11,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from hma_data.conversion.job import convert
-from hma_data.conversion.output import locked
 from hma_data.conversion.plan import Settings
 from hma_data.errors import OutputError, RegistryError, SourceError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
+from hma_data.storage.locks import locked
 from tests.conftest import SMALL, BlockTokenizer, contents, write_toy
 
 

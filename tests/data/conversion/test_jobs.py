@@ -18,12 +18,13 @@ import pytest
 from hma_data.conversion import worker as shard_work
 from hma_data.conversion.engines import Limits
 from hma_data.conversion.job import Conversion, convert
-from hma_data.conversion.output import LOCK, Share, locked
+from hma_data.conversion.output import Share
 from hma_data.errors import HMAError, OutputError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.verify import verify
 from hma_data.sources.hdf5.source import Hdf5Source
+from hma_data.storage.locks import LOCK, locked
 from tests.command import hma
 from tests.conftest import SMALL, BlockTokenizer, contents, write_toy
 from tests.conftest import convert_toy as run
@@ -159,13 +160,13 @@ def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(
     toy_arm: Embodiment, toy_recording: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with locked(out, Share(0, 2)):
+    with locked(out, "0-of-2"):
         with (
             pytest.raises(OutputError, match="another job is writing share 0-of-2"),
-            locked(out, Share(0, 2)),
+            locked(out, "0-of-2"),
         ):
             pass
-        with locked(out, Share(1, 2)):
+        with locked(out, "1-of-2"):
             pass
         with pytest.raises(OutputError, match="another job is writing it"):
             run(toy_arm, toy_recording, out)

@@ -9,12 +9,13 @@ import pytest
 
 from hma_data.conversion import job
 from hma_data.conversion.job import Conversion
-from hma_data.conversion.output import LOCK, Share
+from hma_data.conversion.output import Share
 from hma_data.conversion.report import Shared
 from hma_data.errors import OutputError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
+from hma_data.storage.locks import LOCK
 from tests.command import hma
 from tests.conftest import ARM_YAML, SMALL, BlockTokenizer, contents, write_toy
 from tests.conftest import convert_toy as run

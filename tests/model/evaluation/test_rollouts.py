@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hma_data.tokenizers.base import get_tokenizer
-from hma_model.evaluation.rollouts import decode
+from hma_model.generation.decode import decode
 
 
 class OnGPU(torch.Tensor):

@@ -254,7 +254,7 @@ def test_recorded_pictures_are_those_of_the_windows_frames(tmp_path: Path) -> No
     from hma_data.loading.dataset import WindowDataset
     from hma_data.shards.preview import tokenizer_of
     from hma_data.shards.reader import ShardSet
-    from hma_model.evaluation.rollouts import decode
+    from hma_model.generation.decode import decode
 
     recording = record("pendulum", tmp_path / "rec", 4, seed=1)
     convert(find("pendulum"), recording, "fsq-8", tmp_path / "shards")

@@ -13,7 +13,7 @@ from hma_data.shards.reader import ShardSet
 from hma_model.config import HMAConfig
 from hma_model.evaluation.evaluate import evaluate
 from hma_model.evaluation.rollout_video import rollout_video
-from hma_model.evaluation.rollouts import cameras_for, decode
+from hma_model.generation.decode import cameras_for, decode
 from hma_model.network.model import HMA
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe

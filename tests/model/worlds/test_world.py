@@ -9,7 +9,7 @@ import torch
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError
 from hma_data.tokenizers.base import get_tokenizer
-from hma_model.evaluation.evaluate import decode
+from hma_model.generation.decode import decode
 from hma_model.network.model import HMA
 from hma_model.simulate import World, load_world, starting_window
 

@@ -1,0 +1,57 @@
+"""Decode generated frames to images, and choose the cameras and the prompt that a model takes.
+
+B batch, T frames, h,w grid, S pixels a side, C cameras.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hma_data.errors import UsageError
+from hma_data.loading.views import FIRST, Cameras, view_count
+from hma_data.shards.reader import ShardSet
+from hma_data.tokenizers.network import NetworkTokenizer
+from hma_model.checkpoint.folder import Checkpoint
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.network.model import HMA
+
+
+def default_prompt(length: int) -> int:
+    """Return how many frames of a window of this length a rollout starts from."""
+    return max(1, length // 3)
+
+
+def decode(tokenizer: "Tokenizer", stored: Tensor) -> NDArray[np.uint8]:
+    """Decode ids (B, T, C·h, w) or latents (B, T, c, C·H, W) to pictures (B, T, S, C·S, 3), side by side."""
+    views, rows = stored.flatten(0, 1), tokenizer.spec.grid[0]
+    if isinstance(tokenizer, NetworkTokenizer) and not stored.is_cpu:  # tokens stay on the GPU
+        kept = views if tokenizer.spec.kind == "discrete" else views.half()
+        pictures = torch.cat([tokenizer.pictures(view) for view in kept.split(rows, -2)], 2).numpy(force=True)
+    else:
+        dtype = np.uint32 if tokenizer.spec.kind == "discrete" else np.dtype(tokenizer.spec.dtype)
+        cameras = np.split(views.cpu().numpy().astype(dtype), views.shape[-2] // rows, axis=-2)
+        pictures = np.concatenate([tokenizer.decode(view) for view in cameras], axis=2)
+    return pictures.reshape(*stored.shape[:2], *pictures.shape[1:])
+
+
+def cameras_for(model: "HMA", shards: ShardSet, cameras: Cameras | None = None) -> Cameras:
+    """Return the cameras that a model sees: those given, or those that it was trained on.
+
+    Raises:
+        UsageError: these are more or fewer than the views of the model.
+    """
+    if cameras is None and "origin" in vars(model):
+        card = Checkpoint.open(vars(model)["origin"]).card(shards.embodiment.id)
+        cameras = card.get("data", {}).get("cameras")
+    cameras = FIRST if cameras is None else cameras
+    if (count := view_count(cameras)) != model.config.views:
+        fault = f"are {count} in a frame, but the model takes {model.config.views}"
+        raise UsageError(
+            "cameras", fault, f"name {model.config.views} of {', '.join(shards.manifest.cameras)}"
+        )
+    return cameras
