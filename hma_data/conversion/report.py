@@ -11,7 +11,7 @@ from hma_data.conversion.engines import Notice, Retry
 from hma_data.conversion.plan import Plan
 from hma_data.conversion.worker import Seen, Tick
 from hma_data.errors import RegistryError
-from hma_data.inspection.shard_rate import pause_finding, rate_finding, window_finding
+from hma_data.inspection.shard_flags import pause_finding, rate_finding, window_finding
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet

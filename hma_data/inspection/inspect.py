@@ -409,8 +409,7 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
 
 
 def _shard_set(folder: Path) -> Iterator[Finding]:
-    from hma_data.inspection.shard_pictures import shard_picture_findings
-    from hma_data.inspection.shard_rate import pause_finding, rate_finding, window_finding
+    from hma_data.inspection.shard_flags import pause_finding, picture_findings, rate_finding, window_finding
     from hma_data.shards.reader import ShardSet
     from hma_data.shards.verify import verify
 
@@ -438,4 +437,4 @@ def _shard_set(folder: Path) -> Iterator[Finding]:
         yield off_rate
     if paused := pause_finding(shards):
         yield paused
-    yield from shard_picture_findings(ShardSet(folder))
+    yield from picture_findings(shards)

@@ -1,4 +1,4 @@
-"""Black, frozen and repeating cameras: refused or flagged at conversion, and found in shards that exist."""
+"""Black, frozen and repeating cameras: refused or flagged at conversion, and reported by doctor."""
 
 import json
 from dataclasses import replace
@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from skimage import data as skimage_data
 
-from hma_data.conversion import worker
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.report import Summary
@@ -18,7 +17,6 @@ from hma_data.errors import SourceError
 from hma_data.inspection.inspect import examine
 from hma_data.registry.embodiment import Embodiment, problems
 from hma_data.shards.reader import ShardSet
-from hma_data.tokenizers.base import get_tokenizer
 from tests.command import hma
 from tests.conftest import ARM_YAML, BlockTokenizer
 from tests.data import bag_files, videos
@@ -198,38 +196,14 @@ def test_noise_does_not_hide_a_frozen_camera_and_a_small_motion_does_not_look_fr
 # -- shards that exist
 
 
-@pytest.fixture(scope="module")
-def old_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A set with a black and a frozen episode, and a black second camera, as made without the rule."""
-    folder = tmp_path_factory.mktemp("old")
-    path = write_hdf5(folder / "toy.hdf5", {kind: pictures(kind) for kind in KINDS}, side="black")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worker, "picture_flags", lambda *arguments: {})
-        robot = Embodiment.from_yaml(ARM_YAML)
-        settings = Settings(val_fraction=0.0, cameras=("all",))
-        convert(robot, path, get_tokenizer("fsq-8"), folder / "out", settings=settings)
-    return folder / "out"
-
-
-def test_doctor_finds_black_and_frozen_episodes_of_each_camera(old_shards: Path) -> None:
-    done = hma("doctor", old_shards, "--json")
-    found = {(one["check"], one["key"]): one for one in json.loads(done.stdout)["findings"]}
-    assert done.returncode == 1
-    black, still = found["blank", "top"], found["still", "top"]
-    assert (black["severity"], black["numbers"]["episodes"]) == ("error", ["black"])
-    assert black["numbers"]["train_share"] == pytest.approx(1 / 4)
-    assert "25.0% of the training frames: black" in black["message"]
-    assert (still["severity"], still["numbers"]["episodes"]) == ("warn", ["frozen"])
-    assert found["blank", "side"]["numbers"]["episodes"] == sorted(KINDS)
-    assert found["blank", "side"]["message"].startswith("camera side shows one colour")
-    assert ("still", "side") not in found
-
-
-def test_without_the_tokenizer_doctor_still_names_what_never_changes(tmp_path, block_tokenizer) -> None:
-    episodes = {"a": pictures("good"), "b": np.zeros_like(pictures("black"))}
-    converted(tmp_path, episodes, "{blank: flag}", block_tokenizer)
-    found = [one for one in examine(tmp_path / "out") if one.check in ("blank", "still")]
-    assert [(one.check, one.numbers["episodes"]) for one in found] == [("still", ["b"])]
+def test_doctor_names_the_blank_and_still_episodes_that_were_kept(tmp_path, block_tokenizer) -> None:
+    converted(tmp_path, {kind: pictures(kind) for kind in KINDS}, "{blank: flag}", block_tokenizer)
+    done = hma("doctor", tmp_path / "out", "--json")
+    found = {one["check"]: one for one in json.loads(done.stdout)["findings"]}
+    for check, episode in (("blank", "black"), ("still", "frozen")):
+        assert (found[check]["severity"], found[check]["key"]) == ("warn", "top")
+        assert found[check]["numbers"]["episodes"] == [episode]
+        assert found[check]["message"].endswith(f"throughout in 1 of 4 episodes: {episode}")
 
 
 def test_doctor_of_sound_shards_says_nothing_of_pictures(tmp_path, block_tokenizer) -> None:

@@ -1,6 +1,6 @@
-"""Find the episodes of a shard set whose grid has another rate than its embodiment states, or has pauses.
+"""Report what a conversion flagged in a shard set: rates, pauses, blank and still cameras, short episodes.
 
-A conversion flags them; see `hma_data.episodes.align.rate_flags`.
+The flags are set by `hma_data.episodes.align.rate_flags` and `hma_data.episodes.images.picture_flags`.
 """
 
 from collections.abc import Iterator
@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 from hma_data.episodes.align import OFF_RATE, PAUSE, PAUSED, measured_hz, pause_remedy, rate_remedy
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.sources.common.checks import Finding, Severity
+from hma_data.sources.common.survey import listed
 
 COSTLY = 0.1  # share of the windows above which the loss is a warning
 TRIED = 20  # flagged episodes of which the first with more than one row is measured
@@ -73,6 +74,20 @@ def window_finding(shards: ShardSet) -> Finding | None:
     if frames > 1:
         remedies.append(f"train with windows of fewer frames (frames={frames})")
     return Finding("windows", "error", said, ", or ".join(remedies) or "record longer episodes")
+
+
+def picture_findings(shards: ShardSet) -> Iterator[Finding]:
+    """Yield a finding for each camera that shows one colour, or one image, throughout some episodes."""
+    episodes = shards.episodes
+    for camera in shards.manifest.cameras:
+        for check, shown in (("blank", "one colour"), ("still", "one image")):
+            flagged = episodes.filter(pc.match_substring(episodes["flags"], f"{check}_pictures:{camera}="))
+            if not len(flagged):
+                continue
+            ids = flagged["id"].to_pylist()
+            said = f"camera {camera} shows {shown} throughout in {len(ids):,} of {len(episodes):,} episodes"
+            remedy = "look at them with hma shards preview --only ID; hma convert --exclude leaves them out"
+            yield Finding(check, "warn", f"{said}: {listed(ids)}", remedy, camera, {"episodes": ids})
 
 
 def _measured(shards: ShardSet, rows: list[dict[str, Any]]) -> Iterator[tuple[str, float]]:
