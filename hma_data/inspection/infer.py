@@ -20,15 +20,17 @@ from hma_data.episodes.offset import Offset
 from hma_data.errors import SourceError, UsageError
 from hma_data.inspection import infer_topics
 from hma_data.inspection.infer_choices import (
+    RH20T_GUESSES,
+    STEP_GUESSES,
     Choice,
-    actions,
+    Guess,
     camera_names,
     cameras,
     dims,
+    first_choice,
     instruction,
     is_gripper,
     likely,
-    next_poses,
     shown,
     states,
     vectors,
@@ -45,6 +47,10 @@ from hma_data.storage.paths import StrPath
 LINE = 110
 HIGHEST_HZ = 100_000  # of a rate in a YAML
 TARGET_HZ, SHOWN = 2, 24  # frames a second of the paper; frames that a model should see of an episode
+ACTION_GUESSES: dict[str, tuple[Guess, ...]] = {
+    "rosbag": (infer_topics.commanding_topics, infer_topics.measured_topics, likely),
+    "rh20t": RH20T_GUESSES,
+}  # of the other formats: STEP_GUESSES
 MEASURED_TO = 5e-4  # relative error of a measured rate; the doubt from jittering stamps is added
 
 
@@ -190,7 +196,7 @@ class _Draft:
         if not self.seen.keys:
             raise _lacks(found, "has no colour camera", [key for key in found.keys if key.kind == "camera"])
         numbers = vectors(found.keys)
-        if found.format == "hdf5":  # it has other arrays too: take those with one row per picture
+        if not self.timed:  # HDF5 has other arrays too: take those with one row per frame
             lengths = [key.count for key in self.seen.keys]
             length = max(set(lengths), key=lengths.count)
             self.seen = replace(self.seen, keys=tuple(key for key in self.seen.keys if key.count == length))
@@ -198,17 +204,12 @@ class _Draft:
         if self.bag:
             running = tuple(key for key in self.seen.keys if infer_topics.runs(key))
             self.seen = replace(self.seen, keys=running or self.seen.keys)
-            self.action = infer_topics.actions(numbers)
-            self.states = infer_topics.states(numbers, self.action.keys)
-        elif found.format == "rh20t":
-            self.action, self.states = (
-                next_poses([key for key in found.keys if key.kind == "vector"]),
-                states(numbers, ()),
-            )
-        else:
-            action = actions(numbers)
-            self.action = action if action.keys else likely(numbers)
-            self.states = states(numbers, self.action.keys)
+        rh20t = found.format == "rh20t"  # the names of its tables, not of their values, tell what they hold
+        tables = [key for key in found.keys if key.kind == "vector"]
+        guesses = ACTION_GUESSES.get(found.format, STEP_GUESSES)
+        self.action = first_choice(guesses, tables if rh20t else numbers)
+        chosen_states = infer_topics.states if self.bag else states
+        self.states = chosen_states(numbers, () if rh20t else self.action.keys)
         if not self.action.keys:
             raise _lacks(found, "has nothing that could be an action", self.seen.keys)
         hz = self.seen.keys[0].hz if self.bag else found.hz

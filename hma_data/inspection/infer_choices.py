@@ -1,14 +1,14 @@
 """Choose which keys of a recording are cameras, actions, states and words, by their names and shapes.
 
-The words in a key's name say whether it is a command or a measurement, a gripper or a base, or noise. Where
-they do not decide, the choice carries a question, which becomes a TODO in the YAML. `infer_topics` chooses
-the topics of bags.
+The words in a key's name say whether it is an action or a measurement, a gripper or a base, or noise. Where
+they do not decide, the choice carries a question, which becomes a TODO in the YAML. `STEP_GUESSES` lists, in
+order, how the action of a recording made of steps is found; `infer_topics` has the guesses for bags.
 """
 
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from hma_data.sources.common.inspection import KeyInfo
@@ -226,34 +226,59 @@ def _plain(key: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "_", key).strip("_-")[:100] or "camera"
 
 
-# -- actions of recordings made of steps
+# -- actions
 
 
-def actions(found: list[KeyInfo]) -> Choice:
-    """Choose the action among the vectors of RLDS, HDF5 or LeRobot; empty when no name says action."""
-    outside = [key for key in found if not _is_observed(key.key)]
+def whole_action(found: list[KeyInfo]) -> Choice:
+    """Choose the key that is called action; of several, the one nearest to the root."""
+    outside = _not_observed(found)
     whole = [key for key in outside if _last(key.key).lower() in ("action", "actions")]
-    if whole:
-        chosen = min(whole, key=lambda key: len(re.split(r"[/.]", key.key)))
-        beside = [key for key in outside if _is_beside(key, chosen)]
-        return Choice((chosen,), question((chosen,), beside) if beside else "")
-    group = [key for key in outside if re.match(r"(actions?|action_dict)[/.]", key.key, re.IGNORECASE)]
+    if not whole:
+        return Choice()
+    chosen = min(whole, key=lambda key: len(re.split(r"[/.]", key.key)))
+    beside = [key for key in outside if _is_beside(key, chosen)]
+    return Choice((chosen,), question((chosen,), beside) if beside else "")
+
+
+def action_group(found: list[KeyInfo]) -> Choice:
+    """Choose the keys inside a group called action; leave out parts of the base that never move."""
+    inside = re.compile(r"(actions?|action_dict)[/.]", re.IGNORECASE)
+    group = [key for key in _not_observed(found) if inside.match(key.key)]
     group = [key for key in group if "robot_state" not in _snake(key.key)]
-    if group:
-        moved = [key for key in group if not (key.constant and BASE & set(words(key.key)))]
-        parts = _ordered_parts(moved or group)
-        others = [key for key in moved if key not in parts]
-        asked = [question(parts, others)] if others else []
-        if still := shown(key.key for key in group if moved and key not in moved):
-            asked.append(
-                f"{still} never changes in the episode looked at and is left out; does it in others?"
-            )
-        return Choice(parts, " ".join(asked))
-    for pool in (outside, found):
-        named = [key for key in pool if strength(words(key.key)) and not MEASURED & set(words(key.key))]
-        if named:
-            return _called_otherwise(named, found)
-    return Choice()
+    moved = [key for key in group if not (key.constant and BASE & set(words(key.key)))]
+    if not moved:
+        return Choice(_ordered_parts(group))
+    parts = _ordered_parts(moved)
+    asked = []
+    if others := [key for key in moved if key not in parts]:
+        asked.append(question(parts, others))
+    if still := shown(key.key for key in group if key not in moved):
+        asked.append(f"{still} never changes in the episode looked at and is left out; does it in others?")
+    return Choice(parts, " ".join(asked))
+
+
+def named_otherwise(found: list[KeyInfo]) -> Choice:
+    """Choose the keys whose names say action in other words: command, target, leader, control."""
+    named: list[KeyInfo] = []
+    for pool in (_not_observed(found), found):
+        named = named or [key for key in pool if _command_strength(key) > 0]
+    if not named:
+        return Choice()
+    strongest = max(map(_command_strength, named))
+    chosen = [key for key in named if _command_strength(key) == strongest]
+    if all(is_gripper(key.key) for key in chosen):  # some other key must move the arm
+        chosen += [key for key in _not_observed(found) if MOTION & set(words(key.key))]
+    parts = _ordered_parts(chosen)
+    return Choice(parts, question(parts, [key for key in found if key not in parts]))
+
+
+def _command_strength(key: KeyInfo) -> int:
+    said = set(words(key.key))
+    return 0 if said & MEASURED else strength(said)
+
+
+def _not_observed(found: list[KeyInfo]) -> list[KeyInfo]:
+    return [key for key in found if not _is_observed(key.key)]
 
 
 def _is_beside(key: KeyInfo, chosen: KeyInfo) -> bool:
@@ -264,16 +289,6 @@ def _is_beside(key: KeyInfo, chosen: KeyInfo) -> bool:
     group = chosen.key[: -len(_last(chosen.key))]
     same_group = bool(group) and key.key.startswith(group)
     return same_group or is_gripper(key.key) or bool(said & (BASE | SIDES))
-
-
-def _called_otherwise(named: list[KeyInfo], found: list[KeyInfo]) -> Choice:
-    """Choose keys that are named as commands in other words than action."""
-    strongest = max(strength(words(key.key)) for key in named)
-    chosen = [key for key in named if strength(words(key.key)) == strongest]
-    if all(is_gripper(key.key) for key in chosen):  # some other key must move the arm
-        chosen += [key for key in found if MOTION & set(words(key.key)) and not _is_observed(key.key)]
-    parts = _ordered_parts(chosen)
-    return Choice(parts, question(parts, [key for key in found if key not in parts]))
 
 
 def _ordered_parts(parts: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
@@ -300,7 +315,9 @@ def _place(key: KeyInfo) -> int:
     said = set(words(_last(key.key)))
     if is_gripper(key.key):
         return 3
-    return 2 if said & BASE else 1 if said & ROTATION else 0
+    if said & BASE:
+        return 2
+    return 1 if said & ROTATION else 0
 
 
 def question(chosen: Iterable[KeyInfo], others: Iterable[KeyInfo]) -> str:
@@ -323,9 +340,8 @@ def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...
     names = {_snake(_last(key.key)) for key in named}
     repeated = ("ee_pos", "ee_ori") if "ee_states" in names else ()  # in LIBERO
     named = [key for key in named if _snake(_last(key.key)) not in repeated]
-    own = [
-        key for key in named if _is_observed(key.key) or _snake(_last(key.key)) != "states"
-    ]  # of a simulator
+    # Outside the observations, `states` is the state of a simulator.
+    own = [key for key in named if _is_observed(key.key) or _snake(_last(key.key)) != "states"]
     return tuple(sorted(own, key=_place))
 
 
@@ -339,26 +355,43 @@ def _is_state(key: KeyInfo) -> bool:
     return grips or bool(said & (STATES | ROTATION)) or _is_whole_state(key.key)
 
 
+def stand_in(chosen: Sequence[KeyInfo], found: Iterable[KeyInfo], asked: str, measured: bool) -> Choice:
+    """Return keys that no name calls an action, with the question whether they may stand for one."""
+    others = shown(key.key for key in found if key not in chosen)
+    return Choice(tuple(chosen), asked + (f", or which of {others} is it?" if others else "?"), measured)
+
+
 def likely(found: list[KeyInfo]) -> Choice:
     """Choose what may be an action where no name says so: the robot's own position, else any float vector."""
     own = states(found, ())
     joints = [key for key in own if JOINT & set(words(key.key))]
-    chosen = tuple((joints or list(own) or [key for key in found if key.dtype.startswith("float")])[:1])
+    chosen = joints or own or [key for key in found if key.dtype.startswith("float")]
     if not chosen:
         return Choice()
-    others = shown(key.key for key in found if key not in chosen)
     when = ", as measured a step later," if own else ""
     asked = f"no key is called a command; may {shown([chosen[0].key])}{when} stand for it"
-    return Choice(chosen, asked + (f", or which of {others} is it?" if others else "?"), measured=bool(own))
+    return stand_in(chosen[:1], found, asked, bool(own))
 
 
 def next_poses(found: list[KeyInfo]) -> Choice:
-    """Choose RH20T's pose and width of the next sample, which stand for a command; else what may be one."""
+    """Choose RH20T's pose and width of the next sample, which stand for an action."""
     chosen = tuple(key for key in found if key.key in ("tcp_base/tcp", "gripper/gripper_info"))
-    if not chosen:
-        return likely(found)
     asked = f"may {shown(key.key for key in chosen)} of the next sample stand for the command?"
-    return Choice(chosen, asked, measured=True)
+    return Choice(chosen, asked if chosen else "", measured=True)
+
+
+Guess = Callable[[list[KeyInfo]], Choice]
+STEP_GUESSES: tuple[Guess, ...] = (whole_action, action_group, named_otherwise, likely)
+RH20T_GUESSES: tuple[Guess, ...] = (next_poses, likely)
+
+
+def first_choice(guesses: Iterable[Guess], found: list[KeyInfo]) -> Choice:
+    """Return the choice of the first guess that finds keys; an empty one where none does."""
+    for guess in guesses:
+        choice = guess(found)
+        if choice.keys:
+            return choice
+    return Choice()
 
 
 def instruction(keys: Iterable[KeyInfo]) -> str | None:

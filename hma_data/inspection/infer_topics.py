@@ -14,9 +14,9 @@ from hma_data.inspection.infer_choices import (
     STATES,
     Choice,
     is_gripper,
-    likely,
     question,
     shown,
+    stand_in,
     strength,
     words,
 )
@@ -46,12 +46,12 @@ def runs(key: KeyInfo) -> bool:
     return key.hz is not None and key.hz >= SLOWEST_HZ
 
 
-def actions(found: list[KeyInfo]) -> Choice:
-    """Choose the topics that command the robot; where there are none, what is measured, with a question."""
+def commanding_topics(found: list[KeyInfo]) -> Choice:
+    """Choose the topics that drive the robot: the clearest, its twin of the other arm, and grippers."""
     ranked = [(_rank(topic), topic) for topic in _topics(found)]
     commanding = sorted((pair for pair in ranked if pair[0][0] > 0), key=_order, reverse=True)
     if not commanding:
-        return _measured(found)
+        return Choice()
     best = commanding[0][1]
     chosen = [
         topic
@@ -70,18 +70,17 @@ def actions(found: list[KeyInfo]) -> Choice:
     return Choice(keys, question(keys, others) if others else "")
 
 
-def _measured(found: list[KeyInfo]) -> Choice:
+def measured_topics(found: list[KeyInfo]) -> Choice:
     """Choose the robot's own state as its action: one topic, or the same topic of both arms."""
     own = states(found, ())
     joints = [key for key in own if JOINT & set(words(key.key))] or list(own)
     if not joints:
-        return likely(found)
+        return Choice()
     first = joints[0]
     named = {_name((key,)): key for key in joints}  # one key a topic
-    chosen = tuple(key for key in named.values() if key == first or _other_side((key,), (first,)))
-    others = shown(key.key for key in found if key not in chosen)
+    chosen = [key for key in named.values() if key == first or _other_side((key,), (first,))]
     asked = f"no topic commands the robot; may {shown(key.key for key in chosen)}, as measured, stand for it"
-    return Choice(chosen, asked + (f", or which of {others} is it?" if others else "?"))
+    return stand_in(chosen, found, asked, measured=False)
 
 
 def _name(topic: Topic) -> str:
