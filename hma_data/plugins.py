@@ -1,6 +1,6 @@
 """Find what other installed packages add: sources and tokenizers, each by an entry point.
 
-docs/adding-a-source.md shows a package that adds one of each.
+docs/extending.md shows a package that adds one of each.
 
 A built-in name never comes here. Names are read from the packages' metadata; a package's code is imported
 only by `Plugin.load`.
@@ -62,7 +62,7 @@ class Plugin:
         """Return the error that names the package at fault."""
         packages = " and ".join(self.packages)
         where = f"{packages}, entry point {self.name!r} of {self.entry_point.group}"
-        remedy = remedy or f"repair or uninstall {packages}; docs/adding-a-source.md shows one that works"
+        remedy = remedy or f"repair or uninstall {packages}; docs/extending.md shows one that works"
         return PluginError(where, fault, remedy)
 
 

@@ -18,7 +18,7 @@ from hma_data.tokenizers.base import get_tokenizer
 from tests.command import ROOT, fails, hma
 from tests.conftest import write_toy
 
-PAGE = (ROOT / "docs/adding-a-source.md").read_text()
+PAGE = (ROOT / "docs/extending.md").read_text()
 FILES = dict(re.findall(r"^```\w+\n# (\S+)\n(.*?)^```", PAGE, re.M | re.S))
 COMMANDS = re.findall(r"^hma (.+)$", PAGE, re.M)
 TOKENIZER = FILES["toy_robot/tokenizer.py"]
@@ -55,7 +55,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
 @pytest.fixture
 def toy_robot(install: Install) -> None:
-    """The package of docs/adding-a-source.md."""
+    """The package of docs/extending.md."""
     project = tomllib.loads(FILES["pyproject.toml"])["project"]
     modules = {name: text for name, text in FILES.items() if name.endswith(".py")}
     install(project["name"], modules, project["entry-points"])
@@ -63,7 +63,7 @@ def toy_robot(install: Install) -> None:
 
 @pytest.fixture
 def episodes(tmp_path: Path) -> Path:
-    """A folder with the YAML of docs/adding-a-source.md, and `episodes` of its format."""
+    """A folder with the YAML of docs/extending.md, and `episodes` of its format."""
     draw = np.random.default_rng(0)
     (tmp_path / "episodes").mkdir()
     for i in range(3):

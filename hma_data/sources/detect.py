@@ -18,7 +18,7 @@ from hma_data.storage.kinds import misplaced, own_layout, unreadable
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import place
 
-RECIPE = "docs/adding-a-robot.md, Pictures and tables"
+RECIPE = "docs/adding-a-robot.md, Images and tables"
 PACKED = {  # the command that unpacks a file, by the end of its name
     ".tar": "tar xf", ".tar.gz": "tar xf", ".tgz": "tar xf", ".tar.bz2": "tar xf", ".tar.xz": "tar xf",
     ".tar.zst": "tar xf", ".zip": "unzip", ".7z": "7z x", ".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz",

@@ -1,7 +1,7 @@
 """List the tokenizers: what each is, where its weights come from, and what it needs on this machine.
 
 To add a tokenizer, add a row to `CATALOG`, or have an installed package add an `Entry`
-(docs/adding-a-source.md), and a module with `load(name, *, weights, device, **arguments)`. This module
+(docs/extending.md), and a module with `load(name, *, weights, device, **arguments)`. This module
 imports neither torch nor a built-in tokenizer's module.
 """
 

@@ -47,7 +47,7 @@ _HAND = ("hand_landmark_full.tflite", "hand_landmark_lite.tflite", "hand_landmar
 _REMEDY = (
     "give source.layout.models (or the environment variable HMA_HAND_MODELS) a folder with MediaPipe's "
     "palm_detection_full.tflite and hand_landmark_full.tflite, or the path of hand_landmarker.task; "
-    "docs/hands.md says where to get them"
+    "docs/adding-a-robot.md, Videos of human hands, says where to get them"
 )
 
 # -- the models

@@ -4,7 +4,6 @@ import copy
 import datetime
 import math
 import os
-import re
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hma_data.errors import RegistryError
-from hma_data.registry.components import LAYOUTS
 from hma_data.registry.embodiment import Embodiment, find, problems, registry_files, schema, todos
 from hma_data.storage.yaml_io import MAX_BYTES, parse_yaml, read_yaml, write_yaml
 
@@ -314,13 +312,6 @@ def test_a_fixed_grid_is_refused_where_frames_are_not_resampled(name: str) -> No
 def test_bags_and_videos_of_hands_may_have_a_fixed_grid(name: str) -> None:
     values = changed("source.format", name) | {"sync": {"rate_hz": 2}}
     assert Embodiment.from_values(values, "arm.yaml").rate_hz == 2
-
-
-def test_the_page_on_adding_a_robot_lists_every_layout_key() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "adding-a-robot.md").read_text()
-    table = page[page.index("| format | key of `layout` |") :].split("\n\n")[0]
-    listed = re.findall(r"^\| (\w+) \| `(\w+)` \|", table, re.MULTILINE)
-    assert listed == [(name, key) for name, layout in LAYOUTS.items() for key in layout.model_fields]
 
 
 LAYOUT_VALUES = [
