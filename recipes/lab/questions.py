@@ -17,6 +17,7 @@ What a row measures, besides the steps and the held-out loss (nats a token; not 
 """
 
 import argparse
+import csv
 import statistics
 import tempfile
 import time
@@ -27,7 +28,6 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
-from what_pays import append, read
 
 from hma_data.bench import recipe_module
 from hma_data.console import run_script
@@ -115,6 +115,24 @@ QUESTIONS: dict[str, tuple[Row, ...]] = {
         Row("pre-trained trunk, frozen", ("start=embedded", "freeze=trunk", *NETWORK), NEW, state=True),
     ),
 }  # fmt: skip
+
+
+def append(path: Path, line: dict[str, Any]) -> None:
+    """Add a line to the CSV; a new file gets a header."""
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, list(line))
+        if new:
+            writer.writeheader()
+        writer.writerow(line)
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """Return the lines of the CSV; none if there is no file."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 class Shards:

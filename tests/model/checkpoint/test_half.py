@@ -1,7 +1,5 @@
 """Checkpoints in float16."""
 
-import runpy
-import sys
 from pathlib import Path
 
 import pytest
@@ -9,21 +7,17 @@ import torch
 from safetensors.torch import load_file
 
 from hma_data.errors import CheckpointError
-from hma_data.storage.paths import shipped
 from hma_model.checkpoint import io
 from hma_model.checkpoint.folder import README, SAMPLE, STEM, TRUNK, Checkpoint
 from hma_model.network.model import HMA
 from tests.model.robots import make_model, save
 
-sys.path.insert(0, str(shipped("recipes") / "world"))
-HALF = runpy.run_path(str(shipped("recipes") / "world" / "half.py"))["main"]
-
 
 @pytest.fixture
-def halved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    save(tmp_path / "whole", {"arm": 2, "hand": 3}, samples={"arm": b"a picture"})
-    monkeypatch.setattr("sys.argv", ["half.py", str(tmp_path / "whole"), str(tmp_path / "half")])
-    HALF()
+def halved(tmp_path: Path) -> Path:
+    for name in ("whole", "half"):
+        robots = {"arm": 2, "hand": 3}
+        save(tmp_path / name, robots, samples={"arm": b"a picture"}, half=name == "half")
     return tmp_path / "half"
 
 
