@@ -103,7 +103,6 @@ _SHARES = (
     "history_probability",
     "mask_ratio_min",
     "dropout",
-    "drop_commands",
     "whole_share",
 )
 
@@ -170,14 +169,10 @@ class HMAConfig:
     # drawn as that of digits, so corrupt_max and the history below count here too
     latent_noise: float = 0.0
     told_noise: bool = False  # tell the model each frame's corruption; 0 for what it is shown after training
-    # Tell the model at every frame what its place held in the first frame: of the prompt, or in training in a
-    # frame drawn from the episode up to the window.
-    told_first: bool = False
     # The share of samples whose longer history stays unmasked, with later frames corrupted more.
     history_probability: float = 0.2
     history_frames: int = 4  # the shortest such history
     mask_ratio_min: float = 0.0  # a masked frame's smallest mask probability
-    drop_commands: float = 0.0  # the share of windows that predict video without any command, for guidance
     # The frames of a training pass that predicts video. "window": the window's, masked (paper). "pairs": the
     # true frames, and a masked copy of each from the second on, which sees the true frames before it.
     training_pass: str = "window"

@@ -173,7 +173,6 @@ class MixtureDataset(IterableDataset[Batch]):
         memory_mib: memory for decoded rows in all lanes together, in MiB, about.
         cameras: `first`, `drawn` (a camera for each window), a name, or the names of several cameras, whose
             views are stacked along the height of the token grid.
-        earlier: whether batches have an earlier frame of each window's episode, see `Batch`.
 
     Raises:
         ShardError: the sets do not fit together, or one has no window.
@@ -202,7 +201,6 @@ class MixtureDataset(IterableDataset[Batch]):
         lanes: int = 4,
         memory_mib: int = 1024,
         cameras: Cameras = FIRST,
-        earlier: bool = False,
     ) -> None:
         if not 0 <= rank < world:
             raise UsageError("rank", f"{rank} is not one of 0 to {world - 1}")
@@ -212,7 +210,7 @@ class MixtureDataset(IterableDataset[Batch]):
         self.sets = open_sets(data, cameras)
         self._cameras = cameras if isinstance(cameras, str) else list(cameras)
         self.batch_size, self.rank, self.world, self.lanes = batch_size, rank, world, lanes
-        self.seed, self._short, self._earlier = seed, short, earlier
+        self.seed, self._short = seed, short
         share = memory_mib * MIB / len(self.sets)
         self._decoders = {
             name: Decoder(shards, split, frames, None, short, int(share / 5), cameras)
@@ -364,7 +362,7 @@ class MixtureDataset(IterableDataset[Batch]):
                 self._assignments[which] = UnitAssignment.of(decoder.index, self.world * self.lanes)
             reader = self.rank * self.lanes + lane
             self._sequences[lane, which] = WindowSequence(
-                decoder, self._assignments[which], self.seed, reader, self._pools[which], self._earlier
+                decoder, self._assignments[which], self.seed, reader, self._pools[which]
             )
         return self._sequences[lane, which]
 

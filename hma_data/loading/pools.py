@@ -107,7 +107,6 @@ class WindowSequence:
         seed: of the order.
         reader: number of this reader.
         pool: row groups decoded together.
-        earlier: whether windows come with an earlier frame, see `Rows.cut`.
     """
 
     def __init__(
@@ -117,7 +116,6 @@ class WindowSequence:
         seed: int,
         reader: int,
         pool: int,
-        earlier: bool = False,
     ) -> None:
         self._decoder, self._pool, self._parts = decoder, pool, assignment.parts
         self._entropy = [seed, zlib.crc32(decoder.shards.embodiment.id.encode()), reader]
@@ -127,8 +125,6 @@ class WindowSequence:
         self._begin = self._end = 0  # the part of the sequence that the decoded pool holds
         self._rows: Rows | None = None
         self._view: Ints | None = None
-        self._earlier = earlier
-        self._draws: Ints | None = None
 
     def take(self, start: int, count: int) -> dict[str, NDArray[Any]]:
         """Return windows start to start + count of the sequence: those of `Rows.cut`, and camera (n,)."""
@@ -140,8 +136,7 @@ class WindowSequence:
             chosen = slice(start - self._begin, start - self._begin + some)
             last = None if self._last is None else self._last[chosen]
             view = None if self._view is None else self._view[chosen]
-            draws = None if self._draws is None else self._draws[chosen]
-            cut = rows.cut(self._first[chosen], last, self._decoder.index, view, draws)
+            cut = rows.cut(self._first[chosen], last, self._decoder.index, view)
             cut["camera"] = self._camera[chosen]
             cuts.append(cut)
             start, count = start + some, count - some
@@ -185,8 +180,5 @@ class WindowSequence:
         self._last = np.concatenate(lasts)[mixed] if index.padded_episodes else None
         draws = np.random.default_rng([*self._entropy, epoch, number, 1]).integers(0, 2**31, len(first))
         self._camera, self._view = self._decoder.views.taken(draws)
-        if self._earlier:
-            rng = np.random.default_rng([*self._entropy, epoch, number, 2])
-            self._draws = rng.integers(0, 2**31, len(first))
         self._rows = Rows.join(loaded)
         return self._rows

@@ -36,7 +36,6 @@ class Rows:
 
     def __post_init__(self) -> None:
         self._of_span: tuple[int, NDArray[np.float32], NDArray[np.bool_] | None] | None = None
-        self._begins: Ints | None = None
 
     @classmethod
     def join(cls, several: "Sequence[Rows]") -> "Rows":
@@ -57,30 +56,20 @@ class Rows:
         return Rows(*kept)
 
     def cut(
-        self,
-        first: Ints,
-        last: Ints | None,
-        index: WindowIndex,
-        view: Ints | None = None,
-        draws: Ints | None = None,
+        self, first: Ints, last: Ints | None, index: WindowIndex, view: Ints | None = None
     ) -> dict[str, NDArray[Any]]:
         """Return the windows that start at rows `first` (n,).
 
         Args:
             last: (n,) last rows of their episodes, beyond which windows are padded; None pads no window.
             view: (n,) which of the V cameras each window takes; None takes all.
-            draws: (n,) a random number of at least 0 for each window, for `earlier`.
 
         Returns:
             tokens (n, T, S) or (n, T, V, S), actions (n, T, K), episode (n,) and frame (n,). Where the set
             has marks or windows may be padded, also known (n, T) bool. Where windows may be padded, also
-            inside (n, T) bool, True for frames of the episode. With `draws` also earlier (n, 1, S) or
-            (n, 1, V, S), a frame of the episode, of those here up to the window's first.
+            inside (n, T) bool, True for frames of the episode.
         """
         found: dict[str, NDArray[Any]] = {"episode": self.episode[first], "frame": self.frame[first]}
-        if draws is not None:
-            begins = self._episode_begins()[first]
-            found["earlier"] = self._frames((begins + draws % (first - begins + 1))[:, None], view)
         if last is not None:
             return found | self._padded(first, last, index, view)
         found["tokens"] = self._frames(first[:, None] + index.offsets, view)
@@ -89,14 +78,6 @@ class Rows:
         if known is not None:
             found["known"] = np.all(known[first].reshape(len(first), index.frames, -1), axis=2)
         return found
-
-    def _episode_begins(self) -> Ints:
-        """Return for each row the first row here of its episode, (N,); it is made once."""
-        if self._begins is None:
-            follows = (np.diff(self.episode) == 0) & (np.diff(self.frame) > 0)
-            begins = np.flatnonzero(np.concatenate([[True], ~follows]))
-            self._begins = np.repeat(begins, np.diff(begins, append=len(self)))
-        return self._begins
 
     def _spans(self, span: int) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
         """Return the actions and marks of every run of `span` rows, see `_spans`; they are made once."""
@@ -275,8 +256,6 @@ class Batch:
         camera: (B,) int64, index of the camera among those of the shard set; of stacked views, the first's.
         frame_mask: (B, T) bool, False where a short episode was padded; such frames give no loss. None where
             episodes are not padded.
-        earlier: (B, h, w) int64 or (B, c, H, W) float32, a frame of the window's episode, drawn from those up
-            to the window's first. None unless asked for.
         context: like `tokens` or `latents`, the frames that the model sees in their place; the loss is of the
             true ones. None for these.
     """
@@ -290,7 +269,6 @@ class Batch:
     frame: Tensor | None = None
     camera: Tensor | None = None
     frame_mask: Tensor | None = None
-    earlier: Tensor | None = None
     context: Tensor | None = None
 
     def __len__(self) -> int:
@@ -339,7 +317,6 @@ def assemble(
         known[start:end] = cut.get("known", True)
         inside[start:end] = cut.get("inside", True)
     tokens = np.concatenate([cut["tokens"] for cut in cuts])
-    earlier = np.concatenate([cut["earlier"] for cut in cuts]) if "earlier" in cuts[0] else None
     where = {key: np.concatenate([cut[key] for cut in cuts]) for key in ("episode", "frame", "camera")}
     discrete, size = spec.kind == "discrete", size or count
 
@@ -358,7 +335,6 @@ def assemble(
             latents=None if discrete else taken,
             **{key: torch.from_numpy(values[at].astype(np.int64)) for key, values in where.items()},
             frame_mask=torch.from_numpy(inside[at]) if short == "pad" else None,
-            earlier=None if earlier is None else pictures(earlier[at])[:, 0],
         )
 
 

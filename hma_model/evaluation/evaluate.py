@@ -361,7 +361,7 @@ def _notes(
             "there, and the figures say nothing about the actions"
         )
     blind = any(not OBJECTIVES[name].sees_actions for name, often in config.objectives.items() if often)
-    if not config.drop_commands and not blind:
+    if not blind:
         notes.append("the model was not trained without commands, so its rollouts with none may be poor")
     if episodes == 1:
         notes.append(

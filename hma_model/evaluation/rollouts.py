@@ -29,7 +29,6 @@ class Sampling(TypedDict, total=False):
     temperature: float | None
     order: str
     sample_steps: int | None
-    guidance: float
     noise_level: float
     precision: str
     compile: bool

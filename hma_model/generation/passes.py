@@ -70,7 +70,7 @@ class Passes:
         values = torch.cat([fresh, part.lay_out(frame.values).unsqueeze(1)], dim=1)
         masked = torch.zeros(values.shape[:3], dtype=torch.bool, device=values.device)
         masked[:, -1] = part.lay_out(frame.masked)
-        x = self._embed(values, masked, part.origin)
+        x = self._embed(values, masked)
         if whole and part.levels is not None:
             x = self._tell(x, torch.nn.functional.pad(part.levels, (0, 1)))  # nothing of the new frame
         if not self.caching:
@@ -111,7 +111,7 @@ class Passes:
         times = self.state.cached_times(rows, begin, 2)
         before = times.positions[:, :1]
         past, levels = self.state.past(rows, before), self._levels(rows, before)
-        return Pass(past, self.state.origin(rows), levels, times, self._condition(rows, times.positions))
+        return Pass(past, levels, times, self._condition(rows, times.positions))
 
     def _whole(self, rows: list[int], members: list[int]) -> Pass:
         """Return the pass over all frames and the next one of those rows of a step that are at one time."""
@@ -120,8 +120,7 @@ class Passes:
         before = times.positions[:-1].unsqueeze(0)
         past, levels = self.state.past(chosen, before), self._levels(chosen, before)
         conditioning = self._condition(chosen, times.positions.unsqueeze(0))
-        origin = self.state.origin(chosen)
-        return Pass(past, origin, levels, times, conditioning, among=self.state.tensor(members))
+        return Pass(past, levels, times, conditioning, among=self.state.tensor(members))
 
     def _past_features(self, rows: list[int], count: int, late: int) -> Tensor:
         """Add `count` known frames, `late` before the next one, to the cache; return their features."""
@@ -135,7 +134,7 @@ class Passes:
         positions = times.positions if times.positions.dim() > 1 else times.positions.unsqueeze(0)
         past = self.state.past(rows, positions)
         masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
-        x = self._tell(self._embed(past, masked, self.state.origin(rows)), self._levels(rows, positions))
+        x = self._tell(self._embed(past, masked), self._levels(rows, positions))
         return self.engine.trunk(x, self._condition(rows, positions), times, cache)
 
     def _compute(self, frame: TokenFrame | PatchFrame, part: Pass, first: bool) -> tuple[Tensor, Tensor]:
@@ -147,11 +146,11 @@ class Passes:
             return features, at
         return features[part.lanes], at if len(at) == 1 else at[part.lanes]
 
-    def _embed(self, values: Tensor, masked: Tensor, origin: Tensor) -> Tensor:
+    def _embed(self, values: Tensor, masked: Tensor) -> Tensor:
         """Embed frames (n, T, S) of which some tokens are masked, (n, T, S) bool, as (n, T, S, D)."""
         if self.config.kind == "discrete":
-            return self.model.embed_tokens(values, first=origin)  # a masked token says so by itself
-        return self.model.embed_patches(values, masked.unsqueeze(-1), first=origin)
+            return self.model.embed_tokens(values)  # a masked token says so by itself
+        return self.model.embed_patches(values, masked.unsqueeze(-1))
 
     def _levels(self, rows: list[int], positions: Tensor) -> Tensor | None:
         """Return the noise (n, T) that the model is told of the frames at times (1 or n, T)."""

@@ -54,8 +54,7 @@ class Rollout:
             may not reach the rollout.
         embodiment: one id for all, or one a row.
         batch: B.
-        unmask_steps, temperature, order, sample_steps, guidance, noise_level: as in `HMA.generate`. With
-            guidance other than 1, each row has a twin without commands, row B + its number of the state.
+        unmask_steps, temperature, order, sample_steps, noise_level: as in `HMA.generate`.
         generator: of the seeds of rows that get none.
         cache: keep keys and values of past frames.
         compile: compile the passes over one or two frames, on a GPU with CUDA graphs; the first frames then
@@ -66,9 +65,9 @@ class Rollout:
     Attributes:
         state: the state of the rows.
         passes: of the trunk over their frames.
-        uncertainty: (n,) of the rows of the last step, twins last; if `decoding` measures it. Of tokens, the
-            mean entropy of what was predicted when a token of the trunk was decided, in nats. Of latents,
-            the standard deviation of what might have been drawn for a value, in the tokenizer's units.
+        uncertainty: (n,) of the rows of the last step, if `decoding` measures it. Of tokens, the mean entropy
+            of what was predicted when a token of the trunk was decided, in nats. Of latents, the standard
+            deviation of what might have been drawn for a value, in the tokenizer's units.
     """
 
     def __init__(
@@ -81,7 +80,6 @@ class Rollout:
         temperature: float | None = None,
         order: str = "random",
         sample_steps: int | None = None,
-        guidance: float = 1.0,
         noise_level: float = 0.0,
         generator: torch.Generator | None = None,
         cache: bool = True,
@@ -90,13 +88,13 @@ class Rollout:
     ) -> None:
         self.model, self.config = model, model.config
         warmth = default_temperature(model.config) if temperature is None else temperature
-        decoding = Decoding(unmask_steps, warmth, order, sample_steps, guidance, noise_level)
+        decoding = Decoding(unmask_steps, warmth, order, sample_steps, noise_level)
         check(decoding, self.config)
-        self.batch, self.caching, self.twins = batch, cache, guidance != 1
+        self.batch, self.caching = batch, cache
         self.engine = Engine(model, precision, compile and cache)
         Groups.of(embodiment, batch)  # checks that there are as many ids as rows
         names = [embodiment] * batch if isinstance(embodiment, str) else list(embodiment)
-        self.state = RowState(model, names * (1 + self.twins), generator, cache)
+        self.state = RowState(model, names, generator, cache)
         self.passes = Passes(model, self.engine, self.state, cache)
         self.decoding = decoding
         self.told = False  # some prompt had actions
@@ -157,11 +155,7 @@ class Rollout:
         names = list(embodiments or [self.state.embodiments[row] for row in chosen])
         given = prompt_chunks(self.model, names, actions, known, values.shape[1])
         last = slice(max(values.shape[1] - self.config.frames, 0), None)
-        first = values[:, 0]
-        self.state.begin(chosen, names, values[:, last], first, given.frames(last), seeds)
-        if self.twins:
-            free = replace(given, known=torch.zeros_like(given.known))
-            self.state.begin(self._twins(chosen), names, values[:, last], first, free.frames(last), seeds)
+        self.state.begin(chosen, names, values[:, last], given.frames(last), seeds)
         self.told = self.told or actions is not None
 
     def fork(self, n: int) -> "Rollout":
@@ -169,23 +163,21 @@ class Rollout:
         rows = [row for row in range(self.batch) for _ in range(n)]
         names = [self.state.embodiments[row] for row in rows]
         other = Rollout(
-            self.model, names, len(rows), guidance=self.decoding.guidance if self.twins else 1.0,
-            generator=self.state.shared, cache=self.caching,
+            self.model, names, len(rows), generator=self.state.shared, cache=self.caching,
             compile=self.engine.compiled is not None, precision=self.engine.precision,
         )  # fmt: skip
         other.decoding = self.decoding
-        other.restore(range(len(rows)), self.snapshot().take([*rows, *self._twins(rows)]))
+        other.restore(range(len(rows)), self.snapshot().take(rows))
         return other
 
     def snapshot(self, rows: Sequence[int] | None = None) -> Snapshot:
         """Return a copy of the state of some rows, by default all."""
         chosen = self._chosen(rows)
-        return replace(self.state.snapshot([*chosen, *self._twins(chosen)]), passive=self.passes.passive)
+        return replace(self.state.snapshot(chosen), passive=self.passes.passive)
 
     def restore(self, rows: Sequence[int], snapshot: Snapshot) -> None:
         """Put rows into the state of a snapshot of as many rows, from any rollout of the same model."""
         chosen = self._chosen(rows)
-        chosen += self._twins(chosen)
         if len(snapshot.times) != len(chosen):
             raise HMAError("snapshot", f"has {len(snapshot.times)} rows", f"give one of {len(chosen)}")
         if self._clashes(snapshot.passive):
@@ -205,10 +197,6 @@ class Rollout:
         if not chosen or len(set(chosen)) < len(chosen) or not 0 <= min(chosen) <= max(chosen) < self.batch:
             raise HMAError("rows", f"{chosen} are not rows", f"give some of 0 to {self.batch - 1}, each once")
         return chosen
-
-    def _twins(self, rows: list[int]) -> list[int]:
-        """Return the twins of rows; none without guidance."""
-        return [self.batch + row for row in rows] if self.twins else []
 
     def _clashes(self, passive: bool | None) -> bool:
         """Check whether rows with and without actions meet where their frames differ in tokens."""
@@ -242,14 +230,14 @@ class Rollout:
         if not self.config.predicts_video:
             fault = f"was not trained to predict frames, but for {', '.join(self.config.objectives)}"
             raise HMAError(vars(self.model).get("origin", "the model"), fault, "choose another checkpoint")
-        own = self._begun(rows)
-        chosen = self._room(own)
-        self._take(own, chunk, following, known)
+        chosen = self._begun(rows)
+        self._make_room(chosen)
+        self._take(chosen, chunk, following, known)
         with self.engine.computing(len(chosen)):
             values = self._frame(chosen)
         self.state.put_frame(chosen, values)
         # A copy, because what is made in inference mode could not be changed in place.
-        return self._show(values[: len(own)].clone())
+        return self._show(values.clone())
 
     @torch.no_grad()
     def observe(
@@ -266,16 +254,16 @@ class Rollout:
             frames: tokens (n, h, w) int64, or latents (n, c, H, W) as stored.
             chunk, known, rows: as in `step`; the commands that led to the frame.
         """
-        own = self._begun(rows)
+        chosen = self._begun(rows)
         values = self.model.frame_values(frames.unsqueeze(1)).to(self.model.device)[:, 0]
-        if len(values) != len(own):
-            raise HMAError("observe", f"gets {len(values)} frames", f"give {len(own)}, one for each row")
-        chosen = self._room(own)
+        if len(values) != len(chosen):
+            raise HMAError("observe", f"gets {len(values)} frames", f"give {len(chosen)}, one for each row")
+        self._make_room(chosen)
         if self.caching:
             with self.engine.computing(len(chosen)):
                 self.passes.catch_up(chosen)
-        self._take(own, chunk, None, known)
-        self.state.put_seen(chosen, values.repeat(1 + self.twins, *[1] * (values.dim() - 1)))
+        self._take(chosen, chunk, None, known)
+        self.state.put_seen(chosen, values)
 
     @torch.no_grad()
     def act(self, rows: Sequence[int] | None = None) -> Tensor:
@@ -308,14 +296,12 @@ class Rollout:
                 raise HMAError("step", f"row {row} has no prompt", "reset the row first")
         return own
 
-    def _room(self, own: list[int]) -> list[int]:
-        """Make room for the next frame of rows and of their twins, and return both."""
-        chosen = [*own, *self._twins(own)]
+    def _make_room(self, rows: list[int]) -> None:
+        """Make room for the next frame of rows."""
         if self.config.time_position == "learned":
-            self.state.slide(chosen)
+            self.state.slide(rows)
         if not self.caching:
-            self.state.grow(chosen)
-        return chosen
+            self.state.grow(rows)
 
     def _frame(self, rows: list[int]) -> Tensor:
         """Return the next frame (n, S) of rows, unmasked."""
@@ -346,13 +332,11 @@ class Rollout:
     def _take(
         self, rows: list[int], chunk: Tensor | None, following: Tensor | None, known: Tensor | None
     ) -> None:
-        """Store the chunk at the frame that it conditions; twins get none."""
+        """Store the chunk at the frame that it conditions."""
         if self._clashes(chunk is None):
             raise HMAError("step", "some steps have actions and some have none", "give them always or never")
         if self.passes.passive is None:
             self.passes.passive = chunk is None and not self.told
-        if self.twins:
-            self.state.put_chunk(self._twins(rows), 0, None, None)
         if chunk is None:
             self.state.put_chunk(rows, 0, None, None)
             return
@@ -369,14 +353,12 @@ class Rollout:
     # -- in and out ---------------------------------------------------------------------------------------
 
     def _blank(self, rows: list[int]) -> TokenFrame | PatchFrame:
-        """Return new frames (n, S) of rows, with all their twins last, wholly masked."""
-        values = self.state.blank(len(rows))
-        generators = self.state.drawing(rows[: len(rows) // (1 + self.twins)])
+        """Return new frames (n, S) of rows, wholly masked."""
+        values, generators = self.state.blank(len(rows)), self.state.drawing(rows)
         newest = self.state.newest(rows) if self.config.copy_previous else None
         if self.config.kind == "discrete":
             before = None if newest is None else known_digits(newest, self.config)
-            mask, copies = self.config.mask_id, 1 + self.twins
-            return TokenFrame(values, mask, self.decoding, generators, copies, before=before)
+            return TokenFrame(values, self.config.mask_id, self.decoding, generators, before=before)
         return PatchFrame(values, self.decoding, generators, newest)
 
     def _show(self, values: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ class Snapshot:
     Attributes:
         embodiments, times, pending, prompts: as of `RowState`.
         generators: the states of the generators.
-        frames, first, chunks, known: the rows of the buffers.
+        frames, chunks, known: the rows of the buffers.
         layers: the rows of the cache; empty if there is none yet.
         passive: whether the rollout has no actions; None if it has made no step.
     """
@@ -42,7 +42,6 @@ class Snapshot:
     prompts: tuple[int, ...]
     generators: tuple[Tensor | None, ...]
     frames: Tensor
-    first: Tensor
     chunks: Tensor
     known: Tensor
     layers: tuple[LayerCache, ...] = ()
@@ -63,7 +62,6 @@ class Snapshot:
             prompts=tuple(self.prompts[row] for row in rows),
             generators=tuple(self.generators[row] for row in rows),
             frames=self.frames[index],
-            first=self.first[index],
             chunks=self.chunks[index],
             known=self.known[index],
             layers=tuple(layers),
@@ -76,7 +74,6 @@ class Pass:
 
     Attributes:
         past: (rows, T - 1, S) the frames before the new one that the first pass computes.
-        origin: (rows, S) the first frames of the rows' prompts.
         levels: (rows, T - 1) the noise that the model is told of them; None for none.
         times, conditioning: of the T frames.
         among: numbers of the pass's rows among those of the step; None if they are the same.
@@ -84,7 +81,6 @@ class Pass:
     """
 
     past: Tensor
-    origin: Tensor
     levels: Tensor | None
     times: TimePositions
     conditioning: Conditioning
@@ -118,7 +114,6 @@ class RowState:
         prompts: the time of each row's first frame that is not its prompt's.
         generators: of each row's random numbers; None until a row without a seed draws.
         frames: (B, R, S) ids of the trunk's tokens, or scaled patches (B, R, S, C).
-        first: (B, S) or (B, S, C), the first frame of each row's prompt.
         chunks, known: (B, R, K) float32 raw and (B, R) bool, the chunk in force at each frame.
         layers: the cache; empty until the first pass.
     """
@@ -134,7 +129,6 @@ class RowState:
         slots = config.frames + (config.time_position == "rotary")
         blank = self.blank(batch).unsqueeze(1)
         self.frames = torch.zeros_like(blank).repeat(1, slots, *[1] * (blank.dim() - 2))
-        self.first = torch.zeros_like(blank[:, 0])
         self.chunks = torch.zeros(batch, slots, widest(model, self.embodiments), device=model.device)
         self.known = torch.zeros(batch, slots, dtype=torch.bool, device=model.device)
         self.layers: list[LayerCache] = []
@@ -167,17 +161,13 @@ class RowState:
         rows: Sequence[int],
         names: Sequence[str],
         frames: Tensor,
-        first: Tensor,
         given: ActionConditioning,
         seeds: Sequence[int] | None,
     ) -> None:
-        """Start rows anew at time 0 with frames (n, P, S) and the chunks (n, P, K) in force at them.
-
-        `first` (n, S) is the first frame of the prompt, of which `frames` are the last.
-        """
+        """Start rows anew at time 0 with frames (n, P, S) and the chunks (n, P, K) in force at them."""
         self._widen(given.chunks.shape[2])
         index, count, width = self.tensor(rows), frames.shape[1], given.chunks.shape[2]
-        self.frames[index, :count], self.first[index] = frames, first
+        self.frames[index, :count] = frames
         self.chunks[index, :count, :width], self.known[index, :count] = given.chunks, given.known
         for i, row in enumerate(rows):
             self.embodiments[row] = names[i]
@@ -220,10 +210,6 @@ class RowState:
     def past(self, rows: Sequence[int], positions: Tensor) -> Tensor:
         """Return the frames (n, T, S) at times (n or 1, T)."""
         return self.frames[self.tensor(rows).unsqueeze(1), positions % self.slots]
-
-    def origin(self, rows: Sequence[int]) -> Tensor:
-        """Return the first frames (n, S) of the rows' prompts."""
-        return self.first[self.tensor(rows)]
 
     def made(self, rows: Sequence[int], positions: Tensor) -> Tensor:
         """Return whether the frames at times (n or 1, T) are not the prompt's, (n, T) bool."""
@@ -320,9 +306,7 @@ class RowState:
         """Return a copy of the state of rows."""
         states = tuple(None if one is None else one.get_state() for one in self.generators)
         lists = tuple(self.embodiments), tuple(self.times), tuple(self.pending), tuple(self.prompts), states
-        return Snapshot(*lists, self.frames, self.first, self.chunks, self.known, tuple(self.layers)).take(
-            rows
-        )
+        return Snapshot(*lists, self.frames, self.chunks, self.known, tuple(self.layers)).take(rows)
 
     def restore(self, rows: Sequence[int], kept: Snapshot) -> None:
         """Put rows into the state of a snapshot."""
@@ -330,7 +314,6 @@ class RowState:
         self._reserve(length)
         self._widen(width)
         self.frames[index, :length], self.known[index, :length] = kept.frames, kept.known
-        self.first[index] = kept.first
         self.chunks[index, :length, :width] = kept.chunks
         if kept.layers:
             like = kept.layers[0].time

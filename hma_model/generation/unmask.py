@@ -38,7 +38,6 @@ class Decoding:
             share of fresh noise in a step.
         order: "random" or "confidence"; patches have no confidence.
         sample_steps: sampling steps of the diffusion head; None for the configuration's.
-        guidance: how much the commands change, times what they change; of rows with twins only.
         noise_level: the share of a generated frame's digits that the model is told to distrust.
         measure: add up how unsure the model is of what it decides; see `uncertainty` of the frames.
     """
@@ -47,7 +46,6 @@ class Decoding:
     temperature: float = TEMPERATURE
     order: str = "random"
     sample_steps: int | None = None
-    guidance: float = 1.0
     noise_level: float = 0.0
     measure: bool = False
 
@@ -62,10 +60,6 @@ def masked_after(step: int, steps: int, tokens: int) -> int:
 class TokenFrame:
     """A frame of discrete tokens that is unmasked step by step.
 
-    With two copies, the second half of the frames are the twins without commands: the scores are theirs, and
-    `guidance` times the difference of the first half's to theirs (arXiv 2207.12598). A frame and its twin get
-    the same tokens.
-
     Attributes:
         values: (B, S) int64 ids of the trunk's tokens; `mask_id` means masked.
         before: (B, S, F) int64 digits of the frame before; None for models that do not copy it.
@@ -78,14 +72,13 @@ class TokenFrame:
         mask_id: int,
         decoding: Decoding,
         generators: Sequence[torch.Generator],
-        copies: int = 1,
         rank: Tensor | None = None,
         noise: Tensor | None = None,
         before: Tensor | None = None,
     ) -> None:
         self.values, self.mask_id, self.decoding = values, mask_id, decoding
-        self.generators, self.copies = generators, copies
-        self.rank = _ranks(values, generators, copies) if rank is None else rank
+        self.generators = generators
+        self.rank = _ranks(values, generators) if rank is None else rank
         self.noise, self.before = noise, before
         self.nats = torch.zeros(len(values), device=values.device)
 
@@ -96,9 +89,9 @@ class TokenFrame:
         values, rank = lay_out(self.values), lay_out(self.rank)
         asked = count if self.decoding.order == "random" else values.shape[1]
         noise = self._noise(readout, asked)
-        noise = None if noise is None else lay_out(noise.repeat(self.copies, 1, 1, 1))
+        noise = None if noise is None else lay_out(noise)
         before = None if self.before is None else lay_out(self.before)
-        return TokenFrame(values, self.mask_id, self.decoding, (), self.copies, rank, noise, before)
+        return TokenFrame(values, self.mask_id, self.decoding, (), rank, noise, before)
 
     @property
     def masked(self) -> Tensor:
@@ -138,9 +131,6 @@ class TokenFrame:
         noise = self._noise(readout, features.shape[1]) if self.noise is None else self.noise
 
         def choose(scores: Tensor, first: int) -> Tensor:
-            if self.copies > 1:
-                commanded, free = scores.chunk(2)
-                scores = torch.lerp(free, commanded, way.guidance)
             drawn = scores  # with noise, the largest of the sums is a sample from the softmax
             if noise is not None:
                 n, digits, _, values = scores.shape
@@ -150,11 +140,11 @@ class TokenFrame:
                 unsure.append(torch.special.entr(scores.softmax(-1)).sum((1, -1)))
             if way.order == "confidence":
                 sure.append(scores.log_softmax(-1).gather(-1, taken.unsqueeze(-1)).squeeze(-1).sum(1))
-            return taken if self.copies == 1 else taken.repeat(self.copies, 1, 1)
+            return taken
 
         tokens = readout.ids(readout.decide(features, choose, before).transpose(1, 2))
         confidence, entropy = (sum(some, torch.zeros(())) for some in (sure, unsure))
-        return tokens, confidence.repeat(self.copies, 1), entropy.repeat(self.copies, 1)
+        return tokens, confidence, entropy
 
     def _noise(self, readout: TokenReadout, tokens: int) -> Tensor | None:
         """Return Gumbel noise (n, F, k, V) for k tokens, times the temperature; None at 0."""
@@ -166,7 +156,7 @@ class TokenFrame:
 
 
 class PatchFrame:
-    """A frame of patches that is unmasked step by step; twins are as in `TokenFrame`.
+    """A frame of patches that is unmasked step by step.
 
     Attributes:
         values: (B, S, C) scaled patches.
@@ -183,9 +173,8 @@ class PatchFrame:
         before: Tensor | None = None,
     ) -> None:
         self.values, self.decoding, self.generators, self.before = values, decoding, generators, before
-        self.copies = len(values) // len(generators)
         self.masked = torch.ones(values.shape[:2], dtype=torch.bool, device=values.device)
-        self.rank = _ranks(values, generators, self.copies)
+        self.rank = _ranks(values, generators)
         self.variance = torch.zeros(len(values), device=values.device)
 
     @property
@@ -200,18 +189,16 @@ class PatchFrame:
         conditions = readout(features.unsqueeze(1), position, before).squeeze(1)
         conditions = _gather(conditions, chosen).flatten(0, 1)
         way = self.decoding
-        guidance = None if self.copies == 1 else way.guidance
 
         def draw(generators: Sequence[torch.Generator]) -> Tensor:
-            drawn = readout.sample(conditions, way.sample_steps, way.temperature, generators, guidance)
+            drawn = readout.sample(conditions, way.sample_steps, way.temperature, generators)
             return drawn.view(len(generators), chosen.shape[1], -1)
 
         patches = draw(self.generators)
         if way.measure:  # half the squared difference of two draws is their variance
             other = draw([_copy(one) for one in self.generators])
             variance = (patches - other).square().mean(-1).sum(1) / 2
-            self.variance = self.variance + variance.repeat(self.copies)
-        patches = patches.repeat(self.copies, 1, 1)
+            self.variance = self.variance + variance
         self.values = self.values.scatter(1, chosen.unsqueeze(-1).expand_as(patches), patches)
         self.masked = self.masked.scatter(1, chosen, False)
 
@@ -223,9 +210,9 @@ def _copy(generator: torch.Generator) -> torch.Generator:
     return made
 
 
-def _ranks(values: Tensor, generators: Sequence[torch.Generator], copies: int) -> Tensor:
-    """Return random ranks (B, S) of frames, those of a frame's twin the same."""
-    return uniform((len(generators), values.shape[1]), generators, values.device).repeat(copies, 1)
+def _ranks(values: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
+    """Return random ranks (B, S) of the tokens of frames."""
+    return uniform(values.shape[:2], generators, values.device)
 
 
 def _top(score: Tensor, masked: Tensor, count: int) -> Tensor:
@@ -245,7 +232,6 @@ def check(decoding: Decoding, config: HMAConfig) -> None:
     for name, value, allowed, remedy in (
         ("unmask_steps", decoding.steps, decoding.steps >= 1, "give at least 1"),
         ("temperature", decoding.temperature, decoding.temperature >= 0, "give at least 0"),
-        ("guidance", decoding.guidance, decoding.guidance >= 0, "give at least 0; 1 is without"),
         ("noise_level", decoding.noise_level, 0 <= decoding.noise_level <= 1, "give a share from 0 to 1"),
         ("noise_level", decoding.noise_level, told or not decoding.noise_level, "train with told_noise"),
         ("order", decoding.order, decoding.order in orders, f"a {kind} model takes {' or '.join(orders)}"),

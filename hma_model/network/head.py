@@ -246,17 +246,11 @@ class LatentReadout(nn.Module):
         steps: int | None = None,
         temperature: float = 0.0,
         generator: Generators = None,
-        guidance: float | None = None,
     ) -> Tensor:
         """Draw patches (M, C) float32 under conditions (M, …), as `DiffusionHead.sample`."""
         conditions, kept = self._parts(conditions)
-        drawn = self.diffusion.sample(conditions, steps, temperature, generator, guidance)
-        if kept is None:
-            return drawn
-        if guidance is not None:
-            commanded, free = kept.chunk(2)
-            kept = torch.lerp(free, commanded, guidance)
-        return drawn + kept
+        drawn = self.diffusion.sample(conditions, steps, temperature, generator)
+        return drawn if kept is None else drawn + kept
 
     def _parts(self, conditions: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return the conditions (M, D) of the head, and what is kept (M, C)."""
@@ -390,16 +384,14 @@ class DiffusionHead(nn.Module):
         steps: int | None = None,
         temperature: float = 0.0,
         generator: Generators = None,
-        guidance: float | None = None,
     ) -> Tensor:
         """Draw samples by DDIM.
 
         Args:
-            condition: (M, D); with guidance (2 M, D), the second half without commands.
+            condition: (M, D).
             steps: evaluations of the network, by default the configuration's, at most its training steps.
             temperature: share of fresh noise in a step; 0 is deterministic given the first noise.
             generator: of the first noise and the fresh noise.
-            guidance: how far each prediction goes from that without commands to that with them.
 
         Returns:
             (M, C) float32.
@@ -409,13 +401,9 @@ class DiffusionHead(nn.Module):
         levels = torch.linspace(total - 1, 0, count).round().long()
         alpha_bars = [*(self.alpha_bars[level] for level in levels.tolist()), 1.0]
         embedded, embedded_levels = self.condition(condition), self._level(levels.to(condition.device))
-        copies = 1 if guidance is None else 2
-        x = randn((len(condition) // copies, self.values), generator, condition.device)
+        x = randn((len(condition), self.values), generator, condition.device)
         for index in range(count):
-            predicted = self._predict(x.repeat(copies, 1), embedded_levels[index], embedded)
-            if guidance is not None:
-                commanded, free = predicted.chunk(2)
-                predicted = torch.lerp(free, commanded, guidance)
+            predicted = self._predict(x, embedded_levels[index], embedded)
             x = self._step(x, predicted, alpha_bars[index], alpha_bars[index + 1], temperature, generator)
         return x
 

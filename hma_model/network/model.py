@@ -183,7 +183,7 @@ class HMA(nn.Module):
 
         Args:
             batch: windows of one or several embodiments, on the model's device. Any object with the fields of
-                `Batch` will do; it may lack `frame_mask`, `earlier` and `context`.
+                `Batch` will do; it may lack `frame_mask` and `context`.
             objective: forward, passive, policy, full or inverse; by default drawn by its weight.
             generator: the generator of every random draw; the draws take place on its device.
 
@@ -201,7 +201,6 @@ class HMA(nn.Module):
         embodiment: str | Sequence[str],
         action_mask: Tensor | None = None,
         true: Tensor | None = None,
-        first: Tensor | None = None,
     ) -> Tensor:
         """Compute the scores of every token of a window.
 
@@ -212,7 +211,6 @@ class HMA(nn.Module):
             action_mask: (B, T) bool, True where a chunk is known; by default all are.
             true: (B, T, h, w) int64 tokens whose digits a chain's later digits are given; by default those
                 are the likeliest.
-            first: (B, h, w) int64, what a model that is `told_first` is told; by default the first frame.
 
         Returns:
             (B, T, h, w, F, V) float32, low digit first; with `merge`, of the trunk's tokens and their digits.
@@ -220,7 +218,7 @@ class HMA(nn.Module):
         self._require("discrete", "video_logits")
         groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
         conditioning = self.condition(actions, action_mask, groups, times)
-        return self.logits_under(conditioning, tokens, groups, times, true, first)
+        return self.logits_under(conditioning, tokens, groups, times, true)
 
     def logits_under(
         self,
@@ -229,7 +227,6 @@ class HMA(nn.Module):
         groups: Groups,
         times: TimePositions,
         true: Tensor | None = None,
-        first: Tensor | None = None,
         frame: Tensor | None = None,
     ) -> Tensor:
         """Compute `video_logits` under a conditioning that `condition` has computed.
@@ -237,7 +234,7 @@ class HMA(nn.Module):
         With `frame` (B,) int64, only that frame of each window is scored, and T is 1.
         """
         values = groups.sort(self.frame_values(tokens))
-        x = self.embed_tokens(values, first=self._first(first, groups))
+        x = self.embed_tokens(values)
         given = None if true is None else to_digits(groups.sort(self.frame_values(true)), self.config.digits)
         before = None
         if self.config.copy_previous:
@@ -258,7 +255,6 @@ class HMA(nn.Module):
         actions: Tensor | None,
         embodiment: str | Sequence[str],
         action_mask: Tensor | None = None,
-        first: Tensor | None = None,
     ) -> Tensor:
         """Compute the conditions under which `LatentReadout.sample` draws.
 
@@ -266,8 +262,6 @@ class HMA(nn.Module):
             latents: (B, T, c, H, W), already multiplied by the configuration's `latent_scale`.
             mask: (B, T, H, W) bool, True for latent pixels the model may not see.
             actions, embodiment, action_mask: as in `video_logits`.
-            first: (B, c, H, W) as stored, what a model that is `told_first` is told; by default the first
-                frame.
 
         Returns:
             (B, T, H/p, W/p, D); with `copy_previous` (B, T, H/p, W/p, D + c*p*p).
@@ -275,7 +269,7 @@ class HMA(nn.Module):
         self._require("continuous", "video_conditions")
         groups, times = Groups.of(embodiment, len(latents)), self.time_positions(latents.shape[1])
         conditioning = self.condition(actions, action_mask, groups, times)
-        return self.conditions_under(conditioning, latents, mask, groups, times, first)
+        return self.conditions_under(conditioning, latents, mask, groups, times)
 
     def conditions_under(
         self,
@@ -284,11 +278,10 @@ class HMA(nn.Module):
         mask: Tensor,
         groups: Groups,
         times: TimePositions,
-        first: Tensor | None = None,
     ) -> Tensor:
         """Compute `video_conditions` under a conditioning that `condition` has computed."""
         patches, pixels = patchify(latents, self.config.patch), patchify(mask.unsqueeze(2), self.config.patch)
-        x = self.embed_patches(groups.sort(patches), groups.sort(pixels), first=self._first(first, groups))
+        x = self.embed_patches(groups.sort(patches), groups.sort(pixels))
         before = None
         if self.config.copy_previous:
             order = range(-1, patches.shape[1] - 1)
@@ -382,7 +375,6 @@ class HMA(nn.Module):
         cache: bool = True,
         sample_steps: int | None = None,
         known: Tensor | None = None,
-        guidance: float = 1.0,
         noise_level: float = 0.0,
         precision: str = "float32",
         compile: bool = False,
@@ -403,8 +395,6 @@ class HMA(nn.Module):
             sample_steps: sampling steps of the diffusion head.
             known: (B, P + frames) bool, False where a chunk is unknown, as `action_mask` in training; by
                 default all are known.
-            guidance: exaggerates what the commands change: scores are u + guidance (c - u), u without and c
-                with commands. Each pass then costs two. For models trained with `drop_commands`.
             noise_level: how corrupted the model is to take its own frames for, 0 to 1. For models trained
                 with `told_noise`.
             precision: "float32"; "bf16" or "int8" for products in these.
@@ -419,7 +409,7 @@ class HMA(nn.Module):
         made = generate(
             self, prompt, actions, embodiment, frames, mask=known, unmask_steps=unmask_steps,
             temperature=temperature, generator=generator, order=order, cache=cache, sample_steps=sample_steps,
-            guidance=guidance, noise_level=noise_level, precision=precision, compile=compile,
+            noise_level=noise_level, precision=precision, compile=compile,
         )  # fmt: skip
         if actions is not None:
             used = prompt.shape[1] + frames - 1
@@ -460,46 +450,27 @@ class HMA(nn.Module):
             return merge_tokens(frames.long(), config.merge, config.vocab_size)
         return patchify(frames.float() * config.latent_scale, config.patch)
 
-    def _first(self, frame: Tensor | None, groups: Groups) -> Tensor | None:
-        """Return the values (B, S, …) of first frames, sorted by embodiment."""
-        return None if frame is None else groups.sort(self.frame_values(frame.unsqueeze(1))[:, 0])
-
-    def embed_tokens(
-        self, tokens: Tensor, previous: Sequence[int] | None = None, first: Tensor | None = None
-    ) -> Tensor:
+    def embed_tokens(self, tokens: Tensor, previous: Sequence[int] | None = None) -> Tensor:
         """Embed ids (B, T, S) as (B, T, S, D).
 
         Args:
             tokens: the configuration's `mask_id` means masked.
             previous: (T,) for each frame the index of the frame before it, or -1; by default the frames
                 follow one another.
-            first: (B, S) what a model that is `told_first` is told; by default the first of the frames.
         """
         embed = self.trunk.embed
         assert isinstance(embed, TokenEmbedding)
-        x = embed(tokens, range(-1, tokens.shape[1] - 1) if previous is None else previous)
-        if self.trunk.first is None:
-            return x
-        return x + self.trunk.first(embed((tokens[:, 0] if first is None else first).unsqueeze(1), [-1]))
+        return embed(tokens, range(-1, tokens.shape[1] - 1) if previous is None else previous)
 
-    def embed_patches(
-        self,
-        patches: Tensor,
-        masked: Tensor,
-        previous: Sequence[int] | None = None,
-        first: Tensor | None = None,
-    ) -> Tensor:
+    def embed_patches(self, patches: Tensor, masked: Tensor, previous: Sequence[int] | None = None) -> Tensor:
         """Embed scaled patches (B, T, S, c*p*p) with masks of pixels (B, T, S, p*p or 1) as (B, T, S, D).
 
-        `previous` is that of `embed_tokens`, and so is `first`, (B, S, c*p*p).
+        `previous` is that of `embed_tokens`.
         """
         embed = self.trunk.embed
         assert isinstance(embed, LatentEmbedding)
-        x = embed(patches, masked, range(-1, patches.shape[1] - 1) if previous is None else previous)
-        if self.trunk.first is None:
-            return x
-        seen = (patches[:, 0] if first is None else first).unsqueeze(1)
-        return x + self.trunk.first(embed(seen, torch.zeros_like(masked[:, :1]), [-1]))
+        order = range(-1, patches.shape[1] - 1) if previous is None else previous
+        return embed(patches, masked, order)
 
     def video_features(self, features: Tensor) -> Tensor:
         """Return the features (B, T, S, D) of (B, T, N, D) without the action tokens."""

@@ -234,8 +234,6 @@ def _shown_chunks(
     if not objective.sees_actions:
         return None
     config, known = model.config, batch.action_mask & ~dropped
-    if config.drop_commands and model.training and objective.predicts_video:
-        known &= uniform((len(known), 1), generator, known.device) >= config.drop_commands
     given = align(config, batch.actions, known, known.shape[1])
     return given.frames(layout.frames) if layout.paired else given
 
@@ -254,21 +252,20 @@ def _embed(
     `true` are the values (B, T, S, …) of the window's frames. The model sees those of `batch.context`
     instead, if there are any.
     """
-    context, earlier = _optional(batch, "context"), _optional(batch, "earlier")
+    context = _optional(batch, "context")
     frames = true if context is None else model.frame_values(context)
     if layout.paired:
         frames = torch.cat([frames[:, : layout.past], true[:, 1:]], dim=1)
-    first = true[:, 0] if earlier is None else model.frame_values(earlier.unsqueeze(1))[:, 0]
     if model.config.kind == "discrete":
         shown = groups.sort(corrupt_tokens(model.config, frames, video, generator))
-        x = model.embed_tokens(shown, layout.previous, groups.sort(first))
+        x = model.embed_tokens(shown, layout.previous)
     else:
         masked = video.masked.to(frames.device).unsqueeze(-1)
         if spread := model.config.latent_noise:
             rate = spread * video.corruption.to(frames.device)[..., None, None]
             frames = frames + rate * randn(frames.shape, generator, frames.device)
         shown = groups.sort(frames)
-        x = model.embed_patches(shown, groups.sort(masked), layout.previous, groups.sort(first))
+        x = model.embed_patches(shown, groups.sort(masked), layout.previous)
     if model.trunk.noise is not None:
         x = x + model.trunk.noise(groups.sort(video.corruption.to(x.device)))
     return x, shown

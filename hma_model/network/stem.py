@@ -183,22 +183,6 @@ class NoiseEmbedding(nn.Module):
         return (waves.to(self.weight.dtype) @ self.weight).unsqueeze(2)
 
 
-class FirstFrame(nn.Module):
-    """A map of the embedded first frame, which is added to the tokens of every frame at its places.
-
-    It begins at zero, so it can be added to a trained trunk.
-    """
-
-    def __init__(self, config: HMAConfig) -> None:
-        super().__init__()
-        self.linear = Linear(config.width, config.width, bias=False)
-        nn.init.zeros_(self.linear.weight)
-
-    def forward(self, embedded: Tensor) -> Tensor:
-        """Map (B, 1, S, D) to (B, 1, S, D)."""
-        return self.linear(embedded)
-
-
 # -- actions
 
 

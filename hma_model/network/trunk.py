@@ -19,7 +19,7 @@ from torch.utils.checkpoint import checkpoint
 from hma_model.config import HMAConfig
 from hma_model.network.linear import Linear, after_gelu, after_norm, recomputed
 from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv, turns_of
-from hma_model.network.stem import FirstFrame, LatentEmbedding, Modulation, NoiseEmbedding, TokenEmbedding
+from hma_model.network.stem import LatentEmbedding, Modulation, NoiseEmbedding, TokenEmbedding
 
 MOST_SEQUENCES = 2**15  # of one call of attention: kernels of a GPU refuse 65,536 and more
 
@@ -387,7 +387,6 @@ class Trunk(nn.Module):
         tokens = config.tokens_per_frame + max(config.appended_tokens, config.absent_tokens)
         self.embed = LatentEmbedding(config) if continuous else TokenEmbedding(config)
         self.noise = NoiseEmbedding(config) if config.told_noise else None
-        self.first = FirstFrame(config) if config.told_first else None
         self.position = nn.Parameter(torch.randn(positions, tokens, config.width) * 0.02)
         if config.position_init == "sinusoid":
             with torch.no_grad():

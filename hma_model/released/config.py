@@ -33,7 +33,6 @@ _OURS = (
     "merge",
     "masked_input",
     "told_noise",
-    "told_first",
     "digit_order",
     "copy_previous",
     "action_waves",

@@ -9,7 +9,7 @@ Otherwise there are W passes.
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from hma_data.errors import RecipeError, ShardError, UsageError
+from hma_data.errors import RecipeError, UsageError
 from hma_data.loading.dataset import Batch, MixtureDataset
 from hma_data.loading.mixture import Mixture
 from hma_data.shards.reader import ShardSet
@@ -46,7 +46,6 @@ class TrainData:
         recipe: states mixture, windows and seed.
         sets: shard sets by embodiment.
         world: the ranks.
-        earlier: whether windows come with an earlier frame of their episode.
 
     Attributes:
         passes: passes of a step, of all ranks together.
@@ -57,12 +56,9 @@ class TrainData:
         ShardError: a set has no window.
     """
 
-    def __init__(
-        self, recipe: "Recipe", sets: Mapping[str, ShardSet], world: World, earlier: bool = False
-    ) -> None:
+    def __init__(self, recipe: "Recipe", sets: Mapping[str, ShardSet], world: World) -> None:
         self.passes, size = share(recipe, world.size)
         self.own = range(world.rank, self.passes, world.size)
-        self._earlier = earlier
         self._workers = -(-recipe.workers // len(self.own))
         self._data = [self._dataset(recipe, sets, size, self.own[0])]
         self._batches: list[Iterator[Batch]] = []
@@ -80,7 +76,7 @@ class TrainData:
             return MixtureDataset(
                 list(sets.values()),
                 size,
-                recipe.drawn_frames,
+                recipe.frames,
                 **given,
                 samples=recipe.steps * recipe.windows_per_step if recipe.mixture.max_epochs else None,
                 short=recipe.short,
@@ -89,18 +85,11 @@ class TrainData:
                 world=self.passes,
                 memory_mib=max(MEMORY_MIB // self.passes, 1),
                 cameras=recipe.cameras,
-                earlier=self._earlier,
             )
         except UsageError as fault:
             remedy = fault.remedy or f"the data has {', '.join(sets)}"
             where = fault.where.replace("mixture ", "mixture.")
             raise RecipeError(f"recipe: {where}", fault.fault, remedy) from fault
-        except ShardError as fault:
-            if not recipe.self_rollout:
-                raise
-            needed = f"asks for {recipe.frames} + {recipe.self_rollout_frames} frames; {fault}"
-            remedy = "lower it, or set short=pad, so that windows of short episodes begin at fewer frames"
-            raise RecipeError("recipe: self_rollout_frames", needed, remedy) from fault
 
     @property
     def mixture(self) -> Mixture:

@@ -46,11 +46,11 @@ def require_shardable(recipe: "Recipe", config: HMAConfig) -> None:
         RecipeError: an option needs the whole network on every rank.
     """
     remedy = "use parallel=ddp"
-    wrong = [name for name in ("self_forward", "self_rollout") if getattr(recipe, name)]
-    if wrong or recipe.optimizer == "muon":
-        name, said = (wrong[0], "") if wrong else ("optimizer", "muon ")
-        fault = f"{said}does not work with parallel=fsdp on several ranks"
-        raise RecipeError(f"recipe: {name}", fault, remedy)
+    fault = "does not work with parallel=fsdp on several ranks"
+    if recipe.self_forward:
+        raise RecipeError("recipe: self_forward", fault, remedy)
+    if recipe.optimizer == "muon":
+        raise RecipeError("recipe: optimizer", f"muon {fault}", remedy)
     seeing = {OBJECTIVES[name].sees_actions for name, weight in recipe.objectives.items() if weight}
     if config.absent_action == "skip" and len(seeing) > 1:
         fault = "skip does not work with parallel=fsdp where only some objectives see actions"

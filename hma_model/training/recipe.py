@@ -159,10 +159,8 @@ class Recipe(_Settings):
     ema: Beta = Field(0.0, description="decay of averaged weights, which are evaluated and saved; 0 without")
     self_forward: Share = Field(0.0, description="share of windows whose past is the model's prediction")
     self_forward_frames: Count = Field(2, ge=1, description="frames in a row of such a past")
-    self_rollout: Share = Field(0.0, description="share of windows whose past is the model's rollout")
-    self_rollout_frames: Count = Field(16, ge=1, description="frames before the window that it may begin")
-    self_forward_from: Steps = Field(0, description="step from which these shares rise")
-    self_forward_over: Steps = Field(0, description="number of steps in which these shares rise")
+    self_forward_from: Steps = Field(0, description="step from which this share rises")
+    self_forward_over: Steps = Field(0, description="number of steps in which this share rises")
 
     seed: Count = Field(42, ge=0, lt=2**63)
     precision: Literal["fp32", "bf16"] = "fp32"
@@ -186,11 +184,6 @@ class Recipe(_Settings):
     def windows_per_step(self) -> int:
         """Return the number of windows of a step, between two updates of the weights."""
         return self.batch_size * self.accumulate
-
-    @property
-    def drawn_frames(self) -> int:
-        """Return the number of frames that are drawn for a window, with those before it for rollouts."""
-        return self.frames + (self.self_rollout_frames if self.self_rollout else 0)
 
     def values(self) -> dict[str, Any]:
         """Return all settings as plain values."""

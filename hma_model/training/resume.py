@@ -38,7 +38,7 @@ VERSION = 1  # of `training/`; any change in the meaning of its files raises it
 TRAINED_BY = {
     *("dropout", "action_loss_weight", "label_smoothing", "corrupt_max", "history_probability"),
     *("history_frames", "mask_ratio_min", "diffusion_repeats", "diffusion_sample_steps"),
-    *("training_pass", "whole_share", "position_init", "latent_noise", "drop_commands"),
+    *("training_pass", "whole_share", "position_init", "latent_noise"),
 }
 
 

@@ -43,7 +43,7 @@ from hma_model.training.resume import (
     write_state,
 )
 from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment, require_memory
-from hma_model.training.scheduled_sampling import forwarded, rolled, share_at
+from hma_model.training.scheduled_sampling import forwarded, share_at
 from hma_model.training.start import Start
 
 
@@ -54,9 +54,6 @@ class Run:
         if not recipe.data:
             raise RecipeError("recipe: data", "names no shards", "add data=[FOLDER, …]")
         self.out, self.device, self.world = out, device, world or World()
-        if recipe.self_rollout and not any(OBJECTIVES[name].predicts_video for name in recipe.objectives):
-            fault = f"needs frames to roll out, which {', '.join(recipe.objectives)} does not predict"
-            raise RecipeError("recipe: self_rollout", fault, "add one such as forward, or set it to 0")
         try:
             self.sets = open_sets(recipe.data, recipe.cameras)
         except UsageError as wrong:
@@ -75,7 +72,7 @@ class Run:
             require_shardable(recipe, self._config())
         often = max(recipe.objectives, key=lambda name: recipe.objectives[name])
         self.objective = OBJECTIVES[often]  # whose loss the evaluations compute
-        self.train_data = TrainData(recipe, self.sets, self.world, self._config().told_first)
+        self.train_data = TrainData(recipe, self.sets, self.world)
         self.digests = data_digests(self.sets)
         self.stats = {name: shards.manifest.stats for name, shards in self.sets.items()}
         if self.start:
@@ -258,20 +255,15 @@ class Run:
     def _with_own_past(self, number: int, batch: Batch) -> Batch:
         """Return the batch, in which the past of some windows is the model's own, as the recipe has it."""
         recipe = self.recipe
-        if recipe.self_rollout:
-            share = share_at(self.step, recipe, recipe.self_rollout)
-            batch = rolled(self.model, batch, share, recipe.frames, self._draws("rollout", number))
-        if share := share_at(self.step, recipe, recipe.self_forward):
-            draws = self._draws("self_forward", number)
-            batch = forwarded(self.model, batch, share, recipe.self_forward_frames, draws)
-        return batch
+        share = share_at(self.step, recipe)
+        if not share:
+            return batch
+        draws = torch.Generator().manual_seed(seed_for(recipe.seed, "self_forward", self.step, number))
+        return forwarded(self.model, batch, share, recipe.self_forward_frames, draws)
 
     def _uncompiled(self) -> AbstractContextManager[Any]:
         """Let compiled blocks run as they are: each number of windows would be compiled anew."""
         return torch.compiler.set_stance("force_eager") if self.recipe.compile else nullcontext()
-
-    def _draws(self, name: str, number: int) -> torch.Generator:
-        return torch.Generator().manual_seed(seed_for(self.recipe.seed, name, self.step, number))
 
     def _autocast(self) -> AbstractContextManager[Any]:
         if self.recipe.precision == "fp32":

@@ -36,8 +36,7 @@ from hma_model.training.runtime import RECIPE, START
 
 # fields that a run may turn on for a checkpoint's trunk, and their parameters, which change nothing at first
 ADDED = {
-    "told_noise": "trunk.noise.", "told_first": "trunk.first.",
-    "digit_order": "readout.chain.", "copy_previous": "readout.copy.",
+    "told_noise": "trunk.noise.", "digit_order": "readout.chain.", "copy_previous": "readout.copy.",
 }  # fmt: skip
 WAVES = "action_waves"
 OF_THE_TRUNK = {WAVES, "copy_previous"}  # what recipes turn on; a frozen trunk stays as it is

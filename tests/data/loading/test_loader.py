@@ -185,35 +185,6 @@ def test_short_episodes_are_padded_with_their_last_frame_and_masked(tmp_path: Pa
     assert WindowDataset(out, "train", FRAMES)[0].frame_mask is None
 
 
-def test_earlier_frames_are_of_the_episode_and_come_again(sets: list[Path]) -> None:
-    def stream(**how: object) -> MixtureDataset:
-        return MixtureDataset(sets, 6, FRAMES, lanes=2, seed=5, **how)  # type: ignore[arg-type]
-
-    rows = {folder.name: ShardSet(folder) for folder in sets}
-    whole, drawn = stream(earlier=True), []
-    batches = list(islice(whole, 40))
-    for batch, plain in zip(batches, stream(), strict=False):
-        assert same(batch, plain) and plain.earlier is None
-        for i, name in enumerate(batch.embodiment):
-            episode, frame = int(batch.episode[i]), int(batch.frame[i])
-            tokens = rows["two" if name == "toy_two" else "one"].episode_rows(episode, ["tokens"])["tokens"]
-            found = (tokens[: frame + 1].astype(np.int64) == batch.earlier[i].reshape(-1).numpy()).all(1)
-            assert found.any()
-            drawn.append(frame - int(np.flatnonzero(found)[-1]))
-    assert min(drawn) == 0 and max(drawn) > 10  # every frame of the toy's episodes differs
-    again = stream(earlier=True)
-    again.load_state_dict(next_state(sets, 17))
-    for batch, other in zip(batches[17:], again, strict=False):
-        assert torch.equal(batch.earlier, other.earlier)
-
-
-def next_state(sets: list[Path], steps: int) -> dict[str, object]:
-    """The state of a stream with earlier frames after so many batches."""
-    stream = MixtureDataset(sets, 6, FRAMES, lanes=2, seed=5, earlier=True)
-    list(islice(stream, steps))
-    return stream.state_dict()
-
-
 def test_windows_of_an_episode_longer_than_a_row_group_are_whole(tmp_path: Path) -> None:
     write_toy(tmp_path / "toy.hdf5", [90])
     with pytest.MonkeyPatch.context() as patch:

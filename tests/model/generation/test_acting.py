@@ -69,7 +69,7 @@ def test_acting_leaves_no_trace_in_the_video() -> None:
     batch = small_batch(model.config, NAMES, frames=8)
     runs = []
     for acts in (True, False):
-        rollout = Rollout(model, NAMES, 2, temperature=0.5, guidance=1.5)
+        rollout = Rollout(model, NAMES, 2, temperature=0.5)
         rollout.prompt(batch.tokens[:, :2], batch.actions, seeds=[1, 2])
         for at in range(2, 5):
             _ = acts and rollout.act()

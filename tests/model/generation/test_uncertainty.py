@@ -29,7 +29,7 @@ def latents(rows: int, model: HMA) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(0))
 
 
-@pytest.mark.parametrize("options", [{}, {"order": "confidence", "unmask_steps": 3}, {"guidance": 2.0}])
+@pytest.mark.parametrize("options", [{}, {"order": "confidence", "unmask_steps": 3}])
 def test_the_entropy_is_measured_and_changes_nothing(options: dict[str, Any]) -> None:
     model = tiny_model(ROBOT)
     prompt = torch.randint(0, 8**6, (2, 2, 8, 8), generator=torch.Generator().manual_seed(0))
@@ -55,7 +55,7 @@ def test_a_model_that_knows_nothing_has_the_entropy_of_the_vocabulary() -> None:
     assert rollout.uncertainty.item() == pytest.approx(6 * math.log(8) * model.config.merge**2, rel=1e-4)
 
 
-@pytest.mark.parametrize("options", [{}, {"temperature": 1.0, "unmask_steps": 3}, {"guidance": 2.0}])
+@pytest.mark.parametrize("options", [{}, {"temperature": 1.0, "unmask_steps": 3}])
 def test_the_spread_of_latents_is_measured_and_changes_nothing(options: dict[str, Any]) -> None:
     model = small_model(kind="continuous", diffusion_clip=1.0)
     frames, spreads = [], []
@@ -84,7 +84,7 @@ def test_the_spread_is_the_standard_deviation_of_the_draws_in_the_tokenizers_uni
 ) -> None:
     model = small_model(kind="continuous", latent_scale=0.5, grid=(32, 32))
 
-    def draw(conditions: Tensor, steps: Any, temperature: Any, generators: Any, guidance: Any) -> Tensor:
+    def draw(conditions: Tensor, steps: Any, temperature: Any, generators: Any) -> Tensor:
         return 3 + 0.2 * randn((len(conditions), model.config.patch_dim), generators, conditions.device)
 
     monkeypatch.setattr(model.readout, "sample", draw)

@@ -88,7 +88,7 @@ def test_the_network_and_the_window_are_the_checkpoints(base, leg, tmp_path):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("told_noise", True), ("told_first", True), ("digit_order", "chain"), ("copy_previous", True)],
+    [("told_noise", True), ("digit_order", "chain"), ("copy_previous", True)],
 )
 def test_what_begins_at_nothing_can_be_turned_on_for_a_tuned_trunk(base, tmp_path, key, value):
     arm, still = make_shards(tmp_path / "arm", "arm"), ["steps=1", "lr=1e-12", "model.corrupt_max=0.2"]

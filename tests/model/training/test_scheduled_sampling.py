@@ -13,7 +13,7 @@ from hma_model.training.loop import train
 from hma_model.training.parallel import World
 from hma_model.training.recipe import make_recipe
 from hma_model.training.run import Run
-from hma_model.training.scheduled_sampling import SAMPLE_STEPS, forwarded, rolled, share_at
+from hma_model.training.scheduled_sampling import SAMPLE_STEPS, forwarded, share_at
 from tests.model.robots import CONFIG, make_model
 from tests.model.runs import TINY
 from tests.model.shards import make_shards
@@ -119,14 +119,14 @@ def test_latents_are_replaced_by_what_the_diffusion_head_samples():
 
 def test_the_share_rises_from_a_step_over_a_number_of_steps():
     recipe = make_recipe({"self_forward": 0.5, "self_forward_from": 10, "self_forward_over": 4})
-    assert [share_at(step, recipe, 0.5) for step in (0, 9, 10, 11, 13, 14, 99)] == [
+    assert [share_at(step, recipe) for step in (0, 9, 10, 11, 13, 14, 99)] == [
         0, 0, 0.125, 0.25, 0.5, 0.5, 0.5,
     ]  # fmt: skip
-    assert share_at(0, make_recipe({}), 0.5) == 0.5
+    assert share_at(0, make_recipe({"self_forward": 0.5})) == 0.5
 
 
-@pytest.mark.parametrize("past", [{"self_forward": 0.5}, {"self_rollout": 0.7, "self_rollout_frames": 3}])
-def test_a_run_with_a_past_of_its_own_goes_on_bit_for_bit(past, tmp_path):
+def test_a_run_with_a_past_of_its_own_goes_on_bit_for_bit(tmp_path):
+    past = {"self_forward": 0.5}
     data = [str(make_shards(tmp_path / "arm", "arm"))]
     recipe = make_recipe({**TINY, "data": data, "self_forward_from": 2, **past})
     whole = train(recipe, out=tmp_path / "whole", show=False)
@@ -144,10 +144,9 @@ def test_a_run_with_a_past_of_its_own_goes_on_bit_for_bit(past, tmp_path):
     assert plain.losses != whole.losses
 
 
-@pytest.mark.parametrize("past", ["self_forward", "self_rollout"])
-def test_sharded_ranks_are_refused(past, tmp_path):
+def test_sharded_ranks_are_refused(tmp_path):
     data = [str(make_shards(tmp_path / "arm", "arm"))]
-    recipe = make_recipe({**TINY, "data": data, past: 0.5, "parallel": "fsdp"})
+    recipe = make_recipe({**TINY, "data": data, "self_forward": 0.5, "parallel": "fsdp"})
     with pytest.raises(RecipeError, match="use parallel=ddp"):
         Run(recipe, tmp_path, torch.device("cpu"), World(0, 2))
 
@@ -159,12 +158,6 @@ def test_passes_that_skip_actions_are_refused_where_they_would_disagree(tmp_path
     recipe["model"] = {**TINY["model"], "absent_action": "skip"}
     with pytest.raises(RecipeError, match="absent_action: skip does not work with parallel=fsdp"):
         Run(make_recipe(recipe), tmp_path, torch.device("cpu"), World(0, 2))
-
-
-def test_rollouts_without_predicted_frames_are_refused(tmp_path):
-    recipe = make_recipe({**TINY, "data": ["x"], "self_rollout": 0.5, "objectives": {"policy": 1}})
-    with pytest.raises(RecipeError, match="self_rollout: needs frames .* policy does not predict"):
-        Run(recipe, tmp_path, torch.device("cpu"))
 
 
 def test_no_loss_is_due_on_padded_frames(model):
@@ -258,130 +251,3 @@ def test_no_gradient_flows_through_the_past_and_the_draws_of_training_stay_as_th
     given = forwarded(model, batch(), 1.0, 2, torch.Generator().manual_seed(3))
     assert not given.context.requires_grad and torch.equal(torch.get_rng_state(), state)
     assert all(parameter.grad is None for parameter in model.parameters())
-
-
-# -- rollouts before the window
-
-LONG = FRAMES + 7
-
-
-def long_batch(size: int = 8, continuous: bool = False) -> Batch:
-    """Frame t of row b is b + t · 100 in every token and action, so that windows show their place."""
-    place = torch.arange(size).view(-1, 1) + 100 * torch.arange(LONG)
-    names = ["arm", "hand"] * (size // 2)
-    shape = (size, LONG, 2, 4, 4) if continuous else (size, LONG, 2, 3)
-    frames = place.view(size, LONG, *[1] * (len(shape) - 2)).expand(shape).clone()
-    actions = place.unsqueeze(-1).expand(size, LONG, 6).float()
-    stored = {"latents": frames.float()} if continuous else {"tokens": frames}
-    return Batch(names, actions, torch.ones(size, LONG, dtype=torch.bool), **stored)
-
-
-def begins(given: Batch) -> list[int]:
-    """Return the frame of the longer batch that each window begins with; all of it must be cut alike."""
-    stored = given.tokens if given.tokens is not None else given.latents
-    places = stored.flatten(2)[:, :, 0].long()
-    first = places[:, :1] // 100
-    assert torch.equal(places // 100, first + torch.arange(FRAMES))
-    assert torch.equal(places % 100, torch.arange(len(places)).view(-1, 1).expand_as(places))
-    assert torch.equal(given.actions[:, :, 0].long(), places)
-    return first.flatten().tolist()
-
-
-def marked(made: list, prompts: list):
-    """A stand-in for generation: frame t of a row's rollout has -1 - t in every token."""
-
-    def generate(model, prompt, actions, names, count, known, generator=None):
-        assert not model.training and len(names) == len(prompt)
-        made.append(count)
-        prompts.append(prompt.shape[1])
-        times = prompt.shape[1] + torch.arange(count)
-        return (
-            (-1 - times)
-            .view(1, count, *[1] * (prompt.dim() - 2))
-            .expand(len(prompt), count, *prompt.shape[2:])
-        )
-
-    return generate
-
-
-@pytest.mark.parametrize("continuous", [False, True])
-@pytest.mark.parametrize("seed", range(6))
-def test_a_window_of_a_rollout_has_its_frames_up_to_the_one_before_its_last(
-    continuous, seed, model, monkeypatch
-):
-    made, prompts = [], []
-    monkeypatch.setattr("hma_model.training.scheduled_sampling.generate", marked(made, prompts))
-    given = rolled(model, long_batch(8, continuous), 1.0, FRAMES, torch.Generator().manual_seed(seed))
-    (count,), (prompt,) = made, prompts
-    assert 2 <= prompt <= FRAMES and model.training
-    stored = given.tokens if given.tokens is not None else given.latents
-    for row, begin in enumerate(begins(given)):
-        for t in range(FRAMES):
-            seen, true = given.context[row, t], stored[row, t]
-            own = begin + t >= prompt and t < FRAMES - 1
-            assert torch.equal(seen, torch.full_like(seen, -1 - begin - t) if own else true)
-    assert count == max(begins(given)) + FRAMES - 1 - prompt
-
-
-def test_windows_of_rollouts_begin_anywhere_and_others_stay_true(model, monkeypatch):
-    made, prompts, seen = [], [], set()
-    monkeypatch.setattr("hma_model.training.scheduled_sampling.generate", marked(made, prompts))
-    rows, whole = 0, 0
-    for seed in range(60):
-        given = rolled(model, long_batch(), 0.4, FRAMES, torch.Generator().manual_seed(seed))
-        seen |= set(begins(given))
-        if given.context is not None:
-            own = changed(given, given.tokens)
-            rows += int(own.any(1).sum())
-            whole += int(own[:, :-1].all(1).sum())
-    assert seen == set(range(LONG - FRAMES + 1)) and set(prompts) == set(range(2, FRAMES + 1))
-    assert 0.25 < rows / (60 * 8) < 0.45 and whole
-    true = rolled(model, long_batch(), 0.0, FRAMES, torch.Generator().manual_seed(1))
-    assert true.context is None and true.tokens.shape[1] == FRAMES
-
-
-def test_a_rollout_is_what_generation_makes_with_the_same_seeds(model):
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(0.2 * torch.randn_like(parameter))
-    g = torch.Generator().manual_seed(0)
-    long = replace(
-        long_batch(4), tokens=torch.randint(64, (4, LONG, 2, 3), generator=g),
-        actions=torch.randn(4, LONG, 6, generator=g),
-    )  # fmt: skip
-    state = torch.get_rng_state()
-    given = rolled(model, long, 1.0, FRAMES, torch.Generator().manual_seed(5))
-    assert torch.equal(torch.get_rng_state(), state) and not given.context.requires_grad
-    again = torch.Generator().manual_seed(5)
-    draws = torch.rand((3, 4), generator=again)
-    begin, prompt = (draws[1] * (LONG - FRAMES + 1)).long(), 2 + int(draws[2, 0] * (FRAMES - 1))
-    count = LONG - 1 - prompt
-    with torch.no_grad():
-        made = model.eval().generate(
-            long.tokens[:, :prompt], long.actions, long.embodiment, count,
-            known=long.action_mask, generator=again,
-        )  # fmt: skip
-    for row in range(4):
-        first = int(begin[row])
-        known = torch.cat([long.tokens[row, :prompt], made[row]])[first : first + FRAMES - 1]
-        assert torch.equal(given.context[row, :-1], known)
-
-
-def test_windows_of_padded_episodes_lie_inside_them(model):
-    lengths = [LONG, FRAMES + 2, FRAMES, FRAMES - 2] * 2
-    inside = torch.arange(LONG) < torch.tensor(lengths).unsqueeze(1)
-    for seed in range(20):
-        long = replace(long_batch(), frame_mask=inside)
-        given = rolled(model, long, 0.0, FRAMES, torch.Generator().manual_seed(seed))
-        for begin, length, mask in zip(begins(given), lengths, given.frame_mask):
-            assert begin <= max(length - FRAMES, 0)
-            assert mask.tolist() == [begin + t < length for t in range(FRAMES)]
-
-
-def test_rollouts_longer_than_the_episodes_say_what_to_do(tmp_path):
-    data = [str(make_shards(tmp_path / "arm", "arm", length=12, episodes=8))]
-    recipe = {**TINY, "data": data, "self_rollout": 0.5, "self_rollout_frames": 50}
-    with pytest.raises(RecipeError, match=r"self_rollout_frames: asks for \d+ \+ 50 frames.*short=pad"):
-        train(make_recipe(recipe), out=tmp_path / "run", show=False)
-    padded = make_recipe({**recipe, "short": "pad", "steps": 2, "eval_every": 0})
-    assert train(padded, out=tmp_path / "padded", show=False).step == 2
