@@ -51,10 +51,11 @@ def print_json(values: Any) -> None:
     print(json.dumps(values, indent=1, ensure_ascii=False, default=str))
 
 
-MAX_TITLE = 40  # letters in the column of titles; a longer title pushes its text to the right
-MAX_NAME = 20  # letters of a path, beyond which `short_paths` shortens it
+LONGEST_TITLE = 40  # letters in the column of titles; a longer title pushes its text to the right
+LONGEST_NAME = 20  # letters of a path, beyond which `short_paths` shortens it
 GAP = 3  # letters between columns
 MANY_ROWS = 500  # laying out more than this with rich takes seconds
+SECONDS_BETWEEN_LINES = 10  # of progress off a terminal
 
 
 def print_table(
@@ -71,40 +72,39 @@ def print_table(
         title: printed above.
         repeated: so many of the first columns begin each part of a table that is cut.
     """
-    if len(rows) > MANY_ROWS:
-        _print_columns(columns, rows)
-        return
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
     cells = [[_cell(value) for value in row] for row in rows]
-    numeric = [_is_numeric([row[i] for row in rows]) for i in range(len(columns))]
     widths = [max(map(len, [name, *(row[i] for row in cells)])) for i, name in enumerate(columns)]
-    console = stdout()
-    parts = [[*range(len(columns))]]
-    if sys.stdout.isatty() and sum(widths) + GAP * len(columns) > console.width:
+    if len(rows) > MANY_ROWS:
+        for row in [list(columns), *cells]:
+            print("  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip())
+        return
+    is_terminal = sys.stdout.isatty()
+    console = Console(width=None if is_terminal else 200, soft_wrap=not is_terminal, highlight=False)
+    numeric = [_is_numeric([row[i] for row in rows]) for i in range(len(columns))]
+    parts = [list(range(len(columns)))]
+    if is_terminal and sum(widths) + GAP * len(columns) > console.width:
         if not all(numeric[repeated:]):
             _print_paragraphs(console, columns, cells, title)
             return
         parts = _parts(widths, repeated, console.width)
     for part in parts:
-        console.print(_table(columns, cells, numeric, part, title if part is parts[0] else ""))
-
-
-def _table(
-    columns: Sequence[str], cells: list[list[str]], numeric: list[bool], part: list[int], title: str
-) -> Any:
-    """Return the columns of those indices as a table of rich."""
-    from rich.box import SIMPLE
-    from rich.markup import escape
-    from rich.table import Table
-
-    heads = [escape(columns[i]) for i in part]
-    table = Table(*heads, title=escape(title) or None, title_justify="left", box=SIMPLE, pad_edge=False)
-    table.columns[0].overflow = "fold"  # users type it into the next command, so it is never cut short
-    for column, i in zip(table.columns, part, strict=True):
-        if numeric[i]:
-            column.justify, column.no_wrap = "right", True
-    for row in cells:
-        table.add_row(*(escape(row[i]) for i in part))
-    return table
+        above = Text(title) if title and part is parts[0] else None
+        table = Table(title=above, title_justify="left", box=SIMPLE, pad_edge=False)
+        for i in part:
+            table.add_column(
+                Text(columns[i]),
+                justify="right" if numeric[i] else "left",
+                no_wrap=numeric[i],
+                overflow="ellipsis" if i else "fold",  # users type the first into the next command
+            )
+        for row in cells:
+            table.add_row(*(Text(row[i]) for i in part))
+        console.print(table)
 
 
 def _print_paragraphs(console: Any, columns: Sequence[str], cells: list[list[str]], title: str) -> None:
@@ -116,13 +116,12 @@ def _print_paragraphs(console: Any, columns: Sequence[str], cells: list[list[str
         console.print(Text(title))
     for first, *others in cells:
         console.print(Text(first, "bold"), soft_wrap=True)
-        named = [
-            (name, cell) for name, cell in zip(columns[1:], others, strict=True) if cell not in ("", "-")
-        ]
-        pieces: list[Any] = []
-        for name, cell in named:
-            pieces += [(f"{'; ' if pieces else ''}{name}: ", "dim"), cell]
-        console.print(Padding(Text.assemble(*pieces), (0, 0, 0, 2)))
+        named = Text("; ").join(
+            Text.assemble((f"{name}: ", "dim"), cell)
+            for name, cell in zip(columns[1:], others, strict=True)
+            if cell not in ("", "-")
+        )
+        console.print(Padding(named, (0, 0, 0, 2)))
 
 
 def _parts(widths: Sequence[int], repeated: int, room: int) -> list[list[int]]:
@@ -141,29 +140,9 @@ def _parts(widths: Sequence[int], repeated: int, room: int) -> list[list[int]]:
 
 
 def _is_numeric(values: Sequence[Any]) -> bool:
-    return any(isinstance(value, int | float | Decimal) for value in values) and not any(
-        map(_is_word, values)
-    )
-
-
-def stdout() -> Any:
-    """Return a console on standard output; it is wide where standard output is not a terminal."""
-    from rich.console import Console
-
-    return Console(
-        width=None if sys.stdout.isatty() else 200, soft_wrap=not sys.stdout.isatty(), highlight=False
-    )
-
-
-def _is_word(value: Any) -> bool:
-    return isinstance(value, str) and value != "unknown"
-
-
-def _print_columns(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    cells = [list(columns), *([_cell(value) for value in row] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row in cells:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    """Check whether a column holds numbers and no words; "unknown" stands for a number."""
+    words = [value for value in values if isinstance(value, str) and value != "unknown"]
+    return not words and any(isinstance(value, int | float | Decimal) for value in values)
 
 
 def _cell(value: Any) -> str:
@@ -179,7 +158,7 @@ def _cell(value: Any) -> str:
 def print_lines(lines: Iterable[tuple[str, str]]) -> None:
     """Print pairs of a title and a text with the texts in one column, folded to a terminal's width."""
     pairs = list(lines)
-    width = min(max((len(title) for title, _ in pairs), default=0), MAX_TITLE)
+    width = min(max((len(title) for title, _ in pairs), default=0), LONGEST_TITLE)
     room = shutil.get_terminal_size().columns - width - 2 if sys.stdout.isatty() else 0
     last = ""
     for title, text in pairs:
@@ -195,7 +174,7 @@ def short_paths(paths: Sequence[str]) -> dict[str, str]:
 
     A single path, and paths that are short, stay as they are.
     """
-    if len(paths) < 2 or max(map(len, paths)) <= MAX_NAME:
+    if len(paths) < 2 or max(map(len, paths)) <= LONGEST_NAME:
         return {path: path for path in paths}
     parts = [path.rstrip("/").split("/") for path in paths]
     for _ in range(2):  # from the front, then from the back
@@ -219,13 +198,9 @@ def human_count(count: int, noun: str) -> str:
 
 def human_bytes(count: float) -> str:
     """Return a number of bytes as text: 1234567 -> 1.2 MB."""
-    if count < 1000:
-        return f"{count:.0f} B"
-    for unit in ("kB", "MB", "GB"):
-        count /= 1000
-        if count < 1000:
-            return f"{count:.1f} {unit}"
-    return f"{count / 1000:.1f} TB"
+    from rich.filesize import decimal
+
+    return f"{count:.0f} B" if count < 1000 else decimal(int(count))
 
 
 def human_seconds(seconds: float) -> str:
@@ -263,44 +238,34 @@ def progress(description: str, total: float = 0, unit: str = "frames") -> Iterat
         total: the amount in all; 0 where it is not known yet.
         unit: the unit of the amounts; "bytes" are shown in kB, MB or GB.
     """
-    if sys.stderr.isatty():
-        with _bar(description, total, unit) as update:
-            yield update
-    else:
+    if not sys.stderr.isatty():
         lines = _Lines(description, total, unit)
         yield lines
         lines.close()
-
-
-@contextmanager
-def _bar(description: str, total: float, unit: str) -> Iterator[Update]:
+        return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.table import Column
-    from rich.text import Text
 
-    class Times(ProgressColumn):
-        def render(self, task: Task) -> Text:
-            return Text(human_times(task.elapsed or 0.0, task.time_remaining if task.total else None))
-
-    bar = Progress(
+    with Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
         TextColumn("{task.fields[amount]}"),
-        Times(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
         # The last column alone is shortened in a narrow terminal.
         TextColumn("{task.fields[extra]}", markup=False, table_column=Column(ratio=1, no_wrap=True)),
         expand=True,
         console=Console(stderr=True),
         refresh_per_second=5,
-    )
-    with bar:
-        task = bar.add_task(description, total=total or None, amount="", extra="")
+    ) as bar:
+        number = bar.add_task(description, total=total or None, amount="", extra="")
+        [task] = bar.tasks
 
         def update(done: float, extra: str = "", total: float | None = None) -> None:
-            whole = total or bar.tasks[0].total
-            amount = _amount(done, whole or 0, bar.tasks[0].speed or 0, unit)
-            bar.update(task, completed=done, total=whole, extra=extra, amount=amount)
+            whole = total or task.total
+            amount = _amount(done, whole or 0, task.speed or 0, unit)
+            bar.update(number, completed=done, total=whole, extra=extra, amount=amount)
 
         yield update
 
@@ -329,30 +294,30 @@ class _Lines:
 
     def __init__(self, description: str, total: float, unit: str) -> None:
         self._text, self._total, self._unit = description, total, unit
-        self._start = self._began = self._shown = time.monotonic()
-        self._first: float | None = None
+        self._start = self._shown = time.monotonic()
+        self._begun: tuple[float, float] | None = None  # amount and time from which the rate counts
         self._done, self._extra = 0.0, ""
-        self._told = False  # whether the last call has been shown
+        self._is_told = False  # whether the last call has been shown
 
     def __call__(self, done: float, extra: str = "", total: float | None = None) -> None:
         self._done, self._extra, self._total = done, extra, total or self._total
-        self._told = False
-        if self._first is None or done <= self._first:
+        self._is_told = False
+        if self._begun is None or done <= self._begun[0]:
             # Neither the work of an earlier run nor the preparation counts for the rate.
-            self._first, self._began = done, time.monotonic()
-        if time.monotonic() - self._shown >= 10:
-            self._show()
+            self._begun = done, time.monotonic()
+        if time.monotonic() - self._shown >= SECONDS_BETWEEN_LINES:
+            self._show(*self._begun)
 
     def close(self) -> None:
-        if self._first is not None and not self._told:
-            self._show()
+        if self._begun is not None and not self._is_told:
+            self._show(*self._begun)
 
-    def _show(self) -> None:
-        self._shown, self._told = time.monotonic(), True
-        elapsed = self._shown - self._start
-        rate = (self._done - (self._first or 0)) / max(self._shown - self._began, 1e-9)
+    def _show(self, first: float, begun: float) -> None:
+        self._shown, self._is_told = time.monotonic(), True
+        rate = (self._done - first) / max(self._shown - begun, 1e-9)
         missing = self._total - self._done
         left = missing / rate if rate > 0 and missing > 0 else None
         amount = _amount(self._done, self._total, rate, self._unit)
         words = f", {self._extra}" if self._extra else ""
-        print(f"{self._text}: {amount}, {human_times(elapsed, left)}{words}", file=sys.stderr, flush=True)
+        times = human_times(self._shown - self._start, left)
+        print(f"{self._text}: {amount}, {times}{words}", file=sys.stderr, flush=True)
