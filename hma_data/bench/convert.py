@@ -120,7 +120,7 @@ def _record(path: Path, settings: dict[str, Any]) -> None:
 
 def _tokenizer_alone(settings: dict[str, Any], rows: int) -> float:
     """Return the CPU seconds for `rows` frames in a worker's batches, measured on a part of them."""
-    from hma_data.conversion.worker import BATCH
+    from hma_data.conversion.worker import FRAMES_A_BATCH
     from hma_data.cpu import usable_cores
     from hma_data.tokenizers.base import get_tokenizer
 
@@ -128,12 +128,12 @@ def _tokenizer_alone(settings: dict[str, Any], rows: int) -> float:
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(max(1, usable_cores() // max(settings["workers"], 1)))
     size = tokenizer.spec.image_size
-    frames = np.random.default_rng(1).integers(0, 256, (BATCH, size, size, 3), np.uint8)
+    frames = np.random.default_rng(1).integers(0, 256, (FRAMES_A_BATCH, size, size, 3), np.uint8)
     tokenizer.encode(frames)
     done, began = 0, time.process_time()
     while done < min(rows, 4_096):
         tokenizer.encode(frames)
-        done += BATCH
+        done += FRAMES_A_BATCH
     return (time.process_time() - began) * rows / done
 
 

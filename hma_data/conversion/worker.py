@@ -21,7 +21,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.conversion.engines import FIRST, Attempt, Report, Step, Work
+from hma_data.conversion.engines import FIRST_ATTEMPT, Attempt, Report, Step, Work
 from hma_data.conversion.extend import Content, kept_frames
 from hma_data.conversion.output import Made
 from hma_data.conversion.plan import ShardUnit, camera_fault, read_clip
@@ -47,8 +47,8 @@ from hma_data.storage.fetch import EPISODE_WAITS_S as WAITS_S
 from hma_data.storage.fetch import disk_is_full, storage_is_away, worth_another_try
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
-BATCH = 32  # frames decoded and tokenized together
-BEAT_S = 20.0
+FRAMES_A_BATCH = 32  # decoded and tokenized together
+SIGN_EVERY_S = 20.0
 FATAL = TokenizerError, OutputError, ShardError, RegistryError, MissingDependencyError  # no episode's fault
 
 Frames = NDArray[np.uint8]
@@ -117,7 +117,7 @@ class MakeWork:
 
 
 def make_shard(
-    job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report, attempt: Attempt = FIRST
+    job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report, attempt: Attempt = FIRST_ATTEMPT
 ) -> Made:
     """Read, align, tokenize and write the episodes of one shard."""
     layout = job.layout
@@ -150,10 +150,11 @@ def make_shard(
 
 @contextmanager
 def _signs_of_life(report: Report) -> Iterator[None]:
+    """Report from a thread while the block runs, so that the engine does not count it as hung."""
     over = Event()
 
     def beat() -> None:
-        while not over.wait(BEAT_S):
+        while not over.wait(SIGN_EVERY_S):
             report(Tick())
 
     thread = Thread(target=beat, daemon=True)
@@ -187,11 +188,24 @@ class _Episode:
     flags: dict[str, int] = field(default_factory=dict)
 
 
-Decoded = _Episode | tuple[str, Frames] | Refused | None  # None ends the episode that was begun
+@dataclass(frozen=True)
+class _Pictures:
+    """The next pictures (n, S, S, 3) of a camera of the episode that was begun."""
+
+    camera: str
+    frames: Frames
+
+
+class _End:
+    """The end of the episode that was begun: all its pictures have come."""
+
+
+# An episode is begun by itself, goes on with its pictures, and ends with _End; or it is refused.
+Decoded = _Episode | _Pictures | _End | Refused
 
 
 def _decoded(job: Job, unit: ShardUnit, report: Report, attempt: Attempt) -> Iterator[Decoded]:
-    """Yield each episode, its pictures in batches with their camera, and None; or a Refused.
+    """Read the episodes of a shard, each as the items that `Decoded` names.
 
     This runs ahead in a thread. An episode may begin again, or be refused, after some of its pictures; its
     earlier items are then void.
@@ -242,25 +256,25 @@ def _episode(
         try:
             if report:
                 report(Seen(name, *clip.frames_at(name, kept[:1]).shape[1:3]))
-            for start in range(0, len(kept), BATCH):
-                indices = clip.frame_indices[name][kept[start : start + BATCH]]
+            for start in range(0, len(kept), FRAMES_A_BATCH):
+                indices = clip.frame_indices[name][kept[start : start + FRAMES_A_BATCH]]
                 frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
                 content.add(start, frames)
                 seen.add(frames)
-                yield name, frames
+                yield _Pictures(name, frames)
         except EpisodeError as fault:
             if len(layout.cameras) == 1:
                 raise
             raise camera_fault(ref.id, name, layout.cameras, fault) from fault
         episode.flags |= picture_flags(seen, job.embodiment.quality, ref.id, name)
-    yield None
+    yield _End()
 
 
 def _tokenized(
     items: Iterator[Decoded], tokenizer: Tokenizer, report: Report
 ) -> Iterator[_Episode | Refused]:
     """Yield whole and refused episodes in order; a batch may hold frames of several episodes."""
-    batches = Batches(tokenizer.encode, BATCH)
+    batches = Batches(tokenizer.encode, FRAMES_A_BATCH)
     unfinished: deque[_Episode | Refused] = deque()
     begun: _Episode | None = None
 
@@ -272,16 +286,17 @@ def _tokenized(
             yield unfinished.popleft()
 
     for item in items:
-        if begun is not None:
-            if isinstance(item, tuple):
-                report(Tick(frames=batches.add(begun, *item)))
-            elif item is None:
-                begun.read, begun = True, None
-            else:  # its earlier items are void
+        if isinstance(item, _Pictures):
+            assert begun is not None
+            report(Tick(frames=batches.add(begun, item.camera, item.frames)))
+        elif isinstance(item, _End):
+            assert begun is not None
+            begun.read = True
+            begun = None
+        else:
+            if begun is not None:  # it begins again or is refused: what came of it is void
                 batches.drop(begun)
                 unfinished.pop()
-                begun = None
-        if isinstance(item, _Episode | Refused):
             unfinished.append(item)
             begun = item if isinstance(item, _Episode) else None
         yield from ready()

@@ -45,7 +45,7 @@ class Attempt:
     refused: Mapping[str, str] = field(default_factory=dict)  # step to skip -> how it ended the process
 
 
-FIRST = Attempt()
+FIRST_ATTEMPT = Attempt()
 Work = Callable[[Any, Report, Attempt], Any]
 OnEvent = Callable[[int, Any], None]
 

@@ -14,14 +14,24 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection, wait
-from typing import Any, Protocol
+from typing import Any
 
-from hma_data.conversion.engines import FIRST, LIMITS, Attempt, Cause, Ledger, Limits, OnEvent, Step, Work
+from hma_data.conversion.engines import (
+    FIRST_ATTEMPT,
+    LIMITS,
+    Attempt,
+    Cause,
+    Ledger,
+    Limits,
+    OnEvent,
+    Step,
+    Work,
+)
 from hma_data.cpu import take_ordinary_priority
 from hma_data.errors import HMAError
 
 CRASHES = {"SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGSYS"}  # signals of a process's own faults
-TICK_S = 0.5
+TICK_S = 0.5  # longest wait for a message; hung processes are looked for after each
 START_FAILURES = 10  # limit of processes in a row that end before they are ready
 UNGUARDED = 86  # exit code of a worker that would start workers while it imports the script of its parent
 
@@ -46,11 +56,11 @@ def run(
     if workers < 1:
         work = make_work(1)
         for number, unit in enumerate(units):
-            yield work(unit, partial(_report, on_event, number), FIRST)
+            yield work(unit, partial(_report, on_event, number), FIRST_ATTEMPT)
         return
     ledger = Ledger(units, limits, on_event)
     count = min(workers, len(ledger.units))
-    pool = Pool(lambda: WorkerProcess(make_work, count), count, ledger, on_event)
+    pool = _Pool(make_work, count, ledger, on_event)
     try:
         while ledger.open:
             pool.fill()
@@ -76,7 +86,7 @@ def _report(on_event: OnEvent, number: int, event: Any) -> None:
         on_event(number, event)
 
 
-class WorkerProcess:
+class _WorkerProcess:
     """A spawned process that runs one unit after the other."""
 
     def __init__(self, make_work: Callable[[int], Work], workers: int) -> None:
@@ -88,11 +98,13 @@ class WorkerProcess:
         theirs.close()
         self.ready = False  # whether it can take a unit
         self.unit: int | None = None  # the number of the unit it is at
-        self.step, self._heard = "", time.monotonic()  # the last step that the unit reported
+        self.step = ""  # the last one that the unit reported
+        self._heard = time.monotonic()
 
     def start_unit(self, number: int, unit: Any, attempt: Attempt) -> None:
         """Hand a unit to the process."""
-        self.unit, self.step, self._heard = number, "", time.monotonic()
+        self.unit, self.step = number, ""
+        self._heard = time.monotonic()
         with suppress(OSError):  # it died just now; its end will be noticed
             self.pipe.send((unit, attempt))
 
@@ -129,38 +141,27 @@ class WorkerProcess:
         return "killed", f"ended by {name}"
 
 
-class Units(Protocol):
-    """The units of a pool: the Ledger, or the one unit of an actor; see Ledger for the methods."""
-
-    limits: Limits
-
-    def take(self) -> tuple[int, Any, Attempt] | None: ...
-
-    def finished(self, number: int) -> None: ...
-
-    def lost(self, number: int, cause: Cause, step: str, how: str) -> None: ...
-
-
-class Pool:
-    """The processes of one run: `count` of them, each made by `start`."""
+class _Pool:
+    """The `count` processes of one run."""
 
     def __init__(
-        self, start: Callable[[], WorkerProcess], count: int, units: Units, on_event: OnEvent
+        self, make_work: Callable[[int], Work], count: int, ledger: Ledger, on_event: OnEvent
     ) -> None:
-        self._start, self._count, self._units, self._on_event = start, count, units, on_event
+        self._make_work, self._count = make_work, count
+        self._ledger, self._on_event = ledger, on_event
         self._start_failures = 0
-        self.processes: list[WorkerProcess] = []
+        self.processes: list[_WorkerProcess] = []
 
     def fill(self) -> None:
         """Start the processes that are missing."""
         while len(self.processes) < self._count:
-            self.processes.append(self._start())
+            self.processes.append(_WorkerProcess(self._make_work, self._count))
 
     def turn(self) -> Iterator[Any]:
         """Hand out units, then handle the messages of the processes; yield results."""
         for process in self.processes:
             free = process.ready and process.unit is None and process.process.is_alive()
-            if free and (taken := self._units.take()):
+            if free and (taken := self._ledger.take()):
                 process.start_unit(*taken)
         pipes = {process.pipe: process for process in self.processes}
         ends = {process.process.sentinel: process for process in self.processes}
@@ -172,10 +173,10 @@ class Pool:
             yield from self._listen(process)  # its messages from before it died
             self._bury(process)
         for process in list(self.processes):
-            if process.hangs(self._units.limits.quiet_s):
+            if process.hangs(self._ledger.limits.quiet_s):
                 self._bury(process, hung=True)
 
-    def _listen(self, process: WorkerProcess) -> Iterator[Any]:
+    def _listen(self, process: _WorkerProcess) -> Iterator[Any]:
         for kind, value in process.messages():
             number = process.unit
             if kind == "failed":
@@ -186,15 +187,15 @@ class Pool:
                 continue
             elif kind == "short of memory":
                 process.unit = None
-                self._units.lost(number, "killed", process.step, "ran out of memory")
+                self._ledger.lost(number, "killed", process.step, "ran out of memory")
             elif kind == "done":
                 process.unit = None
-                self._units.finished(number)
+                self._ledger.finished(number)
                 yield value
             else:
                 self._on_event(number, value)
 
-    def _bury(self, process: WorkerProcess, hung: bool = False) -> None:
+    def _bury(self, process: _WorkerProcess, hung: bool = False) -> None:
         self.processes.remove(process)
         cause, how = process.end()
         if process.process.exitcode == UNGUARDED:
@@ -202,7 +203,7 @@ class Pool:
             fault = "starts workers when it is imported, and each worker imports it"
             raise HMAError(script, fault, 'put the call under `if __name__ == "__main__":`')
         if hung:
-            cause, how = "hung", f"made no progress for {self._units.limits.quiet_s:g} s"
+            cause, how = "hung", f"made no progress for {self._ledger.limits.quiet_s:g} s"
         if not process.ready:
             self._start_failures += 1
             if self._start_failures >= START_FAILURES:
@@ -211,7 +212,7 @@ class Pool:
                     remedy = "the messages above say why"
                 raise HMAError("a worker", f"cannot start; the last one {how}", remedy)
         if process.unit is not None:
-            self._units.lost(process.unit, cause, process.step, how)
+            self._ledger.lost(process.unit, cause, process.step, how)
 
     def close(self) -> None:
         """End every process."""

@@ -456,12 +456,12 @@ def test_an_episode_that_breaks_off_in_the_middle_leaves_nothing_of_itself(
 
         for i, picture in enumerate(pictures):
             encoded[i] = cv2.imencode(".png", picture)[1].ravel() if i < 20 else np.zeros(9, np.uint8)
-    shard_work_batch = shard_work.BATCH
+    shard_work_batch = shard_work.FRAMES_A_BATCH
     try:
-        shard_work.BATCH = 4
+        shard_work.FRAMES_A_BATCH = 4
         summary = run(toy_arm, toy_recording, tmp_path / "out")
     finally:
-        shard_work.BATCH = shard_work_batch
+        shard_work.FRAMES_A_BATCH = shard_work_batch
     assert summary.manifest.quarantined == 1
     assert verify(tmp_path / "out") == []
     rest = tmp_path / "rest.hdf5"

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from hma_data.conversion.engines import FIRST, Attempt, Report, Step, Work
+from hma_data.conversion.engines import FIRST_ATTEMPT, Attempt, Report, Step, Work
 from hma_data.conversion.engines.ray import Worker
 from hma_data.errors import TokenizerError
 from tests.data.conversion.test_engines import PLAIN, MakeWork, Unit
@@ -58,20 +58,20 @@ def opened(make_work: Callable[[int], Work]) -> Worker:
 def test_a_units_events_and_result_are_told_in_order(tmp_path: Path) -> None:
     worker = opened(MakeWork(tmp_path))
     for number, unit in enumerate(PLAIN[:2]):
-        end, events = worker.do(number, unit, FIRST)
+        end, events = worker.do(number, unit, FIRST_ATTEMPT)
         assert end == ("done", (unit.name, ["a", "b"]))
         said = [event for _, event in events if not isinstance(event, Step)]
         assert said == [f"{unit.name} a", f"{unit.name} b"] and {n for n, _ in events} == {number}
 
 
 def test_an_actor_that_was_never_opened_says_so() -> None:
-    assert Worker().do(0, PLAIN[0], FIRST) == (("closed", None), [])
+    assert Worker().do(0, PLAIN[0], FIRST_ATTEMPT) == (("closed", None), [])
 
 
 def test_looks_and_the_end_give_every_event_once() -> None:
     worker, heard = opened(Chatty()), []
     with ThreadPoolExecutor(1) as other:
-        task = other.submit(worker.do, 3, 300, FIRST)
+        task = other.submit(worker.do, 3, 300, FIRST_ATTEMPT)
         while not task.done():
             heard += worker.look(0.05)
     assert heard + task.result()[1] == [(3, number) for number in range(300)]
@@ -94,6 +94,6 @@ def test_in_a_later_attempt_a_step_begins_only_when_the_driver_has_heard_of_it(t
 @pytest.mark.parametrize(("trouble", "kind"), [("memory", "short of memory"), ("error", "failed")])
 def test_how_a_unit_ends_is_told_and_the_next_is_done(trouble: str, kind: str, tmp_path: Path) -> None:
     worker = opened(MakeWork(tmp_path))
-    (end, value), _ = worker.do(0, Unit("bad", ("a", "b"), "b", trouble), FIRST)
+    (end, value), _ = worker.do(0, Unit("bad", ("a", "b"), "b", trouble), FIRST_ATTEMPT)
     assert end == kind and (value is None or str(value) == str(TokenizerError("weights", "are wrong")))
-    assert worker.do(1, PLAIN[0], FIRST)[0] == ("done", ("u0", ["a", "b"]))
+    assert worker.do(1, PLAIN[0], FIRST_ATTEMPT)[0] == ("done", ("u0", ["a", "b"]))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hma_data.conversion.engines import FIRST
+from hma_data.conversion.engines import FIRST_ATTEMPT
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import UsageError
@@ -199,7 +199,7 @@ def test_recipe_leaves_shards_and_no_recording(tmp_path: Path, block_tokenizer: 
     recipe = module_from_spec(spec)
     spec.loader.exec_module(recipe)
     work = recipe.make_work(tmp_path, 2, SEED, block_tokenizer, Settings(frames="strided"), "cpu", 1)
-    line = work("arm1_02", lambda event: None, FIRST)
+    line = work("arm1_02", lambda event: None, FIRST_ATTEMPT)
     assert "80 frames" in line and not list((tmp_path / "recordings").iterdir())
     assert (tmp_path / "shards" / "arm1_02" / MANIFEST).is_file()
     assert Embodiment.load(tmp_path / "embodiments" / "arm1_02.yaml") == embodiment("arm1_02")
