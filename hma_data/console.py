@@ -77,7 +77,7 @@ def print_table(
     from rich.table import Table
     from rich.text import Text
 
-    cells = [[_cell(value) for value in row] for row in rows]
+    cells = [[cell_text(value) for value in row] for row in rows]
     widths = [max(map(len, [name, *(row[i] for row in cells)])) for i, name in enumerate(columns)]
     if len(rows) > MANY_ROWS:
         for row in [list(columns), *cells]:
@@ -145,11 +145,12 @@ def _is_numeric(values: Sequence[Any]) -> bool:
     return not words and any(isinstance(value, int | float | Decimal) for value in values)
 
 
-def _cell(value: Any) -> str:
+def cell_text(value: Any, digits: int = 4) -> str:
+    """Return a cell of a table as text, floats with so many digits."""
     if value is None:
         return "-"
     if isinstance(value, float):
-        return f"{value:,.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
+        return f"{value:,.{digits}g}" if abs(value) < 10**digits else f"{value:,.0f}"
     if isinstance(value, int) and not isinstance(value, bool):
         return f"{value:,}"
     return str(value)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from hma_data.console import print_table
+from hma_data.console import cell_text, print_table
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -70,13 +70,7 @@ def _environment(package: str) -> "Environment":
 
 
 def _shown(cell: Any) -> str:
-    if cell is None:
-        return "–"
-    if isinstance(cell, float):
-        return f"{cell:.3g}" if abs(cell) < 1000 else f"{cell:,.0f}"
-    if isinstance(cell, int) and not isinstance(cell, bool):
-        return f"{cell:,}"
-    return str(cell)
+    return "–" if cell is None else cell_text(cell, digits=3)
 
 
 def _markdown(cell: Any) -> str:

@@ -1,0 +1,83 @@
+"""Budgets of size: lines, syntax nodes and modules of each package, lines of tests, words of docs.
+
+A capability pays for its code by what it replaces. Where it cannot, the number in the table is raised in the
+same commit, whose message says why. Nodes are counted beside lines, so that packing lines saves nothing.
+"""
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
+    "hma_data": (700, 4_100, 7),
+    "hma_data/bench": (1_370, 11_600, 7),
+    "hma_data/cli": (1_470, 10_400, 8),
+    "hma_data/conversion": (3_320, 24_000, 12),
+    "hma_data/episodes": (1_330, 11_700, 7),
+    "hma_data/hub": (590, 4_200, 3),
+    "hma_data/inspection": (2_030, 18_900, 9),
+    "hma_data/lab": (3_910, 35_300, 18),
+    "hma_data/loading": (1_370, 11_600, 6),
+    "hma_data/registry": (1_280, 8_200, 5),
+    "hma_data/shards": (2_720, 21_500, 10),
+    "hma_data/sources": (11_800, 99_000, 55),
+    "hma_data/storage": (1_860, 12_700, 10),
+    "hma_data/tokenizers": (3_260, 23_700, 17),
+    "hma_model": (480, 2_800, 3),
+    "hma_model/bench": (1_630, 12_500, 9),
+    "hma_model/checkpoint": (990, 6_900, 5),
+    "hma_model/cli": (1_400, 8_800, 9),
+    "hma_model/demo": (540, 4_600, 4),
+    "hma_model/evaluation": (4_490, 36_800, 24),
+    "hma_model/generation": (1_720, 14_300, 12),
+    "hma_model/hub": (1_150, 8_700, 6),
+    "hma_model/network": (2_760, 23_800, 14),
+    "hma_model/play": (1_510, 11_300, 8),
+    "hma_model/policies": (2_100, 15_000, 13),
+    "hma_model/released": (880, 7_700, 5),
+    "hma_model/synthetic": (1_160, 9_300, 5),
+    "hma_model/training": (3_410, 28_300, 16),
+    "hma_model/worlds": (1_510, 11_600, 7),
+}
+PRODUCT_LINES, PRODUCT_NODES = 61_900, 494_000
+TEST_LINES = 45_300
+DOC_WORDS = 42_000
+
+
+@cache
+def sizes() -> dict[str, tuple[int, int, int]]:
+    """Return package -> lines, syntax nodes and modules."""
+    found = dict.fromkeys(BUDGETS, (0, 0, 0))
+    for path in modules():
+        parts = path.relative_to(ROOT).parts
+        package = "/".join(parts[:2]) if len(parts) > 2 else parts[0]
+        text = path.read_text(encoding="utf-8")
+        own = len(text.splitlines()), sum(1 for _ in ast.walk(ast.parse(text))), 1
+        before = found.get(package, (0, 0, 0))
+        found[package] = tuple(a + b for a, b in zip(before, own, strict=True))
+    return found
+
+
+def modules() -> Iterator[Path]:
+    for package in ("hma_data", "hma_model"):
+        yield from (ROOT / package).rglob("*.py")
+
+
+@pytest.mark.parametrize("package", sizes())
+def test_a_package_keeps_to_its_budget(package: str) -> None:
+    assert package in BUDGETS, f"{package} is new: give it a budget"
+    for what, own, most in zip(("lines", "syntax nodes", "modules"), sizes()[package], BUDGETS[package]):
+        assert own <= most, f"{package} has {own:,} {what}, its budget is {most:,}"
+
+
+def test_product_tests_and_docs_keep_to_their_budgets() -> None:
+    lines, nodes, _ = (sum(column) for column in zip(*sizes().values(), strict=True))
+    tests = sum(len(path.read_text().splitlines()) for path in (ROOT / "tests").rglob("*.py"))
+    words = sum(len(path.read_text().split()) for path in (ROOT / "docs").rglob("*.md"))
+    assert lines <= PRODUCT_LINES and nodes <= PRODUCT_NODES
+    assert tests <= TEST_LINES
+    assert words <= DOC_WORDS
