@@ -1,4 +1,4 @@
-"""Read videos of human hands: where both hands are in the picture stands for the action."""
+"""Read videos of human hands: where both hands are in the image stands for the action."""
 
 from hma_data.sources.base import Recognition
 

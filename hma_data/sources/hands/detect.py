@@ -1,14 +1,14 @@
-"""Find hands in pictures with MediaPipe's two models, run by LiteRT on one thread.
+"""Find hands in images with MediaPipe's two models, run by LiteRT on one thread.
 
-The palm model searches the whole picture (192×192) and gives 2016 × 18 values and 2016 scores. Each palm
+The palm model searches the whole image (192×192) and gives 2016 × 18 values and 2016 scores. Each palm
 gives a rotated square for the landmark model (224×224), which gives 21 points, the presence of a hand and its
-handedness. The points give the square of the next picture, so the palm model runs only while fewer than two
+handedness. The points give the square of the next frame, so the palm model runs only while fewer than two
 hands are tracked. The constants are those of MediaPipe's published graphs: palm_detection_cpu,
 palm_detection_detection_to_roi, hand_landmark_cpu, hand_landmark_landmarks_to_roi and
 hand_landmark_tracking_cpu.
 
 Left and right are the person's own hands. The model's handedness is the probability of a right hand in a
-picture that is not mirrored; MediaPipe's graph assumes mirrored pictures, and calls such a hand "Left".
+image that is not mirrored; MediaPipe's graph assumes mirrored frames, and calls such a hand "Left".
 
 Geometry is in pixels, angles in radians, x to the right and y down.
 """
@@ -39,8 +39,8 @@ PALM_SIDE, HAND_SIDE = 192, 224  # pixels of each model's input
 ANCHORS = 2016
 HANDS = 2  # tracked at most
 PALM_SCORE, SUPPRESSION, PRESENCE, SAME = 0.5, 0.3, 0.5, 0.5
-VERSION = 1  # part of the key of cached detections: raise it when the same picture may give other points
-_KNUCKLES = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]  # the points that give the next picture's square
+VERSION = 1  # part of the key of cached detections: raise it when the same image may give other points
+_KNUCKLES = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]  # the points that give the next frame's square
 _SURE = 0.8  # probability of a side; a second hand of that side with less becomes the other hand
 _PALM = ("palm_detection_full.tflite", "palm_detection_lite.tflite", "hand_detector.tflite")
 _HAND = ("hand_landmark_full.tflite", "hand_landmark_lite.tflite", "hand_landmarks_detector.tflite")
@@ -135,9 +135,9 @@ class Network:
             raise SourceError(where, fault_text, _REMEDY)
         self._input, self._outputs = given["index"], [outputs[width].pop(0) for width in widths]
 
-    def __call__(self, picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-        """Return the flat outputs for a picture (side, side, 3) of values 0..1."""
-        self._interpreter.set_tensor(self._input, picture[None])
+    def __call__(self, image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+        """Return the flat outputs for an image (side, side, 3) of values 0..1."""
+        self._interpreter.set_tensor(self._input, image[None])
         self._interpreter.invoke()
         return [self._interpreter.get_tensor(index).reshape(-1) for index in self._outputs]
 
@@ -147,27 +147,27 @@ class Network:
 
 @dataclass(frozen=True)
 class Hand:
-    """One hand in one picture.
+    """One hand in one image.
 
     Of the points, 0 is the wrist; four of each finger follow, thumb first, tips at 4, 8, 12, 16, 20.
     """
 
     side: str  # left or right, the person's own
     score: float  # probability that there is a hand, 0..1
-    points: Floats  # (21, 2) x and y as fractions of the picture's width and height; may lie outside it
+    points: Floats  # (21, 2) x and y as fractions of the image's width and height; may lie outside it
 
 
 @dataclass(frozen=True)
 class Square:
-    """A rotated square of a picture: centre, side and clockwise angle."""
+    """A rotated square of an image: centre, side and clockwise angle."""
 
     x: float
     y: float
     side: float
     angle: float
 
-    def to_picture(self, size: int) -> Floats:
-        """Return the (2, 3) affine map from a picture of the square, `size` pixels wide, to the picture."""
+    def to_image(self, size: int) -> Floats:
+        """Return the (2, 3) affine map from an image of the square, `size` pixels wide, to the image."""
         scale = self.side / size
         cos, sin = math.cos(self.angle) * scale, math.sin(self.angle) * scale
         half = size / 2
@@ -178,15 +178,15 @@ class Square:
 class Track:
     """A tracked hand."""
 
-    square: Square  # where the next picture is searched for it
-    right: float = 0.0  # sum of P(right) over the pictures it was seen in
+    square: Square  # where the next frame is searched for it
+    right: float = 0.0  # sum of P(right) over the frames it was seen in
     seen: int = 0  # number of them
 
 
 class MediaPipeHands:
-    """A detector of at most one left and one right hand in each picture of a video, in order.
+    """A detector of at most one left and one right hand in each frame of a video, in order.
 
-    `mirrored` pictures are as front cameras show them. Without models it takes those of $HMA_HAND_MODELS.
+    `mirrored` frames are as front cameras show them. Without models it takes those of $HMA_HAND_MODELS.
 
     Raises:
         SourceError: there are no models, or they are other models.
@@ -203,27 +203,27 @@ class MediaPipeHands:
         self._tracks: list[Track] = []
 
     def reset(self) -> None:
-        """Forget the pictures before: the next one is of another video."""
+        """Forget the frames before: the next one is of another video."""
         self._tracks = []
 
-    def detect(self, picture: Images) -> list[Hand]:
-        """Return the hands in a picture (H, W, 3) RGB."""
-        height, width = picture.shape[:2]
+    def detect(self, image: Images) -> list[Hand]:
+        """Return the hands in an image (H, W, 3) RGB."""
+        height, width = image.shape[:2]
         tracks = self._tracks
         if len(tracks) < HANDS:
-            squares = [square_of_palm(palm) for palm in self._palms(picture)[:HANDS]]
+            squares = [square_of_palm(palm) for palm in self._palms(image)[:HANDS]]
             fresh = (s for s in squares if not any(_overlap(s, track.square) > SAME for track in tracks))
             tracks = [*tracks, *map(Track, fresh)]
         found: list[tuple[Track, float, Floats]] = []
         for track in tracks:
-            score, points, p_right = self._look(picture, track.square)
+            score, points, p_right = self._look(image, track.square)
             if score < PRESENCE or any(_same(points, other) for _, _, other in found):
                 continue
             square = square_of_points(points)
             found.append((Track(square, track.right + p_right, track.seen + 1), score, points))
         found = found[:HANDS]
         self._tracks = [track for track, _, _ in found]
-        # A hand's side is the mean over all pictures so far, because single values flicker.
+        # A hand's side is the mean over all frames so far, because single values flicker.
         sides = choose_sides([track.right / track.seen for track in self._tracks])
         return [
             Hand(side, score, points / (width, height))
@@ -231,19 +231,19 @@ class MediaPipeHands:
             if side
         ]
 
-    def _palms(self, picture: Images) -> list[Floats]:
-        """Return the palms in a picture, the surest first: (9, 2) two corners and seven points in pixels."""
-        height, width = picture.shape[:2]
+    def _palms(self, image: Images) -> list[Floats]:
+        """Return the palms in an image, the surest first: (9, 2) two corners and seven points in pixels."""
+        height, width = image.shape[:2]
         whole = Square(width / 2, height / 2, max(width, height), 0.0)
-        values, scores = self._palm(cut(picture, whole, PALM_SIDE))
+        values, scores = self._palm(cut(image, whole, PALM_SIDE))
         found = decode_palms(values.reshape(ANCHORS, 18), scores, self._anchors)
-        matrix = whole.to_picture(PALM_SIDE)
+        matrix = whole.to_image(PALM_SIDE)
         return [palm * PALM_SIDE @ matrix[:, :2].T + matrix[:, 2] for palm in found]
 
-    def _look(self, picture: Images, square: Square) -> tuple[float, Floats, float]:
-        """Return presence, points (21, 2) in pixels of the whole picture, and P(right)."""
-        values, presence, handedness = self._hand(cut(picture, square, HAND_SIDE))
-        matrix = square.to_picture(HAND_SIDE)
+    def _look(self, image: Images, square: Square) -> tuple[float, Floats, float]:
+        """Return presence, points (21, 2) in pixels of the whole image, and P(right)."""
+        values, presence, handedness = self._hand(cut(image, square, HAND_SIDE))
+        matrix = square.to_image(HAND_SIDE)
         points = values.reshape(21, 3)[:, :2].astype(np.float64) @ matrix[:, :2].T + matrix[:, 2]
         plain = float(handedness[0])
         return float(presence[0]), points, 1 - plain if self._mirrored else plain
@@ -259,14 +259,14 @@ def choose_sides(p_right: Sequence[float]) -> list[str | None]:
     return sides
 
 
-def cut(picture: Images, square: Square, size: int) -> NDArray[np.float32]:
-    """Cut a square out of a picture as (size, size, 3) float32 in 0..1; black beyond the edge."""
+def cut(image: Images, square: Square, size: int) -> NDArray[np.float32]:
+    """Cut a square out of an image as (size, size, 3) float32 in 0..1; black beyond the edge."""
     cv2: Any = opencv()
-    matrix = square.to_picture(size)
+    matrix = square.to_image(size)
     # Here pixel i covers i to i+1; OpenCV counts from the centres of pixels.
     matrix[:, 2] += matrix[:, :2] @ (0.5, 0.5) - 0.5
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    shown = cv2.warpAffine(picture, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_CONSTANT)
+    shown = cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_CONSTANT)
     return np.multiply(shown, np.float32(1 / 255), dtype=np.float32)
 
 
@@ -289,7 +289,7 @@ def decode_palms(values: NDArray[Any], scores: NDArray[Any], anchors: Floats) ->
         anchors: (2016, 2).
 
     Returns:
-        for each palm (9, 2): upper left, lower right and seven points, as fractions of the model's picture.
+        for each palm (9, 2): upper left, lower right and seven points, as fractions of the model's image.
     """
     chance = 1 / (1 + np.exp(-np.clip(scores.astype(np.float64), -100, 100)))
     order = np.flatnonzero(chance >= PALM_SCORE)
@@ -331,11 +331,11 @@ def square_of_palm(palm: Floats) -> Square:
 
 
 def square_of_points(points: Floats) -> Square:
-    """Return the square in which the hand of those points (21, 2) is expected in the next picture."""
+    """Return the square in which the hand of those points (21, 2) is expected in the next frame."""
     ahead = ((points[5] + points[13]) / 2 + points[9]) / 2
     angle = _upright(points[0], ahead)
     cos, sin = math.cos(angle), math.sin(angle)
-    turn = np.array([[cos, -sin], [sin, cos]])  # from the hand's own axes to the picture's
+    turn = np.array([[cos, -sin], [sin, cos]])  # from the hand's own axes to the image's
     own = points[_KNUCKLES] @ turn
     low, high = own.min(axis=0), own.max(axis=0)
     width, height = high - low

@@ -112,7 +112,7 @@ class HandTable:
     | side | left or right, the person's own hand |
     | score | optional: rows below source.layout.min_score are ignored |
 
-    and one of these, as fractions of the picture's width and height (x to the right, y down):
+    and one of these, as fractions of the image's width and height (x to the right, y down):
 
     | columns | gives |
     |---|---|
@@ -204,7 +204,7 @@ class EpicHands:
     """Labels of EPIC-KITCHENS-100: `P01_01.MP4` has its labels in `P01_01.pkl`.
 
     A file is a pickled list of byte strings, each a protobuf message of one frame (types.proto of
-    epic-kitchens/epic-kitchens-100-hand-object-bboxes). Boxes are fractions of the picture.
+    epic-kitchens/epic-kitchens-100-hand-object-bboxes). Boxes are fractions of the image.
     """
 
     def __init__(self, files: dict[str, Path], layout: HandsLayout) -> None:

@@ -33,7 +33,7 @@ SIDES = ("left", "right")
 PARTS = {"center": 2, "wrist": 2, "landmarks": 42}
 POINTS = {f"{side}/{part}": width for side in SIDES for part, width in PARTS.items()}
 KEYS = tuple(point + suffix for point in POINTS for suffix in ("", "/next", "/delta"))
-BEYOND = 0.05  # share of the picture's side by which a label may lie outside; it is moved to the edge
+BEYOND = 0.05  # share of the image's side by which a label may lie outside; it is moved to the edge
 LATE = 0.01  # share of a video's frames by which labels may continue after its end
 
 
@@ -83,11 +83,11 @@ def _natural_order(name: str) -> list[tuple[int, int, str]]:
 
 @dataclass(frozen=True)
 class Header:
-    """The facts of a video file's header and first picture, known without reading its packets."""
+    """The facts of a video file's header and first frame, known without reading its packets."""
 
     frames: int  # how many; 0 where the header does not state it
     hz: float  # stated rate; 0 where none is stated
-    width: int  # pixels of the decoded pictures
+    width: int  # pixels of the decoded frames
     height: int
     codec: str  # h264, av1, …
 
@@ -147,7 +147,7 @@ def labels_from_rows(
     """Make labels from one row a hand; of two hands of one side in a frame, the higher score counts.
 
     Landmarks alone, as fractions, give center and wrist too. The center is that of the points' box; points
-    outside the picture are moved to its edge.
+    outside the image are moved to its edge.
 
     Args:
         frames: (R,) index of the frame.
@@ -194,7 +194,7 @@ def cut_into_runs(
 
     Args:
         needed: points that a frame of a run must have.
-        video: number, rate and size of its pictures.
+        video: number, rate and size of its frames.
         where: the video, for errors.
 
     Raises:
@@ -234,7 +234,7 @@ def cut_into_runs(
 
 
 def episode_frames(labels: HandLabels, span: tuple[int, int], layout: HandsLayout) -> int:
-    """Count the pictures of the episode that a run gives."""
+    """Count the frames of the episode that a run gives."""
     start, stop = span
     every = layout.pictures == "every"
     return int(labels.frames[stop - 1] - labels.frames[start]) if every else stop - start - 1
@@ -274,7 +274,7 @@ def _within(labels: HandLabels, frames: int, where: str) -> HandLabels:
 def _as_fractions(
     labels: HandLabels, needed: Sequence[str], size: tuple[int, int], where: str
 ) -> tuple[HandLabels, int]:
-    """Convert labels to fractions of the picture; treat hands outside it as missing, and count them."""
+    """Convert labels to fractions of the image; treat hands outside it as missing, and count them."""
     points, lost = {}, np.zeros(len(labels), bool)
     for point, raw in labels.points.items():
         values = raw / np.tile(size, raw.shape[1] // 2) if labels.pixels else raw
@@ -285,7 +285,7 @@ def _as_fractions(
             lost |= beyond
             if beyond.sum() > seen / 2:
                 x, y = raw[beyond][0, :2]
-                fault = f"{int(beyond.sum()):,} of {seen:,} labels of {point} lie outside the picture of "
+                fault = f"{int(beyond.sum()):,} of {seen:,} labels of {point} lie outside the image of "
                 fault += f"{size[0]}×{size[1]} pixels, the first at {x:.4g}, {y:.4g}"
                 remedy = "check that these are its labels, and source.layout.label_size"
                 raise EpisodeError(where, fault, remedy)

@@ -36,7 +36,7 @@ from hma_data.sources.hands.runs import (
 )
 from hma_data.storage.files import atomic_path, cache_folder
 
-BATCH = 8  # frames decoded together: 200 MB of 4K pictures
+BATCH = 8  # frames decoded together: 200 MB of 4K images
 TABLES = (".csv", ".json", ".npz", ".npy", ".parquet", ".h5", ".hdf5")  # a robot's numbers, perhaps
 NEAR = 2_000  # files among which they are looked for
 ROBOT = "docs/adding-a-robot.md, HDF5 with videos beside it"
@@ -59,8 +59,8 @@ def scan(name: str, video: VideoFile, detector: MediaPipeHands, frames: Iterable
     detector.reset()
     for start in range(0, len(chosen), BATCH):
         batch = chosen[start : start + BATCH]
-        for index, picture in zip(batch.tolist(), video.frames(batch), strict=True):
-            hands += [(index, hand) for hand in detector.detect(picture)]
+        for index, image in zip(batch.tolist(), video.frames(batch), strict=True):
+            hands += [(index, hand) for hand in detector.detect(image)]
     points = np.array([hand.points for _, hand in hands], np.float32).reshape(-1)
     return pa.table(
         {
@@ -160,7 +160,7 @@ def _near(root: Path) -> Iterator[Path]:
 
 
 def _look(name: str, video: Video, header: Header, survey: Survey, pairs: int) -> None:
-    """Hand one video's times and some pictures to the survey; compare its packets with its header."""
+    """Hand one video's times and some frames to the survey; compare its packets with its header."""
     survey.made |= {"frames", "rate"}
     try:
         file = VideoFile(video.path)

@@ -1,8 +1,8 @@
-"""Read videos of human hands; the positions of both hands in the picture stand for the action.
+"""Read videos of human hands; the positions of both hands in the image stand for the action.
 
 A uri is a video file or a folder of videos. An episode has the camera `video`. Its values are the positions
-of the hands, as fractions of the picture's width and height (0..1, x to the right, y down). They refer to the
-picture as it is decoded, before any flip, rotation or crop of the YAML:
+of the hands, as fractions of the image's width and height (0..1, x to the right, y down). They refer to the
+image as it is decoded, before any flip, rotation or crop of the YAML:
 
     left/center, right/center        centre of the hand's box
     left/wrist, right/wrist
@@ -81,7 +81,7 @@ class HandsSource:
         return list(self._find(as_text(uri)))
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
-        """Return the videos, or their runs where there are annotations; no picture is decoded.
+        """Return the videos, or their runs where there are annotations; no frame is decoded.
 
         Raises:
             SourceError: no videos, no models or labels, no labels that fit, or no run that is long enough.
@@ -105,7 +105,7 @@ class HandsSource:
         raise SourceError(uri, fault, _MORE_RUNS)
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
-        """Return one run of a video; its pictures are decoded on demand.
+        """Return one run of a video; its frames are decoded on demand.
 
         Raises:
             EpisodeError: the video or its labels are damaged, or no run is long enough.
@@ -162,7 +162,7 @@ class HandsSource:
         return self._detector[2:]
 
 
-class _Pictures:
+class _RunFrames:
     """The Stream of a run: the frames of a video with the indices (T,)."""
 
     def __init__(self, file: VideoFile, indices: NDArray[np.int64]) -> None:
@@ -236,7 +236,7 @@ def _episode(
     span = start, stop = runs.spans[chosen]
     marks = labels.frames[start:stop]
     every = layout.pictures == "every"
-    stream = _Pictures(file, np.arange(marks[0], marks[-1]) if every else marks[:-1])
+    stream = _RunFrames(file, np.arange(marks[0], marks[-1]) if every else marks[:-1])
     steps = np.diff(file.timestamps[marks[:-1]])
     regular = not len(steps) or (np.abs(steps - np.median(steps)) <= REGULAR * np.median(steps)).all()
     steady = bool(regular) and not every and embodiment.sync.rate_hz is None

@@ -32,13 +32,13 @@ SUFFIXES = (".h5", ".hdf5", ".hdf")
 WHOLE_FILE = "/"
 OPEN_FILES = 8
 CHUNK_CACHE = 16 << 20  # bytes a dataset, where its chunks are not larger
-HELD_BYTES = 512 << 20  # of decompressed chunks in memory, over all datasets of pictures
+HELD_BYTES = 512 << 20  # of decompressed chunks in memory, over all datasets of images
 MAX_BYTES = 1 << 30  # of a chunk
 MAX_NUMBERS = 1 << 26  # values read whole; they become float64
-MAX_ROW = 1 << 28  # values of a row: more than any picture has
+MAX_ROW = 1 << 28  # values of a row: more than any image has
 MAX_DEPTH = 4  # of the groups above the episodes
 LOOKED = 8  # most groups looked into to see whether they and their like are episodes
-MIN_ENCODED = 64  # bytes a row: no picture has fewer
+MIN_ENCODED = 64  # bytes a row: no image has fewer
 TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
 MAX_KEYS = 5_000  # datasets and groups of an episode that are listed
 _EPISODE_NAME = re.compile(r"(demo|episode|ep|traj|trajectory|rollout)[_-]?\d+")
@@ -50,7 +50,7 @@ _PART = re.compile(  # of a robot or a scene; one episode holds several
 class OpenFiles:
     """The files open in this process; the least recently used is closed first. None stays open after a fork.
 
-    Datasets of pictures stay open too, so that a chunk that several calls need is decompressed once.
+    Datasets of images stay open too, so that a chunk that several calls need is decompressed once.
     """
 
     def __init__(self) -> None:
@@ -280,7 +280,7 @@ def _guess_pattern(handle: h5py.File) -> str:
 def _numbered(group: h5py.Group, depth: int = 0) -> tuple[str, int] | None:
     """Return the pattern of the groups that are episodes, and the rows of the shortest looked into; or None.
 
-    They differ in a number, and most hold pictures and commands. Numbered cameras and arms are none: they do
+    They differ in a number, and most hold images and actions. Numbered cameras and arms are none: they do
     not hold both, or are named as such, or what is as long lies beside them.
     """
     inner = {name: group[name] for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)}
@@ -344,23 +344,23 @@ def _are_short(inner: dict[str, h5py.Group | h5py.Dataset], apart: set[str], row
 
 
 def _is_coded(dtype: np.dtype[Any]) -> bool:
-    """Check whether a value may be an encoded picture, so is bytes and no text."""
+    """Check whether a value may be an encoded image, so is bytes and no text."""
     string = h5py.check_string_dtype(dtype)
     return dtype.kind in "OSV" and not (string and string.encoding == "utf-8")
 
 
 def _rows_of_episode(group: h5py.Group) -> int:
-    """Return the rows of what may be pictures, with numbers of as many rows, or one more or less; else 0."""
-    pictures, values = [], []
+    """Return the rows of what may be images, with numbers of as many rows, or one more or less; else 0."""
+    images, values = [], []
     for _, item in walk(group):
         shape: tuple[int, ...] = item.shape or ()
         dtype = item.dtype
         padded = len(shape) == 2 and shape[1] > MIN_ENCODED
         if (dtype == np.uint8 and (len(shape) >= 3 or padded)) or (len(shape) == 1 and _is_coded(dtype)):
-            pictures.append(shape[0])
+            images.append(shape[0])
         elif dtype.kind == "f" and len(shape) == 2:
             values.append(shape[0])
-    return max((count for count in pictures for other in values if abs(count - other) <= 1), default=0)
+    return max((count for count in images for other in values if abs(count - other) <= 1), default=0)
 
 
 def _matching(group: h5py.Group, parts: list[str]) -> list[str]:

@@ -31,7 +31,7 @@ from hma_data.sources.hdf5.file import (
     text,
     walk,
 )
-from hma_data.sources.hdf5.pictures import as_bytes, as_rgb, encoded, picture_kind, pixels_of
+from hma_data.sources.hdf5.images import as_bytes, as_rgb, encoded, image_kind, pixels_of
 from hma_data.sources.hdf5.videos import is_video, video_keys, videos_beside
 
 LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
@@ -157,7 +157,7 @@ def _environment(handle: h5py.File) -> dict[str, Any]:
 
 
 def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: int) -> None:
-    """Hand one episode's numbers, times and some pictures to the survey."""
+    """Hand one episode's numbers, times and some frames to the survey."""
     for key, info in first.keys.items():
         item = group.get(key)
         if not (isinstance(item, h5py.Dataset) and item.shape and item.shape[0] and is_plausible(item)):
@@ -166,7 +166,7 @@ def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: in
         try:
             with explained(where):
                 if info.kind == "camera":
-                    _pictures(name, key, item, info, survey, pairs, first.pixels.get(key))
+                    _images(name, key, item, info, survey, pairs, first.pixels.get(key))
                 elif info.kind == "vector" and item.size <= MAX_VALUES:
                     _values(name, key, numbers(group, key, name), info, survey, first)
         except HMAError as fault:
@@ -196,7 +196,7 @@ def _pixels(group: h5py.Group) -> dict[str, str]:
     return {key: stated for key, stated in found.items() if stated == first}
 
 
-def _pictures(
+def _images(
     name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, pairs: int, pixels: str | None
 ) -> None:
     layout = Hdf5Layout.model_validate({"pixels": pixels})
@@ -206,10 +206,10 @@ def _pictures(
             found = as_bytes(found, layout, f"{name} {key}")
             survey.pictures(name, key, as_rgb(found), run, info.codec)
             continue
-        pictures = [
+        images = [
             decode_image(encoded(row), f"{name} {key}, frame {i}") for row, i in zip(found, run, strict=True)
         ]
-        for start, frames in checks.stacked(pictures):
+        for start, frames in checks.stacked(images):
             survey.pictures(name, key, frames, run[start : start + len(frames)], info.codec)
 
 
@@ -285,11 +285,11 @@ def _keys(group: h5py.Group, place: EpisodeGroup, pixels: Container[str]) -> Ite
 def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | None]:
     """Return kind, shape of one sample, and codec."""
     shape = item.shape or ()
-    pictures = picture_kind(item) if shape and shape[0] and is_plausible(item) else None
-    if pictures == "raw":
+    images = image_kind(item) if shape and shape[0] and is_plausible(item) else None
+    if images == "raw":
         shape = as_rgb(rows(item, [0])).shape[1:]
         return "camera", (*shape[:2], 1) if _is_grey(item.shape) else shape, "raw"
-    if pictures == "encoded":
+    if images == "encoded":
         first = rows(item, [0])[0]
         start = bytes(encoded(first)[:8])
         codec = "jpeg" if start[:2] == b"\xff\xd8" else "png" if start[:4] == b"\x89PNG" else None
@@ -308,5 +308,5 @@ def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | N
 
 
 def _is_grey(shape: tuple[int, ...]) -> bool:
-    """Check whether raw pictures (T, H, W), (T, H, W, C) or (T, C, H, W) have one channel."""
+    """Check whether raw images (T, H, W), (T, H, W, C) or (T, C, H, W) have one channel."""
     return len(shape) == 3 or (shape[3] if shape[3] in (1, 3, 4) else shape[1]) == 1

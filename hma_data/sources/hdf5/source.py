@@ -8,13 +8,13 @@ An episode is a group (`data/demo_0`) or a whole file. The file itself shows whi
       layout: {episodes: "data/*", timestamps: obs/time}   # "/" means one file an episode
 
 A uri is a file or a folder of files. Keys are paths inside the episode's group. HDF5 stores no rate: the rate
-is the embodiment's `frequency_hz`, unless `layout.timestamps` names a key of times. Where pictures and
+is the embodiment's `frequency_hz`, unless `layout.timestamps` names a key of times. Where images and
 states have one row more than the actions (ManiSkill), `last_observation: drop` leaves out the row after the
 last action.
 
-Pictures are raw arrays of several shapes and number types, or one JPEG or PNG a row. Colour pictures of 8
-bits are read as they are, with their axes found from the shape. Other arrays are read as pictures only where
-`source.layout` says what their numbers mean: `layout: {axes: TCHW, pixels: 0-1}`. Pictures may also be the
+Images are raw arrays of several shapes and number types, or one JPEG or PNG a row. Colour images of 8
+bits are read as they are, with their axes found from the shape. Other arrays are read as images only where
+`source.layout` says what their numbers mean: `layout: {axes: TCHW, pixels: 0-1}`. Images may also be the
 frames of a video file beside the HDF5 file; see `videos`.
 
 T frames of an episode, n of them asked for, H×W pixels, C channels.
@@ -51,8 +51,8 @@ from hma_data.sources.hdf5.file import (
     text,
     walk,
 )
+from hma_data.sources.hdf5.images import ImageRows, image_kind
 from hma_data.sources.hdf5.inspect import inspect
-from hma_data.sources.hdf5.pictures import PictureRows, picture_kind
 from hma_data.sources.hdf5.videos import SUFFIXES as VIDEO_SUFFIXES
 from hma_data.sources.hdf5.videos import VideoRows, is_video, video_fingerprints, video_path
 from hma_data.storage.paths import StrPath, as_text
@@ -119,7 +119,7 @@ class Hdf5Source:
         return refs
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
-        """Return one episode; its pictures are read on demand.
+        """Return one episode; its frames are read on demand.
 
         Raises:
             EpisodeError: a damaged file, a missing key, a wrong width, an empty episode.
@@ -138,17 +138,17 @@ class Hdf5Source:
             if embodiment.state:
                 observed = _vector(group, embodiment.state, where)
                 check(embodiment.state.components[0].key, len(observed))
-            cameras: dict[str, PictureRows | VideoRows] = {}
+            cameras: dict[str, ImageRows | VideoRows] = {}
             for camera in embodiment.cameras:
                 if is_video(camera.key):
                     cameras[camera.name] = VideoRows(video_path(place.file, camera, layout), times)
                 else:
-                    cameras[camera.name] = self._pictures(place, group, camera.key, layout, times)
+                    cameras[camera.name] = self._images(place, group, camera.key, layout, times)
                 check(camera.key, cameras[camera.name].rows, layout.frames_missing * is_video(camera.key))
-            length = min(len(actions), *(pictures.rows for pictures in cameras.values()))
+            length = min(len(actions), *(images.rows for images in cameras.values()))
             times = times[:length]
-            for pictures in cameras.values():
-                pictures.timestamps = times
+            for images in cameras.values():
+                images.timestamps = times
             streams: dict[str, Stream] = dict(cameras)
             return Episode(
                 id=episode_id,
@@ -161,14 +161,14 @@ class Hdf5Source:
                 metadata=_metadata(group),
             )
 
-    def _pictures(
+    def _images(
         self, place: EpisodeGroup, group: h5py.Group, key: str, layout: Hdf5Layout, times: Floats
-    ) -> PictureRows:
+    ) -> ImageRows:
         try:
-            return PictureRows(self._finder, self._files, place, key, layout, times)
+            return ImageRows(self._finder, self._files, place, key, layout, times)
         except EpisodeError as fault:
-            if "states" in group and not any(picture_kind(item) for _, item in walk(group)):
-                said = "holds a simulator's states and no pictures"
+            if "states" in group and not any(image_kind(item) for _, item in walk(group)):
+                said = "holds a simulator's states and no images"
                 remedy = "render them first, as robomimic's dataset_states_to_obs.py does"
                 raise EpisodeError(place, said, remedy) from fault
             raise

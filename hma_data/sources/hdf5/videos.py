@@ -1,4 +1,4 @@
-"""Read the pictures of an HDF5 file from video files beside it: frame i of a video is row i of the file.
+"""Read the images of an HDF5 file from video files beside it: frame i of a video is row i of the file.
 
 A camera whose key ends as a video file does is such a path, relative to the HDF5 file's folder:
 `videos/front.mp4`. A name in braces is replaced by its value in the JSON file that `layout.metadata` names, a

@@ -18,7 +18,7 @@ from hma_data.errors import EpisodeError
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.sources.lerobot.metadata import Span
 
-TIME_TOLERANCE = 0.25  # of a frame's period, between the time of a row and the time of its picture
+TIME_TOLERANCE = 0.25  # of a frame's period, between the time of a row and the time of its frame
 PAIRING = "source: {layout: {pairing: index}}"
 _held = threading.local()  # key of a camera -> its open video: version 3 has hundreds of episodes in a file
 
@@ -55,10 +55,10 @@ def frames_of_rows(
     indices, off_ms = nearest(file.timestamps[first:last], span.start + times)
     worst = int(np.argmax(off_ms))
     if off_ms[worst] > TIME_TOLERANCE * 1e3 / fps:
-        fault = f"its picture nearest to row {worst} is {off_ms[worst]:.1f} ms away"
+        fault = f"its frame nearest to row {worst} is {off_ms[worst]:.1f} ms away"
         remedy = f"rows and video disagree on time; a frame is {1e3 / fps:.1f} ms"
         if count == rows:
-            remedy += f", and both count {rows}: if row i belongs to picture i, set {PAIRING}"
+            remedy += f", and both count {rows}: if row i belongs to frame i, set {PAIRING}"
         raise EpisodeError(file.path, fault, remedy)
     return indices + first
 

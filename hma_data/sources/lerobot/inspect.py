@@ -1,6 +1,6 @@
 """Inspect a LeRobotDataset without an embodiment: check its metadata against the files that are there.
 
-All of the metadata is checked. Numbers, times and a few pictures are checked for a sample of the episodes
+All of the metadata is checked. Numbers, times and a few frames are checked for a sample of the episodes
 whose files are there. Nothing is fetched from the Hub for this.
 """
 
@@ -14,7 +14,7 @@ from hma_data.sources.common.survey import MAX_VALUES, Survey, sampled
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.sources.lerobot.films import PAIRING, frames_of_rows
 from hma_data.sources.lerobot.metadata import Feature, Metadata, Span, episode_name
-from hma_data.sources.lerobot.rows import Rows, StillPictures, rows_of, times_of
+from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, times_of
 
 LENGTHS = 1_000  # most lengths in the inspection
 LOOKED_FOR = 20_000  # most episodes whose files are looked for, spread over all
@@ -111,7 +111,7 @@ class _Looking:
         return {index for index, path in paths.items() if path in there}
 
     def _rows(self, index: int, pairs: int) -> None:
-        """Hand one episode's numbers, times and parquet pictures to the survey."""
+        """Hand one episode's numbers, times and parquet images to the survey."""
         meta, name = self._meta, episode_name(index)
         try:
             rows = rows_of(meta, index)
@@ -143,13 +143,13 @@ class _Looking:
                 self._survey.note(found)
 
     def _stills(self, name: str, key: str, rows: Rows, pairs: int) -> None:
-        stream = StillPictures(rows, key, np.zeros(len(rows)), self._meta.folder)
+        stream = StillImages(rows, key, np.zeros(len(rows)), self._meta.folder)
         codec = stream.codec()
         for run in checks.runs(checks.choose(len(rows), pairs)):
             self._survey.pictures(name, key, stream.frames(run), run, codec)
 
     def _video(self, key: str, index: int, pairs: int) -> None:
-        """Compare the frames of an episode's video with its rows; hand some pictures to the survey."""
+        """Compare the frames of an episode's video with its rows; hand some frames to the survey."""
         meta, name, span = self._meta, episode_name(index), self._meta.video(index, key)
         self._survey.made.add("frames")
         try:
@@ -184,7 +184,7 @@ class _Looking:
             self.drifts |= as_many
             said = f"{episode_name(index)} {key}: {fault.fault}"
             remedy = (
-                f"both count {len(times):,}: if row i belongs to picture i, set {PAIRING}" if as_many else ""
+                f"both count {len(times):,}: if row i belongs to frame i, set {PAIRING}" if as_many else ""
             )
             self._survey.note(Finding("skew", "warn", said, remedy, key))
 
@@ -218,6 +218,6 @@ def _codec(meta: Metadata, key: str) -> str | None:
         if meta.features[key].dtype == "video":
             return frame_table(meta.folder.path(meta.video(index, key).path)).codec
         rows = rows_of(meta, index)
-        return StillPictures(rows, key, np.zeros(len(rows)), meta.folder).codec()
+        return StillImages(rows, key, np.zeros(len(rows)), meta.folder).codec()
     except HMAError:
         return None

@@ -47,12 +47,12 @@ class Feature(BaseModel):
 
     @property
     def is_depth(self) -> bool:
-        """Check whether the pictures are depth maps."""
+        """Check whether the images are depth maps."""
         return bool(self.video.get("is_depth_map") or self.video.get("video.is_depth_map"))
 
     @property
     def is_camera(self) -> bool:
-        """Check whether the feature holds colour pictures."""
+        """Check whether the feature holds colour images."""
         return self.dtype in ("video", "image") and not self.is_depth
 
     @property

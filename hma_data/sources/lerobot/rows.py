@@ -1,4 +1,4 @@
-"""Read the rows of an episode from the parquet files of a LeRobotDataset, columns of pictures among them.
+"""Read the rows of an episode from the parquet files of a LeRobotDataset, columns of images among them.
 
 T rows of an episode.
 """
@@ -162,8 +162,8 @@ def times_of(rows: Rows, fps: float) -> Floats:
     return times
 
 
-class StillPictures:
-    """A Stream of pictures stored in a parquet column, as bytes or as the path of a file."""
+class StillImages:
+    """A Stream of images stored in a parquet column, as bytes or as the path of a file."""
 
     def __init__(self, rows: Rows, key: str, timestamps: Floats, folder: Folder) -> None:
         rows.check(key)
@@ -173,13 +173,13 @@ class StillPictures:
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
         """See Stream."""
-        pictures = [decode_image(self._bytes(int(index)), self._where(int(index))) for index in indices]
-        if len({picture.shape for picture in pictures}) > 1:
-            raise EpisodeError(self._rows.path, f"{self._key!r} has pictures of several sizes")
-        return np.stack(pictures) if pictures else np.zeros((0, 1, 1, 3), np.uint8)
+        images = [decode_image(self._bytes(int(index)), self._where(int(index))) for index in indices]
+        if len({image.shape for image in images}) > 1:
+            raise EpisodeError(self._rows.path, f"{self._key!r} has images of several sizes")
+        return np.stack(images) if images else np.zeros((0, 1, 1, 3), np.uint8)
 
     def codec(self) -> str | None:
-        """Return png or jpeg, from the first picture; None for anything else."""
+        """Return png or jpeg, from the first image; None for anything else."""
         start = self._bytes(0)[:4]
         return "png" if start == b"\x89PNG" else "jpeg" if start[:2] == b"\xff\xd8" else None
 
@@ -197,11 +197,11 @@ class StillPictures:
         if isinstance(value, str):
             return self._file(value, self._where(index))
         if not isinstance(value, bytes):
-            raise EpisodeError(self._where(index), "holds no picture")
+            raise EpisodeError(self._where(index), "holds no image")
         return value
 
     def _file(self, relative: str, where: str) -> bytes:
         try:
             return self._folder.path(relative).read_bytes()
         except OSError as fault:
-            raise EpisodeError(where, f"its picture {relative!r} cannot be read: {fault.strerror}") from fault
+            raise EpisodeError(where, f"its image {relative!r} cannot be read: {fault.strerror}") from fault

@@ -4,8 +4,8 @@ A uri is a folder, `hf://datasets/NAME/DATASET[@REVISION]`, or `NAME/DATASET` on
 the files of the episodes that are read are fetched. Keys are feature names (`action`,
 `observation.images.cam_high`). The rate is `fps` of info.json, and the embodiment's rate must agree with it.
 
-A row has the picture of its time. Where the film's stamps drift away from the rows' times, the embodiment may
-say `source: {layout: {pairing: index}}`: row i then has picture i, and the times and the rate are the rows'.
+A row has the frame of its time. Where the film's stamps drift away from the rows' times, the embodiment may
+say `source: {layout: {pairing: index}}`: row i then has frame i, and the times and the rate are the rows'.
 
 T frames of an episode.
 """
@@ -26,7 +26,7 @@ from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.lerobot.films import FilmRows, frames_of_rows, open_video
 from hma_data.sources.lerobot.inspect import inspect
 from hma_data.sources.lerobot.metadata import Folder, Metadata, episode_name
-from hma_data.sources.lerobot.rows import Rows, StillPictures, rows_of, times_of
+from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, times_of
 from hma_data.storage.paths import StrPath, as_text
 
 RATE_TOLERANCE = 0.01  # of the rate
@@ -74,7 +74,7 @@ class LeRobotSource:
         ]
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
-        """Return one episode; its pictures are decoded on demand.
+        """Return one episode; its frames are decoded on demand.
 
         Raises:
             EpisodeError: a video is missing or has another number of frames, rows are damaged.
@@ -118,7 +118,7 @@ open = LeRobotSource
 
 
 def pairs_by_index(embodiment: Embodiment) -> bool:
-    """Check whether the embodiment says that row i has picture i."""
+    """Check whether the embodiment says that row i has frame i."""
     return (embodiment.source.layout or {}).get("pairing") == "index"
 
 
@@ -146,7 +146,7 @@ def _check_keys(meta: Metadata, embodiment: Embodiment) -> None:
         if not feature.is_camera:
             kind = "a depth map" if feature.is_depth else feature.dtype
             cameras = ", ".join(name for name, item in meta.features.items() if item.is_camera)
-            raise SourceError(where, f"{camera.key!r} is {kind}, not colour pictures", f"cameras: {cameras}")
+            raise SourceError(where, f"{camera.key!r} is {kind}, not colour images", f"cameras: {cameras}")
 
 
 def _fingerprint(meta: Metadata, index: int, samples: dict[str, str]) -> str:
@@ -200,7 +200,7 @@ def _success(rows: Rows) -> bool | None:
 
 def _stream(meta: Metadata, index: int, camera: Camera, rows: Rows, times: Floats, by_index: bool) -> Stream:
     if meta.features[camera.key].dtype == "image":
-        return StillPictures(rows, camera.key, times, meta.folder)
+        return StillImages(rows, camera.key, times, meta.folder)
     span = meta.video(index, camera.key)
     file = open_video(meta.folder.path(span.path), camera.key)
     return FilmRows(file, times, frames_of_rows(file, span, times, meta.fps, by_index))

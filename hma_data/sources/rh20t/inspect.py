@@ -60,7 +60,7 @@ def inspect(uri: str, episodes: int) -> Inspection:
 
 
 def _look(name: str, scene: Scene, keys: dict[str, KeyInfo], survey: Survey, pairs: int) -> int:
-    """Hand a scene's times, numbers and some pictures to the survey; return the frames of its first film."""
+    """Hand a scene's times, numbers and some frames to the survey; return the frames of its first film."""
     first: np.ndarray | None = None
     for camera in scene.cameras:
         try:

@@ -2,7 +2,7 @@
 
 A camera's key is the name of its folder, `cam_750612070851`. A number's key is a table of the scene and a
 field of it: `tcp_base/tcp`, `gripper/gripper_info`, `joint`. With `/next`, it is the value of the next
-sample, which stands for a command where only what the robot did was recorded. The numbers are those that were
+sample, which stands for an action where only what the robot did was recorded. The numbers are those that were
 taken with the primary camera's frames.
 
 `source.instruction` names the field of task_description.json: task_description_english by default. The file
@@ -58,7 +58,7 @@ class Rh20tSource:
         ]
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
-        """Return one scene; its pictures are decoded on demand.
+        """Return one scene; its frames are decoded on demand.
 
         Raises:
             EpisodeError: a film, table or field is missing or damaged, or a film has more frames than times.

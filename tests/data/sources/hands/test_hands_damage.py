@@ -126,7 +126,7 @@ def test_boxes_outside_the_picture_and_labels_after_the_end_are_refused(folder: 
     source, robot = open_source("hands"), made.hand_video("ego4d_fho")
     wide = made.ego4d({"a": [made.ego4d_action(range(20), "#C C")]}).replace('"x": ', '"x": 9')
     (folder / "fho_main.json").write_text(wide)
-    with pytest.raises(EpisodeError, match=f"outside the picture.*{WIDTH}×{HEIGHT}.*label_size"):
+    with pytest.raises(EpisodeError, match=f"outside the image.*{WIDTH}×{HEIGHT}.*label_size"):
         source.read(str(folder), "a.mp4", robot)
     late = made.ego4d({"a": [made.ego4d_action(range(20, 80), "#C C")]})
     (folder / "fho_main.json").write_text(late)

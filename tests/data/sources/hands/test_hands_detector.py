@@ -120,7 +120,7 @@ def test_overlapping_finds_become_one_weighted_by_their_chances() -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.floats(-3.1, 3.1), st.floats(20, 60), st.floats(-10, 70), st.floats(-10, 50))
 def test_the_map_of_a_square_turns_it_about_its_centre(angle: float, side: float, x: float, y: float) -> None:
-    matrix = Square(x, y, side, angle).to_picture(100)
+    matrix = Square(x, y, side, angle).to_image(100)
     corners = np.array([[0, 0], [100, 0], [100, 100], [0, 100]]) @ matrix[:, :2].T + matrix[:, 2]
     np.testing.assert_allclose(corners.mean(axis=0), [x, y], atol=1e-9)
     edge = corners[1] - corners[0]

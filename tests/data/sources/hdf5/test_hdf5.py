@@ -344,7 +344,7 @@ def test_depth_is_not_a_colour_camera(demos: Path) -> None:
     with h5py.File(demos, "a") as file:
         file["data/demo_0/obs/depth"] = np.zeros((T, H, W, 1), np.float32)
     line = refused(demos, cameras=[{"name": "front", "key": "obs/depth"}])
-    assert "float32, not colour pictures" in line
+    assert "float32, not colour images" in line
 
 
 def test_a_group_is_not_a_dataset(demos: Path) -> None:

@@ -19,7 +19,7 @@ from tests.data.hdf5_files import H, T, W, embodiment, fill, pictures
 
 
 def one(path: Path, key: str = "obs/agentview_image", **written: Any) -> Path:
-    """A file of one demo whose pictures are replaced by what is given."""
+    """A file of one demo whose images are replaced by what is given."""
     with h5py.File(path / "a.h5", "w") as file:
         group = file.create_group("data/demo_0")
         fill(group)
@@ -113,7 +113,7 @@ def test_other_numbers_become_bytes_by_the_range_named(
 
 @pytest.mark.parametrize("dtype", ["f4", "u2", "i8"])
 def test_other_numbers_without_a_range_are_refused_with_what_to_set(tmp_path: Path, dtype: str) -> None:
-    with pytest.raises(EpisodeError, match=r"not colour pictures.*layout\.pixels.*0-1, 0-255, 0-65535"):
+    with pytest.raises(EpisodeError, match=r"not colour images.*layout\.pixels.*0-1, 0-255, 0-65535"):
         shown(one(tmp_path, data=pictures().astype(dtype)))
 
 
@@ -144,7 +144,7 @@ def test_axes_that_could_be_either_are_refused_until_said(tmp_path: Path) -> Non
 
 
 def test_axes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(EpisodeError, match=r"pictures \(12, 16, 3\), source\.layout\.axes says TCHW"):
+    with pytest.raises(EpisodeError, match=r"images \(12, 16, 3\), source\.layout\.axes says TCHW"):
         shown(one(tmp_path, data=pictures()), axes="TCHW")
 
 
@@ -196,7 +196,7 @@ def test_states_without_pictures_say_that_they_must_be_rendered(tmp_path: Path) 
         group = file.create_group("data/demo_0")
         group["states"], group["actions"] = np.zeros((T, 32)), np.zeros((T, 3))
         group.attrs["model_file"] = "<mujoco/>"
-    with pytest.raises(EpisodeError, match=r"simulator's states and no pictures.*dataset_states_to_obs"):
+    with pytest.raises(EpisodeError, match=r"simulator's states and no images.*dataset_states_to_obs"):
         open_source("hdf5").read(str(path), "demo_0", embodiment())
 
 
@@ -286,7 +286,7 @@ def test_a_soft_link_through_another_file_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("dtype", [h5py.ref_dtype, h5py.regionref_dtype, h5py.vlen_dtype(np.float64)])
 def test_references_and_lists_are_no_pictures(tmp_path: Path, dtype: Any) -> None:
     path = one(tmp_path, shape=(T,), dtype=dtype)
-    assert "not colour pictures" in refusal(path)
+    assert "not colour images" in refusal(path)
 
 
 def test_references_are_no_actions(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""HDF5 whose pictures are in video files beside it, as in DROID's raw recordings."""
+"""HDF5 whose images are in video files beside it, as in DROID's raw recordings."""
 
 import json
 from pathlib import Path

@@ -286,7 +286,7 @@ def test_a_key_that_is_no_feature_names_the_nearest(originals: dict[str, Path]) 
     with pytest.raises(SourceError, match=rf"is not a feature.*did you mean {CAMERA}"):
         open_source("lerobot").read(str(originals["v2"]), "episode_000000", arm)
     arm = embodiment(cameras=[{"name": "cam", "key": "action"}])
-    with pytest.raises(SourceError, match=rf"'action' is float32, not colour pictures.*{CAMERA}, {STILL}"):
+    with pytest.raises(SourceError, match=rf"'action' is float32, not colour images.*{CAMERA}, {STILL}"):
         open_source("lerobot").read(str(originals["v2"]), "episode_000000", arm)
 
 

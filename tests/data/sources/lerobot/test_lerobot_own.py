@@ -350,7 +350,7 @@ def test_stamps_that_drift_are_found_and_pairing_by_index_reads_them(apart: Path
     drifting = as_v21(apart, tmp_path / "cloth", row_hz=9.15)
     source = open_source("lerobot")
     cameras = [{"name": "cam", "key": CAM}]
-    with pytest.raises(EpisodeError, match=r"both count 12: if row i belongs to picture i.*pairing: index"):
+    with pytest.raises(EpisodeError, match=r"both count 12: if row i belongs to frame i.*pairing: index"):
         source.read(str(drifting), "episode_000000", arm(cameras=cameras, state=None))
     (told,) = (one for one in examine(str(drifting)) if one.check == "skew")
     assert "pairing: index" in told.remedy and told.severity == "warn"

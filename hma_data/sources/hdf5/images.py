@@ -1,4 +1,4 @@
-"""Tell which HDF5 datasets hold pictures, and convert their rows to RGB.
+"""Tell which HDF5 datasets hold images, and convert their rows to RGB.
 
 T frames of an episode, n of them asked for, H×W pixels, C channels.
 """
@@ -17,13 +17,13 @@ from hma_data.registry.components import Hdf5Layout
 from hma_data.sources.hdf5.file import EpisodeFinder, EpisodeGroup, OpenFiles, dataset, explained, rows
 
 PIXELS = {"0-1": 1.0, "0-255": 255.0, "0-65535": 65535.0}
-LEAST_SIDE = 16  # pixels: a smaller array of other numbers than uint8 is not taken for pictures
+LEAST_SIDE = 16  # pixels: a smaller array of other numbers than uint8 is not taken for images
 _CHANNELS = (1, 3, 4)
 _SLACK = 1e-3  # share of the range by which values may exceed it, as resizing can cause
 
 
-def picture_kind(found: h5py.Dataset, layout: Hdf5Layout | None = None) -> str | None:
-    """Return `raw` or `encoded` by dtype and shape; None where the dataset cannot hold pictures."""
+def image_kind(found: h5py.Dataset, layout: Hdf5Layout | None = None) -> str | None:
+    """Return `raw` or `encoded` by dtype and shape; None where the dataset cannot hold images."""
     shape: tuple[int, ...] = found.shape or ()
     if found.dtype == np.uint8 or (layout and layout.pixels and found.dtype.kind in "fiu"):
         channels_first = layout.axes == "TCHW" if layout and layout.axes else shape[1:2] in ((1,), (3,))
@@ -54,19 +54,19 @@ def pixels_of(found: h5py.Dataset, indices: Sequence[int]) -> str:
     return next((name for name, most in PIXELS.items() if high <= most and not (whole and most == 1)), "")
 
 
-def as_rgb(pictures: NDArray[np.uint8], axes: str | None = None) -> Images:
+def as_rgb(images: NDArray[np.uint8], axes: str | None = None) -> Images:
     """Convert (n, H, W), (n, H, W, 1|3|4) or (n, 1|3|4, H, W) to (n, H, W, 3)."""
-    if pictures.ndim == 3:
-        pictures = pictures[..., None]
-    elif axes == "TCHW" or (axes is None and pictures.shape[3] not in _CHANNELS):
-        pictures = pictures.transpose(0, 2, 3, 1)
-    if pictures.shape[3] == 1:
-        pictures = np.repeat(pictures, 3, axis=3)
-    return np.ascontiguousarray(pictures[..., :3])
+    if images.ndim == 3:
+        images = images[..., None]
+    elif axes == "TCHW" or (axes is None and images.shape[3] not in _CHANNELS):
+        images = images.transpose(0, 2, 3, 1)
+    if images.shape[3] == 1:
+        images = np.repeat(images, 3, axis=3)
+    return np.ascontiguousarray(images[..., :3])
 
 
 def encoded(row: Any) -> NDArray[np.uint8]:
-    """Return the bytes of one encoded picture, a row of bytes; zeros after its end do no harm."""
+    """Return the bytes of one encoded image, a row of bytes; zeros after its end do no harm."""
     if isinstance(row, np.ndarray):
         return row.view(np.uint8).reshape(-1)
     return np.frombuffer(row.tobytes() if isinstance(row, np.void) else row, np.uint8)
@@ -79,21 +79,21 @@ def axes_of(shape: tuple[int, ...], layout: Hdf5Layout, where: str) -> str:
     last, first = shape[3] in _CHANNELS, shape[1] in _CHANNELS
     if layout.axes:
         if not (first if layout.axes == "TCHW" else last):
-            fault = f"holds pictures {shape[1:]}, source.layout.axes says {layout.axes}"
+            fault = f"holds images {shape[1:]}, source.layout.axes says {layout.axes}"
             raise EpisodeError(where, fault, "correct source.layout.axes in the YAML")
         return layout.axes
     if last and first:
-        fault = f"holds pictures {shape[1:]}, whose channels may be first or last"
+        fault = f"holds images {shape[1:]}, whose channels may be first or last"
         raise EpisodeError(where, fault, "set source.layout.axes to TCHW or THWC")
     return "THWC" if last else "TCHW"
 
 
-def as_bytes(pictures: NDArray[Any], layout: Hdf5Layout, where: str) -> NDArray[np.uint8]:
-    """Convert pictures of another number type to uint8, by the range in `layout.pixels`."""
-    if pictures.dtype == np.uint8:
-        return pictures
+def as_bytes(images: NDArray[Any], layout: Hdf5Layout, where: str) -> NDArray[np.uint8]:
+    """Convert images of another number type to uint8, by the range in `layout.pixels`."""
+    if images.dtype == np.uint8:
+        return images
     highest = PIXELS[layout.pixels or "0-255"]
-    values = pictures.astype(np.float32)
+    values = images.astype(np.float32)
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     if not (-_SLACK * highest <= low and high <= highest * (1 + _SLACK)):  # false for NaN too
         fault = f"holds values from {low:g} to {high:g}, source.layout.pixels says {layout.pixels}"
@@ -114,11 +114,11 @@ def remedy_of(found: h5py.Dataset, layout: Hdf5Layout) -> str:
     numbers = found.dtype.kind in "fiu" and found.dtype != np.uint8
     if numbers and len(shape) == 4 and 3 in (shape[1], shape[3]) and not layout.pixels:
         return f"if they are colours, set source.layout.pixels to their range: {', '.join(PIXELS)}"
-    return "expected (T, H, W, 3) uint8, or encoded pictures"
+    return "expected (T, H, W, 3) uint8, or encoded images"
 
 
-class PictureRows:
-    """A camera's Stream: the pictures of one dataset, `rows` in all.
+class ImageRows:
+    """A camera's Stream: the images of one dataset, `rows` in all.
 
     Args:
         finder, files: of the source; the dataset is kept open in `files`.
@@ -127,7 +127,7 @@ class PictureRows:
         times: (T,) seconds of the frames; rows after the last one are not used.
 
     Raises:
-        EpisodeError: the dataset is missing, or holds no colour pictures.
+        EpisodeError: the dataset is missing, or holds no colour images.
     """
 
     def __init__(
@@ -144,9 +144,9 @@ class PictureRows:
         self._key, self._layout, self._where = key, layout, f"{place} {key}"
         found = dataset(finder.group(place), key, str(place))
         self.rows = len(found)
-        self._kind = picture_kind(found, layout)
+        self._kind = image_kind(found, layout)
         if self._kind is None:
-            fault = f"{key!r} holds {found.shape} {found.dtype}, not colour pictures"
+            fault = f"{key!r} holds {found.shape} {found.dtype}, not colour images"
             raise EpisodeError(place, fault, remedy_of(found, layout))
         if self._kind == "raw":
             axes_of(found.shape, layout, self._where)
@@ -162,10 +162,10 @@ class PictureRows:
             )
         if not len(found):
             return np.zeros((0, 1, 1, 3), np.uint8)
-        pictures = [
+        images = [
             decode_image(encoded(row), f"{self._where}[{index}]")
             for row, index in zip(found, indices, strict=True)
         ]
-        if len({picture.shape for picture in pictures}) > 1:
-            raise EpisodeError(self._place, f"{self._key!r} has pictures of several sizes")
-        return np.stack(pictures)
+        if len({image.shape for image in images}) > 1:
+            raise EpisodeError(self._place, f"{self._key!r} has images of several sizes")
+        return np.stack(images)
