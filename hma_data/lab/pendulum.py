@@ -1,7 +1,7 @@
 """Record gymnasium's Pendulum-v1 to RLDS: a rod on an axle, driven by a torque at 20 Hz.
 
-The physics and the picture are the environment's own. The camera is zoomed in on the rod, and an arrow round
-the axle shows the last torque. The torque in a step is applied between its picture and the next. Episodes
+The physics and the frame are the environment's own. The camera is zoomed in on the rod, and an arrow round
+the axle shows the last torque. The torque of a step is applied between its frame and the next. Episodes
 begin at random angles and speeds and last 5 s; the driver changes from one to the next, in the order of
 DRIVERS.
 
@@ -23,7 +23,7 @@ Manoeuvre = Callable[[float, float], float]  # (angle, speed) -> torque
 
 STEPS, PERIOD_S = 100, 0.05
 TORQUE = 2.0  # the environment's limit
-SIZE, ZOOMED, DRAWN = 128, 256, 464  # pixels: the picture, the square that it shows, the whole drawing
+SIZE, ZOOMED, DRAWN = 128, 256, 464  # pixels: the frame, the square that it shows, the whole drawing
 
 
 def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:

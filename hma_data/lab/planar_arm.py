@@ -4,7 +4,7 @@
 
 The arm stands in the middle of a walled square and pushes three loose blocks. Each joint has a motor of
 limited torque, and the elbow has stops; friction with the table slows the blocks. The velocities in a
-frame are applied between its picture and the next. Joint angles and velocities are recorded beside them.
+frame are applied between its frame and the next. Joint angles and velocities are recorded beside them.
 The reward is the distance that the blocks moved, in px. An episode is a success if some block ends 20 px
 or more from its first place. A driver runs random manoeuvres one after another.
 
@@ -35,11 +35,11 @@ STEPS, HZ, TICKS = 96, 30, 8  # frames of an episode, their rate, ticks of the p
 ARENA, BASE = 512.0, np.array([256.0, 256.0])
 UPPER, FORE, RADIUS = 122.0, 102.0, 21.0  # lengths of the links, and half their width
 BLOCK = 46.0  # edge
-SPEED = 2.6  # fastest command
+SPEED = 2.6  # fastest action
 ELBOW_STOP, ELBOW_TURN = 2.5, 2.2  # angles: limit of the elbow, and where drivers turn it back
 MOVED = 20.0  # distance that a block must move for success
 
-SIZE, DRAWN, SHIFT = 128, 256, 4  # of the picture; of the drawing; its coordinates' fractional bits
+SIZE, DRAWN, SHIFT = 128, 256, 4  # of the frame; of the drawing; its coordinates' fractional bits
 TABLE, DARK = (226, 226, 220), (45, 45, 50)  # colours are RGB
 UPPER_COLOR, FORE_COLOR = (40, 90, 200), (240, 145, 30)
 BLOCK_COLORS = ((200, 40, 50), (30, 150, 90), (140, 60, 170))

@@ -32,7 +32,7 @@ EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps; episode
 
 
 class Look(NamedTuple):
-    """The side of a robot's square pictures in px, and the names of their colours."""
+    """The side of a robot's square frames in px, and the names of their colours."""
 
     size: int
     block: str
@@ -43,10 +43,11 @@ class Look(NamedTuple):
 FAST_LOOK = Look(128, "LightSlateGray", "RoyalBlue", "RoyalBlue")
 SLOW_LOOK = Look(96, "Peru", "Crimson", "DodgerBlue")
 FAST_STEPS, SLOW_TICKS = 80, 720
-CAMERA_TICKS, COMMAND_TICKS = 8, 20  # of pusht_slow: from one picture, and one command, to the next
+CAMERA_TICKS, COMMAND_TICKS = 8, 20  # of pusht_slow: from one frame, and one action, to the next
 FAST_PERIOD_S = 0.1
 HELD = 4  # control steps for which a random target is held
-LEAST_S, REST_S = 4.0, 0.6  # shortest episode, and time recorded after success
+SHORTEST_S = 4.0  # of an episode
+REST_S = 0.6  # recorded after success
 
 
 def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
@@ -152,7 +153,7 @@ def _within(target: Floats) -> Floats:
 
 
 class FastPusher:
-    """pusht_fast: an arena whose commands are targets of the pusher, one each 0.1 s."""
+    """pusht_fast: an arena whose actions are targets of the pusher, one each 0.1 s."""
 
     def __init__(
         self, seed: int, episode: int, look: Look = FAST_LOOK, starts: tuple[str, ...] = STARTS
@@ -170,19 +171,19 @@ class FastPusher:
         """Render the arena; (size, size, 3) RGB."""
         return self.arena.picture()
 
-    def advance(self, command: NDArray[np.float32]) -> None:
+    def advance(self, action: NDArray[np.float32]) -> None:
         """Simulate 0.1 s with the target at (x, y)."""
-        self.arena.advance(command.astype(np.float64), round(FAST_PERIOD_S / TICK_S))
+        self.arena.advance(action.astype(np.float64), round(FAST_PERIOD_S / TICK_S))
 
     def driver(self) -> Callable[[], NDArray[np.float32]]:
-        """Return the recorder's driver of the episode, which returns the next command (2,)."""
+        """Return the recorder's driver of the episode, which returns the next action (2,)."""
         arena = self.arena
         targets = Targets(_policy(arena, self.rng, self.start, fly=False), arena.agent)
         return lambda: targets.held if arena.success else targets.next(arena.pose, arena.agent)
 
 
 class Targets:
-    """The commands of pusht_fast under which the pusher goes where a policy wants it.
+    """The actions of pusht_fast under which the pusher goes where a policy wants it.
 
     Args:
         policy: gives the setpoints.
@@ -194,11 +195,11 @@ class Targets:
 
     @property
     def held(self) -> NDArray[np.float32]:
-        """Return the command (2,) that lets the pusher stay at the last setpoint."""
+        """Return the action (2,) that lets the pusher stay at the last setpoint."""
         return _within(self._setpoint).astype(np.float32)
 
     def next(self, pose: Floats, agent: Floats) -> NDArray[np.float32]:
-        """Return the next command (2,), for a pose (3,) of the T and a place (2,) of the pusher."""
+        """Return the next action (2,), for a pose (3,) of the T and a place (2,) of the pusher."""
         ahead, _ = self._policy.act(pose, agent, FAST_PERIOD_S)
         lead = (LAG_S - FAST_PERIOD_S / 2) / FAST_PERIOD_S
         target = _within(ahead + (ahead - self._setpoint) * lead)
@@ -245,7 +246,7 @@ def fast_demo(
         robot.advance(action)
         rows.append((*seen, action, arena.reward))
         if arena.success and not before:
-            stop = min(stop, max(round(LEAST_S / period), len(rows) + round(REST_S / period)))
+            stop = min(stop, max(round(SHORTEST_S / period), len(rows) + round(REST_S / period)))
     images, positions, states, actions, rewards = map(np.stack, zip(*rows, strict=True))
     return Demo(
         actions=actions,
@@ -261,7 +262,7 @@ def fast_demo(
 
 
 class SlowPusher:
-    """pusht_slow: an arena whose commands are the velocity of the pusher's setpoint, and whether it is up."""
+    """pusht_slow: an arena whose actions are the velocity of the pusher's setpoint, and whether it is up."""
 
     def __init__(self, seed: int, episode: int) -> None:
         self.rng = np.random.default_rng((seed, 1, episode))
@@ -279,36 +280,36 @@ class SlowPusher:
         """Render the arena; (size, size, 3) RGB."""
         return self.arena.picture()
 
-    def take(self, command: Floats | NDArray[np.float32]) -> None:
+    def take(self, action: Floats | NDArray[np.float32]) -> None:
         """Set the velocity (vx, vy) in px/s, and raise or lower the pusher."""
-        self.velocity = command[:2].astype(np.float64)
-        self.arena.lift(bool(command[2] > 0.5))
+        self.velocity = action[:2].astype(np.float64)
+        self.arena.lift(bool(action[2] > 0.5))
 
     def run(self, ticks: int) -> None:
-        """Run the physics for `ticks` under the command in force."""
+        """Run the physics for `ticks` under the action in force."""
         self.setpoint = _within(self.setpoint + self.velocity * ticks * TICK_S)
         self.arena.advance(_within(self.setpoint + self.velocity * (LAG_S - ticks * TICK_S / 2)), ticks)
 
-    def advance(self, command: Floats | NDArray[np.float32]) -> None:
-        """Simulate the time from one picture to the next under a command (3,)."""
-        self.take(command)
+    def advance(self, action: Floats | NDArray[np.float32]) -> None:
+        """Simulate the time from one frame to the next under an action (3,)."""
+        self.take(action)
         self.run(CAMERA_TICKS)
 
     def commander(self) -> Callable[[], Floats]:
-        """Return the recorder's driver of the episode; it returns (3,) a command for COMMAND_TICKS."""
+        """Return the recorder's driver of the episode; it returns (3,) an action for COMMAND_TICKS."""
         arena, policy = self.arena, _policy(self.arena, self.rng, self.start, fly=True)
         period = COMMAND_TICKS * TICK_S
 
-        def command() -> Floats:
+        def action() -> Floats:
             ahead, up = policy.act(arena.pose, arena.agent, period)
             if arena.success:
                 return np.zeros(3)
             return np.append((ahead - self.setpoint) / period, up)
 
-        return command
+        return action
 
     def driver(self) -> Callable[[], NDArray[np.float32]]:
-        """Return a driver that returns (3,) the command in force at each picture, as it is recorded."""
+        """Return a driver that returns (3,) the action in force at each frame, as it is recorded."""
         commander, due = self.commander(), self.arena.ticks
         held: Floats = np.zeros(3)
 
@@ -322,7 +323,7 @@ class SlowPusher:
 
 
 def _slow_schedule(rng: np.random.Generator) -> list[tuple[int, str]]:
-    """Return (tick, event) in order; camera and commands jitter by a tick, and stamps give the true time."""
+    """Return (tick, event) in order; camera and actions jitter by a tick, and stamps give the true time."""
     events = [(tick, "joints") for tick in range(0, SLOW_TICKS, 5)]
     events += [(tick + int(rng.integers(-1, 2)), "command") for tick in range(2, SLOW_TICKS, COMMAND_TICKS)]
     events += [(tick + int(rng.integers(-1, 2)), "camera") for tick in range(3, SLOW_TICKS, CAMERA_TICKS)]
@@ -333,7 +334,7 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
     import cv2
 
     robot = SlowPusher(seed, episode)
-    arena, rng, command, stop = robot.arena, robot.rng, robot.commander(), SLOW_TICKS
+    arena, rng, action, stop = robot.arena, robot.rng, robot.commander(), SLOW_TICKS
     messages: list[Message] = []
     for tick, event in _slow_schedule(rng):
         if tick >= stop:
@@ -342,7 +343,7 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
             before = arena.success
             robot.run(ticks)
             if arena.success and not before:
-                stop = min(stop, max(round(LEAST_S / TICK_S), tick + round(REST_S / TICK_S)))
+                stop = min(stop, max(round(SHORTEST_S / TICK_S), tick + round(REST_S / TICK_S)))
         fields: dict[str, Any]
         if event == "camera":
             topic, kind = "/camera/image/compressed", "sensor_msgs/msg/CompressedImage"
@@ -355,7 +356,7 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
             fields["effort"] = np.empty(0)
         else:
             topic, kind = "/command", "geometry_msgs/msg/TwistStamped"
-            given = command()
+            given = action()
             robot.take(given)
             vector = "geometry_msgs/msg/Vector3"
             linear = ros_value(vector, *given.tolist())

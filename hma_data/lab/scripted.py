@@ -1,11 +1,11 @@
-"""Drive a laboratory robot by its recorder's manoeuvres, from its state in the simulator or off pictures.
+"""Drive a laboratory robot by its recorder's manoeuvres, from its state in the simulator or off frames.
 
 The driver of the family and of `planar_arm` needs a pose, and where the blocks lie. `SeenPose` finds both
-from the places of the parts in a picture: it looks for the pose whose parts lie there, and between pictures
-lets the commands move it. What no place shows, such as a hoist or a magnet, only the commands move. The
+from the places of the parts in a frame: it looks for the pose whose parts lie there, and between frames
+lets the actions move it. What no place shows, such as a hoist or a magnet, only the actions move. The
 pose of `pusht_fast` is the place of its pusher, and two points of the T are its blocks: `SeenPush`.
 
-Q values of a pose, A of a command, P own parts, B blocks; places are px of a picture of 128 by 128.
+Q values of a pose, A of an action, P own parts, B blocks; places are px of an image of 128 by 128.
 """
 
 from collections.abc import Callable
@@ -65,7 +65,7 @@ def reacher(robot: str) -> Callable[[State], NDArray[np.float32]]:
 
 
 def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[State], NDArray[np.float32]]:
-    """Return a driver that begins at a pose (Q,): from a state it tells the next command (A,)."""
+    """Return a driver that begins at a pose (Q,): from a state it tells the next action (A,)."""
     if FAMILY.fullmatch(robot):
         drive = Driver(Body.of(robot), pose, rng)
         return lambda state: drive(state.pose, state.blocks, state.holding).astype(np.float32)
@@ -75,34 +75,34 @@ def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[Stat
     arm = SimpleNamespace(joints=pose, blocks=np.zeros((1, 2)))
     next_command = planar_arm.driver(arm, rng)  # type: ignore[arg-type]
 
-    def command(state: State) -> NDArray[np.float32]:
+    def action(state: State) -> NDArray[np.float32]:
         arm.joints, arm.blocks = state.pose, state.blocks / truth.PX
         return next_command()
 
-    return command
+    return action
 
 
 class SeenState(Protocol):
-    """The state of a steerable robot, as pictures and commands tell it."""
+    """The state of a steerable robot, as frames and actions tell it."""
 
     @property
     def state(self) -> State:
         """Return the state as it is now."""
 
-    def move(self, command: NDArray[np.float32]) -> None:
-        """Take a command (A,) that was given, until the next picture."""
+    def move(self, action: NDArray[np.float32]) -> None:
+        """Take an action (A,) that was given, until the next frame."""
 
     def see(self, places: Floats) -> None:
-        """Take the places (P + B, 2) of a new picture."""
+        """Take the places (P + B, 2) of a new frame."""
 
 
 def seen_state(robot: str, own: NDArray[np.int64], places: Floats) -> SeenState:
-    """Return the state of a steerable robot in a first picture.
+    """Return the state of a steerable robot in a first frame.
 
     Args:
         robot: its name.
         own: numbers of the own parts whose places can be trusted.
-        places: (P + B, 2), as a probe reads them off the picture.
+        places: (P + B, 2), as a probe reads them off the frame.
     """
     return SeenPush(places) if robot == PUSHER else SeenPose(robot, own, places)
 
@@ -117,8 +117,8 @@ class SeenPush:
     def state(self) -> State:
         return State(self._agent, self._tee, False)
 
-    def move(self, command: NDArray[np.float32]) -> None:
-        self._agent = self._agent + (command - self._agent) * (1 - np.exp(-pusht.FAST_PERIOD_S / pusht.LAG_S))
+    def move(self, action: NDArray[np.float32]) -> None:
+        self._agent = self._agent + (action - self._agent) * (1 - np.exp(-pusht.FAST_PERIOD_S / pusht.LAG_S))
 
     def see(self, places: Floats) -> None:
         self._agent, self._tee = places[0] / truth.PX, places[1:]
@@ -145,11 +145,11 @@ class SeenPose:
             holding = bool((np.linalg.norm(self._blocks - tip, axis=1) < REACH).any())
         return State(self.pose, self._blocks, holding)
 
-    def move(self, command: NDArray[np.float32]) -> None:
+    def move(self, action: NDArray[np.float32]) -> None:
         if self._body is None:
-            self.pose = self.pose + command / planar_arm.HZ
+            self.pose = self.pose + action / planar_arm.HZ
         else:
-            self.pose = self._body.moved(self.pose, command.astype(np.float64))
+            self.pose = self._body.moved(self.pose, action.astype(np.float64))
 
     def see(self, places: Floats) -> None:
         self.pose = self._search(self.pose, places)

@@ -1,14 +1,14 @@
 """Drive a robot of the laboratory step by step, as its recorder does.
 
     simulator = LabSimulator("mover_04", seed=0)
-    picture = simulator.reset(seed=7)              # the beginning of a scene
-    picture = simulator.step(command)              # one control step
-    picture = simulator.step(simulator.recorded()) # the same under the recorder's own driver
+    frame = simulator.reset(seed=7)              # the beginning of a scene
+    frame = simulator.step(action)               # one control step
+    frame = simulator.step(simulator.recorded()) # the same under the recorder's own driver
 
-The recorders use the same stepping, so that recorded commands give the recorded pictures. One robot differs:
-the recorder of `pusht_slow` lets pictures and commands jitter by 10 ms, which does not happen here.
+The recorders use the same stepping, so that recorded actions give the recorded frames. One robot differs:
+the recorder of `pusht_slow` lets frames and actions jitter by 10 ms, which does not happen here.
 
-A values of a command, S values of a state.
+A values of an action, S values of a state.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from hma_data.errors import UsageError
 from hma_data.lab import FAMILY, family, pendulum, planar_arm, pusht
 from hma_data.registry.embodiment import Embodiment, find
 
-SIZE = 128  # pixels: the side of the pictures
+SIZE = 128  # pixels: the side of the frames
 Driver = Callable[[], NDArray[np.float32]]
 
 
@@ -31,17 +31,17 @@ class Simulation(Protocol):
 
     @property
     def observed(self) -> NDArray[np.float32]:
-        """Return the state (S,) that is recorded with a picture."""
+        """Return the state (S,) that is recorded with a frame."""
 
     def picture(self) -> NDArray[np.uint8]:
         """Draw the scene, as the camera records it."""
 
-    def advance(self, command: NDArray[np.float32], /) -> None:
-        """Simulate one control step under a command (A,)."""
+    def advance(self, action: NDArray[np.float32], /) -> None:
+        """Simulate one control step under an action (A,)."""
 
 
 class LabSimulator:
-    """A robot of the laboratory in one scene, with pictures of the size that conversion gives.
+    """A robot of the laboratory in one scene, with frames of the size that conversion gives.
 
     Attributes:
         embodiment: the robot.
@@ -60,7 +60,7 @@ class LabSimulator:
         self.reset(seed)
 
     def reset(self, seed: int, episode: int = 0) -> NDArray[np.uint8]:
-        """Begin the scene of an episode that `hma_data.lab.record` numbers so; return its first picture."""
+        """Begin the scene of an episode that `hma_data.lab.record` numbers so; return its first frame."""
         robot = self.embodiment.id
         self.seed, self.episode = seed, episode
         self.simulation, self._driver = _BEGINNINGS.get(robot, _family)(robot, seed, episode)
@@ -69,39 +69,39 @@ class LabSimulator:
 
     @property
     def state(self) -> NDArray[np.float32]:
-        """Return the state (S,) that is recorded with the picture."""
+        """Return the state (S,) that is recorded with the frame."""
         return self.simulation.observed
 
     def picture(self) -> NDArray[np.uint8]:
-        """Return the picture of the scene as it is; (SIZE, SIZE, 3) RGB."""
+        """Return the scene as the camera sees it; (SIZE, SIZE, 3) RGB."""
         return prepare(self.simulation.picture()[None], self.embodiment.cameras[0], SIZE)[0]
 
-    def step(self, command: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Simulate one control step under a command (A,), and return the picture after it."""
-        self.advance(command)
+    def step(self, action: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """Simulate one control step under an action (A,), and return the frame after it."""
+        self.advance(action)
         return self.picture()
 
-    def advance(self, command: NDArray[np.float32]) -> None:
-        """Simulate one control step under a command (A,), without a picture."""
-        self._commands.append(np.array(command, np.float32))
+    def advance(self, action: NDArray[np.float32]) -> None:
+        """Simulate one control step under an action (A,), without a frame."""
+        self._commands.append(np.array(action, np.float32))
         self.simulation.advance(self._commands[-1])
 
     def recorded(self) -> NDArray[np.float32]:
-        """Return the command (A,) that the recorder's driver gives here; call it once a step.
+        """Return the action (A,) that the recorder's driver gives here; call it once a step.
 
-        From the beginning of a scene on, these are the commands of the recorded episode.
+        From the beginning of a scene on, these are the actions of the recorded episode.
         """
         return self._driver()
 
     def copy(self) -> "LabSimulator":
         """Return another simulator in the same state, with a driver that begins anew.
 
-        The physics engines cannot copy their contacts, so the copy repeats all commands since the reset.
+        The physics engines cannot copy their contacts, so the copy repeats all actions since the reset.
         """
         other = LabSimulator(self.embodiment.id, self.seed)
         other.reset(self.seed, self.episode)
-        for command in self._commands:
-            other.advance(command)
+        for action in self._commands:
+            other.advance(action)
         return other
 
 

@@ -1,8 +1,8 @@
-"""Simulate the Push-T table: a disc on a spring pushes a T; physics by pymunk, pictures by pygame.
+"""Simulate the Push-T table: a disc on a spring pushes a T; physics by pymunk, frames by pygame.
 
 This is the environment of gym-pusht 0.1.8 (Apache-2.0; after Diffusion Policy, MIT, Columbia Artificial
 Intelligence and Robotics Lab, and pymunk's drawing, MIT, Victor Blomqvist). It is written anew because that
-package asks for a build of OpenCV that overwrites the headless one. States and pictures are the same bits.
+package asks for a build of OpenCV that overwrites the headless one. States and frames are the same bits.
 
 Lengths are pixels of the 512 × 512 table with y downward, angles radians, times seconds.
 """

@@ -1,10 +1,10 @@
-"""Simulate a laboratory robot for as long as needed, with the places of its parts in each picture.
+"""Simulate a laboratory robot for as long as needed, with the places of its parts in each frame.
 
 The simulators and drivers are those of the recorders. Of the pushers' episodes only those are taken that
 wander: the others end when the T lies on its goal.
 
-The state is where things are in the picture, so that it has one unit for every robot: the centre of each
-moving part, in px of a picture of 128 by 128. It tells joint angles, places, headings and an open gripper;
+The state is where things are in the frame, so that it has one unit for every robot: the centre of each
+moving part, in px of an image of 128 by 128. It tells joint angles, places, headings and an open gripper;
 it does not tell a hoist, a lift and a magnet.
 
 T frames a chunk apart, S pixels a side, K = stride * action dim, P parts.
@@ -27,7 +27,7 @@ from hma_data.registry.embodiment import Embodiment, find
 Floats = NDArray[np.float64]
 PUSHERS = ("pusht_fast", "pusht_slow")
 SIMPLE = ("pendulum", "planar_arm", *PUSHERS)
-PX = SIZE / planar_arm.ARENA  # px of a picture of SIZE in one of an arena; gym-pusht's is as large
+PX = SIZE / planar_arm.ARENA  # px of an image of SIZE in one of an arena; gym-pusht's is as large
 ROD = 26.0  # px from the pendulum's axle to the middle of its rod
 STEM = np.array([0.0, 70.0])  # a point on the T's stem, px of the arena
 
@@ -38,8 +38,8 @@ class Episode:
 
     Attributes:
         pictures: (T, S, S, 3) uint8, as the recorder draws them, or only those asked for.
-        chunks: (T, K) float32, the commands from each picture to the next.
-        parts: (T, P, 2) x, y of the parts in px of a picture of 128 by 128.
+        chunks: (T, K) float32, the actions from each frame to the next.
+        parts: (T, P, 2) x, y of the parts in px of an image of 128 by 128.
         states: (T, S) float32, as the recorder stores them.
         driven: how many of the parts, the first ones, are the robot's own; the others lie loose.
     """
@@ -80,7 +80,7 @@ def episode(
         frames: T.
         stride: control steps a frame.
         seed, number: as the recorders take them.
-        drawn: frames of which the picture is drawn; by default all.
+        drawn: numbers of the frames to draw; by default all.
         commands: (T * stride, A) to give it; by default its own driver's.
         wander: of a pusher's episodes, take only those that wander; the others end at the goal.
     """

@@ -30,7 +30,7 @@ class Demo:
     """One episode of T frames for HDF5."""
 
     actions: NDArray[np.float32]  # (T, A)
-    observations: Mapping[str, NDArray[Any]]  # key -> (T, …); uint8 (T, H, W, 3) are pictures
+    observations: Mapping[str, NDArray[Any]]  # key -> (T, …); uint8 (T, H, W, 3) are images
     states: NDArray[np.float64]  # (T, S), the states of the simulator
     rewards: NDArray[np.float64]  # (T,)
     success: bool  # whether the task was done at the end
@@ -43,7 +43,7 @@ def write_hdf5(path: Path, demos: Iterable[Demo], env_args: Mapping[str, Any]) -
         data                    attrs: env_args (JSON), total (frames in all)
           demo_0                attrs: num_samples, and plain facts of the episode
             actions             (T, A) float32
-            obs/<key>           (T, …), pictures (T, H, W, 3) uint8, one compressed chunk a frame
+            obs/<key>           (T, …), images (T, H, W, 3) uint8, one compressed chunk a frame
             states rewards dones
         mask/train mask/valid   names of demos
 

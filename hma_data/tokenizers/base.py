@@ -1,6 +1,6 @@
-"""Define the tokenizer interface: encode pictures to discrete ids or continuous latents, and decode them.
+"""Define the tokenizer interface: encode images to discrete ids or continuous latents, and decode them.
 
-N pictures, h·w grid, c channels. Pictures are uint8 RGB (N, S, S, 3) with S = `spec.image_size`.
+N images, h·w grid, c channels. Images are uint8 RGB (N, S, S, 3) with S = `spec.image_size`.
 A module of this package makes one tokenizer or a family; `get_tokenizer` imports it on use.
 """
 
@@ -30,14 +30,14 @@ class TokenizerSpec:
         name: name that `get_tokenizer` takes.
         version: version of the code, raised when the same weights would give other tokens.
         kind: discrete ids or continuous latents.
-        image_size: side of the square picture in pixels.
+        image_size: side of the square image in pixels.
         grid: (h, w) of the tokens or latents.
         vocab_size: number of ids; None when continuous.
         factored: sizes whose product is the vocabulary, low digit first: id = d0 + factored[0]*d1.
         channels: number c of latent channels; None when discrete.
         latent_scale: factor by which a model multiplies stored latents.
         dtype: dtype of the stored values: uint16, uint32 or float16; uint8 for pixels.
-        resize_filter: filter that resizes pictures to `image_size`; it is part of the spec because it
+        resize_filter: filter that resizes images to `image_size`; it is part of the spec because it
             changes the tokens.
         weights_sha256: SHA-256 of the weights' file, or of the file whose encoder it kept; empty when there
             are no weights.
@@ -85,7 +85,7 @@ class TokenizerSpec:
 
     @property
     def cells(self) -> tuple[int, ...]:
-        """Return the shape of a picture's ids, (h, w), or of its latents, (c, h, w)."""
+        """Return the shape of an image's ids, (h, w), or of its latents, (c, h, w)."""
         return self.grid if self.kind == "discrete" else (self.channels or 0, *self.grid)
 
     @property

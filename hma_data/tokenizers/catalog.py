@@ -26,7 +26,7 @@ class Entry:
     Attributes:
         name: name that `--tokenizer` takes.
         kind: discrete ids or continuous latents.
-        image_size: side of the square picture in pixels.
+        image_size: side of the square image in pixels.
         grid: (h, w) of the tokens or latents.
         description: one line.
         weights: embedded in the package, downloaded from the hub, none needed, or a path that the

@@ -5,7 +5,7 @@ can do, which includes reading and writing files. For that reason there is no de
 user names files that the user trusts (`encoder.jit` and `decoder.jit`, or the folder that holds
 both). Their SHA-256 is recorded in the spec and in every shard.
 
-Both take 256×256 pictures to a 16×16 grid. `di16`: 64,000 ids, finite scalar quantisation with levels
+Both take 256×256 images to a 16×16 grid. `di16`: 64,000 ids, finite scalar quantisation with levels
 (8, 8, 8, 5, 5, 5), the first lowest, so two digits of 512 and 125. `ci16`: latents of 16 channels.
 """
 
@@ -48,7 +48,7 @@ def _output(made: object, shape: tuple[int, ...]) -> Tensor:
 
 
 def _try(tokenizer: NetworkTokenizer, files: list[Path]) -> None:
-    """Encode and decode one grey picture, so that programs of other tokenizers are refused at once."""
+    """Encode and decode one grey image, so that programs of other tokenizers are refused at once."""
     values: NDArray[Any] = np.full((1, IMAGE_SIZE, IMAGE_SIZE, 3), 127, np.uint8)
     for file, half in zip(files, (tokenizer.encode, tokenizer.decode), strict=True):
         try:

@@ -1,19 +1,19 @@
-"""`fsq-16`, `fsq-8` and `vae-8`: encode pictures with weights that are inside the package.
+"""`fsq-16`, `fsq-8` and `vae-8`: encode images with weights that are inside the package.
 
 `fsq-16` and `fsq-8` give discrete ids: a token covers 16×16 pixels and has 18 bits. One network and one file
-of weights serve both: `fsq-16` takes 256×256 pictures (16×16 tokens), `fsq-8` 128×128 pictures (8×8 tokens).
+of weights serve both: `fsq-16` takes 256×256 images (16×16 tokens), `fsq-8` 128×128 images (8×8 tokens).
 The bottleneck has a few channels, each rounded to a fixed number of levels (finite scalar quantisation,
 Mentzer et al. 2023), so there is no learned codebook that could collapse.
 
-`vae-8` gives continuous latents, 4×32×32 for a picture of 256×256 pixels, about standard normal in each
+`vae-8` gives continuous latents, 4×32×32 for an image of 256×256 pixels, about standard normal in each
 channel. The encoder is deterministic: the stored value is the mean of the latent. Training adds a little
-noise to the latents, so that similar latents decode to similar pictures.
+noise to the latents, so that similar latents decode to similar images.
 
-Both networks are convolutional autoencoders. The picture is first cut into 8×8 patches, and all later layers
+Both networks are convolutional autoencoders. The image is first cut into 8×8 patches, and all later layers
 work at 1/8 and 1/16 of its size, which makes them fast on a CPU. A linear code of the patches is added to the
 output of the convolutions. The training recipes are recipes/tokenizer/fsq.yaml and vae.yaml.
 
-B pictures, S side, h·w grid, C latent channels. Pixels inside the networks are in [-1, 1].
+B images, S side, h·w grid, C latent channels. Pixels inside the networks are in [-1, 1].
 """
 
 import math

@@ -1,7 +1,7 @@
 """`svd-vae`, `taesd` and `taef2`: encode with the continuous tokenizers of published diffusion models.
 
 `svd-vae` is the paper's: the autoencoder of Stable Video Diffusion (`AutoencoderKLTemporalDecoder` of
-diffusers). A 256×256 picture gives 4×32×32 latents: the mean of the posterior, stored unscaled as float16. A
+diffusers). A 256×256 image gives 4×32×32 latents: the mean of the posterior, stored unscaled as float16. A
 model multiplies them by `latent_scale` (0.18215). The decoder works on videos; it gets videos of one frame.
 
 `taesd` and `taef2` are tiny networks that are fast on a CPU: `taesd` makes the latents of Stable Diffusion 1
@@ -12,7 +12,7 @@ network consists of 3×3 convolutions, ReLUs and residual blocks in sequence, so
 the weights: a convolution without a bias halves (encoder) or doubles (decoder) the side. Sizes and order
 follow Ollin Boer Bohan's TAESD, whose weights expect pixels in [0, 1].
 
-B pictures, S side, c channels, h side of the grid. Pixels are in [-1, 1].
+B images, S side, c channels, h side of the grid. Pixels are in [-1, 1].
 """
 
 from collections.abc import Mapping
@@ -52,7 +52,7 @@ SVD_FILES = (
     "diffusion_pytorch_model.bin",
 )
 TINY_FILES = ("diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.bin")
-LIMIT = 3.0  # the tiny decoder squeezes latents into (-LIMIT, LIMIT)
+LATENT_LIMIT = 3.0  # the tiny decoder squeezes latents into (-LIMIT, LIMIT)
 POOL_GROUPS = 4
 
 
@@ -156,7 +156,7 @@ class Decoder(Layers):
 
     def forward(self, latents: Tensor) -> Tensor:
         first, *others = self.layers
-        x = functional.relu(first(torch.tanh(latents / LIMIT) * LIMIT))
+        x = functional.relu(first(torch.tanh(latents / LATENT_LIMIT) * LATENT_LIMIT))
         for layer in others:
             x = layer(functional.interpolate(x, scale_factor=2) if _scales(layer) else x)
         return x.mul(2).sub(1)

@@ -1,6 +1,6 @@
 """`magvit2` and `magvit2-plain`: encode with Open-MAGVIT2, the discrete tokenizer of the paper's release.
 
-Both take 256×256 pictures and give 16×16 ids of 18 bits, two digits of 512. They load 1X's
+Both take 256×256 images and give 16×16 ids of 18 bits, two digits of 512. They load 1X's
 `magvit2.ckpt` (the default), TencentARC's checkpoints, and plain safetensors of `encoder.*` and
 `decoder.*`. Widths, levels and blocks are derived from the weights. Some checkpoints, 1X's among them,
 hold averaged weights (`model_ema.*`) beside the plain ones: `magvit2` uses the averaged weights. The
@@ -12,7 +12,7 @@ quantisation, Yu et al. 2024). Parameter names are those of the released checkpo
 checkpoints (1X's among them) have a plain decoder. In later ones (`adaptive`), each stage of the decoder
 has a group norm whose scale and shift come from the code.
 
-B pictures, S side, z channels of the code, h = S / 2^(levels-1). Pixels are in [-1, 1].
+B images, S side, z channels of the code, h = S / 2^(levels-1). Pixels are in [-1, 1].
 """
 
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ VERSION = 1
 IMAGE_SIZE = 256
 WHAT = "an Open-MAGVIT2 tokenizer"
 FILES = ("model.safetensors", "magvit2.safetensors", "magvit2.ckpt")
-FIRST = "encoder.conv_in.weight"
+FIRST_WEIGHT = "encoder.conv_in.weight"
 AVERAGED = "model_ema."
 # Projections around a learned codebook; a network that has them is a VQGAN or IBQ, not Open-MAGVIT2.
 FOREIGN = ("quant_conv.", "post_quant_conv.", "quantize.embedding")
@@ -53,7 +53,7 @@ class Magvit2Config:
     """The network's shape.
 
     Attributes:
-        base: channels at the picture's own size.
+        base: channels at the image's own size.
         z: channels of the code, which is the number of bits of a token.
         mult: channels of each level as multiples of `base`; each level except the last halves the side.
         res_blocks: residual blocks a level.
@@ -115,7 +115,7 @@ class DownLevel(nn.Module):
 class Upsample(nn.Module):
     """An upsampling by 2: a 3×3 convolution makes four times the channels, which become 2×2 pixels.
 
-    Of the output channels of the convolution, the picture channel varies fastest.
+    Of the output channels of the convolution, the image channel varies fastest.
     """
 
     def __init__(self, width: int) -> None:
@@ -141,7 +141,7 @@ class UpLevel(nn.Module):
 
 
 class AdaptiveNorm(nn.Module):
-    """A group norm whose scale comes from the code's spread over the picture, and its shift from the mean."""
+    """A group norm whose scale comes from the code's spread over the image, and its shift from the mean."""
 
     def __init__(self, z: int, width: int) -> None:
         super().__init__()
@@ -231,7 +231,9 @@ def choose_weights(tensors: Mapping[str, Tensor], where: object, *, averaged: bo
     `averaged`, the averaged weights are taken if there are any. Raise TokenizerError if the checkpoint holds
     another network, or averages only a part of it.
     """
-    prefix = min((name.removesuffix(FIRST) for name in tensors if name.endswith(FIRST)), key=len, default="")
+    # Copies of the weights have longer prefixes; the shortest is that of the network itself.
+    prefixes = [name.removesuffix(FIRST_WEIGHT) for name in tensors if name.endswith(FIRST_WEIGHT)]
+    prefix = min(prefixes, key=len, default="")
     named = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
     if foreign := [name for name in named if name.startswith(FOREIGN)]:
         raise TokenizerError(where, f"does not hold the weights of {WHAT}: has {foreign[0]}", OTHER)
@@ -244,7 +246,7 @@ def choose_weights(tensors: Mapping[str, Tensor], where: object, *, averaged: bo
 
 def derive_config(tensors: Mapping[str, Tensor]) -> Magvit2Config:
     """Return the network's shape, derived from the shapes of its weights."""
-    base = tensors[FIRST].shape[0]
+    base = tensors[FIRST_WEIGHT].shape[0]
     levels = len(numbers(tensors, "encoder.down."))
     widths = [tensors[f"encoder.down.{i}.block.0.conv1.weight"].shape[0] for i in range(levels)]
     return Magvit2Config(

@@ -7,7 +7,7 @@ frames are encoded at a time. The same frame then gives the same tokens whatever
 the number of cores. Networks run in float32 on a CPU, and in bfloat16 and channels-last on CUDA, except a
 network that asks for float32.
 
-B pictures of a batch, S side, c channels, h·w grid. Pixels inside are (B, 3, S, S) in [-1, 1].
+B images of a batch, S side, c channels, h·w grid. Pixels inside are (B, 3, S, S) in [-1, 1].
 """
 
 from collections.abc import Callable, Iterable, Iterator

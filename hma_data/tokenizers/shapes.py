@@ -33,7 +33,7 @@ class FsqConfig(BaseModel):
 
     Attributes:
         levels: number of levels of each digit's channels; `[[8, 8, 8], [8, 8, 8]]` is two digits of 512.
-        width: channels at 1/8 and, if there are two, at 1/16 of the picture's side; tokens lie at the last.
+        width: channels at 1/8 and, if there are two, at 1/16 of the image's side; tokens lie at the last.
         hidden: channels inside the residual blocks at 1/8 and 1/16.
         encoder_blocks: residual blocks at each width.
         decoder_blocks: residual blocks at each width in reverse order, then at 1/4.
@@ -81,7 +81,7 @@ class VaeConfig(BaseModel):
 
     Attributes:
         channels: number C of latent channels.
-        width: channels at 1/8 of the picture's side.
+        width: channels at 1/8 of the image's side.
         hidden: channels inside the residual blocks at 1/8.
         encoder_blocks: residual blocks of the encoder.
         decoder_blocks: residual blocks of the decoder at 1/8 and at 1/4.

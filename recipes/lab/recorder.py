@@ -1,4 +1,4 @@
-"""Record a third-party simulator: scripted, noised, random episodes, and copies under perturbed commands.
+"""Record a third-party simulator: scripted, noised, random episodes, and copies under perturbed actions.
 
 A recipe (recipes/lab/*.py) describes its simulator as a `Simulator` and calls `main`. Each episode is kept in
 a file of its own until all are there, so that a recording that was stopped continues at the next episode;
@@ -7,13 +7,13 @@ task in words, what the simulator calls a success, and how the episode was made:
 copy.
 
 Of ten episodes, six are driven by the simulator's scripted expert, two by the expert with smooth noise on its
-commands, and two by smooth random commands. Copy k of an episode begins in the same state; its commands are
+actions, and two by smooth random actions. Copy k of an episode begins in the same state; its actions are
 the recorded ones with k times the noise, whatever happens to the robot. Copies are a recording of their own,
-so that a model can be asked about commands that none of its training episodes had.
+so that a model can be asked about actions that none of its training episodes had.
 
-An episode depends on its seed and number alone, and so do its pictures, on one machine.
+An episode depends on its seed and number alone, and so do its frames, on one machine.
 
-T frames, H×W pixels, A values of a command, S of the robot's state, O of the objects' places.
+T frames, H×W pixels, A values of an action, S of the robot's state, O of the objects' places.
 """
 
 import argparse
@@ -70,9 +70,9 @@ class Simulator(Protocol):
 
     Attributes:
         robot: id of the embodiment.
-        low, high: (A,) limits of a command.
-        noise: (A,) standard deviations of the smooth noise on the expert's commands.
-        centre, spread: (A,) mean and standard deviations of smooth random commands.
+        low, high: (A,) limits of an action.
+        noise: (A,) standard deviations of the smooth noise on the expert's actions.
+        centre, spread: (A,) mean and standard deviations of smooth random actions.
         least, steps: fewest and most frames of an episode.
         rest: frames recorded after the first success.
     """
@@ -91,13 +91,13 @@ class Simulator(Protocol):
         """Begin the scene of a seed, the same for the same seed, and return its task in words."""
 
     def observe(self) -> tuple[NDArray[np.uint8], Floats, Floats]:
-        """Return the picture (H, W, 3) RGB, the robot's state (S,) and the objects' places (O,)."""
+        """Return the frame (H, W, 3) RGB, the robot's state (S,) and the objects' places (O,)."""
 
     def expert(self) -> Floats:
-        """Return the scripted expert's next command (A,)."""
+        """Return the scripted expert's next action (A,)."""
 
-    def step(self, command: NDArray[np.float32], /) -> bool:
-        """Simulate one control step under a command (A,); return whether the simulator calls it a success."""
+    def step(self, action: NDArray[np.float32], /) -> bool:
+        """Simulate one control step under an action (A,); return whether the simulator calls it a success."""
 
 
 @dataclass(frozen=True)
@@ -110,10 +110,10 @@ class Recorded:
     style: str  # scripted, noised or random; of a copy, that of the original
     task: str  # in words
     pictures: NDArray[np.uint8]  # (T, H, W, 3) RGB
-    states: NDArray[np.float64]  # (T, S), seen with the picture
-    objects: NDArray[np.float64]  # (T, O), seen with the picture
-    commands: NDArray[np.float32]  # (T, A), in force from the picture to the next
-    done: NDArray[np.bool_]  # (T,), whether the simulator calls it a success after the command
+    states: NDArray[np.float64]  # (T, S), seen with the frame
+    objects: NDArray[np.float64]  # (T, O), seen with the frame
+    commands: NDArray[np.float32]  # (T, A), in force from the frame to the next
+    done: NDArray[np.bool_]  # (T,), whether the simulator calls it a success after the action
 
     @classmethod
     def load(cls, path: Path) -> "Recorded":
@@ -138,23 +138,23 @@ def record_episode(simulator: Simulator, seed: int, number: int) -> Recorded:
     style = STYLES[number % len(STYLES)]
     wander = _smooth(simulator, (seed, number, 0))
 
-    def command(step: int) -> Floats:
+    def policy(step: int) -> Floats:
         if style == "random":
             return simulator.centre + simulator.spread * next(wander)
         return simulator.expert() + (simulator.noise * next(wander) if style == "noised" else 0.0)
 
-    return _run(simulator, seed, number, style, command, simulator.least, simulator.steps)
+    return _run(simulator, seed, number, style, policy, simulator.least, simulator.steps)
 
 
 def record_copy(simulator: Simulator, seed: int, original: Recorded, copy: int) -> Recorded:
-    """Record a copy of an episode: the same beginning, its commands with `copy` times the smooth noise."""
+    """Record a copy of an episode: the same beginning, its actions with `copy` times the smooth noise."""
     wander, given = _smooth(simulator, (seed, original.number, copy)), original.commands
 
-    def command(step: int) -> Floats:
+    def policy(step: int) -> Floats:
         return given[step] + copy * simulator.noise * next(wander)
 
     number, style, frames = original.number, original.style, len(original.commands)
-    episode = _run(simulator, seed, number, style, command, frames, frames)
+    episode = _run(simulator, seed, number, style, policy, frames, frames)
     return replace(episode, copy=copy)
 
 
@@ -163,7 +163,7 @@ def _run(
     seed: int,
     number: int,
     style: str,
-    command: Callable[[int], Floats],
+    policy: Callable[[int], Floats],
     least: int,
     stop: int,
 ) -> Recorded:
@@ -172,7 +172,7 @@ def _run(
     done: list[bool] = []
     while len(rows) < stop:
         seen = simulator.observe()
-        action = np.clip(command(len(rows)), simulator.low, simulator.high).astype(np.float32)
+        action = np.clip(policy(len(rows)), simulator.low, simulator.high).astype(np.float32)
         rows.append((*seen, action))
         done.append(simulator.step(action))
         if done[-1] and not any(done[:-1]):
@@ -202,7 +202,7 @@ def record_simulator(
         simulator: what to record.
         out: folder to put the recordings in; made if it does not exist.
         episodes: number of episodes, at least one.
-        seed: the same seed gives the same commands and pictures.
+        seed: the same seed gives the same actions and frames.
         perturb: number of perturbed copies of each episode.
 
     Returns:
@@ -296,7 +296,7 @@ def as_hdf5(path: Path, embodiment: Embodiment, episodes: Iterable[Recorded]) ->
 
 
 def as_rlds(path: Path, embodiment: Embodiment, episodes: Iterable[Recorded]) -> None:
-    """Write a TFDS folder with PNG pictures; success and facts are `episode_metadata`."""
+    """Write a TFDS folder with PNG frames; success and facts are `episode_metadata`."""
     camera = embodiment.cameras[0]
     assert camera.size and embodiment.state
     action, state = embodiment.action.components[0].key, embodiment.state.components[0].key
@@ -337,7 +337,7 @@ def as_bags(path: Path, embodiment: Embodiment, episodes: Iterable[Recorded]) ->
     """Write a folder of MCAP files, one an episode, for an arm that is moved by steps of its hand.
 
     The camera's topic is the embodiment's. /servo/command has the steps x, y, z, /gripper/command the last
-    value, /joint_states the state and /objects the places. A command is stamped 2 to 8 ms after its picture,
+    value, /joint_states the state and /objects the places. An action is stamped 2 to 8 ms after its frame,
     when a controller would have computed it.
     """
     path.mkdir()
@@ -362,10 +362,10 @@ def as_bags(path: Path, embodiment: Embodiment, episodes: Iterable[Recorded]) ->
 def _messages(
     embodiment: Embodiment, episode: Recorded, row: int, stamp: int, rng: np.random.Generator
 ) -> Iterator[Message]:
-    """Yield the messages of one row; each is received up to 2 ms after its stamp, pictures 12 to 20 ms."""
-    command, computed = episode.commands[row].tolist(), stamp + int(rng.integers(2_000_000, 8_000_000))
+    """Yield the messages of one row; each is received up to 2 ms after its stamp, frames 12 to 20 ms."""
+    action, computed = episode.commands[row].tolist(), stamp + int(rng.integers(2_000_000, 8_000_000))
     vector = "geometry_msgs/msg/Vector3"
-    linear, turn = ros_value(vector, *command[:3]), ros_value(vector, 0.0, 0.0, 0.0)
+    linear, turn = ros_value(vector, *action[:3]), ros_value(vector, 0.0, 0.0, 0.0)
     picture = {"format": "png", "data": np.frombuffer(_png(episode.pictures[row]), np.uint8)}
     image, twist = "sensor_msgs/msg/CompressedImage", "geometry_msgs/msg/TwistStamped"
     moved = {"twist": ros_value("geometry_msgs/msg/Twist", linear=linear, angular=turn)}
@@ -385,7 +385,7 @@ def _messages(
     yield joints("/objects", stamp, places, episode.objects[row])
     received = computed + int(rng.integers(500_000, 2_000_000))
     yield Message("/servo/command", computed, received, twist, "base", moved)
-    yield joints("/gripper/command", computed, ["gripper"], command[3:])
+    yield joints("/gripper/command", computed, ["gripper"], action[3:])
 
 
 def _png(picture: NDArray[np.uint8]) -> bytes:
@@ -403,7 +403,7 @@ WRITERS = {
 }
 
 
-# -- the command of a recipe
+# -- the command line of a recipe
 
 
 def main(start: Callable[[], Simulator], description: str | None) -> None:

@@ -1,12 +1,12 @@
-"""Record a family of made-up robots that differ in axes, rate, meaning of the command and look.
+"""Record a family of made-up robots that differ in axes, rate, meaning of the action and look.
 
 A name, such as `arm3_04`, decides everything about a robot: `hma_data.lab.family.bodies` draws it. All are
 recorded to HDF5, but the last of HELD_OUT to MCAP. The robots are seen from above and push one to three loose
-blocks (`hma_data.lab.family.world`). The command in a frame is applied between its picture and the next; the
+blocks (`hma_data.lab.family.world`). The action of a frame is applied between that frame and the next; the
 motion obeys the limits.
 
 The reward is the distance that the blocks moved, in px. An episode is a success if some block ends MOVED px
-or more from its first place. T frames, A commands, Q axes, B blocks.
+or more from its first place. T frames, A actions, Q axes, B blocks.
 """
 
 import itertools
@@ -126,13 +126,13 @@ def _component(body: Body, number: int, bags: bool) -> dict[str, Any]:
 
 
 def _write_bag(path: Path, body: Body, seed: int, number: int) -> None:
-    """Write pictures, poses and commands at the control rate; receipt is 0.5 to 20 ms later."""
+    """Write frames, poses and actions at the control rate; receipt is 0.5 to 20 ms later."""
     import cv2
 
     demo = episode(body, seed, number)
     rng = np.random.default_rng((seed, 7, number))
     messages: list[Message] = []
-    for row, command in enumerate(demo.actions):
+    for row, action in enumerate(demo.actions):
         stamp = EPOCH_NS + number * 60_000_000_000 + round(row * 1e9 / body.hz)
         _, png = cv2.imencode(".png", demo.observations["image"][row][..., ::-1])
         image = {"format": "png", "data": png.reshape(-1)}
@@ -140,7 +140,7 @@ def _write_bag(path: Path, body: Body, seed: int, number: int) -> None:
         joints = {"name": [a.name for a in body.axes], "position": pose, "velocity": empty, "effort": empty}
         linear, turn = (
             ros_value("geometry_msgs/msg/Vector3", *part.tolist())
-            for part in (np.pad(command.astype(np.float64), (0, 3 - len(command))), np.zeros(3))
+            for part in (np.pad(action.astype(np.float64), (0, 3 - len(action))), np.zeros(3))
         )
         twist = {"twist": ros_value("geometry_msgs/msg/Twist", linear=linear, angular=turn)}
         for topic, kind, frame, fields in (
@@ -175,9 +175,9 @@ def episode(
     for _ in range(round(seconds * body.hz)):
         seen = world.picture(), world.pose.copy(), world.state
         before = world.blocks.copy()
-        command = drive()
-        world.advance(command)
-        rows.append((*seen, command, _distances(before, world.blocks).sum()))
+        action = drive()
+        world.advance(action)
+        rows.append((*seen, action, _distances(before, world.blocks).sum()))
     images, poses, states, commands, rewards = map(np.stack, zip(*rows, strict=True))
     return Demo(
         actions=commands,
@@ -192,7 +192,7 @@ def episode(
 def driver(
     world: World, rng: np.random.Generator, reach: Reacher | None = None
 ) -> Callable[[], NDArray[np.float32]]:
-    """Return the recorder's driver, which returns the next command (A,)."""
+    """Return the recorder's driver, which returns the next action (A,)."""
     drive = reach or Driver(world.body, world.pose, rng)
     return lambda: drive(world.pose, world.blocks, world.held >= 0).astype(np.float32)
 

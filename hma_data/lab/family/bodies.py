@@ -1,10 +1,10 @@
-"""The bodies of the family: what a name stands for, and how commands move it.
+"""The bodies of the family: what a name stands for, and how actions move it.
 
 Everything about a body is drawn from its name, `<kind>_<number>`: mechanism, size, speeds, rate, blocks,
 colours, background.
 
-Lengths are px of the 128 × 128 picture with y downward, angles radians clockwise from +x, times seconds.
-Q axes of a pose, A commands, B blocks.
+Lengths are px of the 128 × 128 frame with y downward, angles radians clockwise from +x, times seconds.
+Q axes of a pose, A actions, B blocks.
 """
 
 import zlib
@@ -51,7 +51,7 @@ class Body:
 
     @property
     def commands(self) -> tuple[Axis, ...]:
-        """Return the A axes of the command."""
+        """Return the A axes of the action."""
         return self.mechanism.commands
 
     @cached_property
@@ -61,7 +61,7 @@ class Body:
 
     @cached_property
     def ranges(self) -> Floats:
-        """Return the (2, A) lowest and highest commands."""
+        """Return the (2, A) lowest and highest actions."""
         return np.array([a.range for a in self.commands]).T
 
     @property
@@ -78,18 +78,18 @@ class Body:
         """Return whether the gripper is closed, or the magnet on."""
         return bool(self.grip) and bool((pose[-1] < GRIP) == (self.grip == "gripper"))
 
-    def moved(self, pose: Floats, command: Floats) -> Floats:
+    def moved(self, pose: Floats, action: Floats) -> Floats:
         """Return the pose (Q,) one control step later."""
-        step, command = 1 / self.hz, np.clip(command, *self.ranges)
+        step, action = 1 / self.hz, np.clip(action, *self.ranges)
         if self.car:
-            heading = pose[2] + command[1] * step
-            ahead = np.array([np.cos(heading), np.sin(heading)]) * command[0] * step
+            heading = pose[2] + action[1] * step
+            ahead = np.array([np.cos(heading), np.sin(heading)]) * action[0] * step
             pose = np.array([*(pose[:2] + ahead), heading])
         else:
             speed = np.array([a.speed for a in self.axes])
             follows = np.array([a.target for a in self.axes])
             lag = np.array([a.lag or 1.0 for a in self.axes])
-            velocity = np.where(follows, (command - pose) / lag, command)
+            velocity = np.where(follows, (action - pose) / lag, action)
             pose = pose + np.clip(velocity, -speed, speed) * step
         turning = np.array([a.turns for a in self.axes])
         return np.where(turning, wrapped(pose), np.clip(pose, *self.limits))

@@ -35,7 +35,7 @@ class Driver:
         self._manoeuvre: Manoeuvre = lambda pose: np.zeros(len(body.commands))
 
     def __call__(self, pose: Floats, blocks: Floats, holding: bool) -> Floats:
-        """Return the next command (A,) at a pose (Q,) among blocks (B, 2)."""
+        """Return the next action (A,) at a pose (Q,) among blocks (B, 2)."""
         lost = self._goal is None and not self._visible(pose)
         if self._left == 0 or lost:
             self._begin(
@@ -54,10 +54,10 @@ class Driver:
         else:
             self._setpoint = self._setpoint + velocity / self._body.hz
         self._setpoint = np.clip(self._setpoint, *self._body.limits[:, : len(low)])
-        command = np.where(self._follows, self._setpoint, velocity)
+        action = np.where(self._follows, self._setpoint, velocity)
         if self._body.grip:
-            command[-1] = self._opening
-        return np.clip(command, low, high)
+            action[-1] = self._opening
+        return np.clip(action, low, high)
 
     def _turn_back(self, pose: Floats, velocity: Floats) -> None:
         """Turn round the axes that leave the inner nine tenths of their limits, if a velocity is held."""
@@ -91,7 +91,7 @@ class Driver:
             self._opening = 1 - closed if self._body.grip == "gripper" else closed
 
     def _visible(self, pose: Floats) -> bool:
-        """Check whether the tip is well inside the picture."""
+        """Check whether the tip is well inside the frame."""
         tip, _ = self._body.mechanism.tip(pose)
         return bool(tip.min() > 4 and tip.max() < SIZE - 4)
 
@@ -163,7 +163,7 @@ class Reacher:
         self._aim: Floats | None = None
 
     def __call__(self, pose: Floats, blocks: Floats, holding: bool) -> Floats:
-        """Return the next command (A,) at a pose (Q,) among blocks (B, 2)."""
+        """Return the next action (A,) at a pose (Q,) among blocks (B, 2)."""
         body, (tip, _) = self._body, self._body.mechanism.tip(pose)
         if self._aim is None:
             self._aim = blocks[np.linalg.norm(blocks - tip, axis=1).argmin()].copy()
@@ -173,10 +173,10 @@ class Reacher:
         velocity = GAIN * self._way(pose, self._aim - tip)
         lag = np.array([axis.lag for axis in body.axes])
         follows = np.array([axis.target for axis in body.axes])
-        command = np.where(follows, pose + velocity * lag, velocity)
+        action = np.where(follows, pose + velocity * lag, velocity)
         if body.grip:
-            command[-1] = float(body.grip == "gripper")  # open, or off
-        return np.clip(command, low, high)
+            action[-1] = float(body.grip == "gripper")  # open, or off
+        return np.clip(action, low, high)
 
     def _way(self, pose: Floats, miss: Floats) -> Floats:
         """Return the change of the pose (Q,) that brings the tip nearer by (2,): damped least squares."""

@@ -1,6 +1,6 @@
-"""Draw the pictures of the family's robots: colours, backgrounds, shapes and blocks.
+"""Draw the frames of the family's robots: colours, backgrounds, shapes and blocks.
 
-Lengths are pixels of the SIZE × SIZE picture with y downward; colours are RGB. Pictures are drawn at twice
+Lengths are pixels of the SIZE × SIZE frame with y downward; colours are RGB. Frames are drawn at twice
 the size and shrunk.
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Color = tuple[int, int, int]
 
-SIZE, SCALE, SHIFT = 128, 2, 4  # of the picture; of the drawing; its coordinates' fractional bits
+SIZE, SCALE, SHIFT = 128, 2, 4  # of the frame; of the drawing; its coordinates' fractional bits
 DARK: Color = (35, 35, 42)
 LIGHT: Color = (240, 240, 235)
 BACKGROUNDS = ("plain", "two-tone", "gradient", "tiles")
@@ -121,7 +121,7 @@ def box(place: Floats, angle: float, length: float, width: float) -> Floats:
 
 
 def shrunk(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a drawing as a picture (SIZE, SIZE, 3)."""
+    """Return a drawing as a frame (SIZE, SIZE, 3)."""
     small: NDArray[np.uint8] = cv2.resize(image, (SIZE, SIZE), interpolation=cv2.INTER_AREA).astype(np.uint8)
     return small
 

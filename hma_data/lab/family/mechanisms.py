@@ -1,10 +1,10 @@
-"""The mechanisms of the family: axes that commands move, and where the parts are at a pose.
+"""The mechanisms of the family: axes that actions move, and where the parts are at a pose.
 
-A mechanism has Q axes; a pose (Q,) holds a number for each. A command (A,) gives each axis a velocity or a
-target; only a car's commands, speed and turn rate, are not axes of its pose (x, y, heading). A maker draws a
+A mechanism has Q axes; a pose (Q,) holds a number for each. An action (A,) gives each axis a velocity or a
+target; only a car's actions, speed and turn rate, are not axes of its pose (x, y, heading). A maker draws a
 mechanism from a generator, for a model frame of so many seconds.
 
-Lengths are px of the 128 × 128 picture with y downward, angles radians clockwise from +x, times seconds.
+Lengths are px of the 128 × 128 frame with y downward, angles radians clockwise from +x, times seconds.
 """
 
 from collections.abc import Callable
@@ -22,25 +22,25 @@ FINGER = 3.6  # half the width of a finger
 
 @dataclass(frozen=True)
 class Axis:
-    """One number of a pose or of a command."""
+    """One number of a pose or of an action."""
 
     name: str
     unit: str  # of its pose: rad, px, or none
     low: float
     high: float
     speed: float  # fastest motion, unit/s
-    target: bool = False  # whether the command is a position, which the axis follows with a lag
+    target: bool = False  # whether the action is a position, which the axis follows with a lag
     lag: float = 0.0
     turns: bool = False  # without end, and the angle is kept within ±π
 
     @property
     def range(self) -> tuple[float, float]:
-        """Return the lowest and the highest command."""
+        """Return the lowest and the highest action."""
         return (self.low, self.high) if self.target else (-self.speed, self.speed)
 
     @property
     def command_unit(self) -> str:
-        """Return the unit of the command."""
+        """Return the unit of the action."""
         return self.unit if self.target or not self.unit else f"{self.unit}/s"
 
 
@@ -53,7 +53,7 @@ class Mechanism(Protocol):
 
     @property
     def commands(self) -> tuple[Axis, ...]:
-        """Return the A axes of the command."""
+        """Return the A axes of the action."""
 
     def fixed(self) -> list[Shape]:
         """Return the parts that never move, drawn below everything else."""

@@ -1,9 +1,9 @@
 """Simulate a robot of the family among its blocks.
 
 A robot pushes its blocks without dynamics: a block is moved along the shortest way out of the part that
-touches it, and stays inside the picture. A closed gripper, or a magnet that is on, carries a block.
+touches it, and stays inside the frame. A closed gripper, or a magnet that is on, carries a block.
 
-Lengths are px. Q axes, A commands, B blocks, P parts that push.
+Lengths are px. Q axes, A actions, B blocks, P parts that push.
 """
 
 import zlib
@@ -37,10 +37,10 @@ class World:
         """Return the pose (Q,), as recorded."""
         return self.pose.astype(np.float32)
 
-    def advance(self, command: Floats | NDArray[np.float32]) -> None:
-        """Simulate one control step under a command (A,)."""
+    def advance(self, action: Floats | NDArray[np.float32]) -> None:
+        """Simulate one control step under an action (A,)."""
         before = self.body.holds(self.pose)
-        self.pose = self.body.moved(self.pose, command.astype(np.float64))
+        self.pose = self.body.moved(self.pose, action.astype(np.float64))
         if self.body.grip:
             self._carry(before)
         self._push()

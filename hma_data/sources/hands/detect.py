@@ -38,7 +38,10 @@ ENVIRONMENT = "HMA_HAND_MODELS"
 PALM_SIDE, HAND_SIDE = 192, 224  # pixels of each model's input
 ANCHORS = 2016
 HANDS = 2  # tracked at most
-PALM_SCORE, SUPPRESSION, PRESENCE, SAME = 0.5, 0.3, 0.5, 0.5
+PALM_SCORE = 0.5  # least probability of a palm
+SUPPRESSION = 0.3  # overlap above which two palms are merged
+PRESENCE = 0.5  # least probability that a tracked square still holds a hand
+SAME_SQUARE = 0.5  # overlap above which a palm is of a hand that is already tracked
 VERSION = 1  # part of the key of cached detections: raise it when the same image may give other points
 _KNUCKLES = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]  # the points that give the next frame's square
 _SURE = 0.8  # probability of a side; a second hand of that side with less becomes the other hand
@@ -211,9 +214,12 @@ class MediaPipeHands:
         height, width = image.shape[:2]
         tracks = self._tracks
         if len(tracks) < HANDS:
-            squares = [square_of_palm(palm) for palm in self._palms(image)[:HANDS]]
-            fresh = (s for s in squares if not any(_overlap(s, track.square) > SAME for track in tracks))
-            tracks = [*tracks, *map(Track, fresh)]
+            # The palm model finds the tracked hands again; only other palms begin a track.
+            known = [track.square for track in tracks]
+            for palm in self._palms(image)[:HANDS]:
+                square = square_of_palm(palm)
+                if all(_overlap(square, other) <= SAME_SQUARE for other in known):
+                    tracks = [*tracks, Track(square)]
         found: list[tuple[Track, float, Floats]] = []
         for track in tracks:
             score, points, p_right = self._look(image, track.square)

@@ -33,8 +33,10 @@ SIDES = ("left", "right")
 PARTS = {"center": 2, "wrist": 2, "landmarks": 42}
 POINTS = {f"{side}/{part}": width for side in SIDES for part, width in PARTS.items()}
 KEYS = tuple(point + suffix for point in POINTS for suffix in ("", "/next", "/delta"))
-BEYOND = 0.05  # share of the image's side by which a label may lie outside; it is moved to the edge
-LATE = 0.01  # share of a video's frames by which labels may continue after its end
+OUTSIDE_TOLERANCE = (
+    0.05  # share of the image's side by which a label may lie outside; it is moved to the edge
+)
+LATE_TOLERANCE = 0.01  # share of a video's frames by which labels may continue after its end
 
 
 def layout_of(embodiment: Embodiment | None) -> HandsLayout:
@@ -263,7 +265,9 @@ def _within(labels: HandLabels, frames: int, where: str) -> HandLabels:
     """Return the labels of frames that the video has; a few labels may lie beyond its end."""
     inside = (labels.frames >= 0) & (labels.frames < frames)
     beyond = labels.frames[~inside]
-    if len(beyond) and (beyond.min() < 0 or beyond.max() > frames * (1 + LATE) + 2 or not inside.any()):
+    # Published labels run a few frames past the end, because annotators counted by the stated rate.
+    last_allowed = frames * (1 + LATE_TOLERANCE) + 2
+    if len(beyond) and (beyond.min() < 0 or beyond.max() > last_allowed or not inside.any()):
         worst = int(beyond.min() if beyond.min() < 0 else beyond.max())
         fault = f"is labelled at frame {worst:,}, and has {frames:,} frames"
         raise EpisodeError(where, fault, "check that these are its labels, and source.layout.first_frame")
@@ -279,7 +283,7 @@ def _as_fractions(
     for point, raw in labels.points.items():
         values = raw / np.tile(size, raw.shape[1] // 2) if labels.pixels else raw
         with np.errstate(invalid="ignore"):
-            beyond = np.any((values < -BEYOND) | (values > 1 + BEYOND), axis=1)
+            beyond = np.any((values < -OUTSIDE_TOLERANCE) | (values > 1 + OUTSIDE_TOLERANCE), axis=1)
         seen = int(np.isfinite(values).all(axis=1).sum())
         if point in needed:
             lost |= beyond

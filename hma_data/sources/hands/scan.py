@@ -36,11 +36,12 @@ from hma_data.sources.hands.runs import (
 )
 from hma_data.storage.files import atomic_path, cache_folder
 
-BATCH = 8  # frames decoded together: 200 MB of 4K images
-TABLES = (".csv", ".json", ".npz", ".npy", ".parquet", ".h5", ".hdf5")  # a robot's numbers, perhaps
-NEAR = 2_000  # files among which they are looked for
-ROBOT = "docs/adding-a-robot.md, HDF5 with videos beside it"
-LOOKED_AT, FRAMES = 5, 12  # most videos that are searched for hands by an inspection, and frames of each
+BATCH_FRAMES = 8  # frames decoded together: 200 MB of 4K images
+TABLE_SUFFIXES = (".csv", ".json", ".npz", ".npy", ".parquet", ".h5", ".hdf5")  # a robot's numbers, perhaps
+MAX_FILES_BESIDE = 2_000  # files among which they are looked for
+ROBOT_VIDEOS_PAGE = "docs/adding-a-robot.md, HDF5 with videos beside it"
+MAX_VIDEOS = 5  # that an inspection searches for hands
+FRAMES_PER_VIDEO = 12
 
 
 def scan(name: str, video: VideoFile, detector: MediaPipeHands, frames: Iterable[int] | None = None) -> Any:
@@ -57,8 +58,8 @@ def scan(name: str, video: VideoFile, detector: MediaPipeHands, frames: Iterable
     chosen = np.fromiter(range(len(video)) if frames is None else frames, np.int64)
     hands: list[tuple[int, Hand]] = []
     detector.reset()
-    for start in range(0, len(chosen), BATCH):
-        batch = chosen[start : start + BATCH]
+    for start in range(0, len(chosen), BATCH_FRAMES):
+        batch = chosen[start : start + BATCH_FRAMES]
         for index, image in zip(batch.tolist(), video.frames(batch), strict=True):
             hands += [(index, hand) for hand in detector.detect(image)]
     points = np.array([hand.points for _, hand in hands], np.float32).reshape(-1)
@@ -107,9 +108,9 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
     for link in unfollowed(local_path(uri)):
         survey.note(link)
     beside = Counter(item.suffix.lower() for item in _near(local_path(uri)))
-    if tables := ", ".join(f"{beside[suffix]:,} {suffix}" for suffix in TABLES if beside[suffix]):
+    if tables := ", ".join(f"{beside[suffix]:,} {suffix}" for suffix in TABLE_SUFFIXES if beside[suffix]):
         said = f"these videos are read as videos of hands; beside them are {tables}"
-        survey.note(Finding("files", "info", said, f"for a robot's videos: {ROBOT}"))
+        survey.note(Finding("files", "info", said, f"for a robot's videos: {ROBOT_VIDEOS_PAGE}"))
     headers: dict[str, Header] = {}
     for name, video in videos.items():
         try:
@@ -127,7 +128,7 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
             for (height, width, hz, codec), count in kinds.most_common(10)
         )
     try:
-        facts |= _hands_in(videos, chosen[:LOOKED_AT], survey)
+        facts |= _hands_in(videos, chosen[:MAX_VIDEOS], survey)
     except HMAError as fault:
         said = f"hands were not looked for: {fault.where} {fault.fault}"
         survey.note(Finding("hands", "warn", said, fault.remedy, "video"))
@@ -156,7 +157,7 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
 
 def _near(root: Path) -> Iterator[Path]:
     """Return some of the files in the folder of the videos."""
-    return islice((root if root.is_dir() else root.parent).rglob("*"), NEAR)
+    return islice((root if root.is_dir() else root.parent).rglob("*"), MAX_FILES_BESIDE)
 
 
 def _look(name: str, video: Video, header: Header, survey: Survey, pairs: int) -> None:
@@ -189,7 +190,7 @@ def _hands_in(videos: dict[str, Video], chosen: list[str], survey: Survey) -> di
     for name in chosen:
         try:
             file = VideoFile(videos[name].path)
-            frames = np.unique(np.linspace(0, len(file) - 1, FRAMES).astype(np.int64))
+            frames = np.unique(np.linspace(0, len(file) - 1, FRAMES_PER_VIDEO).astype(np.int64))
             # The frames are far apart, so each is scanned alone and no hand is tracked between them.
             seen = [scan(name, file, detector, [index])["side"].to_pylist() for index in frames.tolist()]
         except EpisodeError as fault:

@@ -60,7 +60,7 @@ from hma_data.storage.paths import StrPath, as_text
 
 CAMERA = "video"
 RATE_TOLERANCE = 0.01  # of the rate
-REGULAR = 0.1  # share of the median interval by which the others of a regular video may differ
+INTERVAL_TOLERANCE = 0.1  # share of the median interval by which the others of a regular video may differ
 _MORE_RUNS = "lower source.layout.min_frames, or set source.layout.missing: hold"
 
 
@@ -238,14 +238,19 @@ def _episode(
     every = layout.pictures == "every"
     stream = _RunFrames(file, np.arange(marks[0], marks[-1]) if every else marks[:-1])
     steps = np.diff(file.timestamps[marks[:-1]])
-    regular = not len(steps) or (np.abs(steps - np.median(steps)) <= REGULAR * np.median(steps)).all()
-    steady = bool(regular) and not every and embodiment.sync.rate_hz is None
+    usual = np.median(steps) if len(steps) else 0.0
+    regular = bool((np.abs(steps - usual) <= INTERVAL_TOLERANCE * usual).all())
+    steady = regular and not every and embodiment.sync.rate_hz is None
     if steady and not labels.irregular:
         _check_rate(file.path, _measured_hz(file.timestamps[marks[:-1]]), embodiment)
     text = "; ".join(dict.fromkeys(words for frame, words in labels.texts if marks[0] <= frame < marks[-1]))
     state = [_signal(embodiment.state, file, labels, span, not steady)] if embodiment.state else []
     # Frames in no run count in the first run, or in the only one that is read.
-    left = len(labels) - (stop - start - 1) if number is None else counts["dropped"] if number == 0 else 0
+    left = 0
+    if number is None:
+        left = len(labels) - (stop - start - 1)
+    elif number == 0:
+        left = counts["dropped"]
     held, masked = (int(marked[start : stop - 1].sum()) for marked in (runs.held, runs.missing))
     flags = {"held_frames": held, "masked_frames": masked, "dropped_frames": left}
     return Episode(

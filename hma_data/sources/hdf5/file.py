@@ -37,7 +37,7 @@ MAX_BYTES = 1 << 30  # of a chunk
 MAX_NUMBERS = 1 << 26  # values read whole; they become float64
 MAX_ROW = 1 << 28  # values of a row: more than any image has
 MAX_DEPTH = 4  # of the groups above the episodes
-LOOKED = 8  # most groups looked into to see whether they and their like are episodes
+MAX_GROUPS_SAMPLED = 8  # most groups looked into to see whether they and their like are episodes
 MIN_ENCODED = 64  # bytes a row: no image has fewer
 TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
 MAX_KEYS = 5_000  # datasets and groups of an episode that are listed
@@ -84,7 +84,8 @@ class OpenFiles:
             EpisodeError: see `dataset`.
         """
         name = (path, str(group.name), key)
-        if name not in self._held or not self._held[name][1]:  # false once its file is closed
+        # A handle is false once its file is closed.
+        if name not in self._held or not self._held[name][1]:
             self._held.pop(name, None)
             self._held[name] = _with_room(group, key, where)
         self._held.move_to_end(name)
@@ -110,7 +111,7 @@ def _with_room(group: h5py.Group, key: str, where: str) -> tuple[int, h5py.Datas
     if room <= CHUNK_CACHE:
         return room, found
     slots = 100 * (room // (int(np.prod(found.chunks)) * found.dtype.itemsize) + 1) + 1
-    del found  # the cache is made when the first handle is opened
+    del found  # HDF5 makes the cache with the first handle and ignores the settings of later ones
     access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
     access.set_chunk_cache(min(slots, 1_000_003), room, 1.0)
     return room, h5py.Dataset(h5py.h5d.open(group.id, key.strip("/").encode(), access))
@@ -289,16 +290,17 @@ def _numbered(group: h5py.Group, depth: int = 0) -> tuple[str, int] | None:
         return None
     stem, count = Counter(map(_stem, groups)).most_common(1)[0]
     if "#" not in stem or count < 2:
-        holders = {
-            name: found for name in list(groups)[:LOOKED] if (found := _numbered(groups[name], depth + 1))
-        }
+        sampled = list(groups)[:MAX_GROUPS_SAMPLED]
+        holders = {name: found for name in sampled if (found := _numbered(groups[name], depth + 1))}
         return _below(inner, groups, holders)
     family = sorted((name for name in groups if _stem(name) == stem), key=_natural)
     pattern = "*" if count == len(groups) else re.sub(r"\d+", "[0-9]*", family[0])
     matched = {name for name in groups if fnmatchcase(name, pattern)}
     if _is_part(stem, group) or matched != set(family):
         return None
-    looked = dict.fromkeys(family[i * (count - 1) // (LOOKED - 1)] for i in range(LOOKED))
+    # Walking thousands of groups takes minutes on a slow disk, so a spread sample decides.
+    spread = np.unique(np.linspace(0, count - 1, MAX_GROUPS_SAMPLED).astype(int))
+    looked = [family[i] for i in spread]
     if found := _numbered(groups[family[0]], depth + 1):  # day_1/t000
         return (f"{pattern}/{found[0]}", found[1]) if _are_short(inner, matched, found[1]) else None
     rows = [length for name in looked if (length := _rows_of_episode(groups[name]))]
@@ -315,7 +317,7 @@ def _below(
     """Return the pattern by way of the one group that holds episodes, or of all where they do alike."""
     if len({pattern for pattern, _ in holders.values()}) != 1:
         return None
-    if 1 < len(holders) < min(len(groups), LOOKED):
+    if 1 < len(holders) < min(len(groups), MAX_GROUPS_SAMPLED):
         return None
     name, (pattern, _) = next(iter(holders.items()))
     least = min(rows for _, rows in holders.values())

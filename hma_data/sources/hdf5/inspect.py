@@ -34,7 +34,7 @@ from hma_data.sources.hdf5.file import (
 from hma_data.sources.hdf5.images import as_bytes, as_rgb, encoded, image_kind, pixels_of
 from hma_data.sources.hdf5.videos import is_video, video_keys, videos_beside
 
-LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
+MAX_LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
 _ENDS = ("episode_ends", "episode_lengths", "terminals", "timeouts", "dones")  # of episodes end to end
 _BESIDE = ("compress_len",)  # not rows over time: the bytes of ALOHA's JPEGs, (cameras, T)
@@ -71,7 +71,7 @@ def inspect(
     lengths: dict[str, int] = {}
     held: Counter[str] = Counter()
     pairs = max(1, checks.PAIRS // len(chosen))
-    for name in [*order[:LENGTHS], *(name for name in order[LENGTHS:] if name in chosen)]:
+    for name in [*order[:MAX_LENGTHS], *(name for name in order[MAX_LENGTHS:] if name in chosen)]:
         place = found[name]
         try:
             with explained(place):
@@ -106,7 +106,7 @@ def inspect(
         episodes=len(found),
         keys=keys,
         frames=sum(lengths.values()) if len(lengths) == len(found) else None,
-        lengths=tuple(lengths[name] for name in order[:LENGTHS] if name in lengths),
+        lengths=tuple(lengths[name] for name in order[:MAX_LENGTHS] if name in lengths),
         hz=first.rate,
         robot=robots if isinstance(robots, str) else ", ".join(map(str, robots)) if robots else None,
         facts={name: fact for name, fact in first.facts.items() if fact},

@@ -29,10 +29,10 @@ from hma_data.storage.files import parse_json
 
 SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 MAX_JSON = 16 << 20  # most bytes of the file of `layout.metadata`
-SHOWN = 12  # names in an error
+MAX_NAMES = 12  # names in an error
 FILE = "{file}"  # in a key: the HDF5 file's name without its ending
 MAX_LISTED = 1_000  # files beside an HDF5 file among which videos are looked for
-MOST = 8  # videos of one episode
+MAX_VIDEOS = 8  # videos of one episode
 _NAME = re.compile(r"\{(\w+)\}")
 
 
@@ -77,7 +77,7 @@ def video_path(file: Path, camera: Camera, layout: Hdf5Layout) -> Path:
         values = _metadata(file, layout)
         for name in names:
             if not isinstance(values.get(name), str | int):
-                known = ", ".join(sorted(map(str, values))[:SHOWN]) or "nothing"
+                known = ", ".join(sorted(map(str, values))[:MAX_NAMES]) or "nothing"
                 raise EpisodeError(file, f"{layout.metadata} has no {name!r} for {key}", f"it has {known}")
             key = key.replace(f"{{{name}}}", str(values[name]))
     return _one(file, folder, key, f"camera {camera.name}")
@@ -99,7 +99,7 @@ def video_keys(file: Path) -> Iterator[KeyInfo]:
     Where other HDF5 files lie in the folder, a video must have the file's name in its own.
     """
     alone = _is_alone(file)
-    for key in [key for key in videos_beside(file) if alone or FILE in key][:MOST]:
+    for key in [key for key in videos_beside(file) if alone or FILE in key][:MAX_VIDEOS]:
         with suppress(HMAError, OSError):
             video = VideoFile(file.parent / key.replace(FILE, file.stem))
             size = (video.table.height, video.table.width, 3)
@@ -153,7 +153,7 @@ def _one(file: Path, folder: Path, pattern: str, what: str) -> Path:
                 for item in folder.rglob("*")
                 if item.suffix.lower() in (*SUFFIXES, ".json")
             )
-            remedy = f"beside it are {', '.join(beside[:SHOWN]) or 'no videos'}"
+            remedy = f"beside it are {', '.join(beside[:MAX_NAMES]) or 'no videos'}"
             raise EpisodeError(file, f"{what}: {fault} {pattern}", remedy)
         [path] = found
     if leaves(path, folder):

@@ -16,9 +16,9 @@ from hma_data.sources.lerobot.films import PAIRING, frames_of_rows
 from hma_data.sources.lerobot.metadata import Feature, Metadata, Span, episode_name
 from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, times_of
 
-LENGTHS = 1_000  # most lengths in the inspection
-LOOKED_FOR = 20_000  # most episodes whose files are looked for, spread over all
-CAMERA_BUDGET = 64  # videos opened at most, over all cameras
+MAX_LENGTHS = 1_000  # most lengths in the inspection
+MAX_EPISODES = 20_000  # most episodes whose files are looked for, spread over all
+MAX_VIDEOS = 64  # videos opened at most, over all cameras
 
 
 def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
@@ -38,7 +38,7 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
         episodes=len(lengths),
         keys=keys,
         frames=sum(lengths),
-        lengths=tuple(lengths[:LENGTHS]),
+        lengths=tuple(lengths[:MAX_LENGTHS]),
         hz=measured if looking.drifts else meta.fps,
         robot=meta.info.robot_type or None,
         facts=facts | ({"pairing": "index"} if looking.drifts else {}),
@@ -72,7 +72,7 @@ class _Looking:
         self._meta, self._survey, self._episodes = meta, survey, episodes
         self._videos = [name for name, item in meta.features.items() if item.dtype == "video"]
         indices = list(meta.episodes)
-        self._indices = [indices[i] for i in sampled(len(indices), LOOKED_FOR)]
+        self._indices = [indices[i] for i in sampled(len(indices), MAX_EPISODES)]
         self.drifts = False
 
     def look(self) -> None:
@@ -83,7 +83,7 @@ class _Looking:
         order = [index for index in self._indices if index in whole]
         chosen = [order[i] for i in sampled(len(order), self._episodes)] if order else []
         pairs = max(1, checks.PAIRS // max(len(chosen), 1))
-        limit = max(1, CAMERA_BUDGET // max(len(self._videos), 1))
+        limit = max(1, MAX_VIDEOS // max(len(self._videos), 1))
         shown = set(chosen[:: max(1, -(-len(chosen) // limit))])
         for index in chosen:
             self._survey.episode(episode_name(index))

@@ -26,11 +26,11 @@ class LeRobotEpisode:
     """One episode of T frames for LeRobot."""
 
     pictures: Mapping[str, Sequence[NDArray[np.uint8]] | NDArray[np.uint8]]  # camera -> T/hold of (H, W, 3)
-    action: NDArray[np.float32]  # (T, A), the command issued at each frame
+    action: NDArray[np.float32]  # (T, A), the action issued at each frame
     state: NDArray[np.float32] | None  # (T, S), seen at each frame
     task: str  # in words
     further: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # other features -> (T, values)
-    hold: int = 1  # frames for which a picture stands
+    hold: int = 1  # rows for which an image stands
 
 
 def write_lerobot(

@@ -9,9 +9,9 @@ from hma_data.sources.common import checks
 from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.places import local_path, unfollowed
 from hma_data.sources.common.survey import Survey, sampled
-from hma_data.sources.rh20t.scenes import TOLD, Film, Scene, scenes
+from hma_data.sources.rh20t.scenes import INSTRUCTION_FIELD, Film, Scene, scenes
 
-LENGTHS = 1_000  # most scenes whose lengths are reported
+MAX_LENGTHS = 1_000  # most scenes whose lengths are reported
 
 
 def inspect(uri: str, episodes: int) -> Inspection:
@@ -35,7 +35,7 @@ def inspect(uri: str, episodes: int) -> Inspection:
         survey.episode(name)
         try:
             lengths.append(_look(name, scene, keys, survey, pairs))
-            told = told or scene.task(TOLD)
+            told = told or scene.task(INSTRUCTION_FIELD)
         except HMAError as fault:
             survey.fault(name, fault)
     listed = tuple(survey.key(info) for info in keys.values())
@@ -46,7 +46,7 @@ def inspect(uri: str, episodes: int) -> Inspection:
         episodes=len(names),
         keys=listed,
         frames=sum(lengths) if len(lengths) == len(names) else None,
-        lengths=tuple(lengths[:LENGTHS]),
+        lengths=tuple(lengths[:MAX_LENGTHS]),
         hz=cameras[0].hz if cameras else None,
         facts={
             "dataset": "RH20T",

@@ -30,7 +30,7 @@ from hma_data.storage.files import read_json
 NEXT = "next"  # the ending of a key: the value of the next sample
 CAMERA, TABLES, FILM, STAMPS = "cam_", "transformed", "color.mp4", "timestamps.npy"
 TASKS = "task_description.json"
-TOLD = "task_description_english"  # the field of TASKS that gives the instruction by default
+INSTRUCTION_FIELD = "task_description_english"  # the field of TASKS that gives the instruction by default
 DEPTH = 4  # folders below a uri in which scenes are looked for
 MAX_WIDTH = 4096  # values of a sample
 

@@ -24,12 +24,12 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values
 from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.rh20t.inspect import inspect
-from hma_data.sources.rh20t.scenes import FILM, STAMPS, TABLES, TOLD, Film, Scene, scenes
+from hma_data.sources.rh20t.scenes import FILM, INSTRUCTION_FIELD, STAMPS, TABLES, Film, Scene, scenes
 from hma_data.storage.paths import StrPath, as_text
 
-SUCCESS = 2  # the lowest rating of a task that was done
+SUCCESS_RATING = 2  # the lowest rating of a task that was done
 STAMP_BYTES = 16  # of timestamps.npy for a frame, of colour and of depth, about
-_KEPT = ("rating", "calib_quality", "finish_time", "calib")
+_METADATA_KEYS = ("rating", "calib_quality", "finish_time", "calib")
 
 
 class Rh20tSource:
@@ -84,10 +84,13 @@ class Rh20tSource:
             actions=_signals(scene, embodiment.action, primary),
             states=_signals(scene, embodiment.state, primary) if embodiment.state else (),
             rate_stamped=False,
-            instruction=scene.task(embodiment.source.instruction or TOLD),
-            success=rating >= SUCCESS if isinstance(rating, int) else None,
+            instruction=scene.task(embodiment.source.instruction or INSTRUCTION_FIELD),
+            success=rating >= SUCCESS_RATING if isinstance(rating, int) else None,
             source=str(scene.folder),
-            metadata={"flags": flags, **{key: said[key] for key in _KEPT if _is_plain(said.get(key))}},
+            metadata={
+                "flags": flags,
+                **{key: said[key] for key in _METADATA_KEYS if _is_plain(said.get(key))},
+            },
         )
 
     def _scenes(self, uri: str) -> dict[str, Path]:

@@ -33,9 +33,9 @@ from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 Frames = NDArray[np.uint8]
 Perceptual = Callable[[Frames, Frames], NDArray[np.float64]]
 Results = dict[str, dict[str, Any]]
-BATCH = 32
+BATCH_FRAMES = 32
 GREY = (0.299, 0.587, 0.114)
-MOVES = 24  # of 255: a channel of a pixel that moves differs by more from the frame before or after
+MOVING_THRESHOLD = 24  # of 255: by more a channel of a moving pixel differs from the frame before or after
 BACKBONE = "alexnet-owt-7be5be79.pth"  # torchvision's file of AlexNet, 233 MB
 
 
@@ -51,7 +51,7 @@ def _window(size: int, like: Tensor) -> Tensor:
 
 
 def ssim_map(first: Tensor, second: Tensor) -> Tensor:
-    """Return the structural similarity of (N, C, S, S) pictures in [0, 1] per pixel, (N, C, S-10, S-10)."""
+    """Return the structural similarity of (N, C, S, S) images in [0, 1] per pixel, (N, C, S-10, S-10)."""
     c1, c2 = 0.01**2, 0.03**2
     both = torch.cat([first, second, first * first, second * second, first * second], dim=1)
     smooth = _window(both.shape[2], both) @ both @ _window(both.shape[3], both).T
@@ -80,7 +80,7 @@ def ssim(true: Frames, made: Frames) -> NDArray[np.float64]:
 def moving(film: Frames) -> NDArray[np.bool_]:
     """Return which pixels of (n, S, S, 3) frames move, (n, S, S): unlike the frame before or after."""
     masks = np.zeros(film.shape[:3], np.bool_)
-    changed = np.abs(np.diff(film.astype(np.int16), axis=0)).max(axis=-1) > MOVES
+    changed = np.abs(np.diff(film.astype(np.int16), axis=0)).max(axis=-1) > MOVING_THRESHOLD
     masks[1:] |= changed
     masks[:-1] |= changed
     return masks
@@ -263,10 +263,10 @@ def _moving_db(error: float) -> float:
 
 
 def _batches(frames_iter: Iterable[Frames]) -> Iterator[tuple[Frames, NDArray[np.bool_]]]:
-    """Regroup films and single frames into batches of `BATCH`, beside which pixels of them move."""
+    """Regroup films and single frames into batches of `BATCH_FRAMES`, beside which pixels of them move."""
     films = (item[None] if item.ndim == 3 else item for item in frames_iter)
     pairs = (pair for film in films for pair in zip(film, moving(film), strict=True))
-    for batch in batched(pairs, BATCH):
+    for batch in batched(pairs, BATCH_FRAMES):
         frames, masks = zip(*batch, strict=True)
         yield np.stack(frames), np.stack(masks)
 
@@ -317,7 +317,7 @@ def write_report(folder: StrPath, title: str, results: Results, notes: list[str]
 
     Args:
         folder: str or path of the folder.
-        results: as for `to_markdown`; their `worst_frames` go into the picture.
+        results: as for `to_markdown`; their `worst_frames` go into `worst.png`.
         notes: lines to print below the table.
     """
     folder = as_path(folder)

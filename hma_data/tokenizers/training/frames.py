@@ -1,12 +1,12 @@
-"""Read the pictures that tokenizers are measured on, and draw the crops that they are trained on.
+"""Read the images that tokenizers are measured on, and draw the crops that they are trained on.
 
-Frames to measure on come from pictures, videos, recordings or a shard set's source. Training crops come
-from the pictures and videos that a recipe lists: these are held in memory at a few sizes, and a crop is a
-part of one picture, scaled, rotated, mirrored and recoloured. It depends only on (seed, step, index in the
+Frames to measure on come from images, videos, recordings or a shard set's source. Training crops come
+from the images and videos that a recipe lists: these are held in memory at a few sizes, and a crop is a
+part of one image, scaled, rotated, mirrored and recoloured. It depends only on (seed, step, index in the
 batch).
 
-A film (n, S, S, 3) holds frames of one video, or of one camera in an episode, in order; a lone picture is
-a film of one. N crops, S side of a crop or of the square that the tokenizer takes. Pictures are uint8 RGB.
+A film (n, S, S, 3) holds frames of one video, or of one camera in an episode, in order; a lone image is
+a film of one. N crops, S side of a crop or of the square that the tokenizer takes. Images are uint8 RGB.
 """
 
 import hashlib
@@ -34,8 +34,8 @@ Skip = Callable[[str], object]  # is told why a file or an episode is left out
 VIDEOS = {".mp4", ".avi", ".mkv", ".webm", ".gif"}
 PICTURES = {".png", ".jpg", ".jpeg", ".webp", ".bmp"}
 EPISODES = 16  # number of episodes taken from a recording, evenly spaced
-LARGEST, SMALLEST = 768, 48  # short side of the training pictures that are kept, pixels
-SHARES, SHARE_ODDS = ((0.42, 0.6), (0.3, 1.0), (1.0, 1.0)), (0.45, 0.35, 0.2)  # of a picture's short side
+LARGEST, SMALLEST = 768, 48  # short side of the training images that are kept, pixels
+SHARES, SHARE_ODDS = ((0.42, 0.6), (0.3, 1.0), (1.0, 1.0)), (0.45, 0.35, 0.2)  # of an image's short side
 
 
 # -- frames to measure on
@@ -49,10 +49,10 @@ def films_of(
     frames: int = 64,
     on_skip: Skip = str,
 ) -> Iterator[Frame]:
-    """Return an iterator over films (n, S, S, 3) of a recording, a shard set's source, pictures or videos.
+    """Return an iterator over films (n, S, S, 3) of a recording, a shard set's source, images or videos.
 
     With an embodiment, the data is a recording (a path or URI). Without one, it is a shard set, whose
-    source is read, or a picture, a video or a folder of them.
+    source is read, or an image, a video or a folder of them.
 
     Args:
         data: str or path of the data, or the URI of a recording.
@@ -81,7 +81,7 @@ def read_films(
     resize_filter: Filter = "area",
     on_skip: Skip = str,
 ) -> Iterator[Frame]:
-    """Yield a film (n, S, S, 3) of a picture, a video, or every picture and video below a folder.
+    """Yield a film (n, S, S, 3) of an image, a video, or every image and video below a folder.
 
     Args:
         path: str or path of the file or folder.
@@ -89,7 +89,7 @@ def read_films(
         on_skip: called with the reason for each file that cannot be decoded.
 
     Raises:
-        TokenizerError: the path does not exist, holds no picture and no video, or none can be decoded.
+        TokenizerError: the path does not exist, holds no image and no video, or none can be decoded.
     """
     path = as_path(path)
     if not path.exists():
@@ -115,7 +115,7 @@ def read_films(
 
 
 def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
-    """Yield the picture in a file, or `frames` evenly spaced frames of a video.
+    """Yield the image in a file, or `frames` evenly spaced frames of a video.
 
     Raises:
         TokenizerError: the file cannot be decoded.
@@ -195,7 +195,7 @@ def _evenly(count: int, wanted: int) -> list[int]:
 
 @dataclass
 class Pool:
-    """The pictures of one source, each at several sizes, largest first."""
+    """The images of one source, each at several sizes, largest first."""
 
     name: str
     weight: float
@@ -203,7 +203,7 @@ class Pool:
 
 
 def _levels(picture: Frame) -> list[Frame]:
-    """Return the picture shrunk by area averaging to LARGEST, then to halves down to about 160 pixels."""
+    """Return the image shrunk by area averaging to LARGEST, then to halves down to about 160 pixels."""
     import cv2
 
     levels, wanted = list[Frame](), LARGEST
@@ -232,17 +232,17 @@ def _source_files(source: FileSource | DrawnSource, corpus: Path) -> list[Path]:
 
 
 def load_pools(sources: Sequence[FileSource | DrawnSource], corpus: Path) -> tuple[list[Pool], str]:
-    """Read all pictures of the sources into memory; return them and a SHA-256 of their pixels.
+    """Read all images of the sources into memory; return them and a SHA-256 of their pixels.
 
     Raises:
-        RecipeError: a source has no picture.
+        RecipeError: a source has no image.
     """
     digest = hashlib.sha256()
     pools = []
     for source in sources:
         pictures = []
         for file in _source_files(source, corpus):
-            with suppress(TokenizerError):  # a glob may match a file that is no picture
+            with suppress(TokenizerError):  # a glob may match a file that is no image
                 for picture in read_pictures(file, source.frames):
                     if min(picture.shape[:2]) >= SMALLEST:
                         pictures.append(_levels(picture))
@@ -267,7 +267,7 @@ def draw_batch(pools: list[Pool], side: int, count: int, seed: int, step: int) -
 
 
 def _crop(levels: list[Frame], side: int, rng: np.random.Generator) -> Frame:
-    """Cut a square out of the picture, rotate and mirror it, and scale it to `side`."""
+    """Cut a square out of the image, rotate and mirror it, and scale it to `side`."""
     import cv2
 
     short = min(levels[0].shape[:2])

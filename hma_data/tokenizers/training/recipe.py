@@ -36,7 +36,7 @@ class TrainingRecipe(_Strict):
             steps stay the same.
         ema: decay of the averaged weights; the averaged weights are the ones that are kept.
         decoder_only: whether the encoder stays as it is. Shards and models of the tokenizer that the
-            training starts from then stay valid; only pictures that are decoded change.
+            training starts from then stay valid; only images that are decoded change.
         threads: number of torch threads; it changes only the last bits of the result.
     """
 
@@ -88,7 +88,7 @@ class LossRecipe(_Strict):
 
 
 class FileSource(_Strict):
-    """Pictures and videos under a folder of the corpus.
+    """Images and videos under a folder of the corpus.
 
     Attributes:
         path: folder below the recipe's `corpus`.
@@ -107,7 +107,7 @@ class FileSource(_Strict):
 
 
 class DrawnSource(_Strict):
-    """Pictures made by `recipes/tokenizer/draw.py`, in a folder of the corpus named after their kind."""
+    """Images made by `recipes/tokenizer/draw.py`, in a folder of the corpus named after their kind."""
 
     kind: Literal["pusht", "drawn"]
     pictures: int = Field(gt=0, default=200)

@@ -41,13 +41,15 @@ from hma_data.tokenizers.training.frames import Pool, draw_batch, load_pools
 from hma_data.tokenizers.training.muon import Muon
 from hma_data.tokenizers.training.recipe import LossRecipe, TokenizerRecipe, TrainingRecipe, load_recipe
 
-START, END = 2**32 - 1, 2**32 - 2  # step numbers of the batches that initialise and measure a network
+# Step numbers, which no training reaches, of the batches that initialise and measure a network
+START_STEP = 2**32 - 1
+END_STEP = 2**32 - 2
 
 EDGE_REACH, EDGE_CONTRAST = 4, 0.12  # pixels; difference of grey values in [0, 1]
 
 
 def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tuple[Tensor, Tensor]:
-    """Return the loss of (B, 3, S, S) pictures in [-1, 1], and the mean squared error in [0, 1] units."""
+    """Return the loss of (B, 3, S, S) images in [-1, 1], and the mean squared error in [0, 1] units."""
     made, true = (made + 1) / 2, (true + 1) / 2
     error = made - true
     squared = error.square().mean()
@@ -148,7 +150,7 @@ class Run:
         config, tokens = recipe.network, ""
         network = FsqAutoencoder(config) if isinstance(config, FsqConfig) else VaeAutoencoder(config)
         if recipe.start is None:
-            start_linear(network, self.batch(START, 256))
+            start_linear(network, self.batch(START_STEP, 256))
         else:
             tokens = start_from(network, recipe.start)
         network.encoder.requires_grad_(not recipe.training.decoder_only)
@@ -191,7 +193,7 @@ class Run:
         if isinstance(config, VaeConfig):  # measure its scale on the averaged encoder
             network = VaeAutoencoder(config)
             network.load_state_dict(self.average)
-            scale = round(1 / float(network.encoder(self.batch(END, 128)).std()), 4)
+            scale = round(1 / float(network.encoder(self.batch(END_STEP, 128)).std()), 4)
             config = config.model_copy(update={"latent_scale": scale})
         save_weights(path, config.format, config, self.average, facts, self.tokens_sha256)
 
