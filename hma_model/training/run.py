@@ -91,7 +91,7 @@ class Run:
         self.evaluation: dict[str, Any] = {}  # the figures of the last one
         self.likes: dict[str, str] = {}  # new robot -> the robot with whose stem it began
         self.notes: list[str] = []  # texts for the user that nobody has shown yet
-        self._baseline: evaluate.Means | None = None
+        self._baseline: held_out.Means | None = None
         self._twin: HMA | None = None
         self._sheet_seconds = [0.0]  # of each evaluation's pictures
 
