@@ -392,7 +392,7 @@ PUBLIC = (
     "hma_model.checkpoint.folder", "hma_model.checkpoint.io", "hma_model.demo.run",
     "hma_model.evaluation.evaluate", "hma_model.evaluation.losses", "hma_model.evaluation.perceptual",
     "hma_model.evaluation.report", "hma_model.evaluation.rollout_video", "hma_model.evaluation.suite",
-    "hma_model.evaluation.weights", "hma_model.hub.datasets",
+    "hma_model.hub.datasets",
     "hma_model.hub.listing", "hma_model.hub.publish", "hma_model.hub.sample", "hma_model.network.model",
     "hma_model.released.conversion",
     "hma_model.training.logging", "hma_model.training.loop", "hma_model.training.recipe",

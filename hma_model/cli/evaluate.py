@@ -44,7 +44,7 @@ FIGURES = {  # figures of `hma evaluate` as its table names them; the others hav
 }
 ROLLOUTS = ("true", "shuffled", "none", "copy")
 HIDDEN = ("checkpoint", "data", "seconds_a_frame", "sees_actions", "merge")  # of the readable form
-MEASURES = {"lpips": "LPIPS", "fid": "FID", "fvd": "FVD", "fvd_videogpt": "FVD (VideoGPT)"}
+MEASURES = {"lpips": "LPIPS", "fid": "FID", "fvd": "FVD"}
 DIGITS = {"ssim": 3, "lpips": 3}  # of the figures of rollouts; the others have two
 
 
@@ -81,7 +81,7 @@ def evaluate(
     lpips: Annotated[
         str | None, Option(metavar="FILE#SHA256", help="Weights of LPIPS, with their hash.")
     ] = None,
-    fid: Annotated[str | None, Option(metavar="FILE#SHA256", help="Weights of FID's Inception.")] = None,
+    fid: Annotated[str | None, Option(metavar="FILE#SHA256", help="TorchScript of FID's Inception.")] = None,
     fvd: Annotated[
         list[str] | None, Option(metavar="FILE#SHA256", help="Weights of FVD's I3D; repeat for two.")
     ] = None,
@@ -113,7 +113,7 @@ def evaluate(
             split, windows, frames, prompt, seed=seed, cameras=camera_names(cameras), paper=paper,
             state=episodes if state else 0, sampling=sampling,
         )  # fmt: skip
-        networks = open_networks(lpips, fid, fvd or [])
+        networks = open_networks(lpips, fid, fvd)
         parts = evaluate_all(checkpoints, data, settings, networks, out, device_name(device))
         if out is not None:
             from hma_model.evaluation.report import write_results

@@ -41,7 +41,7 @@ class Scores:
         signal = np.minimum(psnr(truth, predicted), PSNR_LIMIT)
         parts = [signal, ssim(truth, predicted)]
         if judge and judge.networks.lpips:
-            parts.append(judge.networks.lpips(truth, predicted))
+            parts.append(judge.networks.lpips_of(truth, predicted))
         parts = [np.where(pictures.finite, part.reshape(size), np.nan) for part in parts]
         return cls(parts[0], parts[1], parts[2] if len(parts) > 2 else None, pictures.finite)
 
