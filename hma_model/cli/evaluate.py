@@ -79,12 +79,10 @@ def evaluate(
         int, Option(min=2, help="Episodes that --state simulates of a laboratory robot.")
     ] = 32,
     lpips: Annotated[
-        str | None, Option(metavar="FILE#SHA256", help="Weights of LPIPS, with their hash.")
+        str | None, Option(metavar="FILE#SHA256", help="TorchScript of LPIPS, with its hash.")
     ] = None,
     fid: Annotated[str | None, Option(metavar="FILE#SHA256", help="TorchScript of FID's Inception.")] = None,
-    fvd: Annotated[
-        list[str] | None, Option(metavar="FILE#SHA256", help="Weights of FVD's I3D; repeat for two.")
-    ] = None,
+    fvd: Annotated[str | None, Option(metavar="FILE#SHA256", help="TorchScript of FVD's I3D.")] = None,
     out: Annotated[Path | None, Option(help="Folder for results.json, results.md and report.html.")] = None,
     json: Annotated[
         bool, Option("--json", help="Print one JSON object a line, for each checkpoint and set.")
