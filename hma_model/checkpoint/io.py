@@ -121,7 +121,7 @@ def load(folder: StrPath, embodiments: Iterable[str] | None = None, device: str 
     model.load_trunk(trunk, checkpoint.trunk())
     for name in checkpoint.embodiments if embodiments is None else dict.fromkeys(embodiments):
         add_embodiment(model, checkpoint, name)
-    vars(model)["origin"] = checkpoint.folder  # where hub.push_model finds YAML and statistics again
+    model.source = checkpoint
     return model.to(device).eval()
 
 

@@ -32,7 +32,7 @@ from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import finite, kept_arrays, to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path, as_text
-from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
+from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.evaluate import Settings, measure
 from hma_model.evaluation.losses import no_window
 from hma_model.evaluation.perceptual import Networks
@@ -173,12 +173,14 @@ def _frames(model: "HMA", shards: ShardSet, settings: Settings) -> int:
 
 def fingerprint(model: "HMA", shards: ShardSet, settings: Settings, networks: Networks) -> str:
     """Return sixteen hex digits that stand for a part: its checkpoint, set and settings."""
-    robot, origin = shards.embodiment.id, Checkpoint.open(vars(model)["origin"])
+    robot, source = shards.embodiment.id, model.source
+    assert source, "the models of a suite are loaded from checkpoints"
+    card = source.card(robot)
     facts = {
         "version": VERSION,
-        "trunk": origin.trunk_sha256,
-        "embodiment": origin.card(robot).get("files"),
-        "stats": origin.card(robot).get("stats_sha256"),
+        "trunk": source.trunk_sha256,
+        "embodiment": card.get("files"),
+        "stats": card.get("stats_sha256"),
         "config": model.config.to_json(),
         "set": hashlib.sha256((shards.folder / MANIFEST).read_bytes()).hexdigest(),
         "settings": asdict(settings),

@@ -139,7 +139,7 @@ def warn_outside(
         embodiments: one id for all, or one a sample.
         known: (B, T) bool; by default all are.
     """
-    if "origin" not in vars(model):  # only a checkpoint has the range
+    if model.source is None:  # only a checkpoint has the range
         return
     if known is not None:
         actions = actions.masked_fill(~known[..., None], math.nan)
@@ -189,10 +189,8 @@ def card(model: "HMA", embodiment: str) -> dict[str, Any]:
 
 
 def _checkpoint(model: "HMA", embodiment: str) -> Checkpoint | None:
-    if "origin" not in vars(model):
-        return None
-    kept = Checkpoint.open(vars(model)["origin"])
-    return kept if embodiment in kept.embodiments else None
+    kept = model.source
+    return kept if kept and embodiment in kept.embodiments else None
 
 
 def _seen(model: "HMA", embodiment: str) -> Floats | None:

@@ -14,7 +14,6 @@ from hma_data.errors import UsageError
 from hma_data.loading.views import FIRST, Cameras, view_count
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.network import NetworkTokenizer
-from hma_model.checkpoint.folder import Checkpoint
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -45,8 +44,8 @@ def cameras_for(model: "HMA", shards: ShardSet, cameras: Cameras | None = None) 
     Raises:
         UsageError: these are more or fewer than the views of the model.
     """
-    if cameras is None and "origin" in vars(model):
-        card = Checkpoint.open(vars(model)["origin"]).card(shards.embodiment.id)
+    if cameras is None and model.source:
+        card = model.source.card(shards.embodiment.id)
         cameras = card.get("data", {}).get("cameras")
     cameras = FIRST if cameras is None else cameras
     if (count := view_count(cameras)) != model.config.views:

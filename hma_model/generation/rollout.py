@@ -229,7 +229,8 @@ class Rollout:
         """
         if not self.config.predicts_video:
             fault = f"was not trained to predict frames, but for {', '.join(self.config.objectives)}"
-            raise HMAError(vars(self.model).get("origin", "the model"), fault, "choose another checkpoint")
+            where = self.model.source.name if self.model.source else "the model"
+            raise HMAError(where, fault, "choose another checkpoint")
         chosen = self._begun(rows)
         self._make_room(chosen)
         self._take(chosen, chunk, following, known)

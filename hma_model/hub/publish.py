@@ -249,8 +249,7 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
     Raises:
         HubError: an embodiment has no YAML, neither in the model's source nor in the registry.
     """
-    origin = getattr(model, "origin", None)
-    known = Checkpoint.open(origin) if origin else None
+    known = model.source
     yaml, stats, cards = {}, {}, {}
     for name, space in model.embodiments.items():
         if known and name in known.embodiments:

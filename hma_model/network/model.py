@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.storage.paths import StrPath
+from hma_model.checkpoint.folder import Checkpoint
 from hma_model.config import POLICY, READOUTS, ActionSpace, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition, unknown
 from hma_model.network.copying import frames_before
@@ -45,6 +46,7 @@ class HMA(nn.Module):
 
     Attributes:
         config: the architecture.
+        source: the checkpoint that the model was loaded from; None for a model made in memory.
         embodiments: the action space of each embodiment present, by id.
         trunk, readout: the modules that all embodiments share.
         stems, heads: the modules of each embodiment; `stem(id)` and `head(id)` find them.
@@ -53,6 +55,7 @@ class HMA(nn.Module):
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         self.config = config
+        self.source: Checkpoint | None = None
         self.embodiments: dict[str, ActionSpace] = {}
         self.trunk = Trunk(config)
         continuous = config.kind == "continuous"

@@ -60,7 +60,7 @@ def _checkpoint_facts(checkpoint: str, embodiment: str) -> dict[str, str]:
 def world_facts(world: "World") -> dict[str, Any]:
     """Return what changes the frames of a world, beside its checkpoint, unmask steps and temperature."""
     facts = {"order": world.order, "sample_steps": world.sample_steps, "precision": world.precision}
-    in_memory = "origin" not in vars(world.model)
+    in_memory = world.model.source is None
     return facts | ({"weights": object_sha256(world.model.state_dict())} if in_memory else {})
 
 
@@ -97,9 +97,9 @@ def object_sha256(value: Any) -> str:
 
 def digests(world: "World", embodiment: str) -> dict[str, str]:
     """Return what tells the checkpoint of a world from others."""
-    if "origin" not in vars(world.model):
+    kept = world.model.source
+    if kept is None:
         return {"checkpoint": "in memory"}
-    kept = Checkpoint.open(vars(world.model)["origin"])
     return {"checkpoint_sha256": kept.trunk_sha256, "stem_sha256": file_sha256(kept.path(embodiment, STEM))}
 
 

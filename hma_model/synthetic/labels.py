@@ -35,7 +35,7 @@ from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.storage.files import atomic_path, file_sha256, kept_arrays
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
+from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import INVERSE, OBJECTIVES
 from hma_model.generation.commands import Commands, Floats, card, described
 from hma_model.policies.fingerprints import begun, digests
@@ -241,7 +241,7 @@ def _labelled(model: "HMA", embodiment: str, check: StrPath | None) -> ShardSet:
     if check is not None:
         sets = [ShardSet(check)]
     else:
-        sets = Checkpoint.open(vars(model)["origin"]).shards() if "origin" in vars(model) else []
+        sets = model.source.shards() if model.source else []
     found = [one for one in sets if one.embodiment.id == embodiment]
     if not found:
         fault = (

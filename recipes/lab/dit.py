@@ -108,6 +108,7 @@ class DiT(nn.Module):
         self.register_buffer("std", std.clamp(min=1e-6))
         self.register_buffer("shares", cosine_levels(LEVELS).double())
         # what hma_model.evaluation.rollouts asks of a model
+        self.source = None  # no checkpoint of HMA
         self.config = SimpleNamespace(
             kind="continuous", absent_action="embedding", frames=frames, sees_actions=True
         )
