@@ -108,7 +108,7 @@ def _row(key: dict[str, Any]) -> list[Any]:
 
 def _print_checks(report: dict[str, Any]) -> None:
     """Print the checks with their results, one line for each finding, and one of what was not looked at."""
-    from hma_data.inspection.inspect import NOT_LOOKED
+    from hma_data.inspection.inspect import NOT_CHECKED
     from hma_data.sources.common.survey import CHECKS
 
     findings: dict[str, list[str]] = {}
@@ -118,14 +118,14 @@ def _print_checks(report: dict[str, Any]) -> None:
         findings.setdefault(finding["check"], []).append(said)
     titles = {**CHECKS, "fits": "the embodiment fits", "usable": "episodes the embodiment can use"}
     titles["robot"] = "pictures and commands of a robot"
-    done = {check: result for check, result in report["checks"].items() if result != NOT_LOOKED}
+    done = {check: result for check, result in report["checks"].items() if result != NOT_CHECKED}
     print_lines(
         (titles.get(check, check), line)
         for check, result in done.items()
         for line in findings.get(check, [result])
     )
     if others := [titles.get(check, check) for check in report["checks"] if check not in done]:
-        print(f"{NOT_LOOKED}: {', '.join(others)}")
+        print(f"{NOT_CHECKED}: {', '.join(others)}")
 
 
 def doctor(

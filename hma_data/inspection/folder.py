@@ -19,7 +19,7 @@ from hma_data.sources.detect import by_files, recognitions
 from hma_data.storage.paths import StrPath, as_path
 
 SHARDS = "shard set"
-WHOLE = ("rlds", "lerobot", SHARDS)  # formats whose folders are never read together as one recording
+NEVER_JOINED = ("rlds", "lerobot", SHARDS)  # formats whose folders are never read together as one recording
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def _found(folder: Path, known: Mapping[str, Recognition], below: bool) -> Itera
     films = [one for one in inside if one.beside]
     apart = [one for one in inside if not one.beside]
     formats = {one.format for one in apart}
-    if len(apart) > 1 and len(formats) == 1 and not formats & {*WHOLE}:
+    if len(apart) > 1 and len(formats) == 1 and not formats & {*NEVER_JOINED}:
         apart = [Found(folder, apart[0].format)]
     yield from apart
     yield from films

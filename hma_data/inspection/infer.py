@@ -44,14 +44,15 @@ from hma_data.sources.detect import detect, require_utf8
 from hma_data.sources.hdf5.videos import is_video
 from hma_data.storage.paths import StrPath
 
-LINE = 110
-HIGHEST_HZ = 100_000  # of a rate in a YAML
-TARGET_HZ, SHOWN = 2, 24  # frames a second of the paper; frames that a model should see of an episode
+MAX_FLOW_CHARS = 110
+MAX_HZ = 100_000  # of a rate in a YAML
+TARGET_HZ = 2  # of the paper
+FRAMES_PER_EPISODE = 24  # that a model should see
 ACTION_GUESSES: dict[str, tuple[Guess, ...]] = {
     "rosbag": (infer_topics.commanding_topics, infer_topics.measured_topics, likely),
     "rh20t": RH20T_GUESSES,
 }  # of the other formats: STEP_GUESSES
-MEASURED_TO = 5e-4  # relative error of a measured rate; the doubt from jittering stamps is added
+RATE_TOLERANCE = 5e-4  # relative error of a measured rate; the doubt from jittering stamps is added
 
 
 class _Dumper(yaml.SafeDumper):
@@ -69,12 +70,12 @@ class _Dumper(yaml.SafeDumper):
 def _mapping(dumper: _Dumper, value: dict[str, Any]) -> yaml.Node:
     node = dumper.represent_dict(value.items())
     parts = [item for each in value.values() for item in (each if isinstance(each, list) else [each])]
-    node.flow_style = not any(isinstance(part, dict) for part in parts) and len(repr(value)) < LINE
+    node.flow_style = not any(isinstance(part, dict) for part in parts) and len(repr(value)) < MAX_FLOW_CHARS
     return node
 
 
 def _list(dumper: _Dumper, value: list[Any]) -> yaml.Node:
-    flow = not any(isinstance(item, dict) for item in value) and len(repr(value)) < LINE
+    flow = not any(isinstance(item, dict) for item in value) and len(repr(value)) < MAX_FLOW_CHARS
     return dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=flow)
 
 
@@ -120,8 +121,8 @@ def from_inspection(found: Inspection, embodiment_id: str) -> str:
     return head + (f"# {known}\n" if known else "") + _yaml_text(values)
 
 
-def commands(found: Inspection) -> dict[str, Offset]:
-    """Return by topic how commands lie between the pictures of the camera that `infer` takes as the clock."""
+def action_offsets(found: Inspection) -> dict[str, Offset]:
+    """Return by topic how actions lie between the images of the camera that `infer` takes as the clock."""
     try:
         return _Draft(found).offsets
     except SourceError:
@@ -213,7 +214,7 @@ class _Draft:
         if not self.action.keys:
             raise _lacks(found, "has nothing that could be an action", self.seen.keys)
         hz = self.seen.keys[0].hz if self.bag else found.hz
-        self.hz = hz if hz is not None and 0 < hz <= HIGHEST_HZ else None
+        self.hz = hz if hz is not None and 0 < hz <= MAX_HZ else None
         self.used = [*self.seen.keys, *self.action.keys, *self.states]
         self.offsets = infer_topics.offsets(self.action.keys, self.seen.keys[0])
 
@@ -262,7 +263,7 @@ class _Draft:
         if self.timed and camera.jitter_ms and camera.count:
             doubt = 2.5 * camera.jitter_ms * self.hz / 1e3 / math.sqrt(camera.count)
         whole = round(self.hz)
-        tolerance = MEASURED_TO + (min(doubt, 0.02) if doubt == doubt else 0.0)
+        tolerance = RATE_TOLERANCE + (min(doubt, 0.02) if doubt == doubt else 0.0)
         return whole if whole and abs(self.hz / whole - 1) < tolerance else round(self.hz, 3) or None
 
     def _target(self) -> float | int:
@@ -271,7 +272,7 @@ class _Draft:
         if not hz or not lengths:
             return TARGET_HZ
         length, slowest = statistics.median(lengths), max(1, math.floor(hz / TARGET_HZ + 0.5))
-        stride = max(1, min(slowest, int(length // SHOWN)))
+        stride = max(1, min(slowest, int(length // FRAMES_PER_EPISODE)))
         rate = round(hz / stride, 3)
         return TARGET_HZ if stride == slowest else int(rate) if rate == int(rate) else rate
 
@@ -331,7 +332,7 @@ class _Draft:
         if self._target() != TARGET_HZ:
             length = f"{statistics.median(self.found.lengths):g} steps"
             said["target_hz"] = (
-                f"so that a model sees {SHOWN} frames of an episode of {length}, if it has them"
+                f"so that a model sees {FRAMES_PER_EPISODE} frames of an episode of {length}, if it has them"
             )
         if self.action.question:
             said["action"] = f"{TODO}: {self.action.question}"
@@ -389,7 +390,7 @@ def _showing(seen: Choice, findings: Iterable[Finding]) -> tuple[Choice, list[st
 
 
 def _levels(key: KeyInfo) -> dict[str, Any]:
-    """Return the levels of pictures in mono16: all values of 10, 12, 14 or 16 bits, whichever they need."""
+    """Return the levels of images in mono16: all values of 10, 12, 14 or 16 bits, whichever they need."""
     if key.encoding != "mono16":
         return {}
     bits = next(bits for bits in (10, 12, 14, 16) if (key.high or 0) < 1 << bits)
@@ -420,12 +421,12 @@ def _told_apart(components: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return components
 
 
-def _lacks(found: Inspection, fault: str, pictures: Sequence[KeyInfo]) -> SourceError:
+def _lacks(found: Inspection, fault: str, images: Sequence[KeyInfo]) -> SourceError:
     rows = found.format == "hdf5"  # an action has as many rows as the camera
     others = [
         f"{key.key} ({key.count} rows)" if rows else key.key for key in found.keys if key.kind == "vector"
     ]
-    seen = [f"{key.key} of {key.count} rows" if rows else f"{key.key} {key.shape}" for key in pictures]
-    said = f"{fault}; pictures: {shown(seen, 4) or 'none'}; numbers: {shown(others) or 'none'}"
-    remedy = "record cameras and the robot's commands or joint states together; hma inspect lists every key"
+    seen = [f"{key.key} of {key.count} rows" if rows else f"{key.key} {key.shape}" for key in images]
+    said = f"{fault}; images: {shown(seen, 4) or 'none'}; numbers: {shown(others) or 'none'}"
+    remedy = "record cameras and the robot's actions or joint states together; hma inspect lists every key"
     return SourceError(shown([found.uri]), said, remedy)

@@ -106,7 +106,7 @@ def _is_whole_state(key: str) -> bool:
 
 
 def strength(said: Iterable[str]) -> int:
-    """Return how clearly words name a command; 0 for not at all."""
+    """Return how clearly words name an action; 0 for not at all."""
     said = set(said)
     return next((rank for rank, names in _COMMANDS if said & names), 0)
 
@@ -121,7 +121,7 @@ def vectors(keys: Iterable[KeyInfo]) -> list[KeyInfo]:
     ]
 
 
-MIN_SIDE, MAX_RATIO = 8, 8  # of a camera's picture
+MIN_SIDE, MAX_RATIO = 8, 8  # of a camera's image
 MONO = ("mono8", "mono16")  # encodings that say: a grey camera
 _NOT_CAMERA = re.compile(
     r"(^|_)(depth|disparity|masks?|seg|segmentation|semantic|instance|infra|infrared|ir|thermal|labels?|"
@@ -141,7 +141,7 @@ class Choice:
     """Keys taken for one purpose, and the question to ask about them.
 
     Attributes:
-        measured: True where the keys are no commands, but what was measured one step later.
+        measured: True where the keys are no actions, but what was measured one step later.
     """
 
     keys: tuple[KeyInfo, ...] = ()
@@ -161,7 +161,7 @@ def cameras(keys: Iterable[KeyInfo]) -> Choice:
     colour = _ordered(key for key in usable if key.shape[2] == 3)
     mono = _ordered(key for key in usable if key.shape[2] == 1 and key.encoding in MONO)
     grey = _ordered(key for key in usable if key.shape[2] == 1 and key.encoding not in MONO)
-    asked = "only grey pictures are recorded; are these cameras, not depth or masks?"
+    asked = "only grey images are recorded; are these cameras, not depth or masks?"
     return Choice(colour + mono or grey, asked if grey and not colour + mono else "")
 
 
@@ -196,7 +196,7 @@ def _rank(key: str) -> int:
 
 
 def _is_telling(part: str) -> bool:
-    """Check whether a part of a camera's key says more than that it is a picture."""
+    """Check whether a part of a camera's key says more than that it is an image."""
     return any(not _PICTURE.fullmatch(word) for word in words(part))
 
 
@@ -297,7 +297,7 @@ def _ordered_parts(parts: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
 
 
 def _each_once(parts: list[KeyInfo]) -> list[KeyInfo]:
-    """Remove second encodings of one command: velocities beside positions, poses beside joints."""
+    """Remove second encodings of one action: velocities beside positions, poses beside joints."""
 
     def what(key: KeyInfo) -> frozenset[str]:
         return frozenset(words(key.key)) - PLACE - MOTION
@@ -323,7 +323,7 @@ def _place(key: KeyInfo) -> int:
 def question(chosen: Iterable[KeyInfo], others: Iterable[KeyInfo]) -> str:
     """Return the question that `validate` reports for an action chosen among several keys."""
     more = shown(key.key for key in others)
-    return f"is {shown(key.key for key in chosen)} the command{f'; also recorded: {more}' if more else ''}?"
+    return f"is {shown(key.key for key in chosen)} the action{f'; also recorded: {more}' if more else ''}?"
 
 
 # -- states and words
@@ -369,14 +369,14 @@ def likely(found: list[KeyInfo]) -> Choice:
     if not chosen:
         return Choice()
     when = ", as measured a step later," if own else ""
-    asked = f"no key is called a command; may {shown([chosen[0].key])}{when} stand for it"
+    asked = f"no key is called an action; may {shown([chosen[0].key])}{when} stand for it"
     return stand_in(chosen[:1], found, asked, bool(own))
 
 
 def next_poses(found: list[KeyInfo]) -> Choice:
     """Choose RH20T's pose and width of the next sample, which stand for an action."""
     chosen = tuple(key for key in found if key.key in ("tcp_base/tcp", "gripper/gripper_info"))
-    asked = f"may {shown(key.key for key in chosen)} of the next sample stand for the command?"
+    asked = f"may {shown(key.key for key in chosen)} of the next sample stand for the action?"
     return Choice(chosen, asked if chosen else "", measured=True)
 
 

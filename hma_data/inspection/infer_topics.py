@@ -1,4 +1,4 @@
-"""Find which topics of a bag command the robot and which measure it, and how far apart messages are."""
+"""Find which topics of a bag drive the robot and which measure it, and how far apart messages are."""
 
 import re
 from collections import defaultdict
@@ -24,7 +24,7 @@ from hma_data.sources.common.inspection import KeyInfo, TopicInfo
 
 _COMMAND_TYPE = re.compile(r"(Twist|JointTrajectory|Command|Cmd|Ackermann|Joy)[A-Za-z]*$")
 _NEVER = re.compile(r"(^|/)(rosout|parameter_events|clock|diagnostics|_action)(/|$)|_service_event$")
-SLOWEST_HZ = 1.0  # a topic with a lower rate is no stream of commands or states
+SLOWEST_HZ = 1.0  # a topic with a lower rate is no stream of actions or states
 CLOCKS_APART_MS = 1000.0  # header stamps that differ so much between topics are not of one clock
 WEAK = 1  # strength of a topic called goal, control or joy; see `strength`
 MARGIN = 1.5  # factor on the longest interval measured
@@ -79,7 +79,7 @@ def measured_topics(found: list[KeyInfo]) -> Choice:
     first = joints[0]
     named = {_name((key,)): key for key in joints}  # one key a topic
     chosen = [key for key in named.values() if key == first or _other_side((key,), (first,))]
-    asked = f"no topic commands the robot; may {shown(key.key for key in chosen)}, as measured, stand for it"
+    asked = f"no topic drives the robot; may {shown(key.key for key in chosen)}, as measured, stand for it"
     return stand_in(chosen, found, asked, measured=False)
 
 
@@ -93,7 +93,7 @@ def _path(key: KeyInfo) -> str:
 
 
 def _rank(topic: Topic) -> tuple[int, bool, float, int]:
-    """Return (strength as a command, whether its rate is known, rate, messages); strength 0: no command."""
+    """Return (strength as an action, whether its rate is known, rate, messages); strength 0: no action."""
     said, first = set(words(_name(topic))), topic[0]
     inside = {word for key in topic for word in words(_path(key))}
     clear = strength(said)
@@ -121,7 +121,7 @@ def _other_side(topic: Topic, best: Topic) -> bool:
 
 
 def _commanded_fields(topic: Topic) -> list[KeyInfo]:
-    """Return the fields of a topic that are the command: desired values, and of these positions, if any."""
+    """Return the fields of a topic that are the action: desired values, and of these positions, if any."""
     desired = [key for key in topic if {"desired", "reference"} & set(words(_path(key)))]
     return _positions(desired or list(topic))
 
@@ -133,7 +133,7 @@ def _positions(fields: list[KeyInfo]) -> list[KeyInfo]:
 
 
 def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
-    """Return what topics measure of the robot: joints and poses, not velocities or commands."""
+    """Return what topics measure of the robot: joints and poses, not velocities or actions."""
     used = {_name((key,)) for key in taken}
     own = [topic for topic in _topics(found) if _name(topic) not in used and not _rank(topic)[0]]
     keys: list[KeyInfo] = []
@@ -165,7 +165,7 @@ def needs_receive_times(keys: Iterable[KeyInfo]) -> str:
 
 
 def offsets(actions: Iterable[KeyInfo], camera: KeyInfo) -> dict[str, Offset]:
-    """Return by topic how the actions lie between the pictures of that camera."""
+    """Return by topic how the actions lie between the frames of that camera."""
     name = camera.topic.name if camera.topic else ""
     return {topic.name: one for topic in about(actions) for one in topic.offsets if one.camera == name}
 
@@ -179,7 +179,7 @@ def told(found: dict[str, Offset]) -> list[str]:
 
 
 def tolerance_ms(found: Iterable[Offset]) -> float | None:
-    """Return the tolerance with which `hold` gives pictures their commands; None where none is needed."""
+    """Return the tolerance with which `hold` gives frames their actions; None where none is needed."""
     return min((one.tolerance_ms for one in found if one.tolerance_ms), default=None)
 
 
@@ -188,7 +188,7 @@ def max_skew_ms(
 ) -> int | None:
     """Return how many ms values may be moved: the longest interval measured, with a margin; None without any.
 
-    A held command may be as old as one interval. A nearest or interpolated value is off by half of one.
+    A held action may be as old as one interval. A nearest or interpolated value is off by half of one.
     """
     held = [topic.gap_ms for topic in about(actions)]
     near = [topic.gap_ms for topic in about([*cameras, *states])]

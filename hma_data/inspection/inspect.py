@@ -27,7 +27,7 @@ from hma_data.episodes.episode import Clip, Floats
 from hma_data.episodes.images import describe_resize
 from hma_data.episodes.offset import Offset, measure
 from hma_data.errors import HMAError, SourceError
-from hma_data.inspection.infer import commands, lacking
+from hma_data.inspection.infer import action_offsets, lacking
 from hma_data.registry.components import Sync
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment, find
 from hma_data.sources.base import SAMPLE, Inspection, LaidOut, Source, open_source
@@ -38,12 +38,12 @@ from hma_data.sources.detect import detect, of_another_format
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import is_remote, place
 
-NOT_LOOKED = "not looked at"  # the result of a check that the recording does not allow
-TRIED = 20  # episodes tried until one can be read
-SQUARE = 256  # pixels: the side of most tokenizers' pictures
-LOOKS = ("blank", "still", "colour", "size")  # checks of pictures; they count only for cameras that are used
-ASTRAY = 0.05  # least share of pictures with the command of another picture that is reported
-EMPTY = Finding("readable", "error", "the recording has no episodes")
+NOT_CHECKED = "not looked at"  # the result of a check that the recording does not allow
+MAX_TRIED = 20  # episodes tried until one can be read
+TOKENIZER_SIDE = 256  # pixels: the side of most tokenizers' images
+IMAGE_CHECKS = ("blank", "still", "colour", "size")  # they count only for cameras that are used
+MIN_ASTRAY = 0.05  # least share of frames with the action of another frame that is reported
+NO_EPISODES = Finding("readable", "error", "the recording has no episodes")
 
 
 def _inspected(uri: str, robot: Embodiment | None, episodes: int) -> tuple[Source, Inspection]:
@@ -78,12 +78,12 @@ def inspect_recording(
     found = [one for one in inspection.findings if not (robot and _answered(one, robot))]
     report = inspection.to_json()
     if not inspection.episodes:
-        found.append(EMPTY)
+        found.append(NO_EPISODES)
     elif robot:
         report["embodiment"] = _fit(uri, robot, source, inspection, found)
     else:
-        offsets = commands(inspection)
-        report["facts"] |= {f"commands {name}": offset.measured for name, offset in offsets.items()}
+        offsets = action_offsets(inspection)
+        report["facts"] |= {f"actions {name}": offset.measured for name, offset in offsets.items()}
         found += [*unanswered(inspection), *proposed(offsets)]
     report["findings"] = [finding.to_json() for finding in found]
     report["problems"] = [str(finding) for finding in found if finding.severity != "info"]
@@ -93,7 +93,7 @@ def inspect_recording(
 
 def _results(made: Iterable[str], found: Iterable[Finding]) -> dict[str, str]:
     """Return the result of each check: ok, the worst severity found, or "not looked at" where impossible."""
-    told = dict.fromkeys(CHECKS, NOT_LOOKED) | dict.fromkeys(made, "ok")
+    told = dict.fromkeys(CHECKS, NOT_CHECKED) | dict.fromkeys(made, "ok")
     for finding in sorted(found, key=lambda one: SEVERITIES.index(one.severity)):
         told[finding.check] = finding.severity
     return told
@@ -110,10 +110,10 @@ def _fit(
         names = ids_for_robot([ref.id for ref in source.index(uri, robot)], robot)
     except HMAError as fault:
         faults.append(fault)
-    for name in names[:TRIED]:
+    for name in names[:MAX_TRIED]:
         try:
             clip = to_clip(source.read(uri, name, robot), robot)
-            pictures = clip.frames_at(robot.primary_camera.name, np.arange(min(len(clip), 2)))
+            frames = clip.frames_at(robot.primary_camera.name, np.arange(min(len(clip), 2)))
             sizes = {name: clip.frames_at(name, np.arange(1)).shape[1:3] for name in clip.frame_indices}
             break
         except HMAError as fault:
@@ -127,10 +127,10 @@ def _fit(
         said = f"{len(faults)} of the first {len(faults) + 1} episodes cannot be used: {faults[0]}"
         found.append(Finding("usable", "warn", said, numbers={"refused": len(faults)}))
     facts["first episode"] = f"{name}: {len(clip)} frames on the grid, {clip.trimmed} trimmed at its ends"
-    facts["pictures"] = "×".join(map(str, pictures.shape[1:]))
+    facts["images"] = "×".join(map(str, frames.shape[1:]))
     for camera in robot.cameras:
         height, width = sizes[camera.name]
-        said = describe_resize(camera, height, width, SQUARE)
+        said = describe_resize(camera, height, width, TOKENIZER_SIDE)
         facts[f"camera {camera.name}"] = said.removeprefix(f"{camera.name}: ")
     hz = measured_hz(np.diff(clip.timestamps))
     facts["rate on the grid"] = f"{hz:.3g} Hz" if hz else "unknown"
@@ -138,7 +138,7 @@ def _fit(
         p50, p95, most = np.percentile(skew, [50, 95, 100])
         facts[f"skew of {stream}"] = f"p50 {p50:.1f} ms, p95 {p95:.1f} ms, max {most:.1f} ms"
     for key, (offset, finding) in judged([clip], robot).items():
-        facts[f"commands {key}"] = offset.measured
+        facts[f"actions {key}"] = offset.measured
         found += [finding] if finding else []
     if hz and is_off_rate(hz, robot):
         said = f"{robot.id} says {robot.rate_hz:g} Hz, the recording's grid ticks at {hz:.3g} Hz"
@@ -171,7 +171,7 @@ def unanswered(inspection: Inspection) -> Iterator[Finding]:
     if lack := lacking(inspection):
         said = f"the recording {lack}"
         yield Finding(
-            "robot", "warn", said, "record cameras and the robot's commands or joint states together"
+            "robot", "warn", said, "record cameras and the robot's actions or joint states together"
         )
     if inspection.format in ONE_INDEX and not inspection.hz:
         yield Finding(
@@ -179,11 +179,11 @@ def unanswered(inspection: Inspection) -> Iterator[Finding]:
         )
 
 
-# -- commands beside pictures
+# -- actions beside frames
 
 
 def proposed(offsets: dict[str, Offset]) -> Iterator[Finding]:
-    """Yield a finding for commands that plain `hold` would pair with the picture after theirs."""
+    """Yield a finding for actions that plain `hold` would pair with the frame after theirs."""
     for name, offset in offsets.items():
         if offset.tolerance_ms and offset.after_ms:
             numbers = {"after_ms": offset.after_ms[0], "tolerance_ms": offset.tolerance_ms}
@@ -192,7 +192,7 @@ def proposed(offsets: dict[str, Offset]) -> Iterator[Finding]:
 
 
 def judged(clips: list[Clip], robot: Embodiment) -> dict[str, tuple[Offset, Finding | None]]:
-    """Measure for each action key how commands lie between pictures, and judge the YAML's pairing of both.
+    """Measure for each action key how actions lie between frames, and judge the YAML's pairing of both.
 
     Recordings made of steps, and grids of a fixed rate, have no such pairing.
     """
@@ -213,20 +213,20 @@ def judged(clips: list[Clip], robot: Embodiment) -> dict[str, tuple[Offset, Find
 
 
 def _astray(key: str, offset: Offset, runs: list[tuple[Floats, Floats]], sync: Sync) -> Finding | None:
-    """Return a finding where the YAML gives pictures the commands of other pictures."""
+    """Return a finding where the YAML gives frames the actions of other frames."""
     if offset.after_ms is None or sync.actions == "interpolate":
         return None
     apart: list[Floats] = []
-    for times, pictures in runs:
-        running = pictures[(pictures >= times[0]) & (pictures <= times[-1])]
+    for times, frames in runs:
+        running = frames[(frames >= times[0]) & (frames <= times[-1])]
         own = hold(times, running, offset.tolerance_ms / 1e3)[0]
         given = matched(sync.actions, times, running, (sync.tolerance_ms or 0) / 1e3)[0]
         apart.append(times[given] - times[own])
     off = np.concatenate(apart)
     for side, share in (("before", float(np.mean(off < 0))), ("after", float(np.mean(off > 0)))):
-        if share >= ASTRAY:
+        if share >= MIN_ASTRAY:
             stated = sync.actions + (f", tolerance_ms {sync.tolerance_ms:g}" if sync.tolerance_ms else "")
-            fault = f"{share:.0%} of pictures get the command of the picture {side} them"
+            fault = f"{share:.0%} of frames get the action of the frame {side} them"
             said = f"{key}: {fault} by actions: {stated}; {offset.said}"
             remedy = f"set sync: {{{offset.pairing}}}" + (
                 "" if offset.tolerance_ms else " without tolerance_ms"
@@ -275,18 +275,18 @@ def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Find
         yield Finding("readable", "error", str(fault))
         return
     if not inspection.episodes:
-        yield EMPTY
+        yield NO_EPISODES
     elif robot is None:
         yield from _without_robot(inspection)
         yield from unanswered(inspection)
-        yield from proposed(commands(inspection))
+        yield from proposed(action_offsets(inspection))
     else:
         yield from _for_robot(inspection, robot)
         yield from _episodes(uri, robot, source, sample, inspection)
 
 
 def _without_robot(inspection: Inspection) -> Iterator[Finding]:
-    """Yield the findings; blank pictures are a warning where no other camera is there to be used."""
+    """Yield the findings; blank frames are a warning where no other camera is there to be used."""
     cameras = {info.key for info in inspection.keys if len(info.shape) == 3}
     blank = {finding.key for finding in inspection.findings if finding.check == "blank"}
     for finding in inspection.findings:
@@ -310,7 +310,7 @@ def _for_robot(inspection: Inspection, robot: Embodiment) -> Iterator[Finding]:
     for finding in inspection.findings:
         if finding.check == "constant" or _answered(finding, robot):
             continue
-        if finding.check in LOOKS:
+        if finding.check in IMAGE_CHECKS:
             camera = cameras.get(finding.key)
             if camera is None or (finding.check == "colour" and camera.color == "bgr"):
                 continue
@@ -341,7 +341,7 @@ def _episodes(
     for name in chosen:
         try:
             clip = to_clip(source.read(uri, name, robot), robot)
-            for camera in robot.cameras:  # can they be decoded? the inspection judged the pictures
+            for camera in robot.cameras:  # can they be decoded? the inspection judged the frames
                 clip.frames_at(camera.name, np.array([len(clip) - 1]))
             clips.append(clip)
         except HMAError as fault:

@@ -14,8 +14,8 @@ from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.sources.common.checks import Finding, Severity
 from hma_data.sources.common.survey import listed
 
-COSTLY = 0.1  # share of the windows above which the loss is a warning
-TRIED = 20  # flagged episodes of which the first with more than one row is measured
+MAX_LOST_SHARE = 0.1  # share of the windows above which the loss is a warning
+MAX_MEASURED = 20  # flagged episodes of which the first with more than one row is measured
 
 
 def rate_finding(shards: ShardSet) -> Finding | None:
@@ -28,7 +28,7 @@ def rate_finding(shards: ShardSet) -> Finding | None:
     if not len(flagged):
         return None
     robot, count, total = shards.embodiment, len(flagged), len(episodes)
-    which, hz = next(_measured(shards, flagged[:TRIED].to_pylist()), ("", None))
+    which, hz = next(_measured(shards, flagged[:MAX_MEASURED].to_pylist()), ("", None))
     said = f"{count:,} of {total:,} episodes have another rate than the stated {robot.rate_hz:g} Hz"
     said += f", such as {which} with {hz:.3g} Hz" if hz else ""
     remedy = f"{rate_remedy(robot)}, and convert again with --overwrite"
@@ -52,8 +52,8 @@ def pause_finding(shards: ShardSet) -> Finding | None:
     lost = whole - WindowIndex.of(shards, "train", WINDOW).count
     said = f"{count:,} of {len(episodes):,} episodes have a pause of {PAUSE:g} steps or more, such as {which}"
     said += f"; {lost:,} of {whole:,} training windows would cross one and are left out" if lost else ""
-    hz = next((hz for _, hz in _measured(shards, flagged[:TRIED].to_pylist())), None)
-    severity: Severity = "warn" if lost > COSTLY * whole else "info"
+    hz = next((hz for _, hz in _measured(shards, flagged[:MAX_MEASURED].to_pylist())), None)
+    severity: Severity = "warn" if lost > MAX_LOST_SHARE * whole else "info"
     numbers = {"episodes": count, "windows": lost}
     return Finding("gaps", severity, said, pause_remedy(shards.embodiment, hz), numbers=numbers)
 

@@ -1,7 +1,7 @@
 """Show an episode in Rerun: cameras, decoded tokens, actions, states and skew on one clock.
 
 The timelines are `time`, seconds since the episode's first frame, and `frame`. The entities are
-`cameras/NAME` and `decoded/NAME` (pictures), `actions`, `states`, `skew_ms/STREAM` (curves), `about` (text).
+`cameras/NAME` and `decoded/NAME` (frames), `actions`, `states`, `skew_ms/STREAM` (curves), `about` (text).
 
 T frames, H×W pixels, A values a frame.
 """
@@ -27,9 +27,9 @@ from hma_data.storage.files import atomic_path
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
-QUALITY = 92  # of the JPEGs
-BATCH = 16  # pictures that are in memory at a time
-GROUPS = re.compile(r"^(skew_ms|training/loss|held_out/loss)/.*")  # curves of one scale share a view
+JPEG_QUALITY = 92  # percent
+FRAMES_AT_ONCE = 16  # in memory
+CURVE_GROUPS = re.compile(r"^(skew_ms|training/loss|held_out/loss)/.*")  # curves of one scale share a view
 
 
 def rerun() -> Any:
@@ -48,7 +48,7 @@ def rerun() -> Any:
 
 
 class View:
-    """A recording for Rerun, with its blueprint: the pictures above, the curves below.
+    """A recording for Rerun, with its blueprint: the frames above, the curves below.
 
     Args:
         name: of the recording.
@@ -62,16 +62,16 @@ class View:
         self._rr, self.times = rerun(), np.asarray(times, np.float64)
         self._stream = self._rr.RecordingStream("hma_view")
         self._stream.send_recording_name(name)
-        self._shown: list[str] = []  # entities of pictures
+        self._shown: list[str] = []  # entities of images
         self._drawn: list[str] = []  # entities of curves, or of groups of them
 
     def pictures(self, entity: str, batches: Iterable[Images]) -> None:
-        """Add the pictures (n, H, W, 3) RGB of all frames, in batches."""
+        """Add the images (n, H, W, 3) RGB of all frames, in batches."""
         cv2, rr, start = opencv(), self._rr, 0
         self._shown.append(entity)
         for frames in batches:
             jpegs = [
-                cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+                cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
                 for frame in frames
             ]
             rows = np.arange(start, start + len(jpegs))
@@ -123,7 +123,7 @@ class View:
     def _blueprint(self) -> Any:
         rrb = self._rr.blueprint
         seen = [rrb.Spatial2DView(origin=entity, name=entity) for entity in self._shown]
-        groups = dict.fromkeys(GROUPS.sub(r"\1", entity) for entity in self._drawn)
+        groups = dict.fromkeys(CURVE_GROUPS.sub(r"\1", entity) for entity in self._drawn)
         drawn = [rrb.TimeSeriesView(origin=group, name=group) for group in groups]
         below = rrb.Horizontal(
             rrb.Vertical(*drawn), rrb.TextDocumentView(origin="about"), column_shares=[3, 1]
@@ -168,7 +168,7 @@ def view_recording(
 
 
 def view_shards(folder: StrPath, episode: int = 0, tokenizer: Tokenizer | None = None) -> View:
-    """Show an episode of a shard set; its pictures are decoded from the tokens.
+    """Show an episode of a shard set; its frames are decoded from the tokens.
 
     Args:
         folder: str or path of the set, or its URI.
@@ -218,13 +218,13 @@ def _masked(values: NDArray[Any], known: NDArray[Any] | None) -> NDArray[np.floa
 
 
 def _recorded(clip: Clip, camera: str) -> Iterator[Images]:
-    """Yield the pictures of the frames, as large as they were recorded."""
+    """Yield the images of the frames, as large as they were recorded."""
     for rows in _parts(np.arange(len(clip))):
         yield clip.frames_at(camera, rows)
 
 
 def _coded(clip: Clip, robot: Embodiment, camera: str, tokenizer: Tokenizer) -> Iterator[Images]:
-    """Yield the pictures of the frames after the tokenizer has encoded and decoded them."""
+    """Yield the images of the frames after the tokenizer has encoded and decoded them."""
     spec, stream = tokenizer.spec, clip.episode.streams[camera]
     for rows in _parts(clip.frame_indices[camera]):
         frames = prepared(stream, rows, robot.camera(camera), spec.image_size, spec.resize_filter)
@@ -232,7 +232,7 @@ def _coded(clip: Clip, robot: Embodiment, camera: str, tokenizer: Tokenizer) -> 
 
 
 def _parts(values: NDArray[Any]) -> Iterator[NDArray[Any]]:
-    return (values[start : start + BATCH] for start in range(0, len(values), BATCH))
+    return (values[start : start + FRAMES_AT_ONCE] for start in range(0, len(values), FRAMES_AT_ONCE))
 
 
 def _number(ids: Sequence[str], episode: int, where: str) -> str:

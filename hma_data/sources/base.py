@@ -56,7 +56,7 @@ class Source(Protocol):
     """A reader of one recording format. `uri` is the path (str or path object) or the URI of a recording."""
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
-        """Return what the recording holds; sample the values and pictures of `episodes` episodes."""
+        """Return what the recording holds; sample the values and frames of `episodes` episodes."""
         ...
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> Sequence[EpisodeRef]:
@@ -68,7 +68,7 @@ class Source(Protocol):
         ...
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
-        """Return one episode; its pictures are decoded on demand."""
+        """Return one episode; its frames are decoded on demand."""
         ...
 
 

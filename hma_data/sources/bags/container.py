@@ -1,7 +1,7 @@
 """Define what the three kinds of bag file share: the contract, records, the index by time, chunks.
 
 A container is one file. It yields the messages of wanted topics in the file's order. Where it has an index,
-it counts the messages without reading them. It finds a message again by its place, so for pictures only
+it counts the messages without reading them. It finds a message again by its place, so for images only
 places are kept in memory. No container holds an open file between calls.
 
 A piece is a run of a file's records: one chunk, or messages outside of chunks. Its topics and its times of
@@ -201,7 +201,7 @@ class IndexedFile(ABC):
             whole = replace(wanted, heads=frozenset())
             for piece in pieces:
                 for record in self._in_piece(file, index, piece, whole):
-                    if len(record.data) >= KEPT_FROM:  # so that pictures are not fetched again
+                    if len(record.data) >= KEPT_FROM:  # so that images are not fetched again
                         file.blocks.keep(record.place, bytes(record.data))
                     yield record
 

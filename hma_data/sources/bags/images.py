@@ -1,4 +1,4 @@
-"""Turn messages into pictures: raw, compressed, and video stored one frame a message.
+"""Turn messages into images: raw, compressed, and video stored one frame a message.
 
 The types are Image and CompressedImage of sensor_msgs; CompressedImage, RawImage and CompressedVideo of
 foxglove, in any encoding of messages; and FFMPEGPacket. T messages; H×W pixels, uint8 RGB.
@@ -35,7 +35,7 @@ KINDS = {
 DEPTH = ("compresseddepth", "16uc1", "32fc1")
 MONO16 = "mono16"  # grey of 16 bits; `levels` of the camera say what becomes black and white
 Levels = tuple[float, float]
-ENCODINGS = {  # of raw pictures: bytes of a pixel, OpenCV's conversion to RGB
+ENCODINGS = {  # of raw images: bytes of a pixel, OpenCV's conversion to RGB
     "rgb8": (3, ""), "bgr8": (3, "BGR2RGB"), "8uc3": (3, "BGR2RGB"),
     "rgba8": (4, "RGBA2RGB"), "bgra8": (4, "BGRA2RGB"), "8uc4": (4, "BGRA2RGB"),
     "mono8": (1, "GRAY2RGB"), "8uc1": (1, "GRAY2RGB"),
@@ -50,18 +50,18 @@ ENCODERS = (("264", "h264"), ("265", "h265"), ("hevc", "h265"), ("vp9", "vp9"), 
 BLOCK = 64  # video messages fetched at a time
 NAL_UNIT = re.compile(b"\x00\x00\x01(.)", re.DOTALL)
 AV1_SEQUENCE = 1  # type of the unit that holds a sequence header
-# What FFmpeg logs where a reference picture is missing, and the level of that message.
+# What FFmpeg logs where a reference image is missing, and the level of that message.
 MISSING = {"h264": ("DEBUG", "Frame num gap"), "h265": ("ERROR", "Could not find ref")}
 
 
-def picture_kind(message_type: str) -> str | None:
-    """Return raw, still or video; None for a type without pictures."""
+def image_kind(message_type: str) -> str | None:
+    """Return raw, still or video; None for a type without images."""
     short = re.sub(r"^foxglove(_msgs)?[./](msg[./])?", "foxglove/", message_type).replace("/msg/", "/")
     return KINDS.get(short)
 
 
 def codec(message: Any, kind: str) -> str:
-    """Return how the picture is stored: jpeg, png, raw, h264 …"""
+    """Return how the image is stored: jpeg, png, raw, h264 …"""
     if kind == RAW:
         return "raw"
     if kind == VIDEO:
@@ -87,7 +87,7 @@ def video_codec(message: Any) -> str:
 def encoding(message: Any, kind: str) -> str:
     """Return the encoding of the pixels in lower case, such as mono8; empty where the message states none.
 
-    image_transport begins the format of compressed pictures with it: "mono8; jpeg compressed".
+    image_transport begins the format of compressed images with it: "mono8; jpeg compressed".
     """
     if kind == RAW:
         return str(child(message, "encoding")).lower()
@@ -98,13 +98,13 @@ def encoding(message: Any, kind: str) -> str:
 
 
 def picture(message: Any, kind: str, where: str, levels: Levels | None = None) -> Images:
-    """Return a raw or still picture as (H, W, 3) RGB.
+    """Return a raw or still image as (H, W, 3) RGB.
 
     Args:
         levels: the values of 16-bit grey that become 0 and 255.
 
     Raises:
-        EpisodeError: it is not colour or grey of 8 bits, its sizes do not fit, or its bytes are no picture;
+        EpisodeError: it is not colour or grey of 8 bits, its sizes do not fit, or its bytes are no image;
             or it is grey of 16 bits and there are no levels.
     """
     try:
@@ -114,22 +114,22 @@ def picture(message: Any, kind: str, where: str, levels: Levels | None = None) -
         if encoding(message, kind) == MONO16 and (kind == RAW or _is_png(payload(message))):
             if levels is None:
                 remedy = "state the values of black and white in the YAML, such as levels: [0, 4095]"
-                raise EpisodeError(where, "pictures in mono16 have 16 bits of grey", remedy)
+                raise EpisodeError(where, "images in mono16 have 16 bits of grey", remedy)
             return _grey(wide_grey(message, kind, where), levels)
         return _raw(message, where) if kind == RAW else decode_image(payload(message), where)
     except (KeyError, TypeError, ValueError) as fault:
-        raise EpisodeError(where, f"a message is not a picture: {fault!r}") from fault
+        raise EpisodeError(where, f"a message is not an image: {fault!r}") from fault
 
 
 def is_grey(message: Any, kind: str) -> bool:
-    """Check whether a raw or still picture has one channel."""
+    """Check whether a raw or still image has one channel."""
     if kind == RAW:
         return encoding(message, kind) in ("mono8", "8uc1", MONO16)
     return kind == STILL and (encoding(message, kind) == MONO16 or one_channel(payload(message)))
 
 
 def wide_grey(message: Any, kind: str, where: str) -> NDArray[np.uint16]:
-    """Return the values (H, W) of a picture in mono16."""
+    """Return the values (H, W) of an image in mono16."""
     if kind == RAW:
         low_first = "is_bigendian" not in field_names(message) or not child(message, "is_bigendian")
         pixels = _pixels(message, where, pixel=2)
@@ -137,7 +137,7 @@ def wide_grey(message: Any, kind: str, where: str) -> NDArray[np.uint16]:
     cv2 = opencv()
     found = cv2.imdecode(np.frombuffer(payload(message), np.uint8), cv2.IMREAD_UNCHANGED)
     if found is None or found.ndim != 2:
-        raise EpisodeError(where, "a picture in mono16 cannot be decoded")
+        raise EpisodeError(where, "an image in mono16 cannot be decoded")
     return found.astype(np.uint16)
 
 
@@ -153,7 +153,7 @@ def _grey(values: NDArray[np.uint16], levels: Levels) -> Images:
 
 
 def payload(message: Any) -> bytes:
-    """Return the stored bytes of a picture; JSON stores them in base64."""
+    """Return the stored bytes of an image; JSON stores them in base64."""
     data = child(message, "data")
     if isinstance(data, str):
         return base64.b64decode(data, validate=True)
@@ -165,7 +165,7 @@ def _raw(message: Any, where: str) -> Images:
     if stated.lower() not in ENCODINGS:
         raise EpisodeError(
             where,
-            f"pictures in {stated!r} are not 8-bit colour",
+            f"images in {stated!r} are not 8-bit colour",
             f"these can be read: {', '.join([*ENCODINGS, MONO16])}",
         )
     pixel, conversion = ENCODINGS[stated.lower()]
@@ -175,11 +175,11 @@ def _raw(message: Any, where: str) -> Images:
 
 
 def _pixels(message: Any, where: str, pixel: int) -> Images:
-    """Return the bytes (H, W, pixel) of a raw picture without the padding of its rows."""
+    """Return the bytes (H, W, pixel) of a raw image without the padding of its rows."""
     stated = str(child(message, "encoding"))
     height, width, step = (int(child(message, name)) for name in ("height", "width", "step"))
     if min(height, width) < 1 or height * width > MAX_PIXELS:
-        raise EpisodeError(where, f"a picture claims {width}×{height} pixels, the most is {MAX_PIXELS:,}")
+        raise EpisodeError(where, f"an image claims {width}×{height} pixels, the most is {MAX_PIXELS:,}")
     planar = stated.lower() in ("nv12", "nv21")  # rows of colour, half as many, follow those of luma
     rows, row = height * 3 // 2 if planar else height, width * pixel
     step = step or row
@@ -188,7 +188,7 @@ def _pixels(message: Any, where: str, pixel: int) -> Images:
     odd = planar and (height % 2 or width % 2)
     if odd or step < row or len(flat) < step * (rows - 1) + row:
         raise EpisodeError(
-            where, f"a picture of {width}×{height} in {stated} has {len(flat):,} bytes, rows of {step}"
+            where, f"an image of {width}×{height} in {stated} has {len(flat):,} bytes, rows of {step}"
         )
     if len(flat) < step * rows:  # the last row may end with its last pixel
         flat = np.concatenate([flat, np.zeros(step * rows - len(flat), np.uint8)])
@@ -260,14 +260,14 @@ class VideoDecoder:
         self._context: Any = None
         self._to_rgb = FrameToRGB()
         self._next = 0  # the message that the decoder takes next
-        self._taken = -1  # the last picture returned
-        self._ready: dict[int, Any] = {}  # pictures decoded but not returned yet; None for a damaged one
-        self._spoilt = False  # whether the last decoded picture, or one it may depend on, is damaged
-        self._lost = False  # whether a picture since the last key frame is missing
-        self._incomplete: set[int] = set()  # messages that may depend on a missing picture
+        self._taken = -1  # the last image returned
+        self._ready: dict[int, Any] = {}  # images decoded but not returned yet; None for a damaged one
+        self._spoilt = False  # whether the last decoded image, or one it may depend on, is damaged
+        self._lost = False  # whether an image since the last key frame is missing
+        self._incomplete: set[int] = set()  # messages that may depend on a missing image
 
     def frames(self, indices: Sequence[int]) -> dict[int, Images]:
-        """Return the picture (H, W, 3) of each of those indices.
+        """Return the image (H, W, 3) of each of those indices.
 
         Raises:
             EpisodeError: one of them, or one it builds on, cannot be decoded.
@@ -342,9 +342,9 @@ _LOGGING = threading.Lock()  # PyAV's log settings hold for the whole process
 
 @contextmanager
 def _missing_references(codec: str) -> Iterator[list[str]]:
-    """Gather FFmpeg's log messages on missing reference pictures, of H.264 and H.265.
+    """Gather FFmpeg's log messages on missing reference images, of H.264 and H.265.
 
-    FFmpeg goes on without a lost picture, and marks no frame as damaged. In AV1, dav1d returns no picture
+    FFmpeg goes on without a lost image, and marks no frame as damaged. In AV1, dav1d returns no image
     that depends on a lost one.
     """
     import av.logging as log
@@ -390,7 +390,7 @@ class Messages:
 
 
 class StillStream:
-    """A camera of raw or still pictures; see episode.Stream."""
+    """A camera of raw or still images; see episode.Stream."""
 
     def __init__(
         self, timestamps: Floats, messages: Messages, kind: str, levels: Levels | None = None
@@ -414,7 +414,7 @@ class VideoStream:
     """A camera of video; see episode.Stream.
 
     Args:
-        timestamps: (T,) of the pictures shown, which are the last T messages.
+        timestamps: (T,) of the images shown, which are the last T messages.
         keyframes: (M,) of all messages; the messages before those shown serve only for decoding.
     """
 
@@ -440,24 +440,24 @@ class VideoStream:
                 yield payload(message)
 
 
-def _of_one_size(pictures: Iterator[Images], where: str) -> Iterator[Images]:
-    """Yield the pictures; raise EpisodeError at the first whose size differs."""
+def _of_one_size(images: Iterator[Images], where: str) -> Iterator[Images]:
+    """Yield the images; raise EpisodeError at the first whose size differs."""
     first: tuple[int, ...] = ()
-    for item in pictures:
+    for item in images:
         first = first or item.shape
         if item.shape != first:
             shapes = sorted({first, item.shape})
-            raise EpisodeError(where, f"pictures change size within the episode: {shapes}")
+            raise EpisodeError(where, f"images change size within the episode: {shapes}")
         yield item
 
 
-def _stack(pictures: Iterator[Images], count: int) -> Images:
-    """Stack pictures to (count, H, W, 3), one at a time, so that only one picture is in memory twice."""
-    first = next(pictures, None)
+def _stack(images: Iterator[Images], count: int) -> Images:
+    """Stack images to (count, H, W, 3), one at a time, so that only one image is in memory twice."""
+    first = next(images, None)
     if first is None:
         return np.zeros((0, 1, 1, 3), np.uint8)
     stacked = np.empty((count, *first.shape), np.uint8)
     stacked[0] = first
-    for i, item in enumerate(pictures, start=1):
+    for i, item in enumerate(images, start=1):
         stacked[i] = item
     return stacked

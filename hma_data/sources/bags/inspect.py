@@ -22,8 +22,8 @@ from hma_data.sources.bags.images import (
     Messages,
     codec,
     encoding,
+    image_kind,
     is_grey,
-    picture_kind,
     wide_grey,
 )
 from hma_data.sources.bags.messages import (
@@ -48,9 +48,9 @@ MAX_FIELDS = 64  # most numeric keys of a topic whose values are checked
 MAX_HELD = 1 << 16  # most numbers of a key in memory
 MAX_WIDTH = 4096  # most values of an action or state; wider fields are maps or point clouds
 LOGS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")  # not streams
-PAIRS = 4  # runs of neighbouring pictures looked at, for a camera
+PAIRS = 4  # runs of neighbouring frames looked at, for a camera
 APART_S = 1.0  # header stamps further than this from receive times are reported
-WHOLE = (0.0, 65535.0)  # levels at which pictures in mono16 are looked at
+WHOLE = (0.0, 65535.0)  # levels at which frames in mono16 are looked at
 
 
 @dataclass
@@ -100,7 +100,7 @@ class _Topic:
         first = self.sample is None
         if first or count > self.named:
             self.sample, self.named = message, count
-        if first and not picture_kind(self.track.channels[0].type):
+        if first and not image_kind(self.track.channels[0].type):
             topic = self.track.topic
             vectors = [key for key in _values(topic, message) if key.kind == "vector"][:MAX_FIELDS]
             narrow = [key.key for key in vectors if key.shape[0] <= MAX_WIDTH]
@@ -204,7 +204,7 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
 
 
 def _with_offsets(keys: list[KeyInfo], clocks: list[dict[str, _Clock]], survey: Survey) -> list[KeyInfo]:
-    """Add to topics with numbers how their messages lie between the pictures of each camera."""
+    """Add to topics with numbers how their messages lie between the frames of each camera."""
     cameras = [key.topic.name for key in keys if key.kind == "camera" and key.topic]
     topics = {key.topic.name: key.topic for key in keys if key.kind == "vector" and key.topic}
     for name, topic in topics.items():
@@ -221,7 +221,7 @@ def _with_offsets(keys: list[KeyInfo], clocks: list[dict[str, _Clock]], survey: 
 
 
 class _BagInspection:
-    """One bag, read once: its keys; its numbers, times, skew and some pictures go to the survey.
+    """One bag, read once: its keys; its numbers, times, skew and some frames go to the survey.
 
     Attributes:
         clocks: of its topics with messages.
@@ -277,7 +277,7 @@ class _BagInspection:
         if topic.fault:
             self._survey.note(Finding("readable", "warn", topic.fault, key=name))
         stated = track.channels[0]
-        kind = picture_kind(stated.type)
+        kind = image_kind(stated.type)
         times = track.seconds("header")[track.order()]
         measured = measure(times) if name in LOGS else self._times(track, times, bool(kind))
         found: list[KeyInfo] = []

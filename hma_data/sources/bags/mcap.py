@@ -151,7 +151,7 @@ class McapFile(IndexedFile):
     def _in_piece(
         self, file: BinaryIO, index: FileIndex, piece: Piece, wanted: RecordFilter
     ) -> Iterator[Record]:
-        # A chunk of which only heads are read is checked when its first picture is read.
+        # A chunk of which only heads are read is checked when its first frame is read.
         view = self._view(file, piece.at, piece.end, piece.topics.isdisjoint(wanted.heads))
         for opcode, at, start, end in _records(view, 0, len(view)):
             if opcode == MESSAGE:

@@ -1,8 +1,8 @@
-"""Find the start and end of the episodes inside one bag, without decoding a picture.
+"""Find the start and end of the episodes inside one bag, without decoding a frame.
 
 One pass over the primary camera's stamps and the markers' topics makes a table. The last bags and their
 tables are cached for the other episodes of the same bag, while no file changes; an episode is then read by
-its own time range. Tables of remote bags are also kept in this machine's cache folder. F pictures of the
+its own time range. Tables of remote bags are also kept in this machine's cache folder. F frames of the
 primary camera in order of receipt; an episode is a run of them.
 
 A marker is a message that begins or ends an episode: `source.segments.start` and `stop`. It counts when it
@@ -28,7 +28,7 @@ from hma_data.registry.components import Marker, Segments
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace
 from hma_data.sources.bags.container import Channel, Record, RecordFilter
-from hma_data.sources.bags.images import VIDEO, picture_kind
+from hma_data.sources.bags.images import VIDEO, image_kind
 from hma_data.sources.bags.messages import decode, head_stamp
 from hma_data.sources.bags.topic_track import TopicTrack, missing_topic, parse_key
 from hma_data.storage.files import cache_folder, write_atomic
@@ -45,11 +45,11 @@ Rows = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Segment:
-    """One episode: pictures `first` to `stop` of the primary camera.
+    """One episode: frames `first` to `stop` of the primary camera.
 
     Attributes:
-        first_ns, last_ns: receipt of its first and last picture.
-        skip: pictures before it that were also received at first_ns.
+        first_ns, last_ns: receipt of its first and last frame.
+        skip: frames before it that were also received at first_ns.
     """
 
     first: int
@@ -67,10 +67,10 @@ class Table:
     """The episodes of a bag.
 
     Attributes:
-        frames: pictures of the primary camera in the whole bag.
+        frames: frames of the primary camera in the whole bag.
         clock: of that camera, header or receive.
         reach_ns: how far outside the episode's receipt times its messages may have been received.
-        empty: parts without a picture, which are not episodes.
+        empty: parts without a frame, which are not episodes.
         keyframes: video camera -> ascending times of receipt of its key frames; of its first message where
             the codec does not show them.
     """
@@ -84,7 +84,7 @@ class Table:
 
     @property
     def left_out(self) -> int:
-        """Count the pictures that are in no episode."""
+        """Count the frames that are in no episode."""
         return self.frames - sum(map(len, self.segments))
 
 
@@ -140,8 +140,8 @@ def _cached[V](cache: dict[Any, V], key: Any, make: Callable[[], V], limit: int)
 
 
 def heads(channels: Sequence[Channel]) -> frozenset[str]:
-    """Return the topics of pictures whose messages hold their time in their first bytes."""
-    still = {c.topic for c in channels if picture_kind(c.type) not in (None, VIDEO)}
+    """Return the topics of frames whose messages hold their time in their first bytes."""
+    still = {c.topic for c in channels if image_kind(c.type) not in (None, VIDEO)}
     return frozenset(topic for topic in still if all(head_stamp(c) for c in channels if c.topic == topic))
 
 
@@ -156,9 +156,7 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
     camera = embodiment.primary_camera
     if camera.key not in topics:
         raise missing_topic(camera.key, topics, where)
-    videos = {c.topic for c in channels if picture_kind(c.type) == VIDEO} & {
-        c.key for c in embodiment.cameras
-    }
+    videos = {c.topic for c in channels if image_kind(c.type) == VIDEO} & {c.key for c in embodiment.cameras}
     tracks = {key: TopicTrack(key) for key in {camera.key} | videos}
     start = MarkerTrack(segments.start, topics, where) if segments.start else None
     stop = MarkerTrack(segments.stop, topics, where) if segments.stop else None
@@ -175,11 +173,11 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
     parts = [piece for begin, end in runs for piece in _at_gaps(times, begin, end, segments.gap_s)]
     found = tuple(_segment(received, begin, end) for begin, end in parts if begin < end)
     if not found:
-        fault = f"no episode in it holds a picture of {camera.key}"
+        fault = f"no episode in it holds a frame of {camera.key}"
         if start and not len(start.moments()):
             fault = f"no episode begins in it: {start.never()}"
         raise EpisodeError(where, fault, "correct source.segments in the YAML")
-    # The camera's pictures may arrive late; other messages may arrive without that delay.
+    # The camera's frames may arrive late; other messages may arrive without that delay.
     delay_s = np.abs(track.seconds("receive") - track.seconds(clock)).max()
     return Table(
         segments=found,
@@ -215,7 +213,7 @@ def _events(
 ) -> list[tuple[int, bool, int]]:
     """Return the events of the markers.
 
-    Each is a marker's time of receipt, whether it begins an episode, and the index of the first picture after
+    Each is a marker's time of receipt, whether it begins an episode, and the index of the first frame after
     it. Times of the same clock are compared: the messages' own where camera and marker both have them.
     """
     own = np.maximum.accumulate(times)
@@ -232,7 +230,7 @@ def _events(
 
 
 def _runs(events: list[tuple[int, bool, int]], frames: int, begun: bool) -> list[tuple[int, int]]:
-    """Return runs of pictures from each start to its end.
+    """Return runs of frames from each start to its end.
 
     Args:
         begun: whether no marker starts episodes: the first begins with the recording, each other at a stop.

@@ -20,7 +20,7 @@ from hma_data.registry.components import Camera, Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace, find_bags
 from hma_data.sources.bags.container import Channel, Record, RecordFilter, damaged
-from hma_data.sources.bags.images import picture_kind
+from hma_data.sources.bags.images import image_kind
 from hma_data.sources.bags.inspect import report
 from hma_data.sources.bags.messages import decode
 from hma_data.sources.bags.segments import Rows, Table, heads, parted
@@ -116,10 +116,10 @@ def _refs(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> l
 
 
 def _frames(counts: Counter[Channel], embodiment: Embodiment | None) -> int:
-    """Count the pictures of the primary camera; without an embodiment, of the camera with most pictures."""
+    """Count the frames of the primary camera; without an embodiment, of the camera with most frames."""
     topics: Counter[str] = Counter()
     for channel, count in counts.items():
-        if embodiment or picture_kind(channel.type):
+        if embodiment or image_kind(channel.type):
             topics[channel.topic] += count
     return topics[embodiment.primary_camera.key] if embodiment else max(topics.values(), default=0)
 
@@ -250,7 +250,7 @@ class _EpisodeReading:
         return min(self._said, key=lambda said: abs(said[0] - begins))[1]
 
     def _stream(self, camera: Camera, shown: Floats | None = None) -> Stream:
-        """Return a camera; for an episode in a bag, its own pictures, or those around the times `shown`."""
+        """Return a camera; for an episode in a bag, its own frames, or those around the times `shown`."""
         track, clock = self._tracks[camera.key], camera.stamp or self._embodiment.sync.stamp
         if self._segment is None or self._table is None:
             return camera_stream(self._bag, track, clock, levels=camera.levels)
@@ -274,10 +274,10 @@ class _EpisodeReading:
         return Signal(times, component_values(column.component, column.values()[order], self._where))
 
     def _around(self, received: Rows, times: Floats, shown: Floats) -> tuple[int, int]:
-        """Return the range of samples, in order of receipt, that the pictures shown need.
+        """Return the range of samples, in order of receipt, that the frames shown need.
 
-        It begins with the sample in force at the first picture. It ends with the first sample at or after the
-        last picture, or, with `sync.tolerance_ms`, that much later. Where a clock begins anew between two
+        It begins with the sample in force at the first frame. It ends with the first sample at or after the
+        last frame, or, with `sync.tolerance_ms`, that much later. Where a clock begins anew between two
         episodes, only the samples on this episode's side count.
         """
         assert self._segment

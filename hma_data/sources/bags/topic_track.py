@@ -4,7 +4,7 @@ A camera's key is its topic. A number's key is the topic and a path into its mes
 `/joint_states.position`, `/joint_states.position[0:7]`, `/markers.poses[2].position.x`, `/cmd_vel`,
 `/cmd_vel.linear` (a message of numbers gives them in the order of its fields).
 
-Of a message only its times and its place are kept, a few bytes; a camera's pictures are read again by these
+Of a message only its times and its place are kept, a few bytes; a camera's frames are read again by these
 places on demand. T messages of a topic, A values of a component; times are float64 seconds; the clock of a
 topic is `header` or `receive`.
 """
@@ -30,9 +30,9 @@ from hma_data.sources.bags.images import (
     Messages,
     StillStream,
     VideoStream,
+    image_kind,
     is_keyframe,
     payload,
-    picture_kind,
     video_codec,
 )
 from hma_data.sources.bags.messages import (
@@ -258,7 +258,7 @@ class TopicTrack:
         """Add the next message; a message that cannot be decoded is None, and keeps its time of receipt."""
         for column in self.columns:
             column.add(message, len(self))
-        if message is not None and picture_kind(channel.type) == VIDEO:
+        if message is not None and image_kind(channel.type) == VIDEO:
             self._keyframes.append(self._is_keyframe(message))
         self._take(channel, log_ns, place, stamp_ns(message))
 
@@ -329,21 +329,19 @@ def camera_stream(
 
     Args:
         clock: header or receive.
-        shown: [from, to) of the pictures, in order of receipt; all by default. Video may need earlier
+        shown: [from, to) of the frames, in order of receipt; all by default. Video may need earlier
             messages too, to be decoded.
-        levels: of the camera, for pictures in mono16.
+        levels: of the camera, for frames in mono16.
 
     Raises:
-        EpisodeError: the topic holds no pictures, or video that never begins.
+        EpisodeError: the topic holds no images, or video that never begins.
     """
     where = f"{bag.path}, {track.topic}"
-    kinds = {picture_kind(channel.type) for channel in track.channels}
+    kinds = {image_kind(channel.type) for channel in track.channels}
     kind = kinds.pop()
     if kind is None or kinds:
         types = ", ".join(sorted({channel.type or channel.encoding for channel in track.channels}))
-        raise EpisodeError(
-            where, f"holds {types}, not pictures", "name a topic of pictures as the camera's key"
-        )
+        raise EpisodeError(where, f"holds {types}, not images", "name a topic of images as the camera's key")
     order = track.order()
     begin, stop = shown or (0, len(order))
     if kind != VIDEO:

@@ -1,12 +1,12 @@
-"""Check the times and the pictures of a recording, and state what was found.
+"""Check the times and the images of a recording, and state what was found.
 
 Times: rate, jitter, repeated stamps, stamps that go back, pauses, lost frames. T samples of a stream; times
 are float64 seconds in the order of receipt.
 
-Pictures: still, blank, of several sizes, red and blue swapped. That shows in pictures that were decoded from
+Images: still, blank, of several sizes, red and blue swapped. That shows in images that were decoded from
 JPEG or video and then stored without loss: every pixel is then a result of the conversion from YCbCr, which
 gives only a quarter of all colours. The channel order in which all pixels are such results is the right one.
-n pictures, H×W pixels, uint8 RGB.
+n images, H×W pixels, uint8 RGB.
 """
 
 import re
@@ -38,8 +38,8 @@ TIMES = re.compile(rf"(.*/)?(time_?stamps?|times?|stamps?|t)(_({'|'.join(NAMED_U
 STEPS_S = (1e-4, 5.0)  # between samples of a recording
 DRIFT = 0.02  # share of the stated rate by which the measured rate may differ
 
-PAIRS = 16  # pairs of neighbouring pictures compared, for a camera over all its episodes
-PIXELS = 4096  # pixels of a picture whose colours are checked
+PAIRS = 16  # pairs of neighbouring images compared, for a camera over all its episodes
+PIXELS = 4096  # pixels of an image whose colours are checked
 DISTINCT = 1_000  # least number of distinct colours for the YCbCr sign
 SURE, CHANCE = 0.98, 0.6  # share of colours that YCbCr gives: least in the right order, most in the other
 STILL = 0.5  # least share of equal neighbours that is reported
@@ -265,25 +265,25 @@ def seconds_of(values: NDArray[Any], key: str = "") -> NDArray[np.float64] | Non
     return shifted.astype(np.float64) * unit
 
 
-# -- pictures
+# -- images
 
 
 @dataclass
 class Look:
-    """Statistics of one camera's pictures.
+    """Statistics of one camera's images.
 
     Attributes:
-        lossless: whether pictures are stored without loss, so that the YCbCr sign can be used.
-        pictures: how many were added.
+        lossless: whether images are stored without loss, so that the YCbCr sign can be used.
+        images: how many were added.
         sizes: (height, width) -> number of calls of `add` with it.
         changes: how often the size changes within an episode.
-        neighbours, same: pairs of neighbouring pictures compared, and equal ones among them.
+        neighbours, same: pairs of neighbouring images compared, and equal ones among them.
         blank, episodes: episodes in which the camera shows one colour; all episodes looked at.
         colours: some of the colours met.
     """
 
     lossless: bool = True
-    pictures: int = 0
+    images: int = 0
     sizes: dict[tuple[int, int], int] = field(default_factory=dict)
     changes: int = 0
     neighbours: int = 0
@@ -295,13 +295,13 @@ class Look:
     _size: tuple[int, int] = (0, 0)
 
     def add(self, frames: Images, indices: NDArray[np.int64], again: bool = False) -> None:
-        """Add pictures (n, H, W, 3) of one episode, and the rising indices (n,) of their frames.
+        """Add images (n, H, W, 3) of one episode, and the rising indices (n,) of their frames.
 
-        `again` says that they are of the same episode as the pictures before.
+        `again` says that they are of the same episode as the images before.
         """
         if not again:
             self.episodes, self.blank, self._check = self.episodes + 1, self.blank + 1, PictureCheck()
-        self.pictures += len(frames)
+        self.images += len(frames)
         size = (int(frames.shape[1]), int(frames.shape[2]))
         self.changes += again and size != self._size
         self._size = size
@@ -376,26 +376,26 @@ def choose(length: int, pairs: int, starts: NDArray[np.int64] | None = None) -> 
 
 
 def runs(indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Divide the chosen frames into runs of neighbours, so that only one run of pictures is in memory."""
+    """Divide the chosen frames into runs of neighbours, so that only one run of images is in memory."""
     return np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
 
 
-def stacked(pictures: list[Images]) -> Iterator[tuple[int, Images]]:
-    """Yield runs of pictures of one size as (n, H, W, 3), with the index at which each run begins."""
+def stacked(images: list[Images]) -> Iterator[tuple[int, Images]]:
+    """Yield runs of images of one size as (n, H, W, 3), with the index at which each run begins."""
     start = 0
-    for i in range(1, len(pictures) + 1):
-        if i == len(pictures) or pictures[i].shape != pictures[start].shape:
-            yield start, np.stack(pictures[start:i])
+    for i in range(1, len(images) + 1):
+        if i == len(images) or images[i].shape != images[start].shape:
+            yield start, np.stack(images[start:i])
             start = i
 
 
 def one_channel(data: bytes) -> bool:
-    """Check whether a JPEG or PNG is grey, by its header; False for bytes that are no picture."""
+    """Check whether a JPEG or PNG is grey, by its header; False for bytes that are no image."""
     from PIL import Image
 
     try:
-        with Image.open(BytesIO(data)) as picture:
-            return picture.mode in ("1", "L", "LA")
+        with Image.open(BytesIO(data)) as image:
+            return image.mode in ("1", "L", "LA")
     except (OSError, ValueError, Image.DecompressionBombError):
         return False
 
@@ -403,13 +403,13 @@ def one_channel(data: bytes) -> bool:
 def picture_findings(looks: dict[str, Look]) -> Iterator[Finding]:
     """Yield what looks wrong, camera by camera."""
     for key, look in looks.items():
-        if not look.pictures:
+        if not look.images:
             continue
         if len(look.sizes) > 1:
             said = ", ".join(f"{width}×{height}" for height, width in sorted(look.sizes))
             part = "; it changes within episodes" if look.changes else ""
             worst: Severity = "warn" if look.changes else "info"
-            yield Finding("size", worst, f"{key}: pictures of several sizes, {said}{part}", key=key)
+            yield Finding("size", worst, f"{key}: images of several sizes, {said}{part}", key=key)
         if look.blank:
             said = f"{key}: shows only one colour in {look.blank} of {look.episodes} episodes looked at"
             # Where every episode is blank, the camera was never plugged in.
@@ -418,7 +418,7 @@ def picture_findings(looks: dict[str, Look]) -> Iterator[Finding]:
             yield Finding("blank", severity, said, "check the camera's key in the YAML", key, numbers)
         share = look.same / max(look.neighbours, 1)
         if share > STILL and look.blank < look.episodes:
-            said = f"{key}: {share:.0%} of neighbouring pictures are equal"
+            said = f"{key}: {share:.0%} of neighbouring images are equal"
             remedy = f"the camera may be {'frozen' if share == 1 else 'slower than its rate'}"
             yield Finding("still", "warn", said, remedy, key, {"share": share, "pairs": look.neighbours})
         sureness, reason = look.swapped()

@@ -18,7 +18,7 @@ class TopicInfo:
             longest interval; None for fewer than two.
         delay_ms: median from header stamp to receipt; None where messages carry no time.
         goes_back: whether header stamps go back in time.
-        offsets: how the messages lie between the pictures of each camera; of topics with numbers only.
+        offsets: how the messages lie between the images of each camera; of topics with numbers only.
     """
 
     name: str
@@ -36,21 +36,21 @@ class KeyInfo:
     Attributes:
         key: as an embodiment's YAML would name it.
         kind: camera, vector, text or other.
-        shape: of one sample; pictures are (H, W, 3), or (H, W, 1) where they are recorded in grey.
+        shape: of one sample; images are (H, W, 3), or (H, W, 1) where they are recorded in grey.
         dtype: of the values as they are decoded.
         hz: measured or stated rate; None when unknown.
         names: of the values, where the recording has them.
-        codec: of pictures: jpeg, png, raw, av1, h264.
+        codec: of images: jpeg, png, raw, av1, h264.
         count: samples seen (of one episode, or of the whole recording when it is a topic).
         jitter_ms: standard deviation of the intervals.
         topic: the topic that holds the key; of bags only.
         constant: whether a vector never changes in the sampled episodes.
         still: indices of the values of a vector that never change in the sampled episodes.
-        low, high: smallest and largest finite number in the sampled episodes; of pictures in mono16, their
+        low, high: smallest and largest finite number in the sampled episodes; of images in mono16, their
             values before they are scaled.
-        swapped: whether red and blue are swapped in the pictures: sure, no; None where it is unknown.
+        swapped: whether red and blue are swapped in the images: sure, no; None where it is unknown.
         skew_ms: p50, p95 and max distance from the first camera's frames, for a stream with its own clock.
-        encoding: of a bag's pictures, as their messages state it: rgb8, mono8, mono16.
+        encoding: of a bag's images, as their messages state it: rgb8, mono8, mono16.
     """
 
     key: str
@@ -84,7 +84,7 @@ class Inspection:
         keys: each key once.
         robot: the robot's name in the recording.
         facts: other facts about the recording, by name.
-        looked_at: how many episodes were sampled for their values and pictures.
+        looked_at: how many episodes were sampled for their values and images.
         findings: what the checks found, in the order of the checks.
         checks: names of the checks that could be made; a check without a finding passed.
     """

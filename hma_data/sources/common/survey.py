@@ -1,6 +1,6 @@
 """Gather what a sample of episodes shows; the same for every format.
 
-For each episode, a source hands in the lengths of the keys, their numbers, a few pictures, and times
+For each episode, a source hands in the lengths of the keys, their numbers, a few images, and times
 where there are any. A defect of a key becomes one finding, however many episodes have it.
 
 T samples of a key in an episode, A values a sample.
@@ -35,14 +35,14 @@ CHECKS = {  # the checks of an inspection, in the order they are printed
     "gaps": "pauses",
     "rate": "rate as stated",
     "skew": "skew between streams",
-    "offset": "commands beside pictures",
+    "offset": "actions beside frames",
     "finite": "NaN and infinity",
     "constant": "values that never change",
-    "size": "pictures of one size",
-    "blank": "pictures of one colour",
-    "still": "pictures that repeat",
+    "size": "images of one size",
+    "blank": "images of one colour",
+    "still": "images that repeat",
     "colour": "red and blue in order",
-    "hands": "hands in the pictures",
+    "hands": "hands in the images",
 }
 LOSSY = ("jpeg", "h264", "av1", "hevc", "vp8", "vp9", "mpeg4", "mjpeg")
 SHOWN = 5  # faults and episodes named at most
@@ -152,7 +152,7 @@ class Survey:
     def pictures(
         self, name: str, key: str, frames: Images, indices: NDArray[np.int64], codec: str | None
     ) -> None:
-        """Add some pictures (n, H, W, 3) of an episode's camera, and the indices of their frames."""
+        """Add some images (n, H, W, 3) of an episode's camera, and the indices of their frames."""
         self.made |= {"size", "blank", "colour"} | ({"still"} if (np.diff(indices) == 1).any() else set())
         look = self.looks.setdefault(key, Look(lossless=codec not in LOSSY))
         look.add(frames, indices, again=self._shown.get(key) == name)
@@ -244,9 +244,9 @@ class Survey:
             said = f"{rest:,} more of {looked:,} episodes looked at cannot be read"
             yield Finding("readable", severity, said, numbers={"episodes": rest})
         missing = any(one.check == "files" and one.severity == "warn" for one in self._extra)
-        shown = any(look.pictures for look in self.looks.values())
+        shown = any(look.images for look in self.looks.values())
         if (faulty or missing) and not shown and any(key.kind == "camera" for key in keys):
-            yield Finding("readable", "error", "not one picture of the episodes looked at can be read")
+            yield Finding("readable", "error", "not one image of the episodes looked at can be read")
 
     def _keys(self) -> Iterator[Finding]:
         together: dict[tuple[str, ...], list[str]] = {}

@@ -1,4 +1,4 @@
-"""Read pictures of a video file by index, decoding only the frames that are needed.
+"""Read frames of a video file by index, decoding only the frames that are needed.
 
 A first pass over the packets, without decoding, gives the exact time of every frame and the keyframes.
 Reading then keeps one decoder in position. It decodes on while the next frame asked for lies ahead within the
@@ -45,7 +45,7 @@ class FrameTable:
         stamps: (N,) the same in ticks of the stream.
         keys: (N,) for each frame the index of the keyframe its decoding starts from.
         seek_stamps: (N,) ticks to seek to for that keyframe; may differ from when it is shown.
-        width, height: pixels of the decoded pictures.
+        width, height: pixels of the decoded frames.
         codec: h264, av1, hevc, vp9, …
         hz: stated rate; None where the file states none.
         counted: whether the container's times are those of packets, not of frames (B-frames in AVI);
@@ -158,10 +158,10 @@ class VideoFile:
         return self.table.times
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """Return the pictures (n, H, W, 3) RGB uint8 of those frames; rising indices are fastest.
+        """Return the images (n, H, W, 3) RGB uint8 of those frames; rising indices are fastest.
 
         Raises:
-            EpisodeError: a frame cannot be decoded, or the pictures change size.
+            EpisodeError: a frame cannot be decoded, or the frames change size.
             IndexError: an index lies outside the video.
         """
         wanted = np.asarray(indices, np.int64).reshape(-1)
@@ -173,12 +173,12 @@ class VideoFile:
         found: Images = np.zeros((0, self.table.height, self.table.width, 3), np.uint8)
         with _explained(str(self.path)):
             for place, index in enumerate(unique.tolist()):
-                picture = self._picture(index)
+                image = self._image(index)
                 if not place:
-                    found = np.empty((len(unique), *picture.shape), np.uint8)
-                if picture.shape != found.shape[1:]:
-                    raise EpisodeError(self.path, "its pictures change size")
-                found[place] = picture
+                    found = np.empty((len(unique), *image.shape), np.uint8)
+                if image.shape != found.shape[1:]:
+                    raise EpisodeError(self.path, "its frames change size")
+                found[place] = image
         return found if np.array_equal(places, np.arange(len(found))) else found[places]
 
     def close(self) -> None:
@@ -191,7 +191,7 @@ class VideoFile:
         if getattr(self, "_process", 0) == os.getpid():
             self.close()
 
-    def _picture(self, index: int) -> Images:
+    def _image(self, index: int) -> Images:
         try:
             frame = self._frame(index)
         except EpisodeError:
@@ -275,7 +275,7 @@ class VideoFile:
         raise EpisodeError(self.path, f"gives a frame at {frame.pts} ticks, which no packet states")
 
     def _to_rgb(self, frame: Any) -> Images:
-        """Return a frame's picture (H, W, 3)."""
+        """Return a frame's image (H, W, 3)."""
         rgb = self._converter(frame)
         plane = rgb.planes[0]  # its bytes are copied once, into the array that `frames` returns
         lines = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: rgb.height, : rgb.width * 3]
@@ -288,9 +288,9 @@ def _quarters(frame: Any) -> int:
 
 
 def decoded_size(container: Any, stream: Any) -> tuple[int, int]:
-    """Return width and height of the decoded pictures, by the first; of the header where it is damaged.
+    """Return width and height of the decoded frames, by the first; of the header where it is damaged.
 
-    The container is read beyond that picture then.
+    The container is read beyond that frame then.
     """
     from av.error import FFmpegError
 

@@ -1,4 +1,4 @@
-"""Read features.json of a TFDS folder, and decode the columns and pictures of its records.
+"""Read features.json of a TFDS folder, and decode the columns and images of its records.
 
 TensorFlow Datasets joins the names of nested features with "/". A feature inside one sequence (RLDS'
 `steps`) is stored as one flat list over the steps. A feature inside two or more sequences is ragged:
@@ -46,12 +46,12 @@ class Feature:
     """One leaf of features.json."""
 
     name: str  # flattened, as records name it: steps/observation/image
-    kind: str  # number, text, picture or other (stored in a way that is not read here)
-    shape: Shape  # of one value, with None where a size varies; pictures are (H, W, C)
+    kind: str  # number, text, image or other (stored in a way that is not read here)
+    shape: Shape  # of one value, with None where a size varies; images are (H, W, C)
     dtype: str  # of one value, e.g. float32; "string" for text
     nesting: Shape = ()  # lengths of the sequences around it, outermost first, with None where they vary
     encoding: str = "none"  # none, bytes or zlib
-    codec: str | None = None  # png or jpeg for pictures, as stated; the pictures themselves may differ
+    codec: str | None = None  # png or jpeg for images, as stated; the images themselves may differ
 
     @property
     def width(self) -> int | None:
@@ -96,7 +96,7 @@ def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> Feat
     if kind in ("Image", "LabeledImage", "Video"):
         nesting = (*nesting, *(shape[:1] or (None,))) if kind == "Video" else nesting
         codec = content.get("encodingFormat") or content.get("encoding_format") or "png"
-        return Feature(name, "picture", shape[-3:] or (None, None, 3), dtype or "uint8", nesting, codec=codec)
+        return Feature(name, "image", shape[-3:] or (None, None, 3), dtype or "uint8", nesting, codec=codec)
     if kind not in ("Tensor", "Scalar"):
         return Feature(name, "other", shape, dtype or kind, nesting)
     if dtype in ("string", "object", "str"):
@@ -180,10 +180,10 @@ class Steps:
         return bytes(blobs[0]).decode(errors="replace") if blobs else ""
 
     def decoder(self, key: str) -> Decode:
-        """Return a function that maps a step to the picture (H, W, 3) of a key."""
+        """Return a function that maps a step to the image (H, W, 3) of a key."""
         feature, where = self.features[key], f"{self.name}: {key}"
         if feature.kind == "number" and (feature.encoding == "none" or feature.shape.count(None) > 1):
-            whole = cache(lambda: self.numbers(key))  # decoded when the first picture is asked for
+            whole = cache(lambda: self.numbers(key))  # decoded when the first image is asked for
             return lambda index: whole()[index]
         blobs = self.blobs(key)
         if feature.kind == "number":
@@ -197,7 +197,7 @@ class Steps:
             return len(self.example.ints(lengths))
         if feature.name not in self.example:
             return None
-        if feature.kind in ("picture", "text") or feature.encoding != "none":
+        if feature.kind in ("image", "text") or feature.encoding != "none":
             count = len(self.example.blobs(feature.name))
             return count // feature.width if feature.kind == "text" and feature.width else count
         return len(self.example.numbers(feature.name)) // feature.width if feature.width else None

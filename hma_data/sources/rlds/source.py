@@ -2,7 +2,7 @@
 
 An episode is one record, a tf.train.Example whose `steps/…` features run over the steps. The keys of an
 embodiment are paths inside a step (`observation/image`, `action/world_vector`). An episode's id is its split
-and its index in the split (`train/000012`). Numbers are decoded when an episode is read, pictures on demand.
+and its index in the split (`train/000012`). Numbers are decoded when an episode is read, images on demand.
 
 T steps.
 """
@@ -175,11 +175,11 @@ def _steps_per_byte(folder: Folder, split: str) -> float:
 
 
 def is_camera(feature: Feature) -> bool:
-    """Check whether a feature holds a colour picture a step, encoded or as a tensor."""
+    """Check whether a feature holds a colour image a step, encoded or as a tensor."""
     if feature.dtype != "uint8" or len(feature.nesting) != 1:
         return False
     colours = feature.kind == "number" and len(feature.shape) == 3 and feature.shape[2] == 3
-    return feature.kind == "picture" or colours
+    return feature.kind == "image" or colours
 
 
 def _check_keys(folder: Folder, embodiment: Embodiment) -> None:
@@ -187,9 +187,9 @@ def _check_keys(folder: Folder, embodiment: Embodiment) -> None:
     for camera in embodiment.cameras:
         feature = _step_feature(folder, camera.key)
         if not is_camera(feature):
-            pictures = [key for key, found in folder.step_features.items() if is_camera(found)]
-            fault = f"{camera.key} is {_described(feature)} of {feature.dtype}, not a colour picture"
-            raise SourceError(folder.uri, fault, f"its pictures: {', '.join(pictures) or 'none'}")
+            images = [key for key, found in folder.step_features.items() if is_camera(found)]
+            fault = f"{camera.key} is {_described(feature)} of {feature.dtype}, not a colour image"
+            raise SourceError(folder.uri, fault, f"its images: {', '.join(images) or 'none'}")
     for part in embodiment.action.components + (embodiment.state.components if embodiment.state else ()):
         _check_component(folder, part)
     if embodiment.source.instruction:
@@ -228,8 +228,8 @@ def _text_feature(folder: Folder, key: str) -> Feature:
 
 
 def _described(feature: Feature) -> str:
-    if feature.kind == "picture":
-        return "a sequence of pictures a step" if len(feature.nesting) > 1 else "a picture"
+    if feature.kind == "image":
+        return "a sequence of images a step" if len(feature.nesting) > 1 else "an image"
     return {"number": "a tensor", "text": "text"}.get(feature.kind, "a feature")
 
 
@@ -347,7 +347,7 @@ def _survey(
 
 
 def _look(steps: Steps, survey: Survey, pairs: int) -> None:
-    """Hand the numbers, times and some pictures of one episode to the survey."""
+    """Hand the numbers, times and some images of one episode to the survey."""
     for key, feature in steps.features.items():
         try:
             if is_camera(feature):
@@ -397,8 +397,8 @@ def _key_info(steps: Steps, key: str, survey: Survey) -> KeyInfo:
 
 
 def _codec(steps: Steps, key: str) -> str:
-    """Return the codec of a key's first picture; TFDS stores files as given, whatever is stated."""
-    if steps.features[key].kind != "picture":
+    """Return the codec of a key's first image; TFDS stores files as given, whatever is stated."""
+    if steps.features[key].kind != "image":
         return "raw"
     head = bytes(steps.blobs(key)[0][:8])
     if head.startswith(b"\xff\xd8"):

@@ -182,7 +182,7 @@ def test_without_a_commanding_topic_joint_states_are_proposed(tmp_path: Path) ->
     path = bag(tmp_path / "run", topics)
     values = inferred(path)
     assert keys(values, "action") == ["/joint_states.position"]
-    assert "no topic commands the robot" in questions(values)["provenance.action"]
+    assert "no topic drives the robot" in questions(values)["provenance.action"]
     first_clip(path, values)
 
 

@@ -256,7 +256,7 @@ def test_a_still_picture_key_in_lerobot_is_told(tmp_path: Path) -> None:
         length = {"0": 12, "1": 9, "2": 15}[video.stem[-1]]
         encode_video(video, [7] * length)
     said = found(open_source("lerobot").inspect(str(folder)))
-    assert "100% of neighbouring pictures are equal" in said["still"][0]
+    assert "100% of neighbouring images are equal" in said["still"][0]
 
 
 # -- red and blue

@@ -106,15 +106,15 @@ def yaml_of(tmp_path: Path, bag: Path, **sync: Any) -> Path:
 @pytest.mark.parametrize(
     ("name", "sync", "said"),
     [
-        ("1 ms after", {}, "100% of pictures get the command of the picture before them by actions: hold;"),
+        ("1 ms after", {}, "100% of frames get the action of the frame before them by actions: hold;"),
         ("1 ms after", {"tolerance_ms": 5}, ""),
         ("1 ms after", {"actions": "nearest"}, ""),
         ("1 ms before", {}, ""),
-        ("1 ms before", {"tolerance_ms": 49.5}, "get the command of the picture after them"),
-        ("half a period after", {"actions": "nearest"}, "get the command of the picture before them"),
+        ("1 ms before", {"tolerance_ms": 49.5}, "get the action of the frame after them"),
+        ("half a period after", {"actions": "nearest"}, "get the action of the frame before them"),
         ("100 Hz", {}, ""),
         ("100 Hz", {"actions": "nearest"}, ""),
-        ("around, with jitter", {}, "get the command of the picture before them"),
+        ("around, with jitter", {}, "get the action of the frame before them"),
     ],
 )
 def test_doctor_says_when_the_yaml_pairs_commands_with_other_pictures(
@@ -134,5 +134,5 @@ def test_infer_doctor_and_inspect_print_the_offset_in_one_line(tmp_path: Path) -
     assert line in hma("doctor", bag).stdout
     report = inspect_recording(bag)
     measured = "the last one 49.0 ± 0.0 ms before each picture, the next one 1.0 ± 0.0 ms after it"
-    assert report["facts"]["commands /command"] == measured and report["checks"]["offset"] == "info"
+    assert report["facts"]["actions /command"] == measured and report["checks"]["offset"] == "info"
     assert measured in hma("inspect", bag, "-e", yaml_of(tmp_path, bag)).stdout

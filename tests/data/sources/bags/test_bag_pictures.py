@@ -309,7 +309,7 @@ def test_frames_made_from_a_damaged_message_are_refused_up_to_the_next_keyframe(
      ("libsvtav1", "av1"), ("mpeg4", "mpeg4")],
 )  # fmt: skip
 def test_the_codec_of_an_ffmpeg_packet_is_that_of_its_encoder(stated: str, codec: str) -> None:
-    from hma_data.sources.bags.images import picture_kind, video_codec
+    from hma_data.sources.bags.images import image_kind, video_codec
 
-    assert picture_kind("ffmpeg_image_transport_msgs/msg/FFMPEGPacket") == "video"
+    assert image_kind("ffmpeg_image_transport_msgs/msg/FFMPEGPacket") == "video"
     assert video_codec({"encoding": stated, "data": b""}) == codec

@@ -142,7 +142,7 @@ def test_a_bag_without_an_episode_is_told_with_what_came(segments: str, says: st
 
 def test_a_marker_after_the_last_picture_begins_no_episode(tmp_path: Path) -> None:
     path = ros1(tmp_path, make_run(20, said=[Said(TASK, 50.0, "go")]))
-    with pytest.raises(EpisodeError, match="no episode in it holds a picture of /cam"):
+    with pytest.raises(EpisodeError, match="no episode in it holds a frame of /cam"):
         SOURCE.read(str(path), "run", parted("{start: {key: /task}}"))
 
 

@@ -246,7 +246,7 @@ def test_a_missing_camera_or_one_without_pictures_is_told(numbers_bag: Path) -> 
     with pytest.raises(EpisodeError, match=r"no topic for /camera.*did you mean /cam"):
         read(numbers_bag, arm(**{CAMERA: "/camera"}))
     text = keyed("/cmd.angular", 3).to_yaml().replace("key: /cam\n", "key: /cmd\n")
-    with pytest.raises(EpisodeError, match="Twist, not pictures"):
+    with pytest.raises(EpisodeError, match="Twist, not images"):
         read(numbers_bag, Embodiment.from_yaml(text))
 
 

@@ -388,7 +388,7 @@ def test_keys_that_are_not_there_are_answered_with_near_ones(tmp_path):
     folder = toy(tmp_path / "d")
     with pytest.raises(SourceError, match=r"no key 'action/mov'.*did you mean action/move"):
         read(folder, "train/000000", numbers_only(key="action/mov", dims=2))
-    with pytest.raises(SourceError, match="action/move is a tensor of float32, not a colour picture"):
+    with pytest.raises(SourceError, match="action/move is a tensor of float32, not a colour image"):
         read(folder, "train/000000", embodiment(cameras=[{"name": "a", "key": "action/move"}]))
     with pytest.raises(SourceError, match=r"observation/state has 3 values a step, the embodiment says 7"):
         RLDS.index(str(folder), numbers_only(key="observation/state", dims=7))
@@ -402,7 +402,7 @@ def test_depth_is_not_a_colour_picture(tmp_path):
         {"d-train.tfrecord": [record(0, 2)]},
         STEPS | {"depth": image((8, 8, 1), dtype="uint16")},
     )
-    with pytest.raises(SourceError, match="depth is a picture of uint16, not a colour picture"):
+    with pytest.raises(SourceError, match="depth is an image of uint16, not a colour image"):
         RLDS.index(str(folder), embodiment(cameras=[{"name": "a", "key": "depth"}]))
 
 
