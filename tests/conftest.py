@@ -160,10 +160,33 @@ SMALL = Settings(val_fraction=0.2, shard_frames=60)  # several shards of each sp
 
 
 def convert_toy(
-    arm: Embodiment, recording: Path | str, out: Path | str, settings: Settings = SMALL, **options: Any
-) -> Any:
-    """Convert a recording with the block tokenizer; returns what `convert` returns."""
-    return convert(arm, str(recording), BlockTokenizer(), out, settings=settings, **options)
+    arm: Embodiment, recording: Path | str, out: Path | str, settings: Settings = SMALL,
+    tokenizer: Any = None, **options: Any,
+) -> Any:  # fmt: skip
+    """Convert a recording, with the block tokenizer if none is given; returns what `convert` returns."""
+    return convert(arm, str(recording), tokenizer or BlockTokenizer(), out, settings=settings, **options)
+
+
+def toy_shards(
+    folder: Path, lengths: Iterable[int], settings: Settings = SMALL, arm: str = ARM_YAML, **options: Any
+) -> Path:
+    """Record episodes of these lengths beside a folder, and convert them into it; returns the folder."""
+    write_toy(folder.with_suffix(".hdf5"), lengths)
+    convert_toy(Embodiment.from_yaml(arm), folder.with_suffix(".hdf5"), folder, settings, **options)
+    return folder
+
+
+class StoppingTokenizer(BlockTokenizer):
+    """A block tokenizer that stands for Ctrl-C after some batches."""
+
+    def __init__(self, batches: int) -> None:
+        self.left = batches
+
+    def encode(self, frames):
+        self.left -= 1
+        if self.left < 0:
+            raise KeyboardInterrupt
+        return super().encode(frames)
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -12,6 +12,11 @@ ARM = ActionSpace("arm", 3, 2, (1.0, -2.0, 0.5), (2.0, 0.5, 1.0), (True, True, F
 HAND = ActionSpace("hand.v1", 2, 1, (0.0, 3.0), (1.0, 0.0), (True, True))
 
 
+def seeded(value: int = 0) -> torch.Generator:
+    """A generator of random numbers on the CPU."""
+    return torch.Generator().manual_seed(value)
+
+
 def small_config(**changes: Any) -> HMAConfig:
     """Two layers, five frames of sixteen tokens or patches."""
     values: dict[str, Any] = {

@@ -18,7 +18,7 @@ from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.storage.locks import locked
-from tests.conftest import SMALL, BlockTokenizer, contents, write_toy
+from tests.conftest import SMALL, BlockTokenizer, StoppingTokenizer, contents, write_toy
 
 
 def run(
@@ -73,19 +73,9 @@ def test_a_job_stopped_anywhere_ends_with_the_same_bytes(
     whole = tmp_path / "whole"
     run(toy_arm, toy_recording, whole, block_tokenizer)
     for stop_at in (1, 4, 9):
-
-        class Stopping(BlockTokenizer):
-            left = stop_at
-
-            def encode(self, frames):
-                self.left -= 1
-                if self.left < 0:
-                    raise KeyboardInterrupt
-                return super().encode(frames)
-
         out = tmp_path / f"stopped-{stop_at}"
         with pytest.raises(KeyboardInterrupt):
-            run(toy_arm, toy_recording, out, Stopping())
+            run(toy_arm, toy_recording, out, StoppingTokenizer(stop_at))
         assert not list(out.rglob("*.part"))
         (out / "train").mkdir(exist_ok=True)
         (out / "train" / ".shard-00000.parquet.1.part").write_bytes(b"left by a kill")

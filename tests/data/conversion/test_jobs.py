@@ -26,7 +26,7 @@ from hma_data.shards.verify import verify
 from hma_data.sources.hdf5.source import Hdf5Source
 from hma_data.storage.locks import LOCK, locked
 from tests.command import hma
-from tests.conftest import SMALL, BlockTokenizer, contents, write_toy
+from tests.conftest import SMALL, BlockTokenizer, StoppingTokenizer, contents, write_toy
 from tests.conftest import convert_toy as run
 
 ROOT = Path(__file__).parents[3]
@@ -222,18 +222,8 @@ def test_an_extension_stopped_anywhere_ends_with_the_same_bytes(toy_arm: Embodim
         out = tmp_path / f"out-{stop_at}"
         run(toy_arm, first, out)
         if stop_at is not None:
-
-            class Stopping(BlockTokenizer):
-                left = stop_at
-
-                def encode(self, frames):
-                    self.left -= 1
-                    if self.left < 0:
-                        raise KeyboardInterrupt
-                    return super().encode(frames)
-
             with pytest.raises(KeyboardInterrupt):
-                convert(toy_arm, str(second), Stopping(), out, settings=SMALL, extend=True)
+                convert(toy_arm, str(second), StoppingTokenizer(stop_at), out, settings=SMALL, extend=True)
             assert Manifest.load(out).splits["train"]["episodes"] <= 3
         run(toy_arm, second, out, extend=True)
         assert verify(out) == []

@@ -22,16 +22,13 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import read_footer, to_arrow, to_numpy
 from hma_data.shards.stats import Stats
 from hma_data.shards.verify import verify
-from tests.conftest import ARM_YAML, BlockTokenizer, contents, write_toy
+from tests.conftest import ARM_YAML, BlockTokenizer, contents, toy_shards, write_toy
 
 SMALL = Settings(val_fraction=0.3, shard_frames=40)
 
 
 def make(folder: Path, lengths: list[int], settings: Settings = SMALL, yaml: str = ARM_YAML) -> Path:
-    write_toy(folder.with_suffix(".hdf5"), lengths)
-    arm = Embodiment.from_yaml(yaml)
-    convert(arm, str(folder.with_suffix(".hdf5")), BlockTokenizer(), folder, settings=settings)
-    return folder
+    return toy_shards(folder, lengths, settings, yaml)
 
 
 def episodes(folder: Path) -> dict[str, tuple]:

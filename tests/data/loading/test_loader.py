@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import ShardError, UsageError
 from hma_data.loading.dataset import Batch, MixtureDataset, WindowDataset
 from hma_data.loading.mixture import Mixture
-from hma_data.registry.embodiment import Embodiment
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
-from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.conftest import ARM_YAML, toy_shards
 
 FRAMES = 4
 
@@ -24,21 +22,15 @@ FRAMES = 4
 def sets(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two robots of different width and stride; row groups so small that windows cross them."""
     folder = tmp_path_factory.mktemp("sets")
-    one = Embodiment.from_yaml(ARM_YAML)
-    two = Embodiment.from_yaml(
-        ARM_YAML.replace("toy_arm", "toy_two")
-        .replace("target_hz: 5", "target_hz: 10")
-        .replace("dims: 3, names: [a, b, c]", "dims: 2, slice: [0, 2]")
-    )
-    write_toy(folder / "one.hdf5", range(5, 60, 3))
-    write_toy(folder / "two.hdf5", range(3, 20))
-    patch = pytest.MonkeyPatch()
-    patch.setattr(writer, "ROW_GROUP", 25)
-    for arm, name in ((one, "one"), (two, "two")):
+    two = ARM_YAML.replace("toy_arm", "toy_two").replace("target_hz: 5", "target_hz: 10")
+    two = two.replace("dims: 3, names: [a, b, c]", "dims: 2, slice: [0, 2]")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(writer, "ROW_GROUP", 25)
         settings = Settings(val_fraction=0.1, shard_frames=130)
-        convert(arm, str(folder / f"{name}.hdf5"), BlockTokenizer(), folder / name, settings=settings)
-    patch.undo()
-    return [folder / "one", folder / "two"]
+        return [
+            toy_shards(folder / "one", range(5, 60, 3), settings),
+            toy_shards(folder / "two", range(3, 20), settings, two),
+        ]
 
 
 def same(a: Batch, b: Batch) -> bool:
@@ -145,13 +137,10 @@ def test_one_embodiment_twice_is_refused(sets: list[Path]) -> None:
 
 
 def test_strided_rows_give_the_windows_of_all_rows(tmp_path: Path) -> None:
-    write_toy(tmp_path / "toy.hdf5", range(20, 31))
-    arm = Embodiment.from_yaml(ARM_YAML)
     made = {}
     for frames in ("all", "strided"):
         settings = Settings(frames=frames, val_fraction=0)  # type: ignore[arg-type]
-        convert(arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / frames, settings=settings)
-        windows = WindowDataset(tmp_path / frames, "train", FRAMES)
+        windows = WindowDataset(toy_shards(tmp_path / frames, range(20, 31), settings), "train", FRAMES)
         made[frames] = windows.batch(range(len(windows)))
     of_all = {(int(e), int(f)): i for i, (e, f) in enumerate(zip(made["all"].episode, made["all"].frame))}
     grid = made["strided"]
@@ -164,12 +153,7 @@ def test_strided_rows_give_the_windows_of_all_rows(tmp_path: Path) -> None:
 
 
 def test_short_episodes_are_padded_with_their_last_frame_and_masked(tmp_path: Path) -> None:
-    write_toy(tmp_path / "toy.hdf5", [2, 3, 5, 20])
-    settings = Settings(val_fraction=0)
-    out = tmp_path / "out"
-    convert(
-        Embodiment.from_yaml(ARM_YAML), str(tmp_path / "toy.hdf5"), BlockTokenizer(), out, settings=settings
-    )
+    out = toy_shards(tmp_path / "out", [2, 3, 5, 20], Settings(val_fraction=0))
     windows = WindowDataset(out, "train", FRAMES, short="pad")
     assert (windows.index.short_episodes, windows.index.padded_episodes) == (1, 2)
     batch = windows.batch([0, 1, 2])
@@ -186,13 +170,9 @@ def test_short_episodes_are_padded_with_their_last_frame_and_masked(tmp_path: Pa
 
 
 def test_windows_of_an_episode_longer_than_a_row_group_are_whole(tmp_path: Path) -> None:
-    write_toy(tmp_path / "toy.hdf5", [90])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(writer, "ROW_GROUP", 16)
-        settings = Settings(val_fraction=0)
-        arm = Embodiment.from_yaml(ARM_YAML)
-        convert(arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / "out", settings=settings)
-    shards = ShardSet(tmp_path / "out")
+        shards = ShardSet(toy_shards(tmp_path / "out", [90], Settings(val_fraction=0)))
     rows = shards.episode_rows(0, ["tokens", "action"])
     windows = WindowDataset(shards, "train", 10)  # 20 rows: each window lies in two or three row groups
     batch = windows.batch(range(len(windows)))

@@ -8,26 +8,15 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from hma_data.cli.shards import shards_app
-from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import HMAError
-from hma_data.registry.embodiment import Embodiment
-from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.conftest import toy_shards
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("made")
-    write_toy(folder / "toy.hdf5", [14, 15, 16, 17, 60])
     settings = Settings(val_fraction=0.3, shard_frames=40)
-    convert(
-        Embodiment.from_yaml(ARM_YAML),
-        str(folder / "toy.hdf5"),
-        BlockTokenizer(),
-        folder / "set",
-        settings=settings,
-    )
-    return folder / "set"
+    return toy_shards(tmp_path_factory.mktemp("made") / "set", [14, 15, 16, 17, 60], settings)
 
 
 def run(*words: object, code: int = 0) -> Result:

@@ -14,17 +14,16 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.registry.components import Camera
-from hma_data.registry.embodiment import _DECIDES, Embodiment
+from hma_data.registry.embodiment import _DECIDES
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import Footer, arrow_schema
 from hma_data.shards.stats import Stats
 from hma_data.shards.windows import WindowIndex
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.tokenizers.base import TokenizerSpec
-from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.conftest import ARM_YAML, toy_shards
 
 YAML = ARM_YAML.replace("cameras:", "state: {components: [{key: actions, dims: 2, slice: [0, 2]}]}\ncameras:")
 
@@ -117,12 +116,8 @@ class Reader:
 
 @pytest.fixture(scope="module", params=["all", "strided"])
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("made")
-    write_toy(folder / "toy.hdf5", [14, 25, 16, 17, 18, 600])
     settings = Settings(val_fraction=0.4, shard_frames=40, frames=request.param, cameras=("top", "side"))
-    arm = Embodiment.from_yaml(YAML)
-    convert(arm, str(folder / "toy.hdf5"), BlockTokenizer(), folder / "set", settings=settings)
-    return folder / "set"
+    return toy_shards(tmp_path_factory.mktemp("made") / "set", [14, 25, 16, 17, 18, 600], settings, YAML)
 
 
 def test_a_reader_from_the_page_gives_the_rows(made: Path) -> None:

@@ -8,15 +8,13 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import HMAError, OutputError, UsageError
-from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.memmap import export, video_dtype
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import token_column
 from hma_data.tokenizers.base import TokenizerSpec
-from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.conftest import ARM_YAML, BlockTokenizer, toy_shards
 
 SMALL = Settings(val_fraction=0.3, shard_frames=40, cameras=("top", "side"))
 
@@ -47,10 +45,7 @@ class PixelTokenizer:
 
 
 def make(folder: Path, tokenizer=None, settings: Settings = SMALL, yaml: str = ARM_YAML) -> Path:
-    write_toy(folder.with_suffix(".hdf5"), (14, 15, 16, 17))
-    arm = Embodiment.from_yaml(yaml)
-    convert(arm, str(folder.with_suffix(".hdf5")), tokenizer or BlockTokenizer(), folder, settings=settings)
-    return folder
+    return toy_shards(folder, (14, 15, 16, 17), settings, yaml, tokenizer=tokenizer)
 
 
 @pytest.fixture(scope="module")

@@ -7,21 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
-from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import UsageError
-from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.preview import CURSOR, UNKNOWN, Curves, preview
-from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.conftest import BlockTokenizer, toy_shards
 
 
 @pytest.fixture
 def made(tmp_path: Path) -> Path:
-    write_toy(tmp_path / "toy.hdf5", [14, 1, 16, 17, 18])
     settings = Settings(val_fraction=0.3, cameras=("top", "side"))
-    arm = Embodiment.from_yaml(ARM_YAML)
-    convert(arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / "set", settings=settings)
-    return tmp_path / "set"
+    return toy_shards(tmp_path / "set", [14, 1, 16, 17, 18], settings)
 
 
 def test_the_video_shows_each_frame_at_the_recorded_rate(made: Path, tmp_path: Path) -> None:

@@ -16,10 +16,9 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import restat
 from hma_data.errors import ShardError
-from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST, Manifest, finish, plan_hash, seal_problem
 from hma_data.shards.verify import verify
-from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.conftest import toy_shards, write_toy
 
 SMALL = Settings(val_fraction=0.3, shard_frames=40)
 
@@ -27,11 +26,7 @@ SMALL = Settings(val_fraction=0.3, shard_frames=40)
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sound set of several shards; not to be changed."""
-    folder = tmp_path_factory.mktemp("made")
-    write_toy(folder / "toy.hdf5", [14, 15, 16, 17, 18])
-    arm = Embodiment.from_yaml(ARM_YAML)
-    convert(arm, str(folder / "toy.hdf5"), BlockTokenizer(), folder / "set", settings=SMALL)
-    return folder / "set"
+    return toy_shards(tmp_path_factory.mktemp("made") / "set", [14, 15, 16, 17, 18], SMALL)
 
 
 @pytest.fixture

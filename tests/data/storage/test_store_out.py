@@ -22,7 +22,7 @@ from hma_data.shards.verify import verify
 from hma_data.storage import remote as store
 from hma_data.storage.files import cache_folder, remove_parts, upload_folder
 from hma_data.storage.remote import RemotePath, place, put_bytes
-from tests.conftest import SMALL, BlockTokenizer, write_toy
+from tests.conftest import SMALL, BlockTokenizer, StoppingTokenizer, write_toy
 from tests.conftest import contents as local
 from tests.conftest import convert_toy as run
 
@@ -58,17 +58,8 @@ def test_a_store_gets_the_bytes_that_a_folder_gets(toy_arm, toy_recording, out, 
 
 
 def test_a_job_that_was_interrupted_goes_on_where_it_was(toy_arm, toy_recording, out, whole) -> None:
-    class Stopping(BlockTokenizer):
-        left = 6
-
-        def encode(self, frames):
-            self.left -= 1
-            if self.left < 0:
-                raise KeyboardInterrupt
-            return super().encode(frames)
-
     with pytest.raises(KeyboardInterrupt):
-        convert(toy_arm, str(toy_recording), Stopping(), out, settings=SMALL)
+        convert(toy_arm, str(toy_recording), StoppingTokenizer(6), out, settings=SMALL)
     there = {name for name in out.listing() if name.startswith(("train", "val"))}
     assert there and "manifest.json" not in out.listing()
     assert run(toy_arm, toy_recording, out).kept_shards == len(there)

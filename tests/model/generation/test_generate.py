@@ -11,7 +11,7 @@ from hma_model.config import CONDITIONINGS
 from hma_model.generation.passes import Passes
 from hma_model.generation.rollout import Rollout
 from hma_model.network.model import HMA
-from tests.model.network_parts import ARM, small_batch, small_model
+from tests.model.network_parts import ARM, seeded, small_batch, small_model
 
 COMBINATIONS = [
     names for count in (1, 2, 4) for names in combinations(CONDITIONINGS, count)
@@ -32,10 +32,6 @@ LAYOUTS = {
 }  # fmt: skip
 
 
-def _seed(value: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(value)
-
-
 def _rollout(
     model: HMA, cache: bool, prompt: int, frames: int, actions: bool = True, **how: object
 ) -> torch.Tensor:
@@ -43,7 +39,7 @@ def _rollout(
     known = batch.tokens if model.config.kind == "discrete" else batch.latents
     chunks = batch.actions if actions else None
     return model.generate(
-        known[:, :prompt], chunks, batch.embodiment, frames, generator=_seed(), cache=cache, **how
+        known[:, :prompt], chunks, batch.embodiment, frames, generator=seeded(), cache=cache, **how
     )  # type: ignore[arg-type]
 
 
@@ -104,7 +100,7 @@ def test_bfloat16_keeps_the_features_of_the_cache_near_those_of_float32() -> Non
     batch = small_batch(exact.config, ["arm", "hand.v1"], frames=4)
     features = []
     for model in (exact, coarse):
-        rollout = Rollout(model, batch.embodiment, 2, generator=_seed())
+        rollout = Rollout(model, batch.embodiment, 2, generator=seeded())
         rollout.prompt(batch.tokens[:, :3], batch.actions)
         found = _first_features(rollout, batch.actions[:, 2])
         features.append(found.float().flatten())
@@ -115,7 +111,9 @@ def test_bfloat16_keeps_the_features_of_the_cache_near_those_of_float32() -> Non
 def test_the_cache_keeps_features_within_rounding(order: str) -> None:
     model = small_model()
     batch = small_batch(model.config, ["arm"], frames=4)
-    rollouts = [Rollout(model, "arm", cache=cache, order=order, generator=_seed()) for cache in (True, False)]
+    rollouts = [
+        Rollout(model, "arm", cache=cache, order=order, generator=seeded()) for cache in (True, False)
+    ]
     features = []
     for rollout in rollouts:
         rollout.prompt(batch.tokens[:, :3], batch.actions)
@@ -146,7 +144,7 @@ def test_temperature_flattens_what_is_drawn() -> None:
     prompt, actions = batch.tokens[:, :1].expand(64, -1, -1, -1), batch.actions.expand(64, -1, -1)
 
     def kinds(temperature: float) -> float:
-        made = model.generate(prompt, actions, "arm", 1, 1, temperature, _seed())
+        made = model.generate(prompt, actions, "arm", 1, 1, temperature, seeded())
         return sum(made[:, 0, y, x].unique().numel() for y in range(4) for x in range(4)) / 16
 
     assert kinds(0.0) == 1
@@ -162,17 +160,17 @@ def test_the_same_generator_gives_the_same_frames() -> None:
 def test_actions_steer_the_frames_after_them() -> None:
     model = small_model()
     batch = small_batch(model.config, ["arm"], frames=6)
-    first = model.generate(batch.tokens[:, :2], batch.actions, "arm", 4, temperature=0, generator=_seed(1))
+    first = model.generate(batch.tokens[:, :2], batch.actions, "arm", 4, temperature=0, generator=seeded(1))
     batch.actions[:, 3:] += 3
-    second = model.generate(batch.tokens[:, :2], batch.actions, "arm", 4, temperature=0, generator=_seed(1))
+    second = model.generate(batch.tokens[:, :2], batch.actions, "arm", 4, temperature=0, generator=seeded(1))
     assert torch.equal(first[:, :2], second[:, :2]) and not torch.equal(first[:, 2:], second[:, 2:])
 
 
 def test_stepping_equals_generating() -> None:
     model = small_model()
     batch = small_batch(model.config, ["arm", "hand.v1"], frames=6)
-    made = model.generate(batch.tokens[:, :3], batch.actions, batch.embodiment, 3, generator=_seed())
-    rollout = Rollout(model, batch.embodiment, 2, generator=_seed())
+    made = model.generate(batch.tokens[:, :3], batch.actions, batch.embodiment, 3, generator=seeded())
+    rollout = Rollout(model, batch.embodiment, 2, generator=seeded())
     rollout.prompt(batch.tokens[:, :3], batch.actions[:, :2])
     steps = torch.stack([rollout.step(batch.actions[:, k]) for k in (2, 3, 4)], dim=1)
     assert torch.equal(made, steps)

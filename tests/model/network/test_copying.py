@@ -10,7 +10,7 @@ from hma_model.evaluation.metrics import teacher_forced
 from hma_model.network.copying import frames_before, known_digits
 from hma_model.network.head import TokenReadout
 from hma_model.network.stem import from_digits, merge_tokens, split_tokens, to_digits
-from tests.model.network_parts import small_batch, small_config, small_model
+from tests.model.network_parts import seeded, small_batch, small_config, small_model
 
 NAMES = ["arm", "hand.v1", "arm"]
 CHANGES = [
@@ -22,17 +22,13 @@ CHANGES = [
 ]
 
 
-def _seed(value: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(value)
-
-
 def _model(**changes):
     """Return a small model whose gains are not zero."""
     model = small_model(copy_previous=True, **changes)
     gain = model.token_readout.copy
     with torch.no_grad():
-        gain.linear.weight.copy_(torch.randn(gain.linear.weight.shape, generator=_seed(7)))
-        gain.linear.bias.copy_(torch.randn(gain.linear.bias.shape, generator=_seed(8)))
+        gain.linear.weight.copy_(torch.randn(gain.linear.weight.shape, generator=seeded(7)))
+        gain.linear.bias.copy_(torch.randn(gain.linear.bias.shape, generator=seeded(8)))
     return model
 
 
@@ -44,9 +40,9 @@ def _batch(config):
 def _near(digits, config, share=0.7):
     """Return digits of a frame before, many of them the same, and some unknown."""
     other = torch.stack(
-        [torch.randint(0, v, (len(digits),), generator=_seed(v + 9)) for v in config.digits], 1
+        [torch.randint(0, v, (len(digits),), generator=seeded(v + 9)) for v in config.digits], 1
     )
-    before = torch.where(torch.rand(digits.shape, generator=_seed(3)) < share, digits, other)
+    before = torch.where(torch.rand(digits.shape, generator=seeded(3)) < share, digits, other)
     before[::4] = -1
     return before
 
@@ -56,8 +52,8 @@ def test_the_loss_is_that_of_gains_written_out(changes):
     model = _model(label_smoothing=0.0, **changes)
     readout, config = model.token_readout, model.config
     rows, count = 16, len(config.digits)
-    features = torch.randn(rows, config.width, generator=_seed())
-    digits = torch.stack([torch.randint(0, v, (rows,), generator=_seed(v)) for v in config.digits], dim=1)
+    features = torch.randn(rows, config.width, generator=seeded())
+    digits = torch.stack([torch.randint(0, v, (rows,), generator=seeded(v)) for v in config.digits], dim=1)
     before, chained = _near(digits, config), config.digit_order == "chain"
     alone = [part.double() for part in readout(features, digits).split(list(config.digits), dim=-1)]
     gains = readout.copy.linear(features * readout.copy.multiplier).double().view(rows, count, 3)
@@ -80,8 +76,8 @@ def test_the_loss_is_that_of_gains_written_out(changes):
 def test_digits_are_chosen_from_the_scores_of_the_loss(changes):
     model = _model(**changes)
     readout, config = model.token_readout, model.config
-    features = torch.randn(9, config.width, generator=_seed())
-    digits = torch.stack([torch.randint(0, v, (9,), generator=_seed(v)) for v in config.digits], dim=1)
+    features = torch.randn(9, config.width, generator=seeded())
+    digits = torch.stack([torch.randint(0, v, (9,), generator=seeded(v)) for v in config.digits], dim=1)
     before, seen = _near(digits, config), []
 
     def true_digit(scores, first):
@@ -123,7 +119,7 @@ def test_a_masked_place_and_a_frame_without_one_before_gain_nothing():
     assert torch.equal(digits[0, 1:], known_digits(frames, config)[0])
     assert digits[0, 1].tolist() == [[0, 0], [1, 1], [-1, -1]]
     readout = _model(factored=(4, 4)).token_readout
-    features = torch.randn(6, 32, generator=_seed())
+    features = torch.randn(6, 32, generator=seeded())
     nothing = torch.full((6, 2), -1)
     assert torch.equal(readout(features, None, nothing), readout(features))
 
@@ -137,7 +133,7 @@ def test_an_untrained_gain_changes_nothing(changes):
         for parameter in model.token_readout.copy.parameters():
             parameter.zero_()
     batch = _batch(without.config)
-    assert torch.allclose(without(batch, None, _seed()).loss, model(batch, None, _seed()).loss)
+    assert torch.allclose(without(batch, None, seeded()).loss, model(batch, None, seeded()).loss)
     assert torch.allclose(teacher_forced(without, batch)[0], teacher_forced(model, batch)[0], atol=1e-5)
 
 
@@ -148,11 +144,11 @@ def test_rollouts_with_and_without_the_cache_are_equal(changes):
     prompt, actions = batch.tokens[:, :2], batch.actions
     given = {"frames": 2, "unmask_steps": 2, "temperature": 0.5}
     made = [
-        model.generate(prompt, actions, NAMES, generator=_seed(), cache=cache, **given)
+        model.generate(prompt, actions, NAMES, generator=seeded(), cache=cache, **given)
         for cache in (True, False)
     ]
     assert torch.equal(*made)
-    alone = model.generate(prompt[1:2], actions[1:2], NAMES[1:2], generator=_seed(), **given)
+    alone = model.generate(prompt[1:2], actions[1:2], NAMES[1:2], generator=seeded(), **given)
     assert alone.shape == made[0][1:2].shape
 
 
@@ -195,6 +191,6 @@ def test_training_copies_the_past_that_it_shows():
         model.token_readout.copy.linear.bias.fill_(30.0)  # whatever is before is copied
     batch = _batch(model.config)
     still = Batch(NAMES, batch.actions, batch.action_mask, tokens=batch.tokens[:, :1].expand_as(batch.tokens))
-    corrupted = model(still, "forward", _seed()).loss
+    corrupted = model(still, "forward", seeded()).loss
     model.config = model.config.replace(corrupt_max=0.0)
-    assert model(still, "forward", _seed()).loss < 1e-3 < corrupted
+    assert model(still, "forward", seeded()).loss < 1e-3 < corrupted

@@ -11,7 +11,7 @@ from hma_model.evaluation.metrics import teacher_forced
 from hma_model.generation.unmask import Decoding, TokenFrame
 from hma_model.network.head import TokenReadout
 from hma_model.network.stem import from_digits, split_tokens, to_digits
-from tests.model.network_parts import small_batch, small_config, small_model
+from tests.model.network_parts import seeded, small_batch, small_config, small_model
 
 NAMES = ["arm", "hand.v1", "arm"]
 
@@ -21,16 +21,12 @@ def _batch(config):
     return Batch(NAMES, made.actions, made.action_mask, tokens=made.tokens)
 
 
-def _seed(value: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(value)
-
-
 @pytest.mark.parametrize("changes", [{}, {"factored": (5, 3, 2)}, {"factored": (4, 4), "merge": 2}], ids=str)
 def test_the_loss_is_the_sum_over_digits_given_those_before(changes):
     model = small_model(digit_order="chain", **changes)
     readout, config = model.token_readout, model.config
-    features = torch.randn(9, config.width, generator=_seed())
-    digits = torch.stack([torch.randint(0, v, (9,), generator=_seed(v)) for v in config.digits], dim=1)
+    features = torch.randn(9, config.width, generator=seeded())
+    digits = torch.stack([torch.randint(0, v, (9,), generator=seeded(v)) for v in config.digits], dim=1)
     expected = torch.zeros(9)
 
     def true_digit(scores, index):
@@ -46,7 +42,7 @@ def test_the_loss_is_the_sum_over_digits_given_those_before(changes):
 
 def test_a_digit_sees_those_before_it_and_no_other():
     readout = small_model(digit_order="chain", factored=(6, 6, 6)).token_readout
-    features = torch.randn(1, 32, generator=_seed())
+    features = torch.randn(1, 32, generator=seeded())
     digits = torch.tensor([[1, 2, 3]])
     before = readout.split(readout(features, digits))[0]
     for place in range(3):
@@ -70,7 +66,7 @@ def test_it_learns_digits_that_agree_and_samples_them():
             optimizer.step()
         losses[order] = loss.item()
     assert abs(losses["together"] - 2 * math.log(4)) < 0.05 and abs(losses["chain"] - math.log(4)) < 0.05
-    decoding, seeds = Decoding(temperature=1.0), [_seed()]
+    decoding, seeds = Decoding(temperature=1.0), [seeded()]
     frame = TokenFrame(torch.full((1, 256), 16), 16, decoding, seeds)
     frame.unmask(readout, features.unsqueeze(0), torch.zeros(1, 1), 256)
     drawn = to_digits(frame.values[0], (4, 4)).T
@@ -100,5 +96,5 @@ def test_an_untrained_chain_changes_nothing():
         for weight in chained.token_readout.chain.output:
             weight.zero_()
     batch = _batch(together.config)
-    assert torch.equal(together(batch, None, _seed()).loss, chained(batch, None, _seed()).loss)
+    assert torch.equal(together(batch, None, seeded()).loss, chained(batch, None, seeded()).loss)
     assert torch.equal(teacher_forced(together, batch)[0], teacher_forced(chained, batch)[0])

@@ -7,48 +7,44 @@ import torch
 from hma_model.generation.unmask import masked_after
 from hma_model.network.masking import VideoMask, corrupt_tokens, draw_video_mask, drop_chunks
 from hma_model.network.stem import to_digits
-from tests.model.network_parts import small_config
-
-
-def _seed(value: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(value)
+from tests.model.network_parts import seeded, small_config
 
 
 def test_frames_are_masked_with_the_mean_of_the_cosine() -> None:
-    mask = draw_video_mask(small_config(history_probability=0.0), 2000, 5, _seed())
+    mask = draw_video_mask(small_config(history_probability=0.0), 2000, 5, seeded())
     share = mask.masked.float().mean((0, 2))
     assert share[0] == 0
     assert (share[1:] - 2 / math.pi).abs().max() < 0.03
 
 
 def test_a_long_history_stays_unmasked_as_often_as_configured() -> None:
-    mask = draw_video_mask(small_config(history_probability=0.25, history_frames=3), 2000, 5, _seed())
+    mask = draw_video_mask(small_config(history_probability=0.25, history_frames=3), 2000, 5, seeded())
     visible = ~mask.masked.any(2)
     assert abs(visible[:, 1:3].all(1).float().mean().item() - 0.25 - 0.75 * 0.01) < 0.05
 
 
 def test_frames_after_a_long_history_are_corrupted_more_and_more() -> None:
-    mask = draw_video_mask(small_config(history_probability=1.0, history_frames=2), 200, 8, _seed())
+    mask = draw_video_mask(small_config(history_probability=1.0, history_frames=2), 200, 8, seeded())
     assert (mask.corruption.diff(dim=1) >= -1e-6).all()
     assert (mask.corruption[:, -1] > mask.corruption[:, 0]).float().mean() > 0.9
 
 
 def test_each_sample_of_a_batch_draws_its_own_mask() -> None:
-    mask = draw_video_mask(small_config(), 64, 5, _seed())
+    mask = draw_video_mask(small_config(), 64, 5, seeded())
     assert mask.masked.flatten(1).unique(dim=0).shape[0] > 60
     assert mask.corruption[:, 0].unique().numel() > 60
 
 
 def test_the_smallest_mask_probability_holds() -> None:
     config = small_config(mask_ratio_min=0.5, history_probability=0.0, grid=(32, 32))
-    assert draw_video_mask(config, 50, 5, _seed()).masked[:, 1:].float().mean(2).min() > 0.4
+    assert draw_video_mask(config, 50, 5, seeded()).masked[:, 1:].float().mean(2).min() > 0.4
 
 
 def test_digits_are_corrupted_at_the_given_rate_and_masked_tokens_hidden() -> None:
     config = small_config(factored=(64, 64), grid=(32, 32))
-    tokens = torch.randint(0, 4096, (4, 2, 1024), generator=_seed())
-    masked = torch.rand(4, 2, 1024, generator=_seed()) < 0.3
-    corrupted = corrupt_tokens(config, tokens, VideoMask(masked, torch.full((4, 2), 0.2)), _seed(1))
+    tokens = torch.randint(0, 4096, (4, 2, 1024), generator=seeded())
+    masked = torch.rand(4, 2, 1024, generator=seeded()) < 0.3
+    corrupted = corrupt_tokens(config, tokens, VideoMask(masked, torch.full((4, 2), 0.2)), seeded(1))
     assert (corrupted[masked] == 4096).all() and (corrupted[~masked] < 4096).all()
     changed = to_digits(corrupted, (64, 64))[~masked] != to_digits(tokens, (64, 64))[~masked]
     assert (changed.float().mean(0) - 0.2 * 63 / 64).abs().max() < 0.02
@@ -58,16 +54,16 @@ def test_digits_are_corrupted_at_the_given_rate_and_masked_tokens_hidden() -> No
 
 def test_no_corruption_leaves_visible_tokens() -> None:
     config = small_config(corrupt_max=0.0)
-    mask = draw_video_mask(config, 4, 5, _seed())
-    tokens = torch.randint(0, 24, (4, 5, 16), generator=_seed())
-    out = corrupt_tokens(config, tokens, mask, _seed())
+    mask = draw_video_mask(config, 4, 5, seeded())
+    tokens = torch.randint(0, 24, (4, 5, 16), generator=seeded())
+    out = corrupt_tokens(config, tokens, mask, seeded())
     assert torch.equal(out[~mask.masked], tokens[~mask.masked])
 
 
 def test_every_sample_hides_at_least_one_present_chunk() -> None:
-    present = torch.rand(500, 6, generator=_seed()) < 0.4
+    present = torch.rand(500, 6, generator=seeded()) < 0.4
     present[:, 3] = True
-    assert (drop_chunks(present, _seed()) & present).any(1).all()
+    assert (drop_chunks(present, seeded()) & present).any(1).all()
 
 
 def test_unmasking_follows_the_cosine_and_ends_with_nothing_masked() -> None:

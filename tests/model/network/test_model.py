@@ -13,13 +13,9 @@ from hma_model.network.conditioning import Groups
 from hma_model.network.masking import draw_video_mask, drop_chunks
 from hma_model.network.model import HMA
 from hma_model.network.stem import from_digits, patchify, to_digits, unpatchify
-from tests.model.network_parts import ARM, HAND, small_batch, small_config, small_model
+from tests.model.network_parts import ARM, HAND, seeded, small_batch, small_config, small_model
 
 KINDS = ["discrete", "continuous"]
-
-
-def _seed(value: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(value)
 
 
 def test_digits_are_low_first_and_come_back() -> None:
@@ -41,23 +37,23 @@ def test_patches_keep_neighbours_together_and_come_back() -> None:
 def test_the_same_generator_gives_the_same_loss(kind: str, objective: str) -> None:
     model = small_model(kind=kind)
     batch = small_batch(model.config, ["arm", "hand.v1"])
-    first, second = (model(batch, objective, _seed(3)) for _ in range(2))
+    first, second = (model(batch, objective, seeded(3)) for _ in range(2))
     assert torch.equal(first.loss, second.loss) and torch.isfinite(first.loss)
-    assert not torch.equal(first.loss, model(batch, objective, _seed(4)).loss)
+    assert not torch.equal(first.loss, model(batch, objective, seeded(4)).loss)
 
 
 def test_an_untrained_model_knows_nothing() -> None:
     torch.manual_seed(0)
     model = HMA(small_config(width=64, label_smoothing=0.0))
     model.add_embodiment(ARM)
-    loss = model(small_batch(model.config, ["arm"] * 8), "forward", _seed()).video_loss
+    loss = model(small_batch(model.config, ["arm"] * 8), "forward", seeded()).video_loss
     assert loss is not None and abs(loss.item() - math.log(24)) < 0.1
 
 
 def test_video_loss_is_the_mean_over_masked_tokens_of_later_frames() -> None:
     model = small_model(label_smoothing=0.0)
     batch = small_batch(model.config, ["arm", "hand.v1", "arm"])
-    out = model(batch, "forward", _seed())
+    out = model(batch, "forward", seeded())
     assert not out.masked[:, 0].any() and out.masked[:, 1:].any()
     assert out.video_logits is not None and out.video_loss is not None
     digits = to_digits(batch.tokens, model.config.factored)
@@ -73,7 +69,7 @@ def test_video_loss_is_the_mean_over_masked_tokens_of_later_frames() -> None:
 
 def test_logits_are_not_kept_in_training() -> None:
     model = small_model().train()
-    assert model(small_batch(model.config, ["arm"]), "forward", _seed()).video_logits is None
+    assert model(small_batch(model.config, ["arm"]), "forward", seeded()).video_logits is None
 
 
 @pytest.mark.parametrize("objective", ["policy", "inverse", "full"])
@@ -81,17 +77,17 @@ def test_action_loss_ignores_absent_chunks(objective: str) -> None:
     model = small_model()
     batch = small_batch(model.config, ["arm", "hand.v1"])
     batch.action_mask[:, 2] = False
-    first = model(batch, objective, _seed()).action_loss
+    first = model(batch, objective, seeded()).action_loss
     batch.actions[:, 2] += 100
-    assert torch.equal(first, model(batch, objective, _seed()).action_loss)
+    assert torch.equal(first, model(batch, objective, seeded()).action_loss)
     batch.actions[:, :2] += 100
-    assert not torch.equal(first, model(batch, objective, _seed()).action_loss)
+    assert not torch.equal(first, model(batch, objective, seeded()).action_loss)
 
 
 def test_policy_and_inverse_see_all_video() -> None:
     model = small_model()
     for objective in ("policy", "inverse"):
-        out = model(small_batch(model.config, ["arm"]), objective, _seed())
+        out = model(small_batch(model.config, ["arm"]), objective, seeded())
         assert out.video_loss is None and not out.masked.any() and out.action_loss is not None
 
 
@@ -99,7 +95,7 @@ def test_policy_and_inverse_see_all_video() -> None:
 def test_gradients_reach_exactly_the_stems_present(objective: str) -> None:
     model = small_model().train()
     model.add_embodiment(ActionSpace("third", 2, 1, (0.0, 0.0), (1.0, 1.0), (True, True)))
-    model(small_batch(model.config, ["arm", "third"]), objective, _seed()).loss.backward()
+    model(small_batch(model.config, ["arm", "third"]), objective, seeded()).loss.backward()
     for name in ("arm", "third"):
         assert model.stem(name).input.weight.grad.abs().sum() > 0
         assert model.stem(name).modulation.weight.grad.abs().sum() > 0
@@ -116,7 +112,7 @@ def _overfit(objective: str, steps: int, **changes: Any) -> list[float]:
     values = {"layers": 1, "frames": 3, "grid": (2, 2), "corrupt_max": 0.0, "history_probability": 0.0}
     model = HMA(small_config(**(values | {"label_smoothing": 0.0} | changes)))
     model.add_embodiment(ARM)
-    batch, generator = small_batch(model.config, ["arm"] * 4), _seed()
+    batch, generator = small_batch(model.config, ["arm"] * 4), seeded()
     optimizer = torch.optim.AdamW(model.parameters(), 1e-2, weight_decay=0.0)
     losses = []
     for step in range(steps):
@@ -162,7 +158,7 @@ COMBINATIONS = [c for size in (1, 2, 3, 4) for c in itertools.combinations(CONDI
 def test_every_parameter_of_every_combination_of_conditionings_learns(conditioning: tuple[str, ...]) -> None:
     model = small_model(conditioning=conditioning, action_tokens=2).train()
     batch = small_batch(model.config, ["arm", "hand.v1"])
-    (model(batch, "full", _seed()).loss + model(batch, "inverse", _seed()).loss).backward()
+    (model(batch, "full", seeded()).loss + model(batch, "inverse", seeded()).loss).backward()
     idle = [
         name
         for name, parameter in model.named_parameters()
@@ -187,8 +183,8 @@ def test_action_loss_is_the_mean_over_present_chunks(target: str) -> None:
     model = small_model(corrupt_max=0.0, action_target=target)
     batch = small_batch(model.config, ["arm", "hand.v1", "arm"])
     batch.action_mask[0, 1] = batch.action_mask[1, 3:] = False
-    out = model(batch, "policy", _seed(5))
-    generator = _seed(5)
+    out = model(batch, "policy", seeded(5))
+    generator = seeded(5)
     draw_video_mask(model.config, 3, 5, generator)
     known = batch.action_mask & ~drop_chunks(batch.action_mask, generator)
     chunks = model.predict_actions(batch.tokens, batch.embodiment, batch.actions, known)
@@ -250,7 +246,7 @@ def test_inverse_reads_the_frame_after_and_policy_does_not() -> None:
 
 def test_continuous_loss_is_over_masked_patches() -> None:
     model = small_model(kind="continuous")
-    out = model(small_batch(model.config, ["arm"]), "forward", _seed())
+    out = model(small_batch(model.config, ["arm"]), "forward", seeded())
     assert out.masked.shape == (1, 5, 4, 4) and not out.masked[:, 0].any() and torch.isfinite(out.loss)
 
 
@@ -276,7 +272,7 @@ def test_states_divide_and_join_without_loss(kind: str) -> None:
         other.load_embodiment(name, model.stem_state(name), model.head_state(name))
     assert other.embodiments.keys() == model.embodiments.keys()
     batch = small_batch(model.config, ["arm", "hand.v1"])
-    assert torch.equal(model(batch, "full", _seed()).loss, other(batch, "full", _seed()).loss)
+    assert torch.equal(model(batch, "full", seeded()).loss, other(batch, "full", seeded()).loss)
     parts = {**model.trunk_state(), **model.stem_state("arm"), **model.head_state("arm")}
     assert len(parts) == len({id(p) for p in parts.values()})
 

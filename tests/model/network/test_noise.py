@@ -5,13 +5,9 @@ import torch
 
 from hma_data.errors import HMAError
 from hma_model.network.stem import NoiseEmbedding
-from tests.model.network_parts import small_batch, small_model
+from tests.model.network_parts import seeded, small_batch, small_model
 
 NAMES = ["arm", "hand.v1", "arm", "arm"]
-
-
-def _seed(value: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(value)
 
 
 def _embedded_level(model, batch, monkeypatch, objective="forward"):
@@ -20,7 +16,7 @@ def _embedded_level(model, batch, monkeypatch, objective="forward"):
     noise, embed = NoiseEmbedding.forward, model.embed_tokens
     monkeypatch.setattr(NoiseEmbedding, "forward", lambda self, x: told.append(x) or noise(self, x))
     monkeypatch.setattr(model, "embed_tokens", lambda *given: tokens.append(given[0]) or embed(*given))
-    model(batch, objective, _seed())
+    model(batch, objective, seeded())
     return told[0], tokens[0]
 
 
@@ -49,7 +45,7 @@ def test_a_clean_frame_is_as_without_the_embedding():
     plain.load_state_dict({n: t for n, t in told.state_dict().items() if "noise" not in n})
     assert told.trunk.noise is not None and told.trunk.noise.weight.abs().sum() > 0
     batch = small_batch(told.config, NAMES)
-    assert torch.equal(told(batch, None, _seed()).loss, plain(batch, None, _seed()).loss)
+    assert torch.equal(told(batch, None, seeded()).loss, plain(batch, None, seeded()).loss)
     assert torch.equal(
         told.video_logits(batch.tokens, batch.actions, NAMES),
         plain.video_logits(batch.tokens, batch.actions, NAMES),
@@ -59,7 +55,7 @@ def test_a_clean_frame_is_as_without_the_embedding():
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
 def test_the_embedding_learns_from_noise_in_the_past(kind):
     model = small_model(kind=kind, told_noise=True, latent_noise=0.5, training_pass="pairs").train()
-    model(small_batch(model.config, NAMES), "forward", _seed()).loss.backward()
+    model(small_batch(model.config, NAMES), "forward", seeded()).loss.backward()
     assert model.trunk.noise.weight.grad.abs().sum() > 0
 
 
@@ -69,7 +65,7 @@ def test_a_rollout_tells_the_level_of_its_own_frames_only(changes, monkeypatch):
     batch = small_batch(model.config, NAMES, frames=7)
 
     def made(frames, **how):
-        return model.generate(batch.tokens[:, :3], batch.actions, NAMES, frames, generator=_seed(), **how)
+        return model.generate(batch.tokens[:, :3], batch.actions, NAMES, frames, generator=seeded(), **how)
 
     plain, told = made(4), []
     noise = NoiseEmbedding.forward

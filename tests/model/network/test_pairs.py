@@ -13,17 +13,13 @@ from hma_model.network.model import HMA
 from hma_model.network.objectives import Layout
 from hma_model.network.stem import merge_tokens, split_tokens, to_digits
 from hma_model.network.trunk import sinusoids
-from tests.model.network_parts import small_batch, small_config, small_model
+from tests.model.network_parts import seeded, small_batch, small_config, small_model
 
 WHOLE = {
     "training_pass": "pairs", "whole_share": 1.0, "corrupt_max": 0.0, "history_probability": 0.0,
     "label_smoothing": 0.0,
 }  # fmt: skip
 NAMES = ["arm", "hand.v1", "arm"]
-
-
-def _seed(value: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(value)
 
 
 def _batch(model: HMA) -> Batch:
@@ -41,7 +37,7 @@ def test_whole_copies_have_the_loss_of_each_frame_after_its_true_past(changes, o
     if objective == "full":  # hides chunks, so the frames are compared without any
         batch = replace(batch, action_mask=torch.zeros_like(batch.action_mask))
         batch.action_mask[:, 0] = True
-    output = model(batch, objective, _seed())
+    output = model(batch, objective, seeded())
     nats, _ = teacher_forced(model, batch)
     if objective == "forward":
         assert torch.allclose(output.per_sample, nats.mean(dim=1), atol=1e-5)
@@ -55,7 +51,7 @@ def test_whole_copies_have_the_loss_of_each_frame_after_its_true_past(changes, o
 @pytest.mark.parametrize("objective", ["forward", "passive", "policy", "inverse", "full"])
 def test_every_objective_trains_on_pairs(kind, objective):
     model = small_model(kind=kind, training_pass="pairs", masked_input="previous").train()
-    output = model(_batch(model), objective, _seed())
+    output = model(_batch(model), objective, seeded())
     output.loss.backward()
     gradients = [p.grad for p in model.trunk.parameters() if p.grad is not None]
     assert output.loss.isfinite() and all(g.isfinite().all() for g in gradients)
@@ -65,10 +61,10 @@ def test_every_objective_trains_on_pairs(kind, objective):
 def test_a_copy_sees_neither_other_copies_nor_later_frames():
     model = small_model(masked_input="previous", **WHOLE)
     batch = _batch(model)
-    before = model(batch, "forward", _seed()).video_logits
+    before = model(batch, "forward", seeded()).video_logits
     changed = replace(batch, tokens=batch.tokens.clone())
     changed.tokens[:, 3:] = (changed.tokens[:, 3:] + 5) % model.config.vocab_size
-    after = model(changed, "forward", _seed()).video_logits
+    after = model(changed, "forward", seeded()).video_logits
     assert torch.equal(before[:, :4], after[:, :4]) and not torch.equal(before[:, 4], after[:, 4])
 
 
@@ -78,13 +74,13 @@ def test_padding_has_no_loss():
     inside = torch.ones(3, model.config.frames, dtype=torch.bool)
     inside[1, 3:] = False
     batch.frame_mask = inside
-    output = model(batch, "forward", _seed())
+    output = model(batch, "forward", seeded())
     assert not output.masked[1, 3:].any() and output.masked[1, 1:3].all()
 
 
 def test_half_of_the_copies_are_wholly_masked_and_the_past_never():
     config = small_config(training_pass="pairs", whole_share=0.5, grid=(8, 8))
-    mask = draw_pairs_mask(config, 400, 6, 5, _seed())
+    mask = draw_pairs_mask(config, 400, 6, 5, seeded())
     assert mask.masked.shape == (400, 10, 64) and not mask.masked[:, :5].any()
     assert abs(mask.masked[:, 5:].all(2).float().mean().item() - 0.5) < 0.06
     assert (mask.corruption[:, 5:] == 0).all() and (mask.corruption[:, :5] > 0).all()
@@ -95,8 +91,8 @@ def test_noise_in_the_past_of_latents_has_the_spread_of_its_corruption(monkeypat
     original = model.embed_patches
     monkeypatch.setattr(model, "embed_patches", lambda *given: seen.append(given[0]) or original(*given))
     batch = _batch(model)
-    model(batch, "forward", _seed())
-    rate = draw_pairs_mask(model.config, 3, 5, 4, _seed()).corruption[:, :4]
+    model(batch, "forward", seeded())
+    rate = draw_pairs_mask(model.config, 3, 5, 4, seeded()).corruption[:, :4]
     true = model.frame_values(batch.latents)[[0, 2, 1]][:, :4]  # sorted by embodiment
     noise = (seen[0][:, :4] - true).flatten(2)
     assert (noise.std(dim=2) / (2 * rate[[0, 2, 1]]) - 1).abs().max() < 0.25
@@ -121,7 +117,7 @@ def test_frames_that_actions_are_read_from_are_not_corrupted_like_a_rollout(obje
     monkeypatch.setattr(
         objectives, "corrupt_tokens", lambda *given: rates.append(given[2].corruption) or original(*given)
     )
-    model(_batch(model), objective, _seed())
+    model(_batch(model), objective, seeded())
     assert rates[0].max() <= 0.1 and np.ptp(rates[0].numpy(), axis=1).max() == 0
 
 
@@ -135,7 +131,7 @@ def test_sinusoids_tell_neighbours_from_others():
 
 
 def test_squares_of_tokens_become_one_and_come_apart_again():
-    tokens = torch.randint(0, 32768, (2, 3, 6, 4), generator=_seed())
+    tokens = torch.randint(0, 32768, (2, 3, 6, 4), generator=seeded())
     merged = merge_tokens(tokens, 2, 32768)
     assert merged.shape == (2, 3, 6) and merged.max() < 32768**4
     assert torch.equal(split_tokens(merged, 2, 32768, (3, 2)), tokens)
@@ -150,13 +146,13 @@ def test_squares_of_tokens_become_one_and_come_apart_again():
 def test_the_embedding_and_the_loss_are_sums_over_the_digits(factored):
     model = small_model(factored=factored, label_smoothing=0.1)
     config, embed, readout = model.config, model.trunk.embed, model.token_readout
-    tokens = torch.randint(0, config.vocab_size, (2, 3, 16), generator=_seed())
+    tokens = torch.randint(0, config.vocab_size, (2, 3, 16), generator=seeded())
     digits = to_digits(tokens, factored)
     rows = [weight[digits[..., i]].double() for i, weight in enumerate(embed.digits)]
     assert torch.allclose(model.embed_tokens(tokens).double(), sum(rows), atol=1e-5)
 
-    features = torch.randn(7, config.width, generator=_seed())
-    goal = torch.stack([torch.randint(0, v, (7,), generator=_seed(v)) for v in factored], dim=1)
+    features = torch.randn(7, config.width, generator=seeded())
+    goal = torch.stack([torch.randint(0, v, (7,), generator=seeded(v)) for v in factored], dim=1)
     scores = (features.double() @ readout.linear.weight.double().T + readout.linear.bias.double()).split(
         factored, 1
     )

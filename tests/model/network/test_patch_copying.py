@@ -7,14 +7,10 @@ from hma_data.loading.rows import Batch
 from hma_model.network.head import DiffusionHead
 from hma_model.network.stem import patchify
 from hma_model.training.scheduled_sampling import forwarded
-from tests.model.network_parts import small_batch, small_model
+from tests.model.network_parts import seeded, small_batch, small_model
 
 NAMES = ["arm", "hand.v1", "arm"]
 CHANGES = [{}, {"training_pass": "pairs", "masked_input": "previous"}]
-
-
-def _seed(value: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(value)
 
 
 def _model(share: int | None = None, **changes):
@@ -52,10 +48,10 @@ def test_the_head_learns_and_draws_the_difference_to_what_is_kept():
     shares = readout.copy.linear(features * readout.copy.multiplier).sigmoid()
     kept = (shares * before).view(16, values)
     own, patches = conditions[..., :width].view(16, width), torch.randn(16, values)
-    loss = readout.loss(patches, conditions.view(16, -1), _seed())
-    assert torch.allclose(loss, readout.diffusion.loss(patches - kept, own, _seed()))
-    drawn = readout.sample(conditions.view(16, -1), 4, generator=_seed())
-    assert torch.allclose(drawn, readout.diffusion.sample(own, 4, generator=_seed()) + kept)
+    loss = readout.loss(patches, conditions.view(16, -1), seeded())
+    assert torch.allclose(loss, readout.diffusion.loss(patches - kept, own, seeded()))
+    drawn = readout.sample(conditions.view(16, -1), 4, generator=seeded())
+    assert torch.allclose(drawn, readout.diffusion.sample(own, 4, generator=seeded()) + kept)
     assert torch.equal(readout(features, torch.tensor([0]))[..., width:], torch.zeros(1, 1, 16, values))
 
 
@@ -64,9 +60,9 @@ def test_shares_of_nothing_change_nothing(changes):
     without, model = small_model(kind="continuous", **changes), _model(0, **changes)
     model.load_state_dict({**model.state_dict(), **without.state_dict()})
     batch = _batch(without.config)
-    assert torch.equal(without(batch, None, _seed()).loss, model(batch, None, _seed()).loss)
+    assert torch.equal(without(batch, None, seeded()).loss, model(batch, None, seeded()).loss)
     made = [
-        one.eval().generate(batch.latents[:, :2], batch.actions, NAMES, frames=2, generator=_seed())
+        one.eval().generate(batch.latents[:, :2], batch.actions, NAMES, frames=2, generator=seeded())
         for one in (without, model)
     ]
     assert torch.equal(*made)
@@ -86,7 +82,7 @@ def test_rollouts_with_and_without_the_cache_are_equal(changes):
     model = _model(**changes).eval()
     batch = _batch(model.config)
     cached, whole = (
-        model.generate(batch.latents[:, :2], batch.actions, NAMES, 2, generator=_seed(), cache=cache)
+        model.generate(batch.latents[:, :2], batch.actions, NAMES, 2, generator=seeded(), cache=cache)
         for cache in (True, False)
     )
     assert torch.allclose(cached, whole, atol=1e-4)
@@ -95,7 +91,7 @@ def test_rollouts_with_and_without_the_cache_are_equal(changes):
 def test_a_predicted_past_keeps_the_frame_before(nothing_more):
     model = _model(1)
     batch = _batch(model.config)
-    seen = forwarded(model, batch, 1.0, 1, _seed()).context
+    seen = forwarded(model, batch, 1.0, 1, seeded()).context
     for row in range(len(NAMES)):
         (at,) = (seen[row] != batch.latents[row]).flatten(1).any(1).nonzero().flatten().tolist()
         assert torch.allclose(seen[row, at], batch.latents[row, at - 1], atol=1e-6)
@@ -117,7 +113,7 @@ def targets(monkeypatch):
 def test_a_still_window_leaves_nothing_to_draw_but_the_noise_of_its_past(targets):
     for noise in (0.0, 1.0):
         model = _model(1, training_pass="pairs", latent_noise=noise)
-        model(_batch(model.config, still=True), "forward", _seed())
+        model(_batch(model.config, still=True), "forward", seeded())
     quiet, noisy = (target.abs().max() for target in targets)
     assert quiet < 1e-6 and noisy > 0.01
 
@@ -126,7 +122,7 @@ def test_nothing_is_kept_of_what_is_masked(targets):
     model = _model(1, corrupt_max=0.0)
     batch = _batch(model.config)
     batch = Batch(["arm"] * 3, batch.actions, batch.action_mask, latents=batch.latents)  # one order of rows
-    masked = model(batch, "forward", _seed()).masked.flatten(2)
+    masked = model(batch, "forward", seeded()).masked.flatten(2)
     patches = patchify(batch.latents * model.config.latent_scale, model.config.patch)
     before = torch.cat([torch.zeros_like(patches[:, :1]), patches[:, :-1]], dim=1)
     hidden = torch.cat([torch.ones_like(masked[:, :1]), masked[:, :-1]], dim=1)

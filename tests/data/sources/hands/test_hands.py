@@ -36,20 +36,6 @@ VIDEO = Header(1_000, 10.0, 100, 50, "h264")
 BOTH = ("left/center", "right/center")
 
 
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A video of 30 frames at 10 Hz, each showing its number."""
-    return encode(tmp_path_factory.mktemp("clip") / "a.mp4", range(LENGTH))
-
-
-@pytest.fixture
-def folder(tmp_path: Path, clip: Path) -> Path:
-    """A folder with that video."""
-    (tmp_path / "set").mkdir()
-    (tmp_path / "set" / "a.mp4").write_bytes(clip.read_bytes())
-    return tmp_path / "set"
-
-
 def check_run(folder: Path, robot, episode_id: str, frames: range) -> None:
     """An episode's pictures, actions (next) and states are those of its labels, the last left out."""
     source = open_source("hands")

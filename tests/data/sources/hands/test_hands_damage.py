@@ -13,23 +13,9 @@ from hma_data.errors import EpisodeError, HMAError, RegistryError, SourceError
 from hma_data.sources.base import open_source
 from hma_data.sources.hands.runs import videos_of
 from tests.data import hands_files as made
-from tests.data.videos import HEIGHT, WIDTH, encode
+from tests.data.videos import HEIGHT, WIDTH
 
 LENGTH = 30
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A video of 30 frames at 10 Hz, each showing its number."""
-    return encode(tmp_path_factory.mktemp("clip") / "a.mp4", range(LENGTH))
-
-
-@pytest.fixture
-def folder(tmp_path: Path, clip: Path) -> Path:
-    """A folder with that video."""
-    (tmp_path / "set").mkdir()
-    (tmp_path / "set" / "a.mp4").write_bytes(clip.read_bytes())
-    return tmp_path / "set"
 
 
 @pytest.mark.parametrize(
