@@ -7,6 +7,7 @@ leave its column.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,8 @@ MANY_COLUMNS = 10  # HTML shows wider tables in smaller type
 class Table:
     """Rows of cells below their headings.
 
-    A cell is a text, a number, or None for what is absent. HTML shows a second line of a text small.
+    A cell is a text, a number (a Decimal shows all its digits), or None for what is absent. HTML shows the
+    second line of a text small.
     """
 
     columns: Sequence[str]
@@ -42,10 +44,7 @@ class Table:
         """Return it as HTML; columns of numbers are aligned to the right."""
         from markupsafe import Markup
 
-        numeric = [
-            all(isinstance(row[column], int | float) for row in self.rows)
-            for column in range(len(self.columns))
-        ]
+        numeric = [_is_numeric([row[column] for row in self.rows]) for column in range(len(self.columns))]
         lines = [[_shown(cell).partition("\n")[::2] for cell in line] for line in (self.columns, *self.rows)]
         dense = len(self.columns) > MANY_COLUMNS
         return Markup(fill("hma_data", "table.html", lines=lines, numeric=numeric, dense=dense))
@@ -67,6 +66,11 @@ def _environment(package: str) -> "Environment":
         trim_blocks=True,
         lstrip_blocks=True,
     )
+
+
+def _is_numeric(cells: Sequence[Any]) -> bool:
+    known = [cell for cell in cells if cell is not None]
+    return bool(known) and all(isinstance(cell, int | float | Decimal) for cell in known)
 
 
 def _shown(cell: Any) -> str:

@@ -4,13 +4,13 @@ import json as json_text
 import shlex
 import sys
 from collections.abc import Sequence
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
-from hma_data.console import interruptible, print_lines, print_table
+from hma_data.console import interruptible, print_lines
+from hma_data.tables import Table
 from hma_model.cli.options import (
     Cameras,
     Checkpoint,
@@ -28,24 +28,6 @@ from hma_model.cli.options import (
 
 if TYPE_CHECKING:
     from hma_model.evaluation.suite import Part
-
-FIGURES = {  # figures of `hma evaluate` as its table names them; the others have their names in the JSON
-    "against": "compared with",
-    "unmoved_windows": "windows whose pictures never change",
-    "draws": "draws of shuffled actions",
-    "loss": "loss, nats a token",
-    "stored_loss": "loss, nats a stored token",
-    "shuffled_loss": "loss with shuffled actions",
-    "baseline_loss": "loss of token frequencies alone",
-    "accuracy": "accuracy, share of tokens",
-    "masked_perplexity": "perplexity of tokens masked as in training",
-    "masked_accuracy": "accuracy of these",
-    "psnr_action_gain_last": "last frame, true less shuffled, dB",
-}
-ROLLOUTS = ("true", "shuffled", "none", "copy")
-HIDDEN = ("checkpoint", "data", "seconds_a_frame", "sees_actions", "merge")  # of the readable form
-MEASURES = {"lpips": "LPIPS", "fid": "FID", "fvd": "FVD"}
-DIGITS = {"ssim": 3, "lpips": 3}  # of the figures of rollouts; the others have two
 
 
 def evaluate(
@@ -129,123 +111,33 @@ def evaluate(
 
 
 def _print_one(part: "Part") -> None:
-    found = part.found
-    hidden = HIDDEN if found.get("merge", 1) > 1 else (*HIDDEN, "stored_loss")
-    plain = [
-        [_figure(key, found), value, _ends(found.get(f"{key}_95"))]
-        for key, value in found.items()
-        if not isinstance(value, dict | list) and key not in hidden and not key.endswith("_95")
-    ]
-    print_table(["figure", "value", "95 %"], plain)
-    columns = {"psnr": "PSNR dB", "psnr_last": "last frame dB", "ssim": "SSIM"}
-    columns |= {key: name for key, name in MEASURES.items() if key in found["true"]}
-    rows = [
-        [name, *(_rounded(found[name].get(key), key) for key in columns), _ends(found[name]["psnr_last_95"])]
-        for name in ROLLOUTS
-    ]
-    print_table(["rollout", *columns.values(), "last frame, 95 %"], rows)
-    print(
-        f"true: the window's actions; shuffled: another window's, mean of {found['draws']} draws; "
-        "none: without actions; copy: the prompt's last frame, repeated"
-    )
-    if paper := found.get("paper"):
-        said = [[key, value, _ends(paper.get(f"{key}_95"))] for key, value in paper.items()]
-        print_table(["the paper's protocol", "value", "95 %"], [row for row in said if row[0][-3:] != "_95"])
-    _print_state(found.get("state"))
+    from hma_model.evaluation.tables import conditions, details, rollouts, state
+    from hma_model.evaluation.verdict import verdict
+
+    print(conditions(part.found))
+    details(part.found).print()
+    rollouts(part.found).print()
+    for table, about in state(part.found.get("state")):
+        table.print()
+        if about:
+            print(about)
     _print_absences([part])
-    from hma_model.evaluation.evaluate import verdict
-
-    print(f"{part.checkpoint} {verdict(found)}")
-
-
-def _print_state(state: dict[str, Any] | None) -> None:
-    if not state or "true" not in state:
-        return
-    if "values" in state:
-        _print_recorded_state(state)
-        return
-    rows = [
-        [
-            name,
-            *(_rounded(state[name][key], key) for key in ("error_px", "error_px_last")),
-            _ends(state[name]["error_px_last_95"]),
-        ]
-        for name in (*ROLLOUTS, "reconstruction")
-    ]
-    print_table(["robot's place", "error px of 128", "last frame", "95 %"], rows)
-    noisy = state["perturbed"]
-    rows = [
-        [words, noisy[f"psnr{mark}"], noisy[f"psnr{mark}_last"], noisy.get(f"perplexity{mark}")]
-        for words, mark in (("true", ""), (f"perturbed by {noisy['scale']:g} standard deviations", "_star"))
-    ]
-    print_table(["commands", "PSNR dB", "last frame dB", "perplexity"], rows)
-    print(f"{state['episodes']} simulated episodes; the probe errs by {state['probe_px']:.2f} px")
-
-
-def _print_recorded_state(state: dict[str, Any]) -> None:
-    kinds = (*ROLLOUTS, "reconstruction")
-    rows: list[list[Any]] = [
-        [
-            name,
-            *(_rounded(state[name][key], key) for key in ("error_sd", "error_sd_last")),
-            _ends(state[name]["error_sd_last_95"]),
-        ]
-        for name in kinds
-    ]
-    print_table(["recorded state", "error, standard deviations", "last frame", "95 %"], rows)
-    rows = [[row["name"], row["unit"], *(row[kind] for kind in kinds)] for row in state["values"]]
-    print_table(["last frame, error of", "unit", *kinds], rows)
-    print(
-        f"{state['read']} of {state['of']} values can be read off the pictures; what reads them errs by "
-        f"{state['reader_sd']:.2f} standard deviations on true pictures of other episodes"
-    )
-
-
-def _figure(key: str, found: dict[str, Any]) -> str:
-    """Return the name of a figure; what is of squares of tokens says so."""
-    from hma_model.config import token_words
-
-    side, name = found.get("merge") or 1, FIGURES.get(key, key)
-    square = f"{side}×{side}"
-    if side == 1:
-        return name
-    names = {
-        "loss": f"loss, nats a {token_words(side)}",
-        "perplexity": f"perplexity of squares of {square} tokens",
-        "accuracy": f"accuracy, share of squares of {square}",
-    }
-    return names.get(key, name)
-
-
-def _ends(ends: Sequence[float] | None) -> str | None:
-    return None if not ends or None in ends else f"{ends[0]:.4g} to {ends[1]:.4g}"
+    print(f"{part.checkpoint} {verdict(part.found)}")
 
 
 def _print_table(parts: "Sequence[Part]") -> None:
-    from hma_model.evaluation.tables import renamed, rows, verdicts
+    from hma_model.evaluation.tables import comparison, renamed, verdicts
 
     parts, legend = renamed(parts)
     print_lines(legend)
-    names, lines = rows(parts, intervals=False)
+    table, repeated = comparison(parts, intervals=False), 2
     if len({part.checkpoint for part in parts}) == 1:  # the same in every row, and perhaps long
         print(parts[0].checkpoint)
-        names, lines = names[1:], [line[1:] for line in lines]
-    repeated = names.index("robot") + 1
-    print_table(names, [[_number(cell) for cell in line] for line in lines], repeated=repeated)
+        table, repeated = Table(table.columns[1:], [row[1:] for row in table.rows]), 1
+    table.print(repeated=repeated)
     _print_absences(parts)
     for whose, said in verdicts(parts):
         print(f"{whose} {said}")
-
-
-def _number(cell: Any) -> Any:
-    try:
-        return Decimal(cell) if isinstance(cell, str) else cell
-    except InvalidOperation:
-        return cell
-
-
-def _rounded(value: float | None, key: str) -> Decimal | None:
-    return None if value is None else Decimal(f"{value:.{DIGITS.get(key, 2)}f}")
 
 
 def _print_absences(parts: "Sequence[Part]") -> None:

@@ -25,7 +25,7 @@ from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.config import OBJECTIVES, token_words
+from hma_model.config import OBJECTIVES
 from hma_model.evaluation.actions import gaussian, shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, SHARE, ends_of, interval, rounded, summary
 from hma_model.evaluation.losses import (
@@ -46,11 +46,7 @@ if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
-__all__ = ["Settings", "evaluate", "measure", "verdict"]
-
 DRAWS = 5  # of other windows' actions, and of Gaussian ones
-FOLLOWS_DB = 0.5  # gain of the last frame's PSNR from which a model is said to follow its actions
-HEARS = 1.2  # and times the loss with shuffled ones from which it is said to hear them
 PAPER_BATCH = 4  # the paper's perplexity is a mean over batches of so many windows
 Floats = NDArray[np.float64]
 
@@ -223,33 +219,6 @@ def measure(
 def _episodes(batches: list[Batch]) -> NDArray[np.int64]:
     """Return the episode (N,) of each window."""
     return np.concatenate([np.arange(len(b)) if b.episode is None else b.episode.numpy() for b in batches])
-
-
-def verdict(found: Mapping[str, Any]) -> str:
-    """Return a sentence about the result of `evaluate`: whether the model follows its actions."""
-    if not found.get("sees_actions", True):
-        return "was trained without actions"
-    if 2 * found.get("unmoved_windows", 0) > found.get("windows", 0):
-        return "cannot be judged: most of the true pictures never change"
-    gain = found["psnr_action_gain_last"]
-    if gain is None or found.get("loss", 0.0) is None:
-        return "cannot be judged: its predictions are not finite"
-    ends, count = found.get("psnr_action_gain_last_95"), found.get("episodes", 0)
-    said = f"{gain:+.1f} dB on the last frame, true less shuffled actions"
-    if ends:
-        said += f", 95 %: {ends[0]:+.1f} to {ends[1]:+.1f} over {count} episodes"
-    elif count == 1:
-        said += ", of one episode"
-    if gain >= FOLLOWS_DB and ends and ends[0] <= 0:
-        return f"may follow its actions: {said}, too few to be sure"
-    if gain >= FOLLOWS_DB:
-        return f"follows its actions: {said}"
-    loss, shuffled_loss = found.get("loss"), found.get("shuffled_loss")
-    if loss and shuffled_loss and shuffled_loss >= HEARS * loss:
-        unit = token_words(found.get("merge") or 1)
-        nats = f"{loss:.2f} nats a {unit}, {shuffled_loss:.2f} with shuffled ones"
-        return f"hears its actions ({nats}), but its rollouts show little of it yet: {said}"
-    return f"does not follow its actions yet ({said})"
 
 
 def _losses(

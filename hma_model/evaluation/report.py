@@ -17,30 +17,28 @@ from numpy.typing import NDArray
 from hma_data.console import human_count
 from hma_data.storage.files import to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.evaluation.evaluate import verdict
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import over_horizon
 from hma_model.evaluation.showcase import Showcase, choose
 from hma_model.evaluation.suite import RESULTS, Part
-from hma_model.evaluation.tables import WORDS, absences, markdown, renamed, results, rows, value
+from hma_model.evaluation.tables import (
+    MEANINGS,
+    ROLLOUTS,
+    absences,
+    comparison,
+    markdown,
+    renamed,
+    results,
+    state,
+    value,
+)
+from hma_model.evaluation.verdict import verdict
 
 Images = NDArray[np.uint8]
 GIVEN, PREDICTED, GAP = (150, 150, 150), (0, 158, 115), (128, 128, 128)
-GAP_PX, MARK_PX, MOST = 3, 4, 12  # between frames, of the line below them, frames of a strip
-REACH = 96.0  # mean difference of a pixel's channels that is shown brightest
-BASELINES = {
-    "shuffled": "another window's commands",
-    "none": "no commands",
-    "copy": "prompt's last frame repeated",
-}
-SHORT = {
-    "true": "true commands",
-    "shuffled": "another window's",
-    "none": "none",
-    "copy": "frame repeated",
-    "reconstruction": "true pictures",
-}
-STATE = {"true": "true commands", **BASELINES, "reconstruction": "true pictures, from their tokens"}
+GAP_PX, MARK_PX = 3, 4  # between frames, and of the line below them
+STRIP_FRAMES = 12  # at most
+BRIGHTEST = 96.0  # mean difference of a pixel's channels that is shown brightest
 
 
 def write_results(parts: Sequence[Part], out: StrPath, command: str) -> Path:
@@ -67,7 +65,7 @@ def page(parts: Sequence[Part], command: str) -> str:
     made = Page(f"Evaluation of {', '.join(labels)}", lead)
     made.definitions(legend)
     _headline(made, parts)
-    made.section("Does it follow its commands?")
+    made.section("Does it follow its actions?")
     made.definitions([(_whose(part, parts), verdict(part.found)) for part in parts])
     made.section("Figures", "Below a figure: the 95 % interval of its mean, by bootstrap of whole episodes.")
     _figures(made, parts)
@@ -78,7 +76,7 @@ def page(parts: Sequence[Part], command: str) -> str:
         "How to read the strips",
         "Each strip is a window. Grey line: frames that the model gets; green line: frames that it predicts. "
         "The difference is that of the prediction to what the tokens keep: black is none, yellow is "
-        f"{REACH:.0f} of 255 and more. Other commands are those of another window.",
+        f"{BRIGHTEST:.0f} of 255 and more. Other actions are those of another window.",
     )
     for robot in robots:
         _robot(made, [part for part in parts if part.found["embodiment"] == robot])
@@ -89,14 +87,14 @@ def page(parts: Sequence[Part], command: str) -> str:
 
 def _figures(made: Page, parts: Sequence[Part]) -> None:
     """Add the table: a column a checkpoint and robot, so that what is compared stands side by side."""
-    names, lines = rows(parts)
+    table = comparison(parts)
     several = len({part.checkpoint for part in parts}) > 1
-    heads = [f"{line[0]}\n{line[1]}" if several else line[1] for line in lines]
-    turned = zip(names[2:], *(line[2:] for line in lines), strict=True)
-    made.table(
-        ["figure", *heads],
-        [[f"{name}\n{WORDS.get(name, '')}", *map(_below, cells)] for name, *cells in turned],
-    )
+    heads = [f"{row[0]}\n{row[1]}" if several else row[1] for row in table.rows]
+    turned = []
+    for column, name in enumerate(table.columns[2:], 2):
+        about = f"{name}\n{MEANINGS.get(name, '')}"
+        turned.append([about, *(_interval_below(row[column]) for row in table.rows)])
+    made.table(["figure", *heads], turned)
 
 
 def _whose(part: Part, parts: Sequence[Part]) -> str:
@@ -105,8 +103,7 @@ def _whose(part: Part, parts: Sequence[Part]) -> str:
     return robot if len({each.checkpoint for each in parts}) == 1 else f"{part.checkpoint}, {robot}"
 
 
-def _below(cell: Any) -> Any:
-    """Put the interval of a figure below it."""
+def _interval_below(cell: Any) -> Any:
     return cell.replace(" [", "\n", 1).rstrip("]").replace(", ", " to ") if isinstance(cell, str) else cell
 
 
@@ -120,7 +117,7 @@ def _headline(made: Page, parts: Sequence[Part]) -> None:
     for part in parts[:6]:
         gain = part.found["psnr_action_gain_last"]
         if gain is not None:
-            words = "nearer to the truth with its own commands than with others, last frame"
+            words = "nearer to the truth with its own actions than with others, last frame"
             tiles.append((f"{gain:+.1f} dB", f"{_whose(part, parts)}: {words}"))
     if len(parts) == 1:
         found = parts[0].found
@@ -151,10 +148,9 @@ def _robot(made: Page, parts: Sequence[Part]) -> None:
 def _curves(parts: Sequence[Part], name: str) -> dict[str, tuple[Any, Any]]:
     """Return the means by frame and their intervals of each checkpoint, and of the first one's baselines."""
     kinds = [(part.checkpoint, part.found["true"]) for part in parts]
-    several = len(parts) > 1
-    for kind, words in BASELINES.items():  # a copy is the same whatever the model
-        own = f"{words} ({parts[0].checkpoint})" if several and kind != "copy" else words
-        kinds.append((own, parts[0].found[kind]))
+    for kind in ("shuffled", "none", "copy"):
+        whose = f" ({parts[0].checkpoint})" if len(parts) > 1 and kind != "copy" else ""  # a copy is anyone's
+        kinds.append((f"{ROLLOUTS[kind]}{whose}", parts[0].found[kind]))
     key = f"{name}_by_frame"
     return {
         label: (found[key], found[f"{key}_95"])
@@ -164,48 +160,22 @@ def _curves(parts: Sequence[Part], name: str) -> dict[str, tuple[Any, Any]]:
 
 
 def _state(made: Page, part: Part, seconds: float) -> None:
-    state = part.found.get("state")
-    if not state or "true" not in state:
+    measured = part.found.get("state")
+    if not measured or "true" not in measured:
         return
-    if "values" in state:
-        _recorded_state(made, part.checkpoint, state, seconds)
-        return
-    caption = (
-        f"{part.checkpoint}: how far the robot in the picture is from where the simulator's is, "
-        f"{state['episodes']} new episodes; the probe that reads it errs by {state['probe_px']:.2f} px"
-    )
-    made.picture(over_horizon(_errors(state, "error_px"), seconds, "px of 128"), "svg+xml", caption)
-    noisy = state["perturbed"]
-    about = f"perturbed by {noisy['scale']:g} standard deviations, against the simulator's answer to them"
-    names = ["commands", "PSNR dB", "last frame dB", *(["perplexity"] if "perplexity" in noisy else [])]
-    lines = []
-    for words, mark in (("true", ""), (about, "_star")):
-        line = [words, noisy[f"psnr{mark}"], noisy[f"psnr{mark}_last"]]
-        lines.append([*line, *([noisy[f"perplexity{mark}"]] if "perplexity" in noisy else [])])
-    made.table(names, lines)
-
-
-def _recorded_state(made: Page, checkpoint: str, state: dict[str, Any], seconds: float) -> None:
-    caption = (
-        f"{checkpoint}: how far the state read off the pictures is from the recorded one, mean of "
-        f"{state['read']} of {state['of']} values; the network that reads them errs by "
-        f"{state['reader_sd']:.2f} on true pictures"
-    )
-    curves = _errors(state, "error_sd")
-    made.picture(over_horizon(curves, seconds, "standard deviations"), "svg+xml", caption)
-    kinds = [kind for kind in STATE if kind in state]
-    heads = ["error, last frame", "unit", *(SHORT[kind] for kind in kinds)]
-    lines = [[row["name"], row["unit"], *(row[kind] for kind in kinds)] for row in state["values"]]
-    made.table(heads, lines)
-
-
-def _errors(state: dict[str, Any], key: str) -> dict[str, tuple[Any, Any]]:
-    """Return the errors by frame and their intervals of each kind of rollout whose errors are finite."""
-    return {
-        words: (state[kind][f"{key}_by_frame"], state[kind][f"{key}_by_frame_95"])
-        for kind, words in STATE.items()
-        if None not in state[kind][f"{key}_by_frame"]
+    recorded = "values" in measured
+    key, unit = ("error_sd", "standard deviations") if recorded else ("error_px", "px of 128")
+    truth = "the recorded one" if recorded else "the simulator's"
+    curves = {
+        words: (measured[kind][f"{key}_by_frame"], measured[kind][f"{key}_by_frame_95"])
+        for kind, words in ROLLOUTS.items()
+        if None not in measured[kind][f"{key}_by_frame"]
     }
+    tables = state(measured)
+    caption = f"{part.checkpoint}: how far the state read off the images is from {truth}; {tables[0][1]}"
+    made.picture(over_horizon(curves, seconds, unit), "svg+xml", caption)
+    for table, _ in tables[1:]:
+        made.table(table.columns, table.rows)
 
 
 # -- strips
@@ -226,7 +196,7 @@ def _strips(made: Page, parts: Sequence[Part]) -> None:
 
 def _rows(case: Showcase, i: int, parts: Sequence[Part]) -> list[tuple[str, bytes]]:
     truth, prompt = case.truth[i], parts[0].found["prompt"]
-    columns = np.unique(np.linspace(0, len(truth) - 1, min(len(truth), MOST)).astype(int))
+    columns = np.unique(np.linspace(0, len(truth) - 1, min(len(truth), STRIP_FRAMES)).astype(int))
     films = {} if case.recorded is None else {"recorded": case.recorded[i]}
     films["from its tokens"] = truth
     for part in parts:
@@ -234,7 +204,7 @@ def _rows(case: Showcase, i: int, parts: Sequence[Part]) -> list[tuple[str, byte
         made = case.made[part.checkpoint, "true"][i]
         films[f"prediction{mark}"] = made
         films[f"difference{mark}"] = difference(truth, made)
-        films[f"other commands{mark}"] = case.made[part.checkpoint, "shuffled"][i]
+        films[f"other actions{mark}"] = case.made[part.checkpoint, "shuffled"][i]
     return [(name, strip(film[columns], columns, prompt)) for name, film in films.items()]
 
 
@@ -242,7 +212,7 @@ def difference(one: Images, other: Images) -> Images:
     """Return the mean difference of pictures' channels as colours (…, 3), from black to yellow."""
     from matplotlib import colormaps
 
-    share = np.abs(one.astype(np.float32) - other).mean(axis=-1) / REACH
+    share = np.abs(one.astype(np.float32) - other).mean(axis=-1) / BRIGHTEST
     shown: Images = (colormaps["inferno"](share.clip(0, 1))[..., :3] * 255).astype(np.uint8)
     return shown
 

@@ -1,4 +1,4 @@
-"""Put the results of several checkpoints and shard sets into tables: rows, Markdown, JSON.
+"""Put the results of several checkpoints and shard sets into tables; name each figure once.
 
 A mean over sets counts each set once; its interval is that of the mean. The mean perplexity is exp of the
 mean loss.
@@ -6,53 +6,96 @@ mean loss.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from decimal import Decimal
 from typing import Any
 
-from hma_data.console import short_paths
+from hma_data.console import human_count, short_paths
 from hma_data.storage.files import finite
-from hma_model.evaluation.evaluate import verdict
+from hma_data.tables import Table
 from hma_model.evaluation.intervals import over_datasets
 from hma_model.evaluation.suite import Part
+from hma_model.evaluation.verdict import verdict
 
 MEAN = "mean over sets"
-# heading, its key among the values of windows, the figure's path, digits, and whether exp is taken
-COLUMNS: tuple[tuple[str, str, str, int, bool], ...] = (
-    ("perplexity", "loss", "perplexity", 2, True),
-    ("nats/token", "", "stored_loss", 3, False),
-    ("masked", "masked_loss", "masked_perplexity", 2, True),
-    ("accuracy", "accuracy", "accuracy", 3, False),
-    ("PSNR", "true.psnr", "true.psnr", 2, False),
-    ("PSNR last", "true.psnr_last", "true.psnr_last", 2, False),
-    ("ΔPSNR", "psnr_action_gain_last", "psnr_action_gain_last", 2, False),
-    ("SSIM", "true.ssim", "true.ssim", 3, False),
-    ("LPIPS", "true.lpips", "true.lpips", 3, False),
-    ("FID", "", "true.fid", 1, False),
-    ("FVD", "", "true.fvd", 1, False),
-    ("ΔPSNR (paper)", "paper.delta_psnr", "paper.delta_psnr", 2, False),
-    ("state px", "", "state.true.error_px_last", 2, False),
-    ("state sd", "state.error_sd_last", "state.true.error_sd_last", 2, False),
-    ("PSNR none", "none.psnr_last", "none.psnr_last", 2, False),
-    ("PSNR copy", "copy.psnr_last", "copy.psnr_last", 2, False),
-)
-WORDS = {
-    "perplexity": "of whole masked frames, given the true past; of squares, where the model takes squares",
-    "nats/token": "loss a stored token: comparable between all models of a tokenizer",
-    "masked": "perplexity of the tokens that training masks, among its masks",
-    "accuracy": "share of tokens (or of squares of tokens), given the true past",
-    "PSNR": "dB, mean over the horizon of rollouts",
-    "PSNR last": "dB, last frame",
-    "ΔPSNR": "dB, last frame, true less shuffled actions",
-    "SSIM": "mean over the horizon",
-    "LPIPS": "AlexNet, mean over the horizon",
-    "FID": "of all predicted frames",
-    "FVD": "of the predicted parts of windows",
-    "ΔPSNR (paper)": "dB, last frame after the true past, true less Gaussian actions",
-    "state px": "error of the robot's place at the last frame, px of 128",
-    "state sd": "error of the recorded state at the last frame, in its standard deviations",
-    "PSNR none": "dB, last frame, without commands",
-    "PSNR copy": "dB, last frame, the prompt's last frame repeated",
+ROLLOUTS = {  # kind -> what the model was given
+    "true": "the window's own actions",
+    "shuffled": "another window's actions",
+    "none": "no actions",
+    "copy": "the prompt's last frame, repeated",
+    "reconstruction": "the true images, from their tokens",  # of the state's tables only
 }
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of `hma evaluate`, as its tables show it.
+
+    Attributes:
+        name: its heading.
+        path: where the result has it, such as `true.psnr`.
+        digits: after the point.
+        meaning: in words.
+        by_window: its key among the values of windows, of which the mean over sets is made; empty if none.
+        exponential: whether it is exp of the mean of those values.
+        detail: whether only the list of a single checkpoint and set has it.
+    """
+
+    name: str
+    path: str
+    digits: int
+    meaning: str
+    by_window: str = ""
+    exponential: bool = False
+    detail: bool = False
+
+
+def _of_windows(name: str, path: str, digits: int, meaning: str) -> Figure:
+    return Figure(name, path, digits, meaning, by_window=path)
+
+
+FIGURES = (
+    Figure("loss", "loss", 3, "nats a token (or a square of tokens), given the true past", detail=True),
+    Figure("loss, shuffled", "shuffled_loss", 3, "the same with shuffled actions", detail=True),
+    Figure("loss, frequencies", "baseline_loss", 3, "the same of token frequencies alone", detail=True),
+    Figure(
+        "perplexity", "perplexity", 2,
+        "of whole masked frames, given the true past; of squares, where the model takes squares",
+        by_window="loss", exponential=True,
+    ),
+    Figure("nats/token", "stored_loss", 3, "loss a stored token: comparable between models of a tokenizer"),
+    Figure(
+        "masked", "masked_perplexity", 2, "perplexity of the tokens that training masks, among its masks",
+        by_window="masked_loss", exponential=True,
+    ),
+    Figure("masked accuracy", "masked_accuracy", 3, "share of these tokens predicted right", detail=True),
+    _of_windows("accuracy", "accuracy", 3, "share of tokens (or of squares of tokens), given the true past"),
+    _of_windows("PSNR", "true.psnr", 2, "dB, mean over the horizon of rollouts"),
+    _of_windows("PSNR last", "true.psnr_last", 2, "dB, last frame"),
+    _of_windows("ΔPSNR", "psnr_action_gain_last", 2, "dB, last frame, true less shuffled actions"),
+    _of_windows("SSIM", "true.ssim", 3, "mean over the horizon"),
+    _of_windows("LPIPS", "true.lpips", 3, "AlexNet, mean over the horizon"),
+    Figure("FID", "true.fid", 1, "of all predicted frames"),
+    Figure("FVD", "true.fvd", 1, "of the predicted parts of windows"),
+    _of_windows(
+        "ΔPSNR (paper)", "paper.delta_psnr", 2,
+        "dB, last frame after the true past, true less Gaussian actions",
+    ),
+    Figure("PSNR last (paper)", "paper.psnr_last", 2, "dB, the same frame, true actions", detail=True),
+    Figure("PSNR Gaussian (paper)", "paper.gaussian_psnr_last", 2, "dB, Gaussian actions", detail=True),
+    Figure("perplexity (paper)", "paper.perplexity", 2, "mean over batches of four windows", detail=True),
+    Figure("state px", "state.true.error_px_last", 2, "error of the robot's place, last frame, px of 128"),
+    Figure(
+        "state sd", "state.true.error_sd_last", 2,
+        "error of the recorded state at the last frame, in its standard deviations",
+        by_window="state.error_sd_last",
+    ),
+    _of_windows("PSNR none", "none.psnr_last", 2, "dB, last frame, without actions"),
+    _of_windows("PSNR copy", "copy.psnr_last", 2, "dB, last frame, the prompt's last frame repeated"),
+)  # fmt: skip
+MEANINGS = {figure.name: figure.meaning for figure in FIGURES}
+OF_ROLLOUTS = (("PSNR dB", "psnr", 2), ("last frame dB", "psnr_last", 2), ("SSIM", "ssim", 3),
+               ("LPIPS", "lpips", 3), ("FID", "fid", 2), ("FVD", "fvd", 2))  # fmt: skip
 
 
 def renamed(parts: Sequence[Part]) -> tuple[list[Part], list[tuple[str, str]]]:
@@ -70,70 +113,77 @@ def value(found: Mapping[str, Any], path: str) -> Any:
     return item
 
 
-def present(parts: Sequence[Part]) -> list[tuple[str, str, str, int, bool]]:
-    """Return those of the columns that some part has a figure for."""
-    return [column for column in COLUMNS if any(value(part.found, column[2]) is not None for part in parts)]
+# -- several checkpoints and sets
+
+
+def present(parts: Sequence[Part]) -> list[Figure]:
+    """Return the figures of the comparing table that some part has."""
+    return [
+        figure
+        for figure in FIGURES
+        if not figure.detail and any(value(part.found, figure.path) is not None for part in parts)
+    ]
 
 
 def means(parts: Sequence[Part]) -> list[dict[str, Any]]:
     """Return for each checkpoint the means over its sets, with their intervals."""
-    rows = []
+    found = []
     for label in dict.fromkeys(part.checkpoint for part in parts):
         own = [part for part in parts if part.checkpoint == label]
         row: dict[str, Any] = {"checkpoint": label, "embodiment": MEAN, "sets": len(own)}
         row["windows"] = sum(part.found["windows"] for part in own)
         row["episodes"] = sum(part.found["episodes"] for part in own)
-        for _, key, path, _, exponential in present(own):
-            figures = [value(part.found, path) for part in own]
-            if None in figures:
+        for figure in present(own):
+            of_sets = [value(part.found, figure.path) for part in own]
+            if None in of_sets:
                 continue
-            if not key:
-                row[path] = sum(figures) / len(figures)
+            if not figure.by_window:
+                row[figure.path] = round(sum(of_sets) / len(of_sets), 4)
                 continue
             episodes = [part.by_window.get("episode") for part in own]
-            mean, ends = over_datasets([part.by_window[key] for part in own], episodes=episodes)
-            row[path] = math.exp(mean) if exponential else mean
-            row[f"{path}_95"] = [math.exp(end) for end in ends] if exponential and ends else ends
-        rows.append(row)
-    return rows
+            mean, ends = over_datasets([part.by_window[figure.by_window] for part in own], episodes=episodes)
+            scaled = math.exp if figure.exponential else float
+            row[figure.path] = round(scaled(mean), 4)
+            row[f"{figure.path}_95"] = ends and [round(scaled(end), 4) for end in ends]
+        found.append(row)
+    return found
 
 
 def results(parts: Sequence[Part]) -> dict[str, Any]:
     """Return the content of results.json."""
-    averages = [
-        {k: [round(e, 4) for e in v] if isinstance(v, list) else round(v, 4) if isinstance(v, float) else v
-         for k, v in row.items()}
-        for row in means(parts)
-    ]  # fmt: skip
-    return finite({"results": [part.found for part in parts], "means": averages})
+    return finite({"results": [part.found for part in parts], "means": means(parts)})
 
 
-def rows(parts: Sequence[Part], intervals: bool = True) -> tuple[list[str], list[list[Any]]]:
-    """Return the headings and rows of the table: a row a checkpoint and set, then the means over sets."""
-    columns = present(parts)
-    names = ["checkpoint", "robot", "windows", "episodes", *(column[0] for column in columns)]
-    lines: list[list[Any]] = []
-    averages = {row["checkpoint"]: row for row in means(parts)}
-    for label in averages:
+def comparison(parts: Sequence[Part], intervals: bool = True) -> Table:
+    """Return the table of all parts: a row a checkpoint and set, then the means over sets."""
+    figures = present(parts)
+    rows: list[list[Any]] = []
+    for average in means(parts):
+        label = average["checkpoint"]
         own = [part.found for part in parts if part.checkpoint == label]
-        entries = own + ([averages[label]] if len(own) > 1 else [])
-        for found in entries:
-            mean = found is averages[label]
-            line = [label, found["embodiment"], found["windows"], found["episodes"]]
-            for _, _, path, digits, _ in columns:
-                figure = found.get(path) if mean else value(found, path)
-                ends = found.get(f"{path}_95") if mean else value(found, f"{path}_95")
-                line.append(_cell(figure, ends if intervals else None, digits))
-            lines.append(line)
-    return names, lines
+        for found in own:
+            row = [label, found["embodiment"], found["windows"], found["episodes"]]
+            for figure in figures:
+                ends = value(found, f"{figure.path}_95") if intervals else None
+                row.append(_cell(value(found, figure.path), ends, figure.digits))
+            rows.append(row)
+        if len(own) > 1:
+            row = [label, MEAN, average["windows"], average["episodes"]]
+            for figure in figures:  # the keys of a mean are whole paths
+                ends = average.get(f"{figure.path}_95") if intervals else None
+                row.append(_cell(average.get(figure.path), ends, figure.digits))
+            rows.append(row)
+    return Table(["checkpoint", "robot", "windows", "episodes", *(figure.name for figure in figures)], rows)
 
 
-def _cell(figure: Any, ends: Any, digits: int) -> str | None:
-    if figure is None:
-        return None
-    if not isinstance(ends, list):
-        return f"{figure:.{digits}f}"
+def _cell(figure: float | None, ends: Sequence[float] | None, digits: int) -> str | Decimal | None:
+    if figure is None or not ends:
+        return _digits(figure, digits)
     return f"{figure:.{digits}f} [{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"
+
+
+def _digits(figure: float | None, digits: int) -> Decimal | None:
+    return None if figure is None else Decimal(f"{figure:.{digits}f}")
 
 
 def absences(parts: Sequence[Part]) -> list[tuple[str, str]]:
@@ -142,23 +192,22 @@ def absences(parts: Sequence[Part]) -> list[tuple[str, str]]:
     What holds for every one of several parts is of `all`.
     """
     several = len({part.checkpoint for part in parts}) > 1
-    said = [pair for part in parts for pair in part.found.get("missing", {}).items()]
-    said += [
-        (f"{part.checkpoint} on {robot}" if several else robot, note)
-        for part in parts
-        for robot in [part.found["embodiment"]]
-        for note in part.found["notes"]
-    ]
-    said += [
-        (part.found["embodiment"], words)
-        for part in parts
-        if (words := value(part.found, "state.missing")) is not None
-    ]
-    everywhere = {text for text in parts[0].found["notes"] if all(text in p.found["notes"] for p in parts)}
+    said: list[tuple[str, str]] = []
+    for part in parts:
+        said += part.found.get("missing", {}).items()
+    for part in parts:
+        robot = part.found["embodiment"]
+        said += [
+            (f"{part.checkpoint} on {robot}" if several else robot, note) for note in part.found["notes"]
+        ]
+    for part in parts:
+        if (words := value(part.found, "state.missing")) is not None:
+            said.append((part.found["embodiment"], words))
+    everywhere = set.intersection(*(set(part.found["notes"]) for part in parts)) if len(parts) > 1 else set()
     found = []
     for text in dict.fromkeys(text for _, text in said):
         whose = dict.fromkeys(name for name, other in said if other == text)
-        found.append(("all" if len(parts) > 1 and text in everywhere else ", ".join(whose), text))
+        found.append(("all" if text in everywhere else ", ".join(whose), text))
     return found
 
 
@@ -169,17 +218,83 @@ def verdicts(parts: Sequence[Part]) -> list[tuple[str, str]]:
 
 def markdown(parts: Sequence[Part], command: str) -> str:
     """Return the content of results.md."""
-    names, lines = rows(parts)
-    text = ["# Evaluation", "", f"`{command}`", "", _line(names), _line(["---"] * len(names))]
-    text += [_line(["–" if cell is None else cell for cell in line]) for line in lines]
-    text += ["", "In brackets: 95 % intervals, by bootstrap of whole episodes (1,000 resamples).", ""]
+    table = comparison(parts)
+    text = ["# Evaluation", "", f"`{command}`", "", table.markdown(), ""]
+    text += ["In brackets: 95 % intervals, by bootstrap of whole episodes (1,000 resamples).", ""]
     text += [*(f"- {whose} {said}" for whose, said in verdicts(parts)), ""]
-    text += [f"- {name}: {WORDS[name]}" for name in names if name in WORDS]
+    text += [f"- {name}: {MEANINGS[name]}" for name in table.columns if name in MEANINGS]
     if said := absences(parts):
         text += ["", "Not measured, or to be known:", ""]
         text += [f"- {name}: {words}" for name, words in said]
     return "\n".join(text) + "\n"
 
 
-def _line(cells: Sequence[Any]) -> str:
-    return f"| {' | '.join(str(cell).replace('|', '\\|') for cell in cells)} |"
+# -- one checkpoint on one set
+
+
+def conditions(found: Mapping[str, Any]) -> str:
+    """Return a line on what was measured."""
+    windows = human_count(found["windows"], "window")
+    episodes = human_count(found["episodes"], "episode")
+    given = human_count(found["prompt"], "frame")
+    return (
+        f"{windows} of {found['frames']} frames out of {episodes} of {found['split']}, {given} given; "
+        f"camera {found['cameras']}; {found['draws']} draws of shuffled actions; "
+        f"images that never change: in {human_count(found['unmoved_windows'], 'window')}"
+    )
+
+
+def details(found: Mapping[str, Any]) -> Table:
+    """Return the figures of one part that are no rollout's and not of its state."""
+    rows = []
+    for figure in FIGURES:
+        number = value(found, figure.path)
+        elsewhere = figure.path.split(".")[0] in (*ROLLOUTS, "state")
+        if number is not None and not elsewhere:
+            ends = _ends(value(found, f"{figure.path}_95"))
+            rows.append([figure.name, _digits(number, figure.digits), ends, figure.meaning])
+    return Table(["figure", "value", "95 %", "meaning"], rows)
+
+
+def rollouts(found: Mapping[str, Any]) -> Table:
+    """Return the table of the rollouts of one part."""
+    columns = [column for column in OF_ROLLOUTS if found["true"].get(column[1]) is not None]
+    rows = []
+    for kind in ("true", "shuffled", "none", "copy"):
+        figures = [_digits(found[kind].get(key), digits) for _, key, digits in columns]
+        rows.append([kind, *figures, _ends(found[kind]["psnr_last_95"]), ROLLOUTS[kind]])
+    return Table(["rollout", *(column[0] for column in columns), "last frame, 95 %", "given"], rows)
+
+
+def state(found: Mapping[str, Any] | None) -> list[tuple[Table, str]]:
+    """Return the tables of a part's state, each with a line below it; none if it was not measured."""
+    if not found or "true" not in found:
+        return []
+    recorded = "values" in found
+    key, unit = ("error_sd", "standard deviations") if recorded else ("error_px", "px of 128")
+    kinds = [kind for kind in ROLLOUTS if kind in found]
+    errors = [
+        [kind, _digits(found[kind][key], 2), _digits(found[kind][f"{key}_last"], 2),
+         _ends(found[kind][f"{key}_last_95"])]
+        for kind in kinds
+    ]  # fmt: skip
+    first = Table(["state read off the images", f"error, {unit}", "last frame", "95 %"], errors)
+    if recorded:
+        said = (
+            f"{found['read']} of {found['of']} values can be read off the images; what reads them errs by "
+            f"{found['reader_sd']:.2f} standard deviations on true images of other episodes"
+        )
+        values = [[row["name"], row["unit"], *(row[kind] for kind in kinds)] for row in found["values"]]
+        return [(first, said), (Table(["last frame, error of", "unit", *kinds], values), "")]
+    said = f"{found['episodes']} simulated episodes; the probe errs by {found['probe_px']:.2f} px"
+    noisy = found["perturbed"]
+    about = f"perturbed by {noisy['scale']:g} standard deviations, against the simulator's answer to them"
+    answers = [
+        [words, noisy[f"psnr{mark}"], noisy[f"psnr{mark}_last"], noisy.get(f"perplexity{mark}")]
+        for words, mark in (("true", ""), (about, "_star"))
+    ]
+    return [(first, said), (Table(["actions", "PSNR dB", "last frame dB", "perplexity"], answers), "")]
+
+
+def _ends(ends: Sequence[float] | None) -> str | None:
+    return None if not ends or None in ends else f"{ends[0]:.4g} to {ends[1]:.4g}"

@@ -21,9 +21,9 @@ def test_markdown_keeps_each_cell_in_its_column() -> None:
 
 def test_html_escapes_texts_and_aligns_numbers() -> None:
     shown = TABLE.html()
-    assert "<th class=n>frames</th>" in shown and "<th>loss</th>" in shown
+    assert "<th class=n>frames</th>" in shown and "<th class=n>loss</th>" in shown
     assert "<td>&lt;img src=x onerror=alert(1)&gt; | b<br><small>small</small></td>" in shown
-    assert "<td class=n>12,000</td>" in shown and "<td>–</td>" in shown
+    assert "<td class=n>12,000</td>" in shown and "<td class=n>–</td>" in shown
 
 
 def test_text_is_printed_with_its_title(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.shards.reader import ShardSet
 from hma_model.evaluation import actions
 from hma_model.evaluation.actions import gaussian, shuffled, shuffled_actions, without_actions
-from hma_model.evaluation.evaluate import Settings, evaluate, measure, verdict
+from hma_model.evaluation.evaluate import Settings, evaluate, measure
 from hma_model.evaluation.intervals import NATURAL, SHARE, interval, over_datasets
 from hma_model.evaluation.losses import (
     digit_frequencies,
@@ -27,6 +27,7 @@ from hma_model.evaluation.losses import (
 )
 from hma_model.evaluation.metrics import masked_scores, teacher_forced, token_hits, token_nats
 from hma_model.evaluation.rollouts import rollout
+from hma_model.evaluation.verdict import verdict
 from hma_model.network.model import HMA
 from tests.model.robots import CONFIG, SPEC, make_model
 from tests.model.shards import make_shards
@@ -317,7 +318,9 @@ def test_the_verdict_says_whether_the_model_follows_its_actions() -> None:
     )
     assert verdict({"psnr_action_gain_last": 0.1}).startswith("does not follow its actions yet (+0.1 dB")
     heard = {"psnr_action_gain_last": 0.1, "loss": 2.0, "shuffled_loss": 4.0}
-    assert verdict(heard).startswith("hears its actions (2.00 nats a token, 4.00 with shuffled ones), but")
+    assert verdict(heard).startswith(
+        "is sensitive to its actions (2.00 nats a token, 4.00 with shuffled ones), but"
+    )
     assert "(2.00 nats a square of 2×2 tokens, 4.00" in verdict(heard | {"merge": 2})
     assert verdict(heard | {"shuffled_loss": 2.1}).startswith("does not follow its actions yet")
 

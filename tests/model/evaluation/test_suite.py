@@ -16,11 +16,11 @@ from hma_data.lab.truth import episode
 from hma_data.registry.embodiment import find
 from hma_model.cli import main
 from hma_model.evaluation import showcase, suite
-from hma_model.evaluation.evaluate import verdict
 from hma_model.evaluation.report import difference, write_results
 from hma_model.evaluation.simulated import PERTURBATION, perturbed
 from hma_model.evaluation.suite import Settings, evaluate_all
-from hma_model.evaluation.tables import MEAN, absences, means, results, rows
+from hma_model.evaluation.tables import MEAN, absences, comparison, means, results
+from hma_model.evaluation.verdict import verdict
 from tests.model.evaluation.test_evaluate import Blocks
 from tests.model.robots import CONFIG, SPEC, make_model, save
 from tests.model.shards import make_shards
@@ -71,7 +71,8 @@ def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_onc
     )
     low, high = first["true.psnr_95"]
     assert low < first["true.psnr"] < high
-    names, lines = rows(parts)
+    table = comparison(parts)
+    names, lines = table.columns, table.rows
     assert [line[names.index("episodes")] for line in lines] == [2, 2, 4] * 2
     assert [line[1] for line in lines] == ["arm", "hand", "mean over sets"] * 2 and len(lines[0]) == len(
         names
@@ -107,10 +108,10 @@ def test_a_model_of_squares_is_compared_by_the_loss_of_a_stored_token(
     assert {one: whose for whose, one in absences(parts) if "squares of 2×2" in one}.popitem()[1] == (
         f"{tmp_path / 'square'} on arm"
     )
-    assert "nats/token" in rows(parts)[0]
+    assert "nats/token" in comparison(parts).columns
     assert main(["evaluate", str(tmp_path / "square"), str(tmp_path / "arm"), "--windows", "3"]) == 0
     said = capsys.readouterr().out
-    assert "loss, nats a square of 2×2 tokens" in said and "loss, nats a stored token" in said
+    assert "loss, perplexity and accuracy are of squares of 2×2 tokens" in said and "nats/token" in said
 
 
 def test_parts_that_are_done_are_not_computed_again(
@@ -223,7 +224,7 @@ def test_json_is_one_object_a_line(made: Path, capsys: pytest.CaptureFixture[str
     assert kept <= set(lines[0])
     assert main(["evaluate", one, arm, "--windows", "3"]) == 0
     shown = capsys.readouterr().out
-    assert "loss, nats a token" in shown and "not measured" in shown and "none: without actions" in shown
+    assert "3 windows of 4 frames" in shown and "loss, shuffled" in shown and "not measured" in shown
 
 
 # -- the laboratory
