@@ -223,8 +223,7 @@ def rows(found: Found, seed: int) -> list[dict[str, Any]]:
 
 def _row(found: Found, case: Case, mark: int, seed: int) -> dict[str, Any]:
     from hma_model.evaluation.intervals import interval
-    from hma_model.evaluation.metrics import psnr
-    from hma_model.evaluation.scores import PSNR_LIMIT
+    from hma_model.evaluation.metrics import PSNR_LIMIT, psnr
 
     window = [found.frames.index(frame) for frame in range(mark - SPAN + 1, mark + 1)]
     made, true, parts = case.pictures[:, window], found.truth[:, window], found.parts[:, window]
@@ -245,8 +244,7 @@ def _row(found: Found, case: Case, mark: int, seed: int) -> dict[str, Any]:
             "share": round(float(errors.mean() / probe.spread[own].mean()), 3),
             "motion": None if motion is None else round(motion, 2),
         }
-    flat = (-1, *true.shape[2:])
-    signal = np.minimum(psnr(true.reshape(flat), made.reshape(flat)), PSNR_LIMIT)
+    signal = psnr(true, made, limit=PSNR_LIMIT)
     return row | {
         "whole": round(float(probe.wholeness(made, true).mean()), 3),
         "loose_px": round(float(far[..., loose].mean()), 2) if len(loose) else None,

@@ -27,7 +27,7 @@ from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import OBJECTIVES
 from hma_model.evaluation.actions import gaussian, shuffled, without_actions
-from hma_model.evaluation.intervals import NATURAL, SHARE, ends_of, interval, rounded, summary
+from hma_model.evaluation.intervals import NATURAL, SHARE, rounded, summary
 from hma_model.evaluation.losses import (
     masked_val_loss,
     no_window,
@@ -36,7 +36,7 @@ from hma_model.evaluation.losses import (
     validation_losses,
     windows,
 )
-from hma_model.evaluation.metrics import masked_scores, perplexity, teacher_forced
+from hma_model.evaluation.metrics import masked_scores, perplexity, perplexity_summary, teacher_forced
 from hma_model.evaluation.perceptual import Judge, Networks
 from hma_model.evaluation.rollouts import Pictures, Sampling, rollout
 from hma_model.evaluation.scores import ROLLOUTS, Rolled, Scores, counted
@@ -250,22 +250,13 @@ def _losses(
     }
     if table["loss"] is not None:  # a model that takes squares of tokens as one has a loss of squares
         table["stored_loss"] = round(table["loss"] / model.config.merge**2, 6)
-    table |= _perplexity("perplexity", by_window["loss"], seed, episodes)
+    table |= perplexity_summary("perplexity", by_window["loss"], seed, episodes)
     table |= summary("accuracy", by_window["accuracy"], seed, 6, episodes, SHARE)
-    table |= _perplexity("masked_perplexity", masked_nats, seed, episodes)
+    table |= perplexity_summary("masked_perplexity", masked_nats, seed, episodes)
     finite = np.isfinite(masked_hits)
     table |= summary("masked_accuracy", masked_hits[finite], seed, 6, episodes[finite], SHARE)
     table |= {"loss_by_frame": rounded(nats.mean(axis=0)), "accuracy_by_frame": rounded(hits.mean(axis=0))}
     return table, by_window
-
-
-def _perplexity(name: str, nats: Floats, seed: int, episodes: NDArray[np.int64]) -> dict[str, Any]:
-    """Return exp of the mean of losses (N,), with its interval."""
-    nats, episodes = nats[np.isfinite(nats)], episodes[np.isfinite(nats)]
-    if not len(nats):
-        return {name: None, f"{name}_95": None}
-    ends = np.array([perplexity(float(end)) for end in interval(nats, seed, episodes, NATURAL)])
-    return {name: perplexity(float(nats.mean())), f"{name}_95": ends_of(ends)}
 
 
 def _paper(

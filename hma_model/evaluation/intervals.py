@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtri, stdtrit  # scipy.stats would take half a second to import
 
 Floats = NDArray[np.float64]
 Episodes = Sequence[int] | NDArray[Any] | None  # (N,) which windows belong together; None: none do
@@ -45,7 +45,8 @@ def resampled_means(values: NDArray[Any], seed: int = 0, episodes: Episodes = No
 @lru_cache(maxsize=64)
 def _stretch(count: int) -> float:
     """Return by how much the spread of resampled means is too small for that many to draw from."""
-    return float(stats.t.ppf(0.975, count - 1) / stats.norm.ppf(0.975)) * math.sqrt(count / (count - 1))
+    students_t, normal = stdtrit(count - 1, 0.975), ndtri(0.975)
+    return float(students_t / normal) * math.sqrt(count / (count - 1))
 
 
 @lru_cache(maxsize=8)
@@ -88,6 +89,26 @@ def summary(
     mean = rounded(values.mean(), digits) if np.isfinite(values).all() else None
     ends = None if mean is None else ends_of(interval(values, seed, episodes, within), digits)
     return {name: mean, f"{name}_95": ends}
+
+
+def horizon_summary(
+    name: str,
+    values: NDArray[Any],
+    seed: int = 0,
+    digits: int = 4,
+    episodes: Episodes = None,
+    within: tuple[float, float] = ANY,
+) -> dict[str, Any]:
+    """Return the figures of values (N, P) over a horizon of P frames, each with its interval.
+
+    They are `name`, the mean over the horizon, `name_last`, that of its last frame, and `name_by_frame`.
+    """
+    return {
+        **summary(name, values.mean(axis=1), seed, digits, episodes, within),
+        **summary(f"{name}_last", values[:, -1], seed, digits, episodes, within),
+        f"{name}_by_frame": rounded(values.mean(axis=0)),
+        f"{name}_by_frame_95": rounded(interval(values, seed, episodes, within).T),
+    }
 
 
 def ends_of(ends: Floats, digits: int = 4) -> list[float] | None:

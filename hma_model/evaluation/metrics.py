@@ -1,8 +1,8 @@
-"""Compute metrics of predicted pictures and tokens.
+"""Compute metrics of predicted images and tokens.
 
-Picture metrics are numpy on uint8 or float pictures; token metrics are torch on logits.
+Image metrics are numpy on uint8 or float pictures; token metrics are torch on logits.
 
-N pictures of (H, W, C); B batch, T frames, h,w token grid; F factored digits, V values a digit.
+N images of (H, W, C); B batch, T frames, h,w token grid; F factored digits, V values a digit.
 """
 
 import math
@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from hma_data.errors import UsageError
+from hma_model.evaluation.intervals import NATURAL, Episodes, ends_of, interval
 from hma_model.network.conditioning import Groups, align, condition
 from hma_model.network.copying import known_digits
 from hma_model.network.objectives import Layout
@@ -26,84 +28,94 @@ if TYPE_CHECKING:
     from hma_data.loading.dataset import Batch
     from hma_model.network.model import HMA
 
+Floats = NDArray[np.float64]
+Values = NDArray[Any]
 SSIM_WINDOW = 7
+PSNR_LIMIT = 60.0  # dB; where the PSNR of equal images, and with it a mean over frames, would be infinite
 
 
-def psnr(truth: NDArray[Any], pictures: NDArray[Any], data_range: float = 255.0) -> NDArray[np.float64]:
-    """Return the peak signal-to-noise ratio of each picture in dB; infinite if the two are equal.
+def psnr(truth: Values, pictures: Values, data_range: float = 255.0, limit: float = math.inf) -> Floats:
+    """Return the peak signal-to-noise ratio of each image in dB.
 
     Args:
-        truth: (N, H, W, C) or (H, W, C).
+        truth: (…, H, W, C).
         pictures: as truth.
         data_range: the span of the values, 255 for uint8.
+        limit: the ratio of equal images, which would be infinite.
 
     Returns:
-        (N,).
+        (…,).
     """
-    truth, pictures = _pair(truth, pictures)
-    error = np.square(truth - pictures).mean(axis=(1, 2, 3))
+    _require_pair(truth, pictures)
+    error = np.square(np.subtract(truth, pictures, dtype=np.float64)).mean(axis=(-3, -2, -1))
     with np.errstate(divide="ignore"):
-        return 10 * np.log10(data_range**2 / error)
+        return np.minimum(10 * np.log10(data_range**2 / error), limit)
 
 
-def ssim(truth: NDArray[Any], pictures: NDArray[Any], data_range: float = 255.0) -> NDArray[np.float64]:
-    """Return the structural similarity of each picture (Wang et al. 2004), averaged over its channels.
+def ssim(truth: Values, pictures: Values, data_range: float = 255.0) -> Floats:
+    """Return the structural similarity of each image (Wang et al. 2004), averaged over its channels.
 
     The settings are those of the paper's evaluation: a uniform 7x7 window, sample covariance, K1 0.01 and
-    K2 0.03, and only windows inside the picture.
+    K2 0.03, and only windows inside the image.
 
     Args:
-        truth: (N, H, W, C) or (H, W, C), each side at least 7.
+        truth: (…, H, W, C), each side at least 7.
         pictures: as truth.
         data_range: the span of the values.
 
     Returns:
-        (N,), 1 if the two are equal.
+        (…,), 1 if the two are equal.
     """
-    truth, pictures = _pair(truth, pictures)
-    if min(truth.shape[1:3]) < SSIM_WINDOW:
-        height, width = truth.shape[1:3]
-        raise UsageError("ssim", f"pictures of {height}x{width} are smaller than its 7x7 window")
-    return np.array([_similarity(x, y, data_range) for x, y in zip(truth, pictures, strict=True)])
+    _require_pair(truth, pictures)
+    *lead, height, width, channels = truth.shape
+    if min(height, width) < SSIM_WINDOW:
+        raise UsageError("ssim", f"images of {height}x{width} are smaller than its 7x7 window")
+    # one image after the other, so that the arrays of a pair fit a processor's cache
+    flat = (values.reshape(-1, height, width, channels).astype(np.float64) for values in (truth, pictures))
+    return np.array([_similarity(x, y, data_range) for x, y in zip(*flat)]).reshape(lead)
 
 
-def _similarity(truth: NDArray[np.float64], picture: NDArray[np.float64], data_range: float) -> float:
-    """Return the SSIM of two pictures (H, W, C); the arrays of one pair fit a processor's cache."""
+def _similarity(truth: Floats, picture: Floats, data_range: float) -> float:
+    mean_x = _window_means(truth)
+    mean_y = _window_means(picture)
     count = SSIM_WINDOW**2
-    mean_x, mean_y = _box(truth), _box(picture)
-    unbias = count / (count - 1)
-    var_x = unbias * (_box(truth * truth) - mean_x * mean_x)
-    var_y = unbias * (_box(picture * picture) - mean_y * mean_y)
-    covariance = unbias * (_box(truth * picture) - mean_x * mean_y)
-    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    unbias = count / (count - 1)  # the paper's evaluation divides by the sample's degrees of freedom
+    var_x = unbias * (_window_means(truth * truth) - mean_x * mean_x)
+    var_y = unbias * (_window_means(picture * picture) - mean_y * mean_y)
+    covariance = unbias * (_window_means(truth * picture) - mean_x * mean_y)
+    c1 = (0.01 * data_range) ** 2
+    c2 = (0.03 * data_range) ** 2
     above = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     below = (mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2)
     return float((above / below).mean())
 
 
-def _pair(truth: NDArray[Any], pictures: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    if truth.shape != pictures.shape or truth.ndim not in (3, 4):
-        fault = f"the pictures must both be (N, H, W, C); they are {truth.shape} and {pictures.shape}"
+def _window_means(values: Floats) -> Floats:
+    """Return the mean over every 7x7 window inside (H, W, C)."""
+    edge = SSIM_WINDOW // 2
+    means: Floats = uniform_filter(values, SSIM_WINDOW, axes=(0, 1))
+    return means[edge:-edge, edge:-edge]
+
+
+def _require_pair(truth: Values, pictures: Values) -> None:
+    if truth.shape != pictures.shape or truth.ndim < 3:
+        fault = f"the images must both be (…, H, W, C); they are {truth.shape} and {pictures.shape}"
         raise UsageError("metrics", fault)
-    shape = (-1, *truth.shape[-3:])
-    return truth.reshape(shape).astype(np.float64), pictures.reshape(shape).astype(np.float64)
-
-
-def _box(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean over every 7x7 window inside (H, W, C), by running sums along each axis."""
-    for axis in (0, 1):
-        sums = np.zeros([n + (k == axis) for k, n in enumerate(values.shape)])
-        behind, ahead = [slice(None)] * 3, [slice(None)] * 3
-        ahead[axis] = slice(1, None)
-        np.cumsum(values, axis=axis, out=sums[tuple(ahead)])
-        behind[axis], ahead[axis] = slice(None, -SSIM_WINDOW), slice(SSIM_WINDOW, None)
-        values = (sums[tuple(ahead)] - sums[tuple(behind)]) / SSIM_WINDOW
-    return values
 
 
 def perplexity(nats: float) -> float:
     """Return exp of a cross-entropy in nats a token; infinity in place of an overflow."""
     return math.exp(nats) if nats < 700 else math.inf
+
+
+def perplexity_summary(name: str, nats: Floats, seed: int, episodes: Episodes = None) -> dict[str, Any]:
+    """Return exp of the mean of finite losses (N,) as `name`, with its interval."""
+    known = np.isfinite(nats)
+    if not known.any():
+        return {name: None, f"{name}_95": None}
+    own = None if episodes is None else np.asarray(episodes)[known]
+    ends = [perplexity(float(end)) for end in interval(nats[known], seed, own, NATURAL)]
+    return {name: perplexity(float(nats[known].mean())), f"{name}_95": ends_of(np.array(ends))}
 
 
 def token_nats(logits: Tensor, tokens: Tensor, factored: Sequence[int]) -> Tensor:

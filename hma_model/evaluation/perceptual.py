@@ -60,13 +60,11 @@ class Networks:
 
     @torch.no_grad()
     def lpips_of(self, truth: Images, made: Images) -> NDArray[np.float64]:
-        """Return the LPIPS distance (N,) of pictures (N, S, S, 3) from true ones."""
+        """Return the LPIPS distance (…,) of pictures (…, S, S, 3) from true ones."""
         assert self.lpips is not None
-        found = []
-        for start in range(0, len(truth), BATCH_SIZE):
-            pair = [_channels(part[start : start + BATCH_SIZE]) / 127.5 - 1 for part in (truth, made)]
-            found.append(self.lpips(*pair).flatten().double().numpy())
-        return np.concatenate(found)
+        pairs = zip(_channels(truth).split(BATCH_SIZE), _channels(made).split(BATCH_SIZE))
+        found = [self.lpips(one / 127.5 - 1, other / 127.5 - 1).flatten() for one, other in pairs]
+        return torch.cat(found).double().numpy().reshape(truth.shape[:-3])
 
 
 def open_networks(

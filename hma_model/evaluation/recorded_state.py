@@ -26,7 +26,7 @@ from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns
-from hma_model.evaluation.intervals import NATURAL, interval, rounded, summary
+from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded
 from hma_model.evaluation.probe import (
     SHARPNESS,
     UNREADABLE,
@@ -218,7 +218,8 @@ def measure_recorded_state(
         "values": _values(shards, reader, own, {kind: part[kept] for kind, part in joined.items()}),
     }
     for kind, part in joined.items():
-        found[kind] = _figures(part[kept].mean(axis=-1), seed, whose[kept])
+        of_values = part[kept].mean(axis=-1)
+        found[kind] = horizon_summary("error_sd", of_values, seed, episodes=whose[kept], within=NATURAL)
     return found, joined["true"][:, -1].mean(axis=-1)
 
 
@@ -253,16 +254,6 @@ def simulated_reader(
     """Train the reader of a laboratory robot on simulated episodes; arguments as of `train_probe`."""
     pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
     return learn(pictures, np.concatenate([one.states for one in made]).astype(np.float64), seed, tell=tell)
-
-
-def _figures(errors: Floats, seed: int, episodes: NDArray[np.int64]) -> dict[str, Any]:
-    """Return the figures of errors (N, P)."""
-    return {
-        **summary("error_sd", errors.mean(axis=1), seed, episodes=episodes, within=NATURAL),
-        **summary("error_sd_last", errors[:, -1], seed, episodes=episodes, within=NATURAL),
-        "error_sd_by_frame": rounded(errors.mean(axis=0)),
-        "error_sd_by_frame_95": rounded(interval(errors, seed, episodes, NATURAL).T),
-    }
 
 
 def _values(

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from hma_data.loading.dataset import Batch
 from hma_model.evaluation.actions import shuffled, without_actions
-from hma_model.evaluation.intervals import Episodes, interval, rounded, summary
-from hma_model.evaluation.metrics import psnr, ssim
+from hma_model.evaluation.intervals import Episodes, horizon_summary
+from hma_model.evaluation.metrics import PSNR_LIMIT, psnr, ssim
 from hma_model.evaluation.perceptual import Judge
 from hma_model.evaluation.rollouts import Pictures
 
-PSNR_LIMIT = 60.0  # dB; the PSNR of equal pictures, and with it a mean over frames, would be infinite
 ROLLOUTS = ("true", "shuffled", "none", "copy")
 Floats = NDArray[np.float64]
 
@@ -35,15 +34,18 @@ class Scores:
 
     @classmethod
     def of(cls, pictures: Pictures, judge: Judge | None = None) -> "Scores":
-        truth, predicted = (part[:, pictures.prompt :] for part in (pictures.truth, pictures.predicted))
-        size, shape = truth.shape[:2], (-1, *truth.shape[2:])
-        truth, predicted = truth.reshape(shape), predicted.reshape(shape)
-        signal = np.minimum(psnr(truth, predicted), PSNR_LIMIT)
-        parts = [signal, ssim(truth, predicted)]
+        """Return the scores of rollouts; LPIPS where the judge has a network for it."""
+        truth = pictures.truth[:, pictures.prompt :]
+        predicted = pictures.predicted[:, pictures.prompt :]
+
+        def known(values: Floats) -> Floats:
+            return np.where(pictures.finite, values, np.nan)
+
+        lpips = None
         if judge and judge.networks.lpips:
-            parts.append(judge.networks.lpips_of(truth, predicted))
-        parts = [np.where(pictures.finite, part.reshape(size), np.nan) for part in parts]
-        return cls(parts[0], parts[1], parts[2] if len(parts) > 2 else None, pictures.finite)
+            lpips = known(judge.networks.lpips_of(truth, predicted))
+        signal = psnr(truth, predicted, limit=PSNR_LIMIT)
+        return cls(known(signal), known(ssim(truth, predicted)), lpips, pictures.finite)
 
     @classmethod
     def mean(cls, draws: "list[Scores]") -> "Scores":
@@ -58,38 +60,31 @@ class Scores:
     def _combined(
         cls, parts: "list[Scores]", rule: Callable[..., Any], of_finite: Callable[..., Any]
     ) -> "Scores":
-        far = None if parts[0].lpips is None else rule([part.lpips for part in parts])
-        psnrs, ssims = rule([part.psnr for part in parts]), rule([part.ssim for part in parts])
-        return cls(psnrs, ssims, far, of_finite([part.finite for part in parts]))
+        return cls(
+            rule([part.psnr for part in parts]),
+            rule([part.ssim for part in parts]),
+            None if parts[0].lpips is None else rule([part.lpips for part in parts]),
+            of_finite([part.finite for part in parts]),
+        )
 
     def figures(self, seed: int, episodes: Episodes = None) -> dict[str, Any]:
         """Return the means over windows, with their intervals; `episodes` are the windows' own."""
-        mean, frames = partial(summary, seed=seed, episodes=episodes), partial(_by_frame, seed, episodes)
-        found = mean("psnr", self.psnr.mean(axis=1), digits=6)
-        found |= mean("psnr_last", self.psnr[:, -1], digits=6) | frames("psnr", self.psnr)
-        found |= mean("ssim", self.ssim.mean(axis=1), digits=6) | frames("ssim", self.ssim)
+        found = horizon_summary("psnr", self.psnr, seed, 6, episodes)
+        found |= horizon_summary("ssim", self.ssim, seed, 6, episodes)
         if self.lpips is not None:
-            found |= mean("lpips", self.lpips.mean(axis=1)) | frames("lpips", self.lpips)
+            found |= horizon_summary("lpips", self.lpips, seed, episodes=episodes)
         return found
 
     def by_window(self, rollout: str) -> dict[str, Floats]:
         """Return values (N,) of the windows, by the rollout's and the figure's name."""
         found = {
-            "psnr": self.psnr.mean(axis=1),
-            "psnr_last": self.psnr[:, -1],
-            "ssim": self.ssim.mean(axis=1),
+            f"{rollout}.psnr": self.psnr.mean(axis=1),
+            f"{rollout}.psnr_last": self.psnr[:, -1],
+            f"{rollout}.ssim": self.ssim.mean(axis=1),
         }
         if self.lpips is not None:
-            found["lpips"] = self.lpips.mean(axis=1)
-        return {f"{rollout}.{name}": values for name, values in found.items()}
-
-
-def _by_frame(seed: int, episodes: Episodes, name: str, values: Floats) -> dict[str, Any]:
-    """Return the means of values (N, P) over windows and their intervals: P pairs."""
-    return {
-        f"{name}_by_frame": rounded(values.mean(axis=0), 3 if name == "psnr" else 4),
-        f"{name}_by_frame_95": rounded(interval(values, seed, episodes).T),
-    }
+            found[f"{rollout}.lpips"] = self.lpips.mean(axis=1)
+        return found
 
 
 @dataclass

@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 from hma_data.lab import truth
 from hma_data.loading.dataset import Batch
 from hma_model.evaluation.actions import shuffled, without_actions
-from hma_model.evaluation.intervals import NATURAL, interval, rounded, summary
-from hma_model.evaluation.metrics import perplexity, psnr, teacher_forced
+from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded, summary
+from hma_model.evaluation.metrics import PSNR_LIMIT, perplexity_summary, psnr, teacher_forced
 from hma_model.evaluation.probe import Probe, as_seen, state_errors, train_probe
 from hma_model.evaluation.rollouts import Pictures, Sampling, rollout
-from hma_model.evaluation.scores import PSNR_LIMIT
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -124,11 +123,7 @@ def _controllability(probe: Probe, ways: dict[str, Images], parts: Floats, seed:
     }
     for name, pictures in ways.items():
         errors = state_errors(probe, pictures, parts)[..., own].mean(axis=-1)
-        found[name] = summary("error_px", errors.mean(axis=1), seed, within=NATURAL) | {
-            **summary("error_px_last", errors[:, -1], seed, within=NATURAL),
-            "error_px_by_frame": rounded(errors.mean(axis=0)),
-            "error_px_by_frame_95": rounded(interval(errors, seed, within=NATURAL).T),
-        }
+        found[name] = horizon_summary("error_px", errors, seed, within=NATURAL)
     return found
 
 
@@ -138,14 +133,11 @@ def _perturbed(
     """Return PSNR and perplexity under the true commands, and under the perturbed ones."""
     found: dict[str, Any] = {"scale": PERTURBATION}
     for mark, pictures, windows in (("", true, batch), ("_star", made, other)):
-        given, predicted = (part[:, pictures.prompt :] for part in (pictures.truth, pictures.predicted))
-        flat = given.reshape(-1, *given.shape[2:]), predicted.reshape(-1, *given.shape[2:])
-        signal = np.minimum(psnr(*flat), PSNR_LIMIT).reshape(given.shape[:2])
+        given = pictures.truth[:, pictures.prompt :]
+        signal = psnr(given, pictures.predicted[:, pictures.prompt :], limit=PSNR_LIMIT)
         found |= summary(f"psnr{mark}", signal.mean(axis=1), seed)
         found |= summary(f"psnr{mark}_last", signal[:, -1], seed)
         if model.config.kind == "discrete":
-            nats = teacher_forced(model, windows.to(model.device))[0].double().cpu().numpy().mean(axis=1)
-            ends = [perplexity(float(end)) for end in interval(nats, seed, within=NATURAL)]
-            found[f"perplexity{mark}"] = rounded(perplexity(float(nats.mean())))
-            found[f"perplexity{mark}_95"] = rounded(np.array(ends))
+            nats, _ = teacher_forced(model, windows.to(model.device))
+            found |= perplexity_summary(f"perplexity{mark}", nats.double().cpu().numpy().mean(axis=1), seed)
     return found

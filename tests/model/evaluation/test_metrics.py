@@ -35,7 +35,7 @@ def test_ssim_of_a_smooth_picture_on_a_bright_ground_is_scikit_images():
     ramp = np.linspace(250, 255, 40)[None, :, None] * np.ones((40, 1, 3))
     truth, other = ramp.astype(np.uint8), (ramp - 1).astype(np.uint8)
     expected = structural_similarity(truth, other, data_range=255, channel_axis=2)
-    assert ssim(truth, other)[0] == pytest.approx(expected, rel=1e-6)
+    assert ssim(truth, other) == pytest.approx(expected, rel=1e-6)
 
 
 def test_equal_pictures_have_infinite_psnr_and_ssim_one(pictures):
