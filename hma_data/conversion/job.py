@@ -47,7 +47,7 @@ from hma_data.conversion.worker import Job, MakeWork
 from hma_data.episodes.align import OFF_RATE
 from hma_data.errors import OutputError, RegistryError, SourceError, StorageAwayError, UsageError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, finish, shard_sizes
+from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, derive, shard_sizes
 from hma_data.shards.schema import RowLayout, flag_totals, to_numpy
 from hma_data.sources.base import EpisodeRef, open_source
 from hma_data.sources.common.choice import chosen_ids, ids_for_robot
@@ -354,7 +354,8 @@ class _Run:
                 kept = before.shards  # their hashes are known
         names = list(dict.fromkeys([*(shard.path for shard in kept), *(unit.name for unit in plan.units)]))
         known = {shard.path: shard.sha256 for shard in kept} | known_hashes(folder)
-        manifest = finish(folder, names, embodiment, self._spec, plan.facts, self.uri, hashes=known)
+        derived = derive(folder, names, embodiment, self._spec, plan.facts, self.uri, hashes=known)
+        manifest = derived.write(folder)
         remove_notes(folder)
         return manifest
 

@@ -35,7 +35,6 @@ from hma_data.shards.manifest import (
     Manifest,
     derive,
     digest,
-    finish,
     seal_problem,
     shard_sizes,
     stored_embodiment,
@@ -128,7 +127,8 @@ class _Job:
                     written += frames
                     on_progress(written, plan.frames)
             names = [unit.name for unit in plan.units]
-            manifest = finish(out, names, self.embodiment, first.spec, plan.facts, self.source)
+            derived = derive(out, names, self.embodiment, first.spec, plan.facts, self.source)
+            manifest = derived.write(out)
             remove_notes(out)
             return manifest
 

@@ -390,36 +390,20 @@ def derive(
     return Derived(manifest, episodes, gathered.quarantine())
 
 
-def finish(
-    folder: Path,
-    names: Sequence[str],
-    embodiment: Embodiment,
-    tokenizer: TokenizerSpec,
-    plan: dict[str, Any],
-    source: str,
-    hashes: Mapping[str, str] | None = None,
-) -> Manifest:
-    """Derive and write everything that is not a shard; see `derive`."""
-    return derive(folder, names, embodiment, tokenizer, plan, source, hashes).write(folder)
-
-
 def _described(
     folder: Path, names: Sequence[str], hashes: Mapping[str, str]
 ) -> Iterator[tuple[ShardFile, Footer]]:
-    """Yield each shard as the manifest lists it, with its footer; hash a few shards at a time."""
+    """Yield each shard as the manifest lists it, with its footer."""
 
     def look(name: str) -> tuple[pq.FileMetaData, int, str]:
         path = folder / name
         return read_metadata(path), path.stat().st_size, hashes.get(name) or file_sha256(path)
 
-    parts = [names[start : start + 4 * HASHERS] for start in range(0, len(names), 4 * HASHERS)]
     with ThreadPoolExecutor(HASHERS) as pool:
-        ahead = pool.map(look, parts[0] if parts else ())
-        for part, after in zip(parts, [*parts[1:], ()]):  # few are in memory at a time
-            looked, ahead = list(ahead), pool.map(look, after)
-            places = [str(folder / name) for name in part]
-            footers = Footer.several([metadata.metadata for metadata, *_ in looked], places)
-            for name, footer, (metadata, size, sha256) in zip(part, footers, looked):
+        for start in range(0, len(names), 4 * HASHERS):  # few footers are in memory at a time
+            part = names[start : start + 4 * HASHERS]
+            for name, (metadata, size, sha256) in zip(part, pool.map(look, part)):
+                footer = Footer.from_metadata(metadata.metadata, str(folder / name))
                 rows = tuple(group_rows(metadata))
                 file = ShardFile(name, footer.split, sum(rows), len(footer.episodes), size, sha256, rows)
                 yield file, footer

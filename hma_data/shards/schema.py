@@ -7,7 +7,6 @@ import json
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,8 +29,6 @@ ROW_GROUP = 2048
 GROUP_VALUES = 1 << 24  # tokens of a row group; Parquet's writer holds small integers in four bytes each
 MALFORMED = (KeyError, TypeError, ValueError, AttributeError, RecursionError)  # what wrong JSON raises
 _FOOTER = b"hma"
-# a footer as `to_metadata` writes it; in a text of JSON, quotes have a backslash before them
-_EPISODES_OF_TEXT = re.compile(rb'(.*?), "episodes": (\[.*\])(, "quarantine": .*)')
 # flags that measure an episode and count no frames: a sum of them means nothing
 MEASURES = {"millinats", "millilatents"}
 PAUSES = "pauses="  # begins the word of an episode's flags that states its pauses
@@ -146,44 +143,22 @@ class Footer:
         Raises:
             ShardError: the file is no shard, its version is not read here, or its footer is damaged.
         """
-        return cls._of_text(_footer_text(metadata, where), None, where)
-
-    @classmethod
-    def several(cls, metadata: Sequence[dict[bytes, bytes] | None], where: Sequence[str]) -> "list[Footer]":
-        """Read the footers of several shards, several times as fast as one by one; see `from_metadata`."""
-        texts = [_footer_text(values, place) for values, place in zip(metadata, where)]
-        cuts = [_EPISODES_OF_TEXT.fullmatch(text) for text in texts]
-        episodes: list[Any] = [None] * len(texts)
-        if all(cuts):
-            with suppress(ValueError):  # if it is damaged, reading one by one says where
-                episodes = [*Records.of_json_lists(EpisodeRow, [cut[2] for cut in cuts if cut])]
-                texts = [cut[1] + cut[3] for cut in cuts if cut]
-        return [cls._of_text(*args) for args in zip(texts, episodes, where)]
-
-    @classmethod
-    def _of_text(cls, json_text: bytes, episodes: Sequence[EpisodeRow] | None, where: str) -> "Footer":
+        if not metadata or _FOOTER not in metadata:
+            raise ShardError(where, "is a parquet file but not a shard: its footer has no 'hma' entry")
         try:
-            values = parse_json(json_text)
+            values = parse_json(metadata[_FOOTER])
             check_version(values, where)
-            if (episodes is None) != ("episodes" in values):
-                raise KeyError("episodes")
             return cls(
                 plan=values["plan"],
                 name=values["name"],
                 split=values["split"],
-                episodes=Records.of_json(EpisodeRow, values["episodes"]) if episodes is None else episodes,
+                episodes=Records.of_json(EpisodeRow, values["episodes"]),
                 quarantine=tuple(Refused(**item) for item in values["quarantine"]),
                 stats={name: Stats.from_json(stats) for name, stats in values["stats"].items()},
             )
         except MALFORMED as fault:
             said = f"has a damaged footer: {fault!r}"
             raise ShardError(where, said, "delete it and convert again") from fault
-
-
-def _footer_text(metadata: dict[bytes, bytes] | None, where: str) -> bytes:
-    if not metadata or _FOOTER not in metadata:
-        raise ShardError(where, "is a parquet file but not a shard: its footer has no 'hma' entry")
-    return metadata[_FOOTER]
 
 
 def check_version(values: dict[str, Any], where: object) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hma_data.conversion.plan import Plan, Settings, make_plan
 from hma_data.errors import OutputError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import MANIFEST, Manifest, finish
+from hma_data.shards.manifest import MANIFEST, Manifest, derive
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, flags_text
 from hma_data.shards.writer import EpisodeRows, ShardWriter
@@ -130,7 +130,7 @@ def write_shards(
                 stats["action"].merge(layout.stats({"action": one.chunks}, slice(None))["action"])
             writer.close(Footer(plan.facts, unit.name, unit.split, tuple(rows), left, stats))
         left = ()
-    return finish(folder, [unit.name for unit in plan.units], own, spec, plan.facts, origin)
+    return derive(folder, [unit.name for unit in plan.units], own, spec, plan.facts, origin).write(folder)
 
 
 def require_dataset(folder: Path) -> None:

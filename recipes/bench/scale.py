@@ -141,13 +141,13 @@ def _plan(folder: Path, settings: dict[str, Any]) -> None:
 def _write(folder: Path, settings: dict[str, Any]) -> None:
     """Write the manifest, the episodes and the other files of each set from the footers of its shards."""
     from hma_data.conversion.output import known_hashes
-    from hma_data.shards.manifest import finish
+    from hma_data.shards.manifest import derive
 
     for _, _, robot, spec in _robots(settings):
         out = folder / robot.id
         if out.is_dir():
             note = json.loads(out.with_suffix(".json").read_text())
-            finish(out, note["names"], robot, spec, note["facts"], SOURCE, known_hashes(out))
+            derive(out, note["names"], robot, spec, note["facts"], SOURCE, known_hashes(out)).write(out)
 
 
 def _read(folder: Path, settings: dict[str, Any]) -> None:

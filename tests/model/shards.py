@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import finish
+from hma_data.shards.manifest import derive
 from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema, flags_text
 from hma_data.shards.stats import Stats
 from hma_data.shards.writer import EpisodeRows, ShardWriter
@@ -74,5 +74,5 @@ def make_shards(
             stats = Stats.of(np.concatenate([whole[number][1] for number in numbers]))
             writer.close(Footer(plan, path, split, tuple(rows), (), {"action": stats}))
     names = [f"{split}/shard-00000.parquet" for split in parts]
-    finish(folder, names, embodiment, spec, plan, "made")
+    derive(folder, names, embodiment, spec, plan, "made").write(folder)
     return folder

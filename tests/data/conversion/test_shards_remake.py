@@ -16,7 +16,7 @@ from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import merge, split
 from hma_data.errors import OutputError, ShardError, UsageError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import Manifest, finish
+from hma_data.shards.manifest import Manifest, derive
 from hma_data.shards.memmap import export
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import read_footer, to_arrow, to_numpy
@@ -276,4 +276,6 @@ def mask_some(folder: Path) -> None:
         with pq.ParquetWriter(path, table.schema) as writer:
             writer.write_table(table, row_group_size=2048)
             writer.add_key_value_metadata(replace(said, stats={"action": stats}).to_metadata())
-    finish(folder, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source)
+    derive(folder, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source).write(
+        folder
+    )

@@ -16,7 +16,7 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import restat
 from hma_data.errors import ShardError
-from hma_data.shards.manifest import MANIFEST, Manifest, finish, plan_hash, seal_problem
+from hma_data.shards.manifest import MANIFEST, Manifest, derive, plan_hash, seal_problem
 from hma_data.shards.verify import verify
 from tests.conftest import toy_shards, write_toy
 
@@ -208,7 +208,9 @@ def rewritten(folder: Path, change) -> list[str]:
     write(path, change(pq.read_table(path)), footer(path))
     manifest = Manifest.load(folder)
     names = [shard.path for shard in manifest.shards]
-    finish(folder, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source)
+    derive(folder, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source).write(
+        folder
+    )
     return verify(folder)
 
 
@@ -266,7 +268,7 @@ def test_episodes_of_one_recording_in_both_splits_are_found(sound: Path) -> None
         write(path, pq.read_table(path), metadata | {b"hma": json.dumps(values).encode()})
     manifest = Manifest.load(sound)
     names = [shard.path for shard in manifest.shards]
-    finish(sound, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source)
+    derive(sound, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source).write(sound)
     assert any("both splits" in problem for problem in verify(sound))
 
 

@@ -1,9 +1,7 @@
 """Records give back the objects they were made of."""
 
 import copy
-import json
 import pickle
-from dataclasses import asdict
 
 import pyarrow as pa
 import pytest
@@ -50,21 +48,3 @@ def test_missing_fields_have_their_default_and_needed_ones_must_be_there() -> No
         Records.of_json(EpisodeRef, [{"id": "a"}])
     with pytest.raises((TypeError, ValueError)):
         Records.of_json(EpisodeRef, [{"id": "a", "frames": "many"}])
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.lists(REFS, min_size=1, max_size=3))
-def test_json_lists_parsed_together_give_what_each_gives_alone(lists: list[list[EpisodeRef]]) -> None:
-    texts = [json.dumps([asdict(item) for item in items]).encode() for items in lists]
-    assert [list(records) for records in Records.of_json_lists(EpisodeRef, texts)] == lists
-
-
-@pytest.mark.parametrize(
-    "item",
-    ['{"id": "a"}', '{"id": "a", "frames": "many"}', '{"id": "a", "frames": 1, "id": "b"}', "null", "{}}"],
-)
-def test_a_damaged_json_list_is_refused(item: str) -> None:
-    whole = b'[{"id": "a", "frames": 3}]'
-    assert list(Records.of_json_lists(EpisodeRef, [whole])[0]) == [EpisodeRef("a", 3)]
-    with pytest.raises(ValueError):
-        Records.of_json_lists(EpisodeRef, [whole, f"[{item}]".encode(), whole])
