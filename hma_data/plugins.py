@@ -46,11 +46,7 @@ class Plugin:
         return self.call(f"importing {self.entry_point.value}", self.entry_point.load)
 
     def call(self, doing: str, function: Callable[..., Any], *args: Any, **keywords: Any) -> Any:
-        """Return what a function of the package returns.
-
-        Raises:
-            PluginError: it raised what is no HMAError.
-        """
+        """Return what a function of the package returns."""
         try:
             return function(*args, **keywords)
         except HMAError:

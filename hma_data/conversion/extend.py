@@ -81,9 +81,6 @@ def extended(
 
     Returns:
         a plan whose units are the new shards alone; where there are none, its facts are those of `base`.
-
-    Raises:
-        OutputError: the set was made in another way or lacks something, or one of its episodes has changed.
     """
     _refuse_damaged(out, base)
     if ways(plan.facts) != ways(base.plan):
@@ -204,11 +201,7 @@ def looked_at(rows: int) -> list[int]:
 
 
 def kept_frames(clip: Clip, layout: RowLayout) -> NDArray[np.int64]:
-    """Return the frames (N,) of the clip that become rows of a camera.
-
-    Raises:
-        EpisodeError: the clip is shorter than a stride.
-    """
+    """Return the frames (N,) of the clip that become rows of a camera."""
     kept = layout.kept(len(clip))
     if not len(kept):
         fault = f"has {len(clip)} frames, fewer than one stride of {layout.frame_stride}"
@@ -223,9 +216,6 @@ def content_of(
 
     Args:
         facts: of the plan: which cameras and frames, and the tokenizer's spec.
-
-    Raises:
-        EpisodeError: the episode cannot be read any more.
     """
     layout = RowLayout.of_plan(facts, embodiment)
     spec = layout.tokenizer

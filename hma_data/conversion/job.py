@@ -246,9 +246,6 @@ class _Run:
         """Return the plan, and the manifest it extends or None.
 
         A set that was extended before can be continued without `extend`.
-
-        Raises:
-            OutputError: the rows of a strided set are of another stride, or `extended` refuses the set.
         """
         given = self.given
         base = base_manifest(self.folder)

@@ -57,9 +57,6 @@ def clear(out: Path) -> None:
     """Delete the shard set of a folder; keep what lies beside it.
 
     The next `hma hub push-data` writes README.md anew, but it may also be the user's own.
-
-    Raises:
-        OutputError: the folder holds something else.
     """
     _refuse_foreign(out)
     if isinstance(out, RemotePath):
@@ -95,9 +92,6 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
     Args:
         base: the set that the plan extends; its shards may be there too.
         shared: True where other jobs may be writing: unfinished files are then not deleted.
-
-    Raises:
-        OutputError: the folder holds another conversion's shards, or something else.
     """
     _refuse_foreign(out)
     if isinstance(out, RemotePath):

@@ -315,12 +315,7 @@ def chosen_cameras(embodiment: Embodiment, cameras: Sequence[str]) -> list[str]:
 def read_clip(
     source: Source, uri: str, episode_id: str, embodiment: Embodiment, cameras: Sequence[str]
 ) -> Clip:
-    """Return an episode with the cameras that are stored; the others neither refuse nor shorten it.
-
-    Raises:
-        EpisodeError: the episode cannot be used. If it could be without one of several cameras, the error
-            names that camera.
-    """
+    """Return an episode with the cameras that are stored; the others neither refuse nor shorten it."""
 
     def read(names: Sequence[str]) -> Clip:
         robot = embodiment.with_cameras(names)

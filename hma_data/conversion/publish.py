@@ -121,11 +121,7 @@ class HubOutput:
 
     @classmethod
     def of(cls, out: Path) -> "HubOutput | None":
-        """Return the output of an `hf://` path; None for any other path.
-
-        Raises:
-            OutputError: it names no dataset repository.
-        """
+        """Return the output of an `hf://` path; None for any other path."""
         if not isinstance(out, RemotePath) or out.scheme != "hf":
             return None
         found = _URI.fullmatch(str(out))
@@ -140,21 +136,13 @@ class HubOutput:
         return cache_folder() / "staging" / f"{self.repo.replace('/', '--')}-{mark}"
 
     def prepare(self) -> bool:
-        """Create the repository and the branch where they are missing; check whether a set is there.
-
-        Raises:
-            HubError: there is no token, or it may not write there, or the hub cannot be reached.
-        """
+        """Create the repository and the branch where they are missing; check whether a set is there."""
         manifest = f"{self.folder}/{MANIFEST}" if self.folder else MANIFEST
         self._repository.prepare(manifest)
         return manifest in self._repository.files()
 
     def upload(self) -> None:
-        """Upload the staging folder's shard set.
-
-        Raises:
-            HubError: the hub refuses it, or does not answer.
-        """
+        """Upload the staging folder's shard set."""
         self._repository.files()
         publish(self._repository, self.staging, self._repository.files, self.folder)
 

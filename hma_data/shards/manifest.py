@@ -230,11 +230,7 @@ def shard_sizes(folder: Path) -> dict[str, int]:
 
 
 def stored_embodiment(folder: Path) -> Embodiment:
-    """Read the embodiment.yaml of a shard set.
-
-    Raises:
-        RegistryError: it is damaged.
-    """
+    """Read the embodiment.yaml of a shard set."""
     path = folder / EMBODIMENT
     text = path.read_text(encoding="utf-8", errors="replace")
     return Embodiment.from_yaml(text, str(path))
@@ -362,9 +358,6 @@ def derive(
         names: names of the shards, in plan order; all exist.
         source: URI that the recordings came from.
         hashes: sha256 of shards whose sha256 is known, by name; they are not computed again.
-
-    Raises:
-        ShardError: a shard is damaged, or of another plan.
     """
     gathered = Gathered(source)
     files: list[ShardFile] = []

@@ -91,11 +91,7 @@ class ShardSet:
 
     @cached_property
     def episodes(self) -> pa.Table:
-        """Read episodes.parquet.
-
-        Raises:
-            ShardError: it is missing or damaged.
-        """
+        """Read episodes.parquet."""
         return self._episodes()
 
     def _episodes(self, columns: list[str] | None = None, **options: Any) -> pa.Table:
@@ -107,11 +103,7 @@ class ShardSet:
             raise ShardError(path, f"cannot be read: {fault}", "run the same hma convert again") from fault
 
     def refused(self) -> list[dict[str, Any]]:
-        """Read quarantine.jsonl; return one mapping for each refused episode.
-
-        Raises:
-            ShardError: it is missing or damaged.
-        """
+        """Read quarantine.jsonl; return one mapping for each refused episode."""
         path = self.folder / QUARANTINE
         try:
             return [dict(parse_json(line)) for line in path.read_text(encoding="utf-8").splitlines()]
@@ -120,11 +112,7 @@ class ShardSet:
             raise ShardError(path, f"cannot be read: {fault}", remedy) from fault
 
     def camera_index(self, camera: str | None) -> int:
-        """Return the place of a camera among those of the set; None means the first.
-
-        Raises:
-            UsageError: there is no such camera.
-        """
+        """Return the place of a camera among those of the set; None means the first."""
         cameras = self.manifest.cameras
         if camera is not None and camera not in cameras:
             remedy = f"its cameras are {', '.join(cameras)}"
@@ -198,11 +186,7 @@ class ShardSet:
     def episode_rows(
         self, episode_index: int, columns: Sequence[str] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Read all rows of one episode.
-
-        Raises:
-            ShardError: there is no such episode.
-        """
+        """Read all rows of one episode."""
         wanted = pa.scalar(episode_index)  # for a plain number pyarrow would import pandas
         found = self.episodes.filter(pc.equal(self.episodes["episode_index"], wanted)).to_pylist()
         if not found:
@@ -254,11 +238,7 @@ class EpisodeReader:
         return {token_column(layout.tokenizer)[0]: values[layout.token_columns[camera]], **kept}
 
     def rows(self, shard: str, row_start: int, rows: int) -> dict[str, NDArray[Any]]:
-        """Read columns of `rows` rows of a shard from `row_start` on, (rows,) or (rows, width) each.
-
-        Raises:
-            ShardError: the shard is missing or damaged.
-        """
+        """Read columns of `rows` rows of a shard from `row_start` on, (rows,) or (rows, width) each."""
         edges = self._edges(shard)
         first = int(np.searchsorted(edges, row_start, side="right")) - 1
         last = int(np.searchsorted(edges, row_start + rows, side="left"))
@@ -298,11 +278,7 @@ def _words(column: pa.ChunkedArray) -> tuple[Ints, list[str]]:
 
 
 def limit_bytes() -> int:
-    """Return how many bytes of shards may be kept.
-
-    Raises:
-        UsageError: $HMA_CACHE_GB is not a number of gigabytes.
-    """
+    """Return how many bytes of shards may be kept."""
     stated = os.environ.get(LIMIT) or DEFAULT_GB
     try:
         return int(float(stated) * 1e9)

@@ -385,11 +385,7 @@ def _flat(array: pa.Array) -> NDArray[Any]:
 
 
 def read_metadata(path: Path) -> pq.FileMetaData:
-    """Return the metadata of a shard's file.
-
-    Raises:
-        ShardError: it is not a whole parquet file.
-    """
+    """Return the metadata of a shard's file."""
     try:
         return pq.read_metadata(parquet_input(path))
     except (pa.ArrowInvalid, OSError) as fault:
@@ -403,10 +399,6 @@ def group_rows(metadata: pq.FileMetaData) -> list[int]:
 
 
 def read_footer(path: Path) -> tuple[Footer, list[int]]:
-    """Return the footer and the number of rows of each row group of a shard.
-
-    Raises:
-        ShardError: it is not a whole parquet file, or not a shard.
-    """
+    """Return the footer and the number of rows of each row group of a shard."""
     metadata = read_metadata(path)
     return Footer.from_metadata(metadata.metadata, str(path)), group_rows(metadata)

@@ -195,12 +195,7 @@ class LargeFile:
         self._blocks: Blocks | None = None
 
     def open(self) -> BinaryIO:
-        """Open the file for reading.
-
-        Raises:
-            OSError: it is not there.
-            StorageError: it cannot be read; StorageAwayError: the store does not answer.
-        """
+        """Open the file for reading."""
         if not isinstance(self._path, RemotePath):
             return self._path.open("rb")
         if self._blocks is None:
@@ -209,12 +204,7 @@ class LargeFile:
 
 
 def remote_blocks(path: RemotePath) -> Blocks:
-    """Return the blocks of a file of a store.
-
-    Raises:
-        FileNotFoundError: it is not there.
-        StorageError: it cannot be read, or the store does not state its length.
-    """
+    """Return the blocks of a file of a store."""
     size = path.info().get("size")
     if size is None:
         raise StorageError(path, "its server does not state its length", "copy the file here")

@@ -212,11 +212,7 @@ def attempt[T](files: Any, path: str, action: Callable[[], T]) -> T:
 
 
 def info(files: Any, path: str) -> dict[str, Any]:
-    """Return what the file system says of a file; at least `size`.
-
-    Raises:
-        SourceError: nothing is there, or its length is unknown.
-    """
+    """Return what the file system says of a file; at least `size`."""
     found: dict[str, Any] = attempt(files, path, lambda: files.info(path))
     if found.get("size") is None:
         remedy = "copy the files here, or name a server that states it"
@@ -230,11 +226,7 @@ def mark(found: dict[str, Any]) -> str:
 
 
 def fetch(files: Any, path: str, start: int, end: int) -> bytes:
-    """Return the bytes from `start` up to `end`; fewer where the file ends before.
-
-    Raises:
-        SourceError: they cannot be read, or the server answers with something else.
-    """
+    """Return the bytes from `start` up to `end`; fewer where the file ends before."""
     data: bytes = attempt(files, path, lambda: files.cat_file(path, start=start, end=end))
     if len(data) > end - start:
         fault = f"its server sent {len(data)} bytes where {end - start} were asked for"
@@ -243,11 +235,7 @@ def fetch(files: Any, path: str, start: int, end: int) -> bytes:
 
 
 def fetch_whole(files: Any, path: str, limit: int) -> bytes | None:
-    """Return all bytes of a small file; None when there is no such file.
-
-    Raises:
-        SourceError: it cannot be read, or is a local file longer than `limit` bytes.
-    """
+    """Return all bytes of a small file; None when there is no such file."""
 
     def whole() -> Any:
         try:

@@ -22,9 +22,6 @@ def locked(out: Path, share: str = "") -> Iterator[None]:
     Args:
         out: the folder; it is made, and removed again if the job writes nothing.
         share: name of the part that this job writes; jobs of other parts may write at the same time.
-
-    Raises:
-        OutputError: another job is writing, or the folder cannot be written.
     """
     if isinstance(out, RemotePath):
         if out.scheme == "hf":

@@ -51,11 +51,7 @@ def as_address(path: StrPath) -> str | Path:
 
 
 def is_repository(address: StrPath) -> bool:
-    """Check whether an address is a repository: hf://org/name, or org/name unless it is a local folder.
-
-    Raises:
-        HubError: it begins with hf:// and names no model repository.
-    """
+    """Check whether an address is a repository: hf://org/name, or org/name unless it is a local folder."""
     place = as_address(address)
     if isinstance(place, Path):
         return False

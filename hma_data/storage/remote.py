@@ -2,6 +2,8 @@
 
 `place` makes a path of what a user wrote. A `RemotePath` can be joined, listed, read by ranges and deleted;
 `put_file` and `put_bytes` upload whole files.
+
+A store that refuses a request raises StorageError; one that does not answer, StorageAwayError.
 """
 
 import errno
@@ -110,12 +112,7 @@ class RemotePath(PosixPath):
 
     @property
     def files(self) -> Any:
-        """Return the store's file system; fsspec keeps one for each process.
-
-        Raises:
-            StorageError: no store is known by that scheme.
-            MissingDependencyError: the package of the store is not installed.
-        """
+        """Return the store's file system; fsspec keeps one for each process."""
         try:
             return file_system(str(self))[0]
         except ValueError as fault:
@@ -130,11 +127,7 @@ class RemotePath(PosixPath):
     # -- what is there
 
     def info(self) -> dict[str, Any]:
-        """Return what the store says of a file or folder: type, size and more.
-
-        Raises:
-            FileNotFoundError: there is neither a file nor a folder.
-        """
+        """Return what the store says of a file or folder: type, size and more."""
 
         def ask() -> dict[str, Any]:
             self.files.invalidate_cache()  # others write here too
@@ -270,11 +263,7 @@ class RemotePath(PosixPath):
 
 
 def put_file(local: Path, to: RemotePath) -> None:
-    """Upload a file; it appears under its name only when it is whole.
-
-    Raises:
-        StorageError: the store refuses it; StorageAwayError: it does not answer.
-    """
+    """Upload a file; it appears under its name only when it is whole."""
     _put(to, lambda key: to.files.put_file(str(local), key))
 
 
@@ -287,9 +276,6 @@ def create_bytes(content: bytes, to: RemotePath) -> bool:
     """Upload a small file unless there is one of that name, in one step; return False where there is one.
 
     A store that does not support this condition is written as by `put_bytes`.
-
-    Raises:
-        StorageError: the store refuses it; StorageAwayError: it does not answer.
     """
 
     def once() -> bool:
@@ -326,11 +312,7 @@ def _put(to: RemotePath, upload: Callable[[str], Any]) -> None:
 
 
 def fetch_range(path: RemotePath, start: int, stop: int) -> bytes:
-    """Return the bytes of a remote file from `start` up to `stop`, which lies inside it.
-
-    Raises:
-        StorageError: the store refuses it; StorageAwayError: it does not answer.
-    """
+    """Return the bytes of a remote file from `start` up to `stop`, which lies inside it."""
 
     def ask() -> bytes:
         data = bytes(path.files.cat_file(path.key, start=start, end=stop))

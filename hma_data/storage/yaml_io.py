@@ -109,11 +109,7 @@ def read_yaml(path: Path, error: type[HMAError] = RegistryError) -> Any:
 
 
 def read_bytes(path: Path, error: type[HMAError] = RegistryError) -> bytes:
-    """Return the bytes of a YAML file.
-
-    Raises:
-        error: it is no file that can be read, or is larger than MAX_BYTES.
-    """
+    """Return the bytes of a YAML file."""
     try:
         if not path.is_file():
             found = misplaced(path, "a YAML file")

@@ -90,9 +90,6 @@ def import_ray() -> Any:
 
     Under `uv run` Ray would pack the working folder, data in it too, and install everything anew for each
     actor: 48 s instead of one.
-
-    Raises:
-        MissingDependencyError: Ray is not installed.
     """
     os.environ.setdefault(UV_ENVIRONMENT, "0")  # Ray reads it once, when it is imported
     try:
