@@ -18,7 +18,7 @@ from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.storage.locks import locked
-from tests.conftest import SMALL, BlockTokenizer, StoppingTokenizer, contents, write_toy
+from tests.conftest import SMALL, BlockTokenizer, contents, write_toy
 
 
 def run(
@@ -65,22 +65,6 @@ def test_running_again_does_nothing_and_changes_nothing(
     again = run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
     assert again.made_shards == 0
     assert contents(tmp_path / "out") == before
-
-
-def test_a_job_stopped_anywhere_ends_with_the_same_bytes(
-    toy_arm, toy_recording, tmp_path, block_tokenizer
-) -> None:
-    whole = tmp_path / "whole"
-    run(toy_arm, toy_recording, whole, block_tokenizer)
-    for stop_at in (1, 4, 9):
-        out = tmp_path / f"stopped-{stop_at}"
-        with pytest.raises(KeyboardInterrupt):
-            run(toy_arm, toy_recording, out, StoppingTokenizer(stop_at))
-        assert not list(out.rglob("*.part"))
-        (out / "train").mkdir(exist_ok=True)
-        (out / "train" / ".shard-00000.parquet.1.part").write_bytes(b"left by a kill")
-        run(toy_arm, toy_recording, out, block_tokenizer)
-        assert contents(out) == contents(whole)
 
 
 def test_the_shards_of_one_file_or_another_path_are_the_same(

@@ -1,14 +1,8 @@
 """Batch jobs: shares of an array, extension, kills, storage that fails; the same bytes in the end."""
 
-import json
 import os
-import random
-import signal
 import subprocess
 import sys
-import threading
-import time
-from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -17,16 +11,14 @@ import pytest
 
 from hma_data.conversion import worker as shard_work
 from hma_data.conversion.engines import Limits
-from hma_data.conversion.job import Conversion, convert
-from hma_data.conversion.output import Share
+from hma_data.conversion.job import convert
 from hma_data.errors import HMAError, OutputError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import Manifest
 from hma_data.shards.verify import verify
 from hma_data.sources.hdf5.source import Hdf5Source
 from hma_data.storage.locks import LOCK, locked
 from tests.command import hma
-from tests.conftest import SMALL, BlockTokenizer, StoppingTokenizer, contents, write_toy
+from tests.conftest import BlockTokenizer, contents, write_toy
 from tests.conftest import convert_toy as run
 
 ROOT = Path(__file__).parents[3]
@@ -64,32 +56,6 @@ def test_a_device_that_workers_lack_is_one_error(
 
 
 # -- shares
-
-
-@pytest.mark.parametrize("count", [1, 3, 20])
-def test_shares_in_any_order_make_what_one_job_makes(
-    count: int, toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
-) -> None:
-    order = list(range(count))
-    random.Random(count).shuffle(order)
-    for index in order:
-        done = Conversion(
-            toy_arm, str(toy_recording), BlockTokenizer(), tmp_path / "out", settings=SMALL
-        ).run_share(Share(index, count))
-        assert (done.missing == 0) == (index == order[-1])
-    assert contents(tmp_path / "out") == whole
-
-
-def test_shares_run_side_by_side_and_one_of_them_finishes(
-    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
-) -> None:
-    job = Conversion(toy_arm, toy_recording, BlockTokenizer(), tmp_path / "out", settings=SMALL)
-    threads = [threading.Thread(target=job.run_share, args=(Share(i, 3),)) for i in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert contents(tmp_path / "out") == whole
 
 
 @pytest.mark.slow
@@ -209,29 +175,6 @@ def test_added_episodes_become_new_shards_and_the_old_stay(toy_arm: Embodiment, 
     assert contents(out) == after
 
 
-@pytest.mark.slow
-@pytest.mark.slow
-def test_an_extension_stopped_anywhere_ends_with_the_same_bytes(toy_arm: Embodiment, tmp_path: Path) -> None:
-    first, second = tmp_path / "first", tmp_path / "second"
-    for folder in (first, second):
-        folder.mkdir()
-        write_toy(folder / "a.hdf5", [20, 21, 22])
-    write_toy(second / "b.hdf5", [40, 41, 42])
-    results = []
-    for stop_at in (None, 0, 2):
-        out = tmp_path / f"out-{stop_at}"
-        run(toy_arm, first, out)
-        if stop_at is not None:
-            with pytest.raises(KeyboardInterrupt):
-                convert(toy_arm, str(second), StoppingTokenizer(stop_at), out, settings=SMALL, extend=True)
-            assert Manifest.load(out).splits["train"]["episodes"] <= 3
-        run(toy_arm, second, out, extend=True)
-        assert verify(out) == []
-        shards = {name: data for name, data in contents(out).items() if "shard-" in name}
-        results.append(shards)
-    assert results[0] == results[1] == results[2]
-
-
 def test_an_episode_recorded_anew_cannot_extend(toy_arm: Embodiment, tmp_path: Path) -> None:
     recording, out = tmp_path / "toy.hdf5", tmp_path / "out"
     write_toy(recording, [20, 21, 22])
@@ -304,134 +247,6 @@ def test_a_full_disk_is_one_error_and_what_was_made_is_kept(
     assert not list((tmp_path / "out").rglob("*.part"))
     run(toy_arm, toy_recording, tmp_path / "out")
     assert contents(tmp_path / "out") == whole
-
-
-COMMAND = """
-import os, signal, sys, time
-from pathlib import Path
-from hma_data.conversion import worker as shard_work
-from hma_data.conversion.job import convert
-from hma_data.registry.embodiment import Embodiment
-from hma_data.conversion.engines import Limits
-from hma_data.conversion.plan import Settings
-from hma_data.sources.hdf5.source import Hdf5Source
-from hma_data.tokenizers import base
-from tests.conftest import ARM_YAML, BlockTokenizer
-
-TROUBLE = Path(sys.argv[3])
-read = Hdf5Source.read
-def troubled(self, uri, episode_id, embodiment):
-    time.sleep(0.02)
-    said = TROUBLE / episode_id
-    if said.exists():
-        kind = said.read_text()
-        if kind == "hang":
-            time.sleep(600)
-        os.kill(os.getpid(), getattr(signal, kind))
-    return read(self, uri, episode_id, embodiment)
-Hdf5Source.read = troubled
-shard_work.get_tokenizer = lambda *a, **k: BlockTokenizer()
-import hma_data.conversion.job
-hma_data.conversion.job.get_tokenizer = shard_work.get_tokenizer
-hma_data.conversion.job.get_spec = lambda *a, **k: BlockTokenizer().spec
-if __name__ == "__main__":
-    summary = convert(
-        Embodiment.from_yaml(ARM_YAML), sys.argv[1], "block", Path(sys.argv[2]), workers=2,
-        settings=Settings(val_fraction=0.2, shard_frames=60), max_quarantine=1,
-        limits=Limits(quiet_s=float(sys.argv[4]), kills=50),
-    )
-    print("made", summary.made_shards, flush=True)
-"""
-
-
-def job(script: Path, recording: Path, out: Path, trouble: Path, quiet_s: float = 120) -> subprocess.Popen:
-    return subprocess.Popen(
-        [sys.executable, str(script), str(recording), str(out), str(trouble), str(quiet_s)],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-@pytest.fixture
-def script(tmp_path: Path) -> Path:
-    path = tmp_path / "job.py"
-    path.write_text(COMMAND)
-    (tmp_path / "trouble").mkdir()
-    return path
-
-
-def workers_of(pid: int) -> list[int]:
-    try:
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-        names = {child: Path(f"/proc/{child}/cmdline").read_bytes() for child in children}
-    except OSError:
-        return []
-    return [int(child) for child, name in names.items() if b"spawn_main" in name]
-
-
-def shards_in(out: Path) -> int:
-    return len(list(out.rglob("*.parquet")))
-
-
-@pytest.mark.slow
-def test_a_killed_job_is_continued_to_the_same_bytes(
-    script: Path, toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
-) -> None:
-    (tmp_path / "trouble" / "demo_11").write_text("hang")  # so that it cannot end before it is killed
-    process = job(script, toy_recording, tmp_path / "out", tmp_path / "trouble")
-    while process.poll() is None and not shards_in(tmp_path / "out"):
-        time.sleep(0.01)
-    process.kill()
-    _, errors = process.communicate()
-    assert process.returncode == -signal.SIGKILL, errors
-    assert run(toy_arm, toy_recording, tmp_path / "out").kept_shards >= 1
-    assert contents(tmp_path / "out") == whole
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_storm_of_kills_ends_with_the_same_bytes(
-    seed: int, script: Path, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
-) -> None:
-    """Each run loses two workers, then is killed, each at a drawn number of shards; the last one ends."""
-    draws, out = random.Random(seed), tmp_path / "out"
-    for last in (False, False, True):
-        process = job(script, toy_recording, out, tmp_path / "trouble")
-        for victim in ("worker", "worker", "job"):
-            wanted = shards_in(out) + draws.choice([0, 1])
-            while process.poll() is None and (shards_in(out) < wanted or not workers_of(process.pid)):
-                time.sleep(0.01)
-            alive = workers_of(process.pid)
-            if victim == "worker" and alive:
-                with suppress(ProcessLookupError):
-                    os.kill(draws.choice(alive), signal.SIGKILL)
-            elif victim == "job" and not last:
-                process.kill()
-        _, errors = process.communicate(timeout=200)
-        assert process.returncode in (0, -signal.SIGKILL), errors
-    assert process.returncode == 0, errors
-    assert contents(out) == whole
-
-
-@pytest.mark.slow  # test_engines has both, quickly, without a conversion around them
-@pytest.mark.parametrize("kind", ["SIGSEGV", "hang"])
-def test_an_episode_that_crashes_or_hangs_its_reader_is_refused_and_the_rest_kept(
-    kind: str, script: Path, toy_recording: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "trouble" / "demo_5").write_text(kind)
-    process = job(script, toy_recording, tmp_path / "out", tmp_path / "trouble", 30)
-    _, errors = process.communicate(timeout=200)
-    assert process.returncode == 0, errors
-    lines = [json.loads(line) for line in (tmp_path / "out" / "quarantine.jsonl").read_text().splitlines()]
-    assert [line["id"] for line in lines] == ["demo_5"]
-    said = "made no progress for 30 s" if kind == "hang" else "ended the process by SIGSEGV"
-    assert said in lines[0]["message"]
-    assert verify(tmp_path / "out") == []
-    splits = Manifest.load(tmp_path / "out").splits
-    assert splits["train"]["episodes"] + splits["val"]["episodes"] == 11
 
 
 def test_an_episode_that_breaks_off_in_the_middle_leaves_nothing_of_itself(

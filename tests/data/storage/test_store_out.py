@@ -12,9 +12,7 @@ from pathlib import Path
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from hma_data.conversion.job import Conversion, convert
-from hma_data.conversion.output import PLAN, Share
-from hma_data.conversion.report import Shared
+from hma_data.conversion.output import PLAN
 from hma_data.conversion.rewrite import merge, restat
 from hma_data.errors import MissingDependencyError, OutputError, ShardError, StorageAwayError, StorageError
 from hma_data.registry.embodiment import Embodiment
@@ -22,9 +20,9 @@ from hma_data.shards.verify import verify
 from hma_data.storage import remote as store
 from hma_data.storage.files import cache_folder, remove_parts, upload_folder
 from hma_data.storage.remote import RemotePath, place, put_bytes
-from tests.conftest import SMALL, BlockTokenizer, StoppingTokenizer, write_toy
-from tests.conftest import contents as local
+from tests.conftest import SMALL, write_toy
 from tests.conftest import convert_toy as run
+from tests.data.conversion.jobs import files
 
 
 @pytest.fixture(autouse=True)
@@ -41,50 +39,16 @@ def out() -> RemotePath:
     return path
 
 
-def remote(folder: RemotePath) -> dict[str, bytes]:
-    return {name: (folder / name).read_bytes() for name in folder.listing()}
-
-
 # -- the same bytes
 
 
 def test_a_store_gets_the_bytes_that_a_folder_gets(toy_arm, toy_recording, out, whole) -> None:
     summary = run(toy_arm, toy_recording, Path(str(out)))
     assert summary.out == out
-    assert remote(out) == whole
+    assert files(out) == whole
     assert verify(out) == []
     assert not [path for path in cache_folder().rglob("*") if path.is_file()]
     assert run(toy_arm, toy_recording, out).made_shards == 0
-
-
-def test_a_job_that_was_interrupted_goes_on_where_it_was(toy_arm, toy_recording, out, whole) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        convert(toy_arm, str(toy_recording), StoppingTokenizer(6), out, settings=SMALL)
-    there = {name for name in out.listing() if name.startswith(("train", "val"))}
-    assert there and "manifest.json" not in out.listing()
-    assert run(toy_arm, toy_recording, out).kept_shards == len(there)
-    assert remote(out) == whole
-
-
-def test_shares_write_into_one_store(toy_arm, toy_recording, out, whole) -> None:
-    threads: list[threading.Thread] = []
-    done: list[Shared] = []
-    for index in range(3):
-        share = Share(index, 3)
-
-        def work(share: Share = share) -> None:
-            done.append(
-                Conversion(toy_arm, str(toy_recording), BlockTokenizer(), out, settings=SMALL).run_share(
-                    share
-                )
-            )
-
-        threads.append(threading.Thread(target=work))
-        threads[-1].start()
-    for thread in threads:
-        thread.join()
-    assert min(item.missing for item in done) == 0
-    assert remote(out) == whole
 
 
 def test_extension_and_merge_go_into_a_store(toy_arm, tmp_path, out) -> None:
@@ -94,10 +58,10 @@ def test_extension_and_merge_go_into_a_store(toy_arm, tmp_path, out) -> None:
         write_toy(recording / f"{day}.hdf5", range(20, 24))
         run(toy_arm, recording, out, extend=day == "tuesday")
         run(toy_arm, recording, tmp_path / "here", extend=day == "tuesday")
-        assert remote(out) == local(tmp_path / "here")
+        assert files(out) == files(tmp_path / "here")
     merge([out], tmp_path / "merged")
     merge([tmp_path / "here"], out.with_name("merged"))
-    assert remote(out.with_name("merged")) == local(tmp_path / "merged")
+    assert files(out.with_name("merged")) == files(tmp_path / "merged")
 
 
 def test_overwrite_starts_anew_and_foreign_files_are_never_touched(
@@ -107,11 +71,11 @@ def test_overwrite_starts_anew_and_foreign_files_are_never_touched(
     with pytest.raises(OutputError, match="belongs to another conversion"):
         run(toy_arm, toy_recording, out)
     run(toy_arm, toy_recording, out, overwrite=True)
-    assert remote(out) == whole
+    assert files(out) == whole
     put_bytes(b"mine", out.with_name("other") / "notes.txt")
     with pytest.raises(OutputError, match=r"is not a shard set: it holds notes\.txt"):
         run(toy_arm, toy_recording, out.with_name("other"), overwrite=True)
-    assert remote(out.with_name("other")) == {"notes.txt": b"mine"}
+    assert files(out.with_name("other")) == {"notes.txt": b"mine"}
 
 
 def test_an_edited_stride_reaches_a_finished_set_of_a_store(toy_arm, toy_recording, out, tmp_path) -> None:
@@ -120,7 +84,7 @@ def test_an_edited_stride_reaches_a_finished_set_of_a_store(toy_arm, toy_recordi
     summary = run(other, toy_recording, out)
     assert summary.changed == "stride 2 → 10: the model now sees 1 Hz" and not summary.made_shards
     run(other, toy_recording, tmp_path / "whole")
-    assert remote(out) == local(tmp_path / "whole")
+    assert files(out) == files(tmp_path / "whole")
 
 
 def test_a_manifest_is_restored_in_place(toy_arm, toy_recording, out, whole) -> None:
@@ -157,7 +121,7 @@ def test_uploads_that_fail_now_and_then_change_nothing(
     run(toy_arm, toy_recording, out)
     monkeypatch.undo()
     assert failed > 20
-    assert remote(out) == whole
+    assert files(out) == whole
 
 
 def test_a_store_that_goes_away_is_one_error_and_what_was_put_is_kept(
@@ -178,7 +142,7 @@ def test_a_store_that_goes_away_is_one_error_and_what_was_put_is_kept(
             run(toy_arm, toy_recording, out)
     assert {name.split("/")[0] for name in out.listing()} <= {"train", "val", PLAN}
     assert run(toy_arm, toy_recording, out).kept_shards == 2
-    assert remote(out) == whole
+    assert files(out) == whole
 
 
 def test_a_store_that_refuses_is_one_error(toy_arm, toy_recording, out, monkeypatch) -> None:
@@ -205,7 +169,7 @@ def test_a_driver_that_is_not_installed_is_named(toy_arm, toy_recording, monkeyp
 def other(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
     """Return what a job of another plan writes."""
     run(toy_arm, toy_recording, tmp_path / "other", settings=replace(SMALL, seed=3))
-    return local(tmp_path / "other")
+    return files(tmp_path / "other")
 
 
 def once(act):
@@ -229,7 +193,7 @@ def test_another_plan_is_refused_while_a_job_runs(toy_arm, toy_recording, out, w
             run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
 
     run(toy_arm, toy_recording, out, on_progress=once(differ))
-    assert remote(out) == whole
+    assert files(out) == whole
 
 
 def test_a_damaged_claim_is_one_error(toy_arm, toy_recording, out) -> None:
@@ -240,7 +204,7 @@ def test_a_damaged_claim_is_one_error(toy_arm, toy_recording, out) -> None:
 
 def test_an_equal_job_at_the_same_time_only_wastes_work(toy_arm, toy_recording, out, whole) -> None:
     run(toy_arm, toy_recording, out, on_progress=once(lambda: run(toy_arm, toy_recording, out)))
-    assert remote(out) == whole
+    assert files(out) == whole
 
 
 def test_of_several_plans_at_once_one_is_made(toy_arm, toy_recording, out, tmp_path) -> None:
@@ -261,7 +225,7 @@ def test_of_several_plans_at_once_one_is_made(toy_arm, toy_recording, out, tmp_p
         thread.join()
     assert len(made) == 1 and len(refused) == 3
     run(toy_arm, toy_recording, tmp_path / "alone", settings=replace(SMALL, seed=made[0]))
-    assert remote(out) == local(tmp_path / "alone")
+    assert files(out) == files(tmp_path / "alone")
 
 
 def test_a_shard_of_another_plan_is_found_before_the_manifest(toy_arm, toy_recording, out, other) -> None:
@@ -286,7 +250,7 @@ def test_after_a_kill_another_plan_needs_the_claim_deleted(toy_arm, toy_recordin
         run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
     (out / PLAN).unlink()
     run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
-    assert remote(out) == other
+    assert files(out) == other
 
 
 def test_a_part_of_a_running_process_is_left(out: RemotePath) -> None:
@@ -304,7 +268,7 @@ def test_a_card_beside_a_set_of_a_store_stays(toy_arm, toy_recording, out, whole
     run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
     put_bytes(b"my notes", out / "README.md")
     run(toy_arm, toy_recording, out, overwrite=True)
-    assert remote(out) == whole | {"README.md": b"my notes"}
+    assert files(out) == whole | {"README.md": b"my notes"}
     assert verify(out) == []
     put_bytes(b"mine", out / "notes.txt")
     with pytest.raises(OutputError, match=r"holds a file that is not of the set: notes\.txt — move it out"):

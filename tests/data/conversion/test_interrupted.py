@@ -1,0 +1,193 @@
+"""Conversions that are stopped, killed or shared by jobs, here and in stores: the same bytes at the end."""
+
+import json
+import os
+import random
+import signal
+import threading
+import time
+import uuid
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hma_data.conversion.job import Conversion, convert
+from hma_data.conversion.output import PLAN, Share
+from hma_data.shards.manifest import Manifest, shard_sizes
+from hma_data.shards.verify import verify
+from hma_data.storage.files import cache_folder
+from hma_data.storage.remote import is_remote, place
+from tests.conftest import SMALL, BlockTokenizer, StoppingTokenizer, write_toy
+from tests.conftest import convert_toy as run
+from tests.data.conversion.jobs import ends, files, start
+
+S3 = pytest.param("s3", marks=pytest.mark.slow)
+IN_PROCESS = pytest.mark.parametrize("out", ["folder", "memory"], indirect=True)
+KILLED = pytest.mark.parametrize("out", [pytest.param("folder", marks=pytest.mark.slow), S3], indirect=True)
+
+
+@pytest.fixture
+def out(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The output of a conversion: in a folder, in a store of this process, or on a server of S3."""
+    monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
+    if request.param == "s3":
+        return request.getfixturevalue("s3_out")
+    return tmp_path / "out" if request.param == "folder" else place(f"memory://{uuid.uuid4().hex}/set")
+
+
+# -- stopped in this process
+
+
+@IN_PROCESS
+@pytest.mark.parametrize("stop_at", [1, 4, 9])
+def test_a_job_stopped_anywhere_goes_on_where_it_was(stop_at, toy_arm, toy_recording, out, whole) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        convert(toy_arm, toy_recording, StoppingTokenizer(stop_at), out, settings=SMALL)
+    there = shard_sizes(out)
+    left = files(out).keys() - there.keys()
+    assert "manifest.json" not in left and not [name for name in left if name.endswith(".part")]
+    if not is_remote(out):  # a kill would leave it
+        (out / "train").mkdir(exist_ok=True)
+        (out / "train" / ".shard-00000.parquet.1.part").write_bytes(b"left by a kill")
+    assert run(toy_arm, toy_recording, out).kept_shards == len(there)
+    assert files(out) == whole
+    assert not [path for path in cache_folder().rglob("*") if path.is_file()]
+
+
+@IN_PROCESS
+@pytest.mark.parametrize("stop_at", [0, 2])
+def test_an_extension_stopped_anywhere_ends_with_the_same_bytes(stop_at, toy_arm, out, tmp_path) -> None:
+    recording = tmp_path / "recorded"
+    recording.mkdir()
+    write_toy(recording / "a.hdf5", [20, 21, 22])
+    for folder in (out, tmp_path / "undisturbed"):
+        run(toy_arm, recording, folder)
+    write_toy(recording / "b.hdf5", [40, 41, 42])
+    run(toy_arm, recording, tmp_path / "undisturbed", extend=True)
+    with pytest.raises(KeyboardInterrupt):
+        convert(toy_arm, recording, StoppingTokenizer(stop_at), out, settings=SMALL, extend=True)
+    assert Manifest.load(out).splits["train"]["episodes"] <= 3
+    run(toy_arm, recording, out, extend=True)
+    assert verify(out) == []
+    assert files(out) == files(tmp_path / "undisturbed")
+
+
+# -- shares
+
+
+@pytest.mark.parametrize("out", ["folder"], indirect=True)
+@pytest.mark.parametrize("count", [1, 3, 20])
+def test_shares_in_any_order_make_what_one_job_makes(count, toy_arm, toy_recording, out, whole) -> None:
+    order = list(range(count))
+    random.Random(count).shuffle(order)
+    job = Conversion(toy_arm, toy_recording, BlockTokenizer(), out, settings=SMALL)
+    for index in order:
+        assert (job.run_share(Share(index, count)).missing == 0) == (index == order[-1])
+    assert files(out) == whole
+
+
+@IN_PROCESS
+def test_shares_run_side_by_side_and_one_of_them_finishes(toy_arm, toy_recording, out, whole) -> None:
+    job = Conversion(toy_arm, toy_recording, BlockTokenizer(), out, settings=SMALL)
+    threads = [threading.Thread(target=job.run_share, args=(Share(i, 3),)) for i in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert files(out) == whole
+
+
+# -- killed
+
+
+@KILLED
+def test_a_killed_job_is_continued_by_the_same_command(toy_recording, out, whole, tmp_path) -> None:
+    for wanted in (1, 3):
+        process = start(tmp_path, toy_recording, out, workers=0, stop_at=wanted)
+        while process.poll() is None:
+            if len(shard_sizes(out)) >= wanted:
+                process.kill()
+            time.sleep(0.02)
+        _, errors = process.communicate()
+        assert process.returncode == -signal.SIGKILL, errors
+    assert "manifest.json" not in files(out)
+    ends(start(tmp_path, toy_recording, out))
+    assert files(out) == whole
+    assert not list(cache_folder().rglob("*.part"))
+
+
+def workers_of(pid: int) -> list[int]:
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        names = {child: Path(f"/proc/{child}/cmdline").read_bytes() for child in children}
+    except OSError:
+        return []
+    return [int(child) for child, name in names.items() if b"spawn_main" in name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("out", ["folder"], indirect=True)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_storm_of_kills_ends_with_the_same_bytes(seed, toy_recording, out, whole, tmp_path) -> None:
+    """Each run loses two workers, then is killed, each at a drawn number of shards; the last one ends."""
+    draws = random.Random(seed)
+    for last in (False, False, True):
+        process = start(tmp_path, toy_recording, out)
+        for victim in ("worker", "worker", "job"):
+            wanted = len(shard_sizes(out)) + draws.choice([0, 1])
+            while process.poll() is None and (len(shard_sizes(out)) < wanted or not workers_of(process.pid)):
+                time.sleep(0.01)
+            alive = workers_of(process.pid)
+            if victim == "worker" and alive:
+                with suppress(ProcessLookupError):
+                    os.kill(draws.choice(alive), signal.SIGKILL)
+            elif victim == "job" and not last:
+                process.kill()
+        _, errors = process.communicate(timeout=200)
+        assert process.returncode in (0, -signal.SIGKILL), errors
+    assert process.returncode == 0, errors
+    assert files(out) == whole
+
+
+@pytest.mark.slow  # test_engines has both, quickly, without a conversion around them
+@pytest.mark.parametrize("out", ["folder"], indirect=True)
+@pytest.mark.parametrize("kind", ["SIGSEGV", "hang"])
+def test_an_episode_that_crashes_or_hangs_its_reader_is_refused_and_the_rest_kept(
+    kind: str, toy_recording: Path, out: Path, tmp_path: Path
+) -> None:
+    ends(start(tmp_path, toy_recording, out, quiet_s=30, demo_5=kind))
+    lines = [json.loads(line) for line in (out / "quarantine.jsonl").read_text().splitlines()]
+    assert [line["id"] for line in lines] == ["demo_5"]
+    said = "made no progress for 30 s" if kind == "hang" else "ended the process by SIGSEGV"
+    assert said in lines[0]["message"]
+    assert verify(out) == []
+    splits = Manifest.load(out).splits
+    assert splits["train"]["episodes"] + splits["val"]["episodes"] == 11
+
+
+# -- several jobs in one place of a store, which has no lock
+
+
+@pytest.mark.parametrize("out", [S3], indirect=True)
+def test_two_equal_jobs_at_once_only_waste_work(toy_recording, out, whole, tmp_path) -> None:
+    for process in [start(tmp_path, toy_recording, out, workers=0) for _ in range(2)]:
+        ends(process)
+    assert files(out) == whole
+
+
+@pytest.mark.parametrize("out", [S3], indirect=True)
+def test_of_two_jobs_of_different_plans_at_once_one_is_refused(
+    toy_arm, toy_recording, out, whole, tmp_path
+) -> None:
+    run(toy_arm, toy_recording, tmp_path / "other", settings=replace(SMALL, seed=3))
+    jobs = {seed: start(tmp_path, toy_recording, out, workers=0, seed=seed) for seed in (0, 3)}
+    said = {seed: process.communicate(timeout=100)[1] for seed, process in jobs.items()}
+    (winner,) = (seed for seed, process in jobs.items() if process.returncode == 0)
+    loser = 3 - winner
+    assert jobs[loser].returncode == 1
+    assert "OutputError" in said[loser] and "different: settings" in said[loser], said[loser]
+    assert files(out) == {0: whole, 3: files(tmp_path / "other")}[winner]
+    assert not (out / PLAN).is_file()
+    assert verify(out) == []
