@@ -160,7 +160,7 @@ def test_an_extension_killed_before_its_manifest_is_finished_by_the_next_run(tmp
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(job, "finish", killed)
+        patch.setattr(job, "derive", killed)
         with pytest.raises(KeyboardInterrupt):
             run(robot(), recording, out, extend=True)
     summary = run(robot(), recording, out, extend=True)
