@@ -53,11 +53,11 @@ def play(
     from hma_data.shards.reader import ShardSet
     from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
     from hma_model.hub.publish import located
-    from hma_model.worlds.images import read_picture
+    from hma_model.worlds.images import read_image
     from hma_model.worlds.scenes import drivable, opening, trained_on
 
     # what is wrong with it, the data or the pictures is said before torch is imported
-    sets, pictures = list(map(ShardSet, data or ())), list(map(read_picture, prompt or ()))
+    sets, pictures = list(map(ShardSet, data or ())), list(map(read_image, prompt or ()))
     require_checkpoint(checkpoint)
     opened, device = Checkpoint.open(located(checkpoint)[0]), device_name(device)
 
@@ -69,7 +69,7 @@ def play(
 
     sets = sets or trained_on(opened)
     robots = drivable(opened, sets, tokenizer, pictures)
-    first = opening(robots, embodiment, "pictures" if pictures else "recordings" if sets else None)
+    first = opening(robots, embodiment, "images" if pictures else "recordings" if sets else None)
     if len(opened.embodiments) > 1 and pictures and embodiment is None:
         print("the picture is offered for every robot; -e ROBOT opens the page with yours", file=sys.stderr)
     from hma_model.play.server import LOOPBACK, serve

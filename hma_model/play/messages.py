@@ -3,8 +3,8 @@
 A page sends JSON, at most MOST_BYTES a message. The server sends JSON, and binary messages with a frame:
 
     2 bytes   length of the header, big-endian
-    header    JSON: serial, frame, psnr, still, ms, rate, input, command, parted, bytes of the model's JPEG
-    JPEG      the model's picture, then the true one if it is known
+    header    JSON: serial, frame, psnr, still, ms, rate, input, action, parted, bytes of the model's JPEG
+    JPEG      the model's image, then the true one if it is known
 """
 
 import json
@@ -40,10 +40,10 @@ class Resume(_Message):
 
 
 class Drive(_Message):
-    """Hold a command (A,) from now on; `input` numbers it."""
+    """Hold an action (A,) from now on; `input` numbers it."""
 
     do: Literal["drive"]
-    command: list[FiniteFloat] = Field(max_length=256)
+    action: list[FiniteFloat] = Field(max_length=256)
     input: int = Field(ge=0)
 
 
@@ -88,7 +88,7 @@ class Clock(_Message):
 
 
 class Replay(_Message):
-    """Follow the recorded commands, or those of the page."""
+    """Follow the recorded actions, or those of the page."""
 
     do: Literal["replay"]
     on: bool

@@ -1,8 +1,8 @@
-"""Say how a person drives a robot on its picture: where to press, and what a drag does.
+"""Say how a person drives a robot on its image: where to press, and what a drag does.
 
-A pad is a part of the picture in which dragging gives one or two values of a command. Every robot has at
+A pad is a part of the image in which dragging gives one or two values of an action. Every robot has at
 least one pad, unless all its values are switches. Keys and gamepads follow the same pads: a value that moves
-something up and down in the picture has keys for up and down.
+something up and down in the image has keys for up and down.
 """
 
 import re
@@ -19,21 +19,21 @@ from hma_data.lab.family.mechanisms import Arm, Gantry, Rails
 from hma_data.lab.simulator import SIZE
 from hma_model.worlds.scenes import Dimension, Drivable
 
-ARENAS = {"pusht_fast": 512.0}  # side of the picture in units of the command, for targets in the plane
-EDGE = 1.0  # rad: farthest that the first joint of an arm turns that stands at the picture's edge
-MOST_SHARED = 2  # pads side by side for values that no picture shows
+ARENAS = {"pusht_fast": 512.0}  # side of the image in units of the action, for targets in the plane
+EDGE = 1.0  # rad: farthest that the first joint of an arm turns that stands at the image's edge
+MOST_SHARED = 2  # pads side by side for values that no image shows
 
 
 @dataclass(frozen=True)
 class Pad:
-    """A part of the picture to drag on.
+    """A part of the image to drag on.
 
     Attributes:
         x, y: the numbers of the values that a drag sideways and a drag up or down give; None for none.
         flips: whether the values of x and y shrink to the right and downward.
-        low, high: the values of x and y at the picture's left and upper, right and lower edges, if the
+        low, high: the values of x and y at the image's left and upper, right and lower edges, if the
             pointer itself is the target; None if the way from where it was pressed counts.
-        zone: left, top, right and bottom of the part, as shares of the picture.
+        zone: left, top, right and bottom of the part, as shares of the image.
     """
 
     x: int | None
@@ -87,7 +87,7 @@ def _rails(mechanism: Rails, dims: Sequence[Dimension]) -> list[Pad]:
 
 
 def _shared(values: Sequence[int]) -> list[Pad]:
-    """Return pads side by side for values of which nobody knows where the picture shows them."""
+    """Return pads side by side for values of which nobody knows where the image shows them."""
     pairs = [values[start : start + 2] for start in range(0, len(values), 2)][:MOST_SHARED]
     width = 1 / max(1, len(pairs))
     zones = [(n * width, 0.0, (n + 1) * width, 1.0) for n in range(len(pairs))]
@@ -108,23 +108,23 @@ def _arm(mechanism: Arm, found: list[Pad]) -> list[Pad]:
 
 
 def hint(robot: Drivable) -> str:
-    """Return what a drag on the picture does, as a sentence without its full stop."""
+    """Return what a drag on the image does, as a sentence without its full stop."""
     found, dims = pads(robot), robot.dimensions
     if not found:
         return "Use the sliders"
     first = found[0]
     if first.low is not None:
-        return "Drag on the picture to move the target" + "s" * (len(found) > 1)
+        return "Drag on the image to move the target" + "s" * (len(found) > 1)
     if all(pad.x is None or pad.y is None for pad in found) and len(found) > 1:
-        return f"Drag on the picture, along {'each' if len(found) > 2 else 'either'} rail"
+        return f"Drag on the image, along {'each' if len(found) > 2 else 'either'} rail"
     names, shown = [dim.name for dim in dims], labels(robot)
     if len(found) == 1 and {"vx", "speed", "bridge"} & set(names):
-        return "Drag on the picture to steer"
+        return "Drag on the image to steer"
     if len(found) > 1:
         said = [" and ".join(shown[i] for i in (pad.x, pad.y) if i is not None) for pad in found]
-        return f"Drag on the picture: on its left half {said[0]}, on its right half {said[1]}"
+        return f"Drag on the image: on its left half {said[0]}, on its right half {said[1]}"
     ways = (("sideways", first.x), ("up or down", first.y))
-    return f"Drag on the picture: {', '.join(f'{way} {shown[i]}' for way, i in ways if i is not None)}"
+    return f"Drag on the image: {', '.join(f'{way} {shown[i]}' for way, i in ways if i is not None)}"
 
 
 def labels(robot: Drivable) -> list[str]:

@@ -16,14 +16,14 @@ from hma_data.episodes.sheets import gif_bytes, write_mp4, write_text
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 from hma_model.play.session import Frame, Session
-from hma_model.worlds.scenes import Drivable, Picture
+from hma_model.worlds.scenes import Drivable, Image
 
 KINDS = {  # name -> media type and ending
     "mp4": ("video/mp4", ".mp4"),
     "gif": ("image/gif", ".gif"),
     "lerobot": ("application/zip", ".zip"),
 }
-DRIVEN = "driven in a world model by hma play; the pictures are the model's"
+DRIVEN = "driven in a world model by hma play; the images are the model's"
 SIDE, HEAD, GAP = 320, 26, 8  # pixels of a panel, of its title, between panels
 TELL_S = 0.2  # between two messages on how far a file is
 GIF_SIDE, GIF_FRAMES = 192, 600  # smaller and shorter: a GIF is large
@@ -81,14 +81,14 @@ def told_by(session: Session, kind: str) -> Told:
     return tell
 
 
-def _counted(frames: Sequence[Frame], side: int, on_progress: Told) -> Iterator[Picture]:
+def _counted(frames: Sequence[Frame], side: int, on_progress: Told) -> Iterator[Image]:
     for done, panel in enumerate(panels(frames, side), 1):
         yield panel
         on_progress("writing frames" if done < len(frames) else "encoding the film", done, len(frames))
 
 
-def panels(frames: Sequence[Frame], side: int) -> Iterator[Picture]:
-    """Return the model's pictures with titles, and the true ones beside them; an unknown one is white."""
+def panels(frames: Sequence[Frame], side: int) -> Iterator[Image]:
+    """Return the model's images with titles, and the true ones beside them; an unknown one is white."""
     wide = any(frame.true is not None for frame in frames)
     for frame in frames:
         shown = [_panel("world model", frame.model, side)]
@@ -99,12 +99,12 @@ def panels(frames: Sequence[Frame], side: int) -> Iterator[Picture]:
         yield np.concatenate(shown, axis=1)
 
 
-def _panel(title: str, data: bytes, side: int) -> Picture:
+def _panel(title: str, data: bytes, side: int) -> Image:
     import cv2
 
-    picture = decode_image(data, "a frame")
-    width = round(side * picture.shape[1] / picture.shape[0])
-    large = cv2.resize(picture, (width, side), interpolation=cv2.INTER_CUBIC)
+    image = decode_image(data, "a frame")
+    width = round(side * image.shape[1] / image.shape[0])
+    large = cv2.resize(image, (width, side), interpolation=cv2.INTER_CUBIC)
     panel = np.full((side + HEAD, width, 3), 255, np.uint8)
     panel[HEAD:] = large
     write_text(panel, title, (4, HEAD - 9), 0.45)
@@ -117,19 +117,19 @@ def _panel(title: str, data: bytes, side: int) -> Picture:
 def lerobot_episode(robot: Drivable, frames: Sequence[Frame]) -> tuple[LeRobotEpisode, Embodiment]:
     """Return what was driven at the control rate, and the embodiment that describes it.
 
-    A row holds a command and the frame before it, which stands for `stride` rows; after the last frame the
-    last command is held. For each camera another one, with `_true` at the end of its name, has the true
-    pictures.
+    A row holds an action and the frame before it, which stands for `stride` rows; after the last frame the
+    last action is held. For each camera another one, with `_true` at the end of its name, has the true
+    images.
     """
     stride, views = robot.embodiment.stride, len(robot.cameras)
     following = [*frames[1:], frames[-1]]
-    actions = np.concatenate([frame.commands for frame in following])
+    actions = np.concatenate([frame.actions for frame in following])
     shown = {"": [frame.model for frame in frames]}
     if all(frame.true is not None for frame in frames):
         shown["_true"] = [frame.true or b"" for frame in frames]
     cameras = {
-        name + end: _Views(pictures, view, views)
-        for end, pictures in shown.items()
+        name + end: _Views(images, view, views)
+        for end, images in shown.items()
         for view, name in enumerate(robot.cameras)
     }
     states = [frame.state for frame in frames if frame.state is not None]
@@ -141,18 +141,18 @@ def lerobot_episode(robot: Drivable, frames: Sequence[Frame]) -> tuple[LeRobotEp
     return LeRobotEpisode(seen, actions, state, "driven by hand in a world model", hold=stride), own
 
 
-class _Views(Sequence[Picture]):
-    """One of several views side by side in JPEG pictures; a picture is decoded when it is asked for."""
+class _Views(Sequence[Image]):
+    """One of several views side by side in JPEG images; an image is decoded when it is asked for."""
 
-    def __init__(self, pictures: Sequence[bytes], view: int, views: int) -> None:
-        self._pictures, self._view, self._views = pictures, view, views
+    def __init__(self, images: Sequence[bytes], view: int, views: int) -> None:
+        self._images, self._view, self._views = images, view, views
 
     def __len__(self) -> int:
-        return len(self._pictures)
+        return len(self._images)
 
     def __getitem__(self, index: Any) -> Any:
-        picture = decode_image(self._pictures[index], "a frame")
-        return np.split(picture, self._views, axis=1)[self._view]
+        image = decode_image(self._images[index], "a frame")
+        return np.split(image, self._views, axis=1)[self._view]
 
 
 def embodiment_of(
@@ -167,7 +167,7 @@ def embodiment_of(
     Args:
         robot: the robot.
         recording: how it was made, for its provenance.
-        size: height and width of the pictures.
+        size: height and width of the images.
         cameras: their names.
         with_state: whether there are states.
     """

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-FIRST = "rails_03"  # the robot that a page opens with: it follows its commands longest (docs/results.md)
+FIRST = "rails_03"  # the robot that a page opens with: it follows its actions longest (docs/results.md)
 MOST_VIEWERS = 32
 RATE, BURST = 200.0, 400.0  # messages of a viewer a second, and at once
 SCENE = 20.0  # messages that one counts as which begins a scene: all other sessions wait for it
@@ -372,14 +372,14 @@ class Connection:
             self.page.tell({"kind": "error", "text": str(fault)})
 
     def _hold(self, session: Session, message: messages.Drive) -> None:
-        if len(message.command) != len(session.held):
-            fault = f"has {len(message.command)} values, this robot takes {len(session.held)}"
-            self.page.tell({"kind": "error", "text": f"command: {fault}"})
+        if len(message.action) != len(session.held):
+            fault = f"has {len(message.action)} values, this robot takes {len(session.held)}"
+            self.page.tell({"kind": "error", "text": f"action: {fault}"})
             return
-        session.held, session.input = np.array(message.command, np.float32), message.input
+        session.held, session.input = np.array(message.action, np.float32), message.input
         if not session.warned:
             ends = [(dim.low, dim.high) for dim in session.robot.dimensions]
-            rows = enumerate(zip(ends, message.command, strict=True))
+            rows = enumerate(zip(ends, message.action, strict=True))
             beyond = [
                 i for i, ((low, high), value) in rows if abs(2 * value - low - high) > 1.05 * (high - low)
             ]
@@ -388,7 +388,7 @@ class Connection:
                 names = labels(session.robot)
                 said = ", ".join(f"{names[i]} {ends[i][0]:g} to {ends[i][1]:g}" for i in beyond)
                 text = f"the model knows only {said}; what it shows beyond is a guess. This is said once"
-                self.page.tell({"kind": "error", "text": f"command: {text}"})
+                self.page.tell({"kind": "error", "text": f"action: {text}"})
 
 
 async def serve(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import opencv
 from hma_data.errors import UsageError
 from hma_model.play.pads import describe
-from hma_model.worlds.scenes import Drivable, Floats, LabScene, Picture
+from hma_model.worlds.scenes import Drivable, Floats, Image, LabScene
 
 WINDOW = 8  # frames that a restart of the model is given
 KEPT = 3000  # frames to save
@@ -34,14 +34,12 @@ class World(Protocol):
     temperature: float
     order: str
 
-    def open(
-        self, embodiment: str, frames: Picture, chunks: Floats | None = None, *, seed: int = 0
-    ) -> int: ...
+    def open(self, embodiment: str, frames: Image, chunks: Floats | None = None, *, seed: int = 0) -> int: ...
     def reset(
-        self, session: int, frames: Picture, chunks: Floats | None = None, *, seed: int | None = None
+        self, session: int, frames: Image, chunks: Floats | None = None, *, seed: int | None = None
     ) -> None: ...
-    def step(self, commands: Mapping[int, Floats]) -> Mapping[int, Picture]: ...
-    def picture(self, session: int) -> Picture: ...
+    def step(self, actions: Mapping[int, Floats]) -> Mapping[int, Image]: ...
+    def image(self, session: int) -> Image: ...
     def close(self, session: int) -> None: ...
 
 
@@ -56,26 +54,26 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame that was driven to: JPEG pictures of the model and of the truth, and the commands before it.
+    """A frame that was driven to: JPEG images of the model and of the truth, and the actions before it.
 
     Attributes:
-        commands: (stride, A).
+        actions: (stride, A).
         state: (S,) of the simulator after it, or None.
-        psnr: of the two pictures in dB, or None.
-        still: PSNR of a picture that stands still since the beginning or the last sync, or None.
+        psnr: of the two images in dB, or None.
+        still: PSNR of an image that stands still since the beginning or the last sync, or None.
     """
 
     number: int
     model: bytes
     true: bytes | None
-    commands: Floats
+    actions: Floats
     state: Floats | None
     psnr: float | None
     still: float | None = None
 
 
 class Viewer(Protocol):
-    """The receiver of a session's pictures; the engine's thread calls its methods, which return at once."""
+    """The receiver of a session's images; the engine's thread calls its methods, which return at once."""
 
     @property
     def stalled(self) -> bool:
@@ -109,7 +107,7 @@ class Session:
         self.viewer: Viewer | None = None
         self.due = self.touched = now
         self.paused, self.replays, self.fast = True, False, False
-        self.warned = False  # that commands are outside the range of the page
+        self.warned = False  # that actions are outside the range of the page
         self.steps = 0  # single steps asked for
         self.input = 0  # number of the newest input, by which the page measures latency
         self._times: deque[float] = deque(maxlen=40)
@@ -131,9 +129,9 @@ class Session:
     def _begin(self, number: int) -> None:
         self.number, self.scene = number, self.robot.scene(number)
         prompt = self.scene.prompt
-        self._true: deque[Picture] = deque(prompt.frames, maxlen=WINDOW)
+        self._true: deque[Image] = deque(prompt.frames, maxlen=WINDOW)
         self._chunks: deque[Floats] = deque(prompt.chunks, maxlen=WINDOW - 1)
-        self.held = self.scene.command.copy()
+        self.held = self.scene.action.copy()
         self.frames: deque[Frame] = deque(maxlen=KEPT)
         self.count, self.ended, self.steps = 0, False, 0
         self.parted: int | None = None
@@ -141,7 +139,7 @@ class Session:
 
     def _set_start(self) -> None:
         """Take the prompt's last frame as the tokenizer shows it, which the model cannot surpass."""
-        true, shown = self._true[-1], self._world.picture(self.row)
+        true, shown = self._true[-1], self._world.image(self.row)
         self._best, self._still = psnr(shown, true), true
         none = np.zeros((0, 0), np.float32)
         self.start = self._last = Frame(0, jpeg(shown), jpeg(true), none, self._state, self._best, 60.0)
@@ -155,12 +153,12 @@ class Session:
         if not self._true:
             raise UsageError("sync", "the true frames are unknown here", "reset first, or drive a simulator")
         self._world.reset(self.row, *self._history())
-        shown, true = self._world.picture(self.row), self._true[-1]
+        shown, true = self._world.image(self.row), self._true[-1]
         self._best, self._still = psnr(shown, true), true
         self.parted, self._bad = None, 0
         self._last = replace(self._last, model=jpeg(shown), true=jpeg(true), psnr=self._best, still=60.0)
 
-    def _history(self) -> tuple[Picture, Floats]:
+    def _history(self) -> tuple[Image, Floats]:
         """Return the true last frames, and the chunks between them."""
         frames, chunks = list(self._true), list(self._chunks)
         return np.stack(frames), np.stack(chunks[len(chunks) - len(frames) + 1 :])
@@ -188,8 +186,8 @@ class Session:
         """Give the place in the world back."""
         self._world.close(self.row)
 
-    def take(self, picture: Picture, now: float, took: float) -> None:
-        """Take the model's picture (H, W, 3) of the step, which took so many seconds, and show it."""
+    def take(self, image: Image, now: float, took: float) -> None:
+        """Take the model's image (H, W, 3) of the step, which took so many seconds, and show it."""
         self.steps = max(0, self.steps - 1)
         self.count += 1
         period = self.robot.embodiment.stride / self.robot.embodiment.rate_hz
@@ -201,23 +199,23 @@ class Session:
             self._true.append(self._truth)
         score = still = None
         if self._truth is not None:
-            score, still = psnr(picture, self._truth), psnr(self._still, self._truth)
+            score, still = psnr(image, self._truth), psnr(self._still, self._truth)
             self._judge(score, still)
         stride = self.robot.embodiment.stride
-        commands = self._chunks[-1].reshape(stride, -1)
+        actions = self._chunks[-1].reshape(stride, -1)
         true = None if self._truth is None else jpeg(self._truth)
-        frame = Frame(self.count, jpeg(picture), true, commands, self._state, score, still)
+        frame = Frame(self.count, jpeg(image), true, actions, self._state, score, still)
         self.frames.append(frame)
         self._last = frame
         if self.replays:
-            self.touched, self.held = now, commands[-1].copy()
+            self.touched, self.held = now, actions[-1].copy()
         if self.viewer:
             facts: dict[str, Any] = {
                 "ms": round(1000 * took, 1),
                 "rate": self._rate(now),
                 "input": self.input,
             }
-            facts |= {"command": commands[-1].tolist(), "parted": self.parted}
+            facts |= {"action": actions[-1].tolist(), "parted": self.parted}
             self.viewer.show(frame, facts)
 
     @property
@@ -226,7 +224,7 @@ class Session:
         return self.scene.simulator.state if isinstance(self.scene, LabScene) else None
 
     def _judge(self, score: float, still: float) -> None:
-        """Note the moment from which on, for a second, the model's pictures are no better than a still.
+        """Note the moment from which on, for a second, the model's images are no better than a still.
 
         They must be much worse than the tokenizer's own too: a still is exact while nothing moves.
         """
@@ -272,16 +270,16 @@ class Session:
         return [*([self.start] if self.count == len(self.frames) else []), *self.frames]
 
 
-def jpeg(picture: Picture) -> bytes:
-    """Return a picture (H, W, 3) RGB as a JPEG with colours at full size."""
+def jpeg(image: Image) -> bytes:
+    """Return an image (H, W, 3) RGB as a JPEG with colours at full size."""
     cv2 = opencv()
     settings = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     settings += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    data: bytes = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), settings)[1].tobytes()
+    data: bytes = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), settings)[1].tobytes()
     return data
 
 
 def psnr(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
-    """Return the peak signal-to-noise ratio of two pictures in dB, 60 at most."""
+    """Return the peak signal-to-noise ratio of two images in dB, 60 at most."""
     error = float(np.mean((one.astype(np.float32) - other.astype(np.float32)) ** 2))
     return 60.0 if error < 0.065 else round(10 * math.log10(255**2 / error), 2)

@@ -208,7 +208,7 @@ class Engine:
         if not chunks:
             return
         try:
-            pictures = world.step(chunks)
+            images = world.step(chunks)
         except Exception as fault:
             _log.exception("a step of the model failed")
             for session in rows.values():
@@ -216,7 +216,7 @@ class Engine:
             return
         now = time.monotonic()
         for row, session in rows.items():
-            self._guarded(session, partial(session.take, pictures[row], now, now - begun))
+            self._guarded(session, partial(session.take, images[row], now, now - begun))
 
     def _guarded(self, session: Session, function: Callable[[], Any]) -> Any:
         """Call a function of a session; if it fails, close that session and no other."""

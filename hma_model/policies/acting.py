@@ -1,10 +1,10 @@
-"""Let a trained world model act as a policy: picture history in, commands out.
+"""Let a trained world model act as a policy: image history in, actions out.
 
     policy = Acting(load_world("runs/policy"), scenes, horizon=1)     # hma:runs/policy on the command line
 
-The model gives a chunk of commands from each frame on. With a horizon of several chunks it imagines the frame
-that its chunk leads to, commands again, and so on; then all of them are carried out before it looks again.
-What it imagined is forgotten, and the true pictures take its place.
+The model gives a chunk of actions from each frame on. With a horizon of several chunks it imagines the frame
+that its chunk leads to, actions again, and so on; then all of them are carried out before it looks again.
+What it imagined is forgotten, and the true images take its place.
 
 N scenes, A action dims.
 """
@@ -24,33 +24,33 @@ OPTIONS: dict[str, type] = {"horizon": int, "memory": int, "temperature": float,
 
 
 class Follower:
-    """The sessions of a world that follow an arena: they see its pictures and what was commanded between.
+    """The sessions of a world that follow an arena: they see its images and what was actioned between.
 
     Args:
-        memory: pictures that they remember, the newest among them; None for as many as the model can.
+        memory: images that they remember, the newest among them; None for as many as the model can.
 
     Attributes:
         world: of the sessions.
-        commands: of the robot.
+        spec: the actions of the robot.
         sessions: one a scene.
 
     Raises:
-        HMAError: the world lacks the robot, or knows it with other commands.
+        HMAError: the world lacks the robot, or knows it with other actions.
     """
 
     def __init__(self, world: World, scenes: Scenes, where: str, memory: int | None = None) -> None:
-        self.world, self.commands, self.sessions = world, world.commands(scenes.name), list[int]()
+        self.world, self.spec, self.sessions = world, world.action_spec(scenes.name), list[int]()
         self._memory, self._where = memory, where
-        own, robot = self.commands, scenes.robot.embodiment
+        own, robot = self.spec, scenes.robot.embodiment
         if (own.stride, len(own.names)) != (robot.stride, robot.action_dim):
-            fault = f"takes {own.stride} commands of {len(own.names)} values of {scenes.name} in a chunk"
+            fault = f"takes {own.stride} actions of {len(own.names)} values of {scenes.name} in a chunk"
             raise HMAError(where, fault, f"the scenes take {robot.stride} of {robot.action_dim}")
 
     def begin(self, arena: Arena) -> None:
         """Begin with the arena's prompts; an HMAError says that it shows more or fewer cameras."""
-        (high, wide), (height, width) = self.world.picture_shape[:2], arena.pictures.shape[1:3]
+        (high, wide), (height, width) = self.world.image_shape[:2], arena.images.shape[1:3]
         if wide * height != width * high:
-            fault = f"sees {wide // high} views, and the pictures show {width // height}"
+            fault = f"sees {wide // high} views, and the images show {width // height}"
             raise HMAError(self._where, fault, "give a policy that sees the same cameras")
         for session in self.sessions:
             self.world.close(session)
@@ -60,27 +60,27 @@ class Follower:
             self.world.open(name, prompt.frames, prompt.chunks, seed=seed + row)
             for row, prompt in enumerate(self._prompts)
         ]
-        self._taken: list[Floats] = []  # commands (N, A) since the last picture
+        self._taken: list[Floats] = []  # actions (N, A) since the last image
 
     def look(self, arena: Arena) -> None:
-        """See the arena's pictures if they are new."""
+        """See the arena's images if they are new."""
         if not arena.fresh or not self._taken:
             return
         chunks = np.stack(self._taken, axis=1)
         if self._memory is None:
-            self.world.observe(self.by_session(arena.pictures), self.by_session(chunks))
+            self.world.observe(self.by_session(arena.images), self.by_session(chunks))
         else:
             for row, session in enumerate(self.sessions):
-                frames = np.concatenate([self._prompts[row].frames, arena.pictures[row][None]])
+                frames = np.concatenate([self._prompts[row].frames, arena.images[row][None]])
                 known = np.concatenate([self._prompts[row].chunks, chunks[row].reshape(1, -1)])
                 self._prompts[row] = prompt = self._newest(Prompt(frames, known))
                 self.world.reset(session, prompt.frames, prompt.chunks)
         self._taken = []
 
-    def take(self, commands: Floats) -> Floats:
-        """Note commands (N, A) that are given, and return them."""
-        self._taken.append(commands)
-        return commands
+    def take(self, actions: Floats) -> Floats:
+        """Note actions (N, A) that are given, and return them."""
+        self._taken.append(actions)
+        return actions
 
     def _newest(self, prompt: Prompt) -> Prompt:
         first = max(0, len(prompt.frames) - (self._memory or len(prompt.frames)))
@@ -98,12 +98,12 @@ class Acting:
         world: of the model that acts.
         scenes: whose robot it has.
         horizon: chunks between two looks; above 1 for models that also predict video.
-        memory: pictures that it goes by. With 1 it sees neither the past nor its own commands: a policy that
+        memory: images that it goes by. With 1 it sees neither the past nor its own actions: a policy that
             was cloned from few episodes else goes on with what it did last.
         where: its name, for errors.
 
     Raises:
-        HMAError: the model was not trained to act, lacks the robot, or knows it with other commands.
+        HMAError: the model was not trained to act, lacks the robot, or knows it with other actions.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class Acting:
 
     def begin(self, arena: Arena) -> None:
         self._follower.begin(arena)
-        self._ahead: list[Floats] = []  # commands (N, A) that are still to be given
+        self._ahead: list[Floats] = []  # actions (N, A) that are still to be given
 
     def act(self, arena: Arena) -> Floats:
         self._follower.look(arena)
@@ -134,11 +134,11 @@ class Acting:
         return self._follower.take(self._ahead.pop(0))
 
     def _chosen(self) -> list[Floats]:
-        """Return the commands (N, A) of the chunks up to the horizon."""
+        """Return the actions (N, A) of the chunks up to the horizon."""
         world, sessions, made = self._follower.world, self._follower.sessions, list[Floats]()
         kept = {session: world.snapshot(session) for session in sessions if self._horizon > 1}
         for chunk in range(self._horizon):
-            given = {one: self._follower.commands.clip(said) for one, said in world.act(sessions).items()}
+            given = {one: self._follower.spec.clip(said) for one, said in world.act(sessions).items()}
             made += list(np.stack([given[session] for session in sessions], axis=1))
             if chunk < self._horizon - 1:
                 world.step(given)

@@ -1,6 +1,6 @@
 """Let policies act in N scenes of a laboratory robot at once: in its simulator, or in the world model.
 
-Both begin with the same frames and are driven alike: a command each control step, and a new picture after
+Both begin with the same frames and are driven alike: an action each control step, and a new image after
 every `stride` of them, as the environments of the world model show it.
 
 N scenes, S pixels a side, A action dims, K = stride · A, P parts, T chunks of an episode.
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float32]
 Places = NDArray[np.float64]
-Picture = NDArray[np.uint8]
+Image = NDArray[np.uint8]
 
 SEEDS = 100_000  # scenes of a seed; those of the next seed are others
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """N scenes of a laboratory robot, and what its commands are.
+    """N scenes of a laboratory robot, and what its actions are.
 
     Attributes:
         robot: with its simulator.
@@ -58,18 +58,18 @@ class Scenes:
         Raises:
             HMAError: the model lacks the robot, or it is none of the laboratory.
         """
-        found, commands = described(world.model, embodiment), world.commands(embodiment)
+        found, spec = described(world.model, embodiment), world.action_spec(embodiment)
         if simulator and not simulated(embodiment):
             remedy = "choose a robot of the laboratory; hma play shows those of a checkpoint"
             raise HMAError(embodiment, "has no true simulator to compare with", remedy)
         space = world.model.embodiments[embodiment]
         action = {"mean": space.mean, "std": space.std}
-        if commands.seen is not None:
-            action |= {"min": commands.seen[0], "max": commands.seen[1]}
+        if spec.seen is not None:
+            action |= {"min": spec.seen[0], "max": spec.seen[1]}
         numbers = tuple(range(seed * SEEDS, seed * SEEDS + count))
         robot = found or (LabSimulator(embodiment).embodiment if simulated(embodiment) else None)
         if robot is None:
-            raise HMAError(embodiment, "has no YAML, which describes its commands", "load a checkpoint")
+            raise HMAError(embodiment, "has no YAML, which describes its actions", "load a checkpoint")
         return cls(LabRobot(robot, {"action": action}), numbers, seed)
 
     @property
@@ -84,7 +84,7 @@ class Scenes:
 
     @property
     def dimensions(self) -> tuple[Dimension, ...]:
-        """Return the values of a command."""
+        """Return the values of an action."""
         return self.robot.dimensions
 
     def take(self, chosen: range) -> "Scenes":
@@ -101,7 +101,7 @@ class Scenes:
 
 
 def shows_state(robot: str) -> bool:
-    """Check whether the state that a robot's recordings hold can be read off a picture: no velocities."""
+    """Check whether the state that a robot's recordings hold can be read off an image: no velocities."""
     return robot == PUSHER or FAMILY.fullmatch(robot) is not None
 
 
@@ -110,24 +110,24 @@ class Arena(Protocol):
 
     scenes: Scenes
     prompts: Sequence[Prompt]  # of the scenes, at the rate of the model's frames
-    pictures: Picture  # (N, S, S, 3), the newest ones
-    held: Floats  # (N, A), the commands that leave the robot as it is after the prompt
+    images: Image  # (N, S, S, 3), the newest ones
+    held: Floats  # (N, A), the actions that leave the robot as it is after the prompt
 
     @property
     def fresh(self) -> bool:
-        """Return whether the pictures came with the last step."""
+        """Return whether the images came with the last step."""
 
     def states(self) -> list[State]:
         """Return the state of each scene; for robots that are steerable."""
 
     def observed(self) -> Floats | None:
-        """Return the robots' measurements of themselves (N, S'), as recorded; None if pictures tell none."""
+        """Return the robots' measurements of themselves (N, S'), as recorded; None if images tell none."""
 
     def recorded(self) -> Floats:
-        """Return the next commands (N, A) of the recorder's own driver; call it once a step."""
+        """Return the next actions (N, A) of the recorder's own driver; call it once a step."""
 
-    def step(self, commands: Floats) -> None:
-        """Take a command (N, A)."""
+    def step(self, actions: Floats) -> None:
+        """Take an action (N, A)."""
 
 
 class TrueArena:
@@ -135,12 +135,12 @@ class TrueArena:
 
     Args:
         scenes: to begin.
-        size: S of the pictures.
-        drawn: whether there are pictures; else they are those of the prompts.
+        size: S of the images.
+        drawn: whether there are images; else they are those of the prompts.
 
     Attributes:
         prompts: of the scenes.
-        parts: the true places (N, P, 2) of the parts at each picture.
+        parts: the true places (N, P, 2) of the parts at each image.
         told: what `recorded` returned so far.
     """
 
@@ -148,7 +148,7 @@ class TrueArena:
         self.scenes, self._size, self._drawn, self._steps = scenes, size, drawn, 0
         self._begun = scenes.begin()
         self.prompts: Sequence[Prompt] = [scene.prompt for scene in self._begun]
-        self.held = np.stack([scene.command for scene in self._begun])
+        self.held = np.stack([scene.action for scene in self._begun])
         self.parts: list[Places] = []
         self.told: list[Floats] = []
         self._look()
@@ -169,9 +169,9 @@ class TrueArena:
         self.told.append(np.stack([scene.simulator.recorded() for scene in self._begun]))
         return self.told[-1]
 
-    def step(self, commands: Floats) -> None:
-        for scene, command in zip(self._begun, commands, strict=True):
-            scene.simulator.advance(command)
+    def step(self, actions: Floats) -> None:
+        for scene, action in zip(self._begun, actions, strict=True):
+            scene.simulator.advance(action)
         self._steps += 1
         if self.fresh:
             self._look()
@@ -179,12 +179,12 @@ class TrueArena:
     def _look(self) -> None:
         if self._drawn or not self.parts:
             shown = np.stack([scene.simulator.picture() for scene in self._begun])
-            self.pictures: Picture = shown if shown.shape[1] == self._size else resize(shown, self._size)
+            self.images: Image = shown if shown.shape[1] == self._size else resize(shown, self._size)
         self.parts.append(np.stack([truth.parts_of(s.simulator.simulation)[1] for s in self._begun]))
 
 
 class Beginning(Protocol):
-    """The first frames of episodes in the model, and the commands of the true ones."""
+    """The first frames of episodes in the model, and the actions of the true ones."""
 
     @property
     def scenes(self) -> Scenes:
@@ -196,11 +196,11 @@ class Beginning(Protocol):
 
     @property
     def held(self) -> Floats:
-        """Return the commands (N, A) that leave the robots as they are, as of `Arena`."""
+        """Return the actions (N, A) that leave the robots as they are, as of `Arena`."""
 
     @property
     def told(self) -> Sequence[Floats]:
-        """Return the commands (N, A) of each step by the recorder's driver."""
+        """Return the actions (N, A) of each step by the recorder's driver."""
 
 
 class ModelArena:
@@ -227,15 +227,15 @@ class ModelArena:
             mask = np.arange(len(prompts)) == row
             given = {"frames": prompt.frames, "chunks": prompt.chunks}
             seed = [scenes.seed + scenes.numbers[row]] * len(prompts)
-            self.pictures, _ = self._env.reset(seed=seed, options={"prompt": given, "reset_mask": mask})
+            self.images, _ = self._env.reset(seed=seed, options={"prompt": given, "reset_mask": mask})
         self._seen: list[SeenState] | None = None
 
-    def outside(self, commands: Floats) -> str:
-        """Say which of the commands (N, A) leave the range seen in training; "" for none.
+    def outside(self, actions: Floats) -> str:
+        """Say which of the actions (N, A) leave the range seen in training; "" for none.
 
         The environment then says it no more.
         """
-        said = self._env.episodes.commands.outside(commands)
+        said = self._env.episodes.spec.outside(actions)
         self._env.episodes.warned |= bool(said)
         return said
 
@@ -244,15 +244,15 @@ class ModelArena:
         return self._steps % self.scenes.stride == 0
 
     def states(self) -> list[State]:
-        """Return what the probe reads off the pictures, moved by the commands since the last one.
+        """Return what the probe reads off the images, moved by the actions since the last one.
 
         Raises:
             HMAError: there is no probe.
         """
         if self._probe is None:
-            raise HMAError(self.scenes.name, "nothing reads its state off pictures", "give another policy")
+            raise HMAError(self.scenes.name, "nothing reads its state off images", "give another policy")
         if self._seen is None:
-            places = self._probe.read(self.pictures)
+            places = self._probe.read(self.images)
             self._seen = [seen_state(self.scenes.name, self._probe.own, one) for one in places]
         return [seen.state for seen in self._seen]
 
@@ -262,16 +262,16 @@ class ModelArena:
         return np.stack([state.pose for state in self.states()]).astype(np.float32)
 
     def recorded(self) -> Floats:
-        """Return what the driver of the simulator commanded in the true episode."""
+        """Return what the driver of the simulator actioned in the true episode."""
         return self._told[self._steps]
 
-    def step(self, commands: Floats) -> None:
-        self.pictures, *_ = self._env.step(commands)
+    def step(self, actions: Floats) -> None:
+        self.images, *_ = self._env.step(actions)
         self._steps += 1
         if self._seen is not None and self._probe is not None:
-            places = self._probe.read(self.pictures) if self.fresh else None
+            places = self._probe.read(self.images) if self.fresh else None
             for row, seen in enumerate(self._seen):
-                seen.move(commands[row])
+                seen.move(actions[row])
                 if places is not None:
                     seen.see(places[row])
 

@@ -1,6 +1,6 @@
 """Define what a policy is, and check what one returns.
 
-A policy acts in N scenes at once. `Arena` gives it the newest pictures, and to those that ask for it a state.
+A policy acts in N scenes at once. `Arena` gives it the newest images, and to those that ask for it a state.
 
 N scenes, A action dims.
 """
@@ -25,7 +25,7 @@ class Policy(Protocol):
         """Begin episodes in all scenes."""
 
     def act(self, arena: Arena) -> Floats:
-        """Return the next commands (N, A)."""
+        """Return the next actions (N, A)."""
 
 
 @runtime_checkable
@@ -67,23 +67,23 @@ def begin(name: str, policy: Policy, arena: Arena) -> None:
 
 
 def checked(name: str, policy: Policy, arena: Arena) -> Floats:
-    """Return the next commands (N, A) of a policy.
+    """Return the next actions (N, A) of a policy.
 
     Raises:
         HMAError: it raises, or returns another shape or values that are not finite.
     """
     where, width = f"policy {name}", len(arena.scenes.dimensions)
     with _named_errors(name):
-        commands = np.asarray(policy.act(arena), np.float32)
-    if commands.shape != (len(arena.pictures), width):
+        actions = np.asarray(policy.act(arena), np.float32)
+    if actions.shape != (len(arena.images), width):
         names = ", ".join(dim.name for dim in arena.scenes.dimensions)
-        fault = f"returns commands of the shape {commands.shape[1:]}"
+        fault = f"returns actions of the shape {actions.shape[1:]}"
         raise HMAError(where, fault, f"{arena.scenes.name} takes ({width},): {names}")
-    if not np.isfinite(commands).all():
+    if not np.isfinite(actions).all():
         raise HMAError(
-            where, "returns NaN or infinite values", "return a number for each value of the command"
+            where, "returns NaN or infinite values", "return a number for each value of the action"
         )
-    return commands
+    return actions
 
 
 @contextmanager

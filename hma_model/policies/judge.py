@@ -1,12 +1,12 @@
-"""Judge from pictures alone whether an episode of a laboratory robot is a success.
+"""Judge from images alone whether an episode of a laboratory robot is a success.
 
 A task is a score of the places of the parts over an episode, and the least score of a success. The simulator
-knows the places; a judge reads them off pictures with a probe. A probe finds a place even for what is gone,
+knows the places; a judge reads them off images with a probe. A probe finds a place even for what is gone,
 so a loose part of which less than half the pixels are left counts as where it was last seen. Reading blurs
 the score, so the judge's own limit is set on recorded episodes whose outcome is known. Its accuracy is that
 on others.
 
-N episodes, T frames, S pixels a side, P parts. Places are px of a picture of 128 by 128.
+N episodes, T frames, S pixels a side, P parts. Places are px of an image of 128 by 128.
 """
 
 from collections.abc import Callable
@@ -118,7 +118,7 @@ def task_of(robot: str, words: str = "moved") -> Task:
 
 @dataclass(frozen=True)
 class StateJudge:
-    """A judge of one robot and one task, for pictures as its tokenizer shows them.
+    """A judge of one robot and one task, for images as its tokenizer shows them.
 
     It is also a `Judge` of `WorldModelEnv`: the reward is the score so far, and it never ends an episode.
 
@@ -134,9 +134,9 @@ class StateJudge:
     limit: float
     held_out: Accuracy
 
-    def score(self, pictures: Images) -> Floats:
+    def score(self, images: Images) -> Floats:
         """Return the scores (N,) of episodes (N, T, S, S, 3)."""
-        return _read_score(self.task, self.probe, pictures)
+        return _read_score(self.task, self.probe, images)
 
     def true_score(self, parts: Floats) -> Floats:
         """Return the scores (N,) of true places (N, T, P, 2)."""
@@ -147,8 +147,8 @@ class StateJudge:
         judged: Bools = scores >= self.limit
         return judged
 
-    def __call__(self, pictures: Images, commands: Any) -> tuple[float, bool]:
-        return float(self.score(pictures[None])[0]), False
+    def __call__(self, images: Images, actions: Any) -> tuple[float, bool]:
+        return float(self.score(images[None])[0]), False
 
 
 def train_judge(
@@ -167,7 +167,7 @@ def train_judge(
 
     Args:
         robot: a laboratory robot.
-        tokenizer: whose pictures it is to judge.
+        tokenizer: whose images it is to judge.
         stride: control steps a frame.
         frames: T of the episodes to judge.
         task: by default `moved`.
@@ -227,10 +227,10 @@ def best_limit(read: Floats, success: Bools, limit: float) -> float:
     return float(good[np.abs(good - limit).argmin()])
 
 
-def _read_score(task: Task, probe: Probe, pictures: Images) -> Floats:
+def _read_score(task: Task, probe: Probe, images: Images) -> Floats:
     """Return the scores (N,) of episodes (N, T, S, S, 3), by the parts that a probe can read."""
-    places = probe.read(pictures)
-    loose = last_seen(places[..., probe.loose, :], probe.areas(pictures)[..., probe.loose])
+    places = probe.read(images)
+    loose = last_seen(places[..., probe.loose, :], probe.areas(images)[..., probe.loose])
     own = places[..., probe.own, :]
     return task.score(np.concatenate([own, loose], axis=-2), len(probe.own))
 

@@ -62,7 +62,7 @@ class LeRobotPolicy:
         others = [key for key in config.input_features if key not in (*cameras, STATE)]
         if len(cameras) != 1 or others:
             wanted = ", ".join([*cameras, *others]) or "no camera"
-            raise HMAError(self.name, f"takes {wanted}", "a world model gives the picture of one camera")
+            raise HMAError(self.name, f"takes {wanted}", "a world model gives the image of one camera")
         self._camera = cameras[0]
         self._size = config.input_features[self._camera].shape[1:]
         state, action = config.input_features.get(STATE), config.action_feature
@@ -72,8 +72,8 @@ class LeRobotPolicy:
             raise HMAError(self.name, fault, f"{scenes.name} takes {len(scenes.dimensions)}")
 
     def begin(self, arena: Arena) -> None:
-        if arena.pictures.shape[1] != arena.pictures.shape[2]:
-            fault = "takes one camera, and the pictures show several side by side"
+        if arena.images.shape[1] != arena.images.shape[2]:
+            fault = "takes one camera, and the images show several side by side"
             raise HMAError(self.name, fault, "give a policy that sees the same cameras")
         self._policy.reset()
 
@@ -81,10 +81,10 @@ class LeRobotPolicy:
         import torch
         from torch.nn.functional import interpolate
 
-        pictures = torch.from_numpy(arena.pictures).permute(0, 3, 1, 2).float() / 255
-        if pictures.shape[2:] != self._size:
-            pictures = interpolate(pictures, tuple(self._size), mode="bilinear", antialias=True)
-        batch: dict[str, Any] = {self._camera: pictures, TASK: [arena.scenes.name] * len(pictures)}
+        images = torch.from_numpy(arena.images).permute(0, 3, 1, 2).float() / 255
+        if images.shape[2:] != self._size:
+            images = interpolate(images, tuple(self._size), mode="bilinear", antialias=True)
+        batch: dict[str, Any] = {self._camera: images, TASK: [arena.scenes.name] * len(images)}
         if self._state is not None:
             batch[STATE] = torch.from_numpy(self._observed(arena))
         with torch.inference_mode():
@@ -96,9 +96,9 @@ class LeRobotPolicy:
         if state is None or state.shape[1] != self._state:
             have = "none" if state is None else f"one of {state.shape[1]}"
             fault = (
-                f"takes a state of {self._state} values, and of {arena.scenes.name} the pictures tell {have}"
+                f"takes a state of {self._state} values, and of {arena.scenes.name} the images tell {have}"
             )
-            raise HMAError(self.name, fault, "give a policy that acts from pictures alone")
+            raise HMAError(self.name, fault, "give a policy that acts from images alone")
         return state
 
 

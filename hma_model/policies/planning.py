@@ -1,11 +1,11 @@
-"""Plan in a world model: commands are tried in it before the best are given (model-predictive control).
+"""Plan in a world model: actions are tried in it before the best are given (model-predictive control).
 
     cost = Cost(load_world("embedded"), "rails_03", judge)
     solver = CEMSolver(cost, num_samples=64)          # of stable-worldmodel; plan:cem on the command line
 
 `Cost` is what the solvers of stable-worldmodel call `Costable`: it imagines what candidates lead to, all side
-by side, and costs what the pictures show. That is how far a judge finds them from success, or how far the
-last one is from a picture of the goal.
+by side, and costs what the images show. That is how far a judge finds them from success, or how far the
+last one is from an image of the goal.
 
 N scenes, C candidates of each, H frames ahead, S pixels a side, A action dims, K = stride · A.
 """
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, MissingDependencyError, UsageError, install_command
 from hma_model.policies.acting import Follower
-from hma_model.policies.arenas import Arena, Floats, Picture, Scenes
+from hma_model.policies.arenas import Arena, Floats, Image, Scenes
 from hma_model.policies.base import split_options
 from hma_model.worlds.world import World
 
@@ -36,12 +36,12 @@ OPTIONS: dict[str, type] = {
     **dict.fromkeys(("horizon", "samples", "steps", "receding", "unmask_steps"), int), "temperature": float,
 }  # fmt: skip
 ROWS = 128  # that step in one pass; more cost memory and gain nothing
-COARSE = 32  # pixels a side at which pictures are compared with a goal
+COARSE = 32  # pixels a side at which images are compared with a goal
 ELITES = 8  # one candidate in so many is kept by CEM
 
 
 class Cost:
-    """The cost of commands in a world model.
+    """The cost of actions in a world model.
 
     Args:
         world: in which candidates are tried.
@@ -54,12 +54,12 @@ class Cost:
 
     def __init__(self, world: World, embodiment: str, judge: "StateJudge | None" = None) -> None:
         self.world, self.embodiment, self.judge = world, embodiment, judge
-        own = world.commands(embodiment)
+        own = world.action_spec(embodiment)
         space = world.model.embodiments[embodiment]
         self._own, self._mean = own, np.array(space.mean, np.float32)
         self._std = np.array(space.std, np.float32)
         self.sessions: list[int] = []
-        self.first: Picture | None = None  # (N, S, S, 3) in which the judged episodes began
+        self.first: Image | None = None  # (N, S, S, 3) in which the judged episodes began
 
     @property
     def space(self) -> gymnasium.spaces.Box:
@@ -68,31 +68,31 @@ class Cost:
         low, high = (self._own.low - self._mean) / scale, (self._own.high - self._mean) / scale
         return gymnasium.spaces.Box(low, high, dtype=np.float32)
 
-    def commands(self, candidates: NDArray[Any]) -> Floats:
-        """Return candidates (…, A), held for a chunk, or (…, K), as commands (…, stride, A)."""
+    def actions(self, candidates: NDArray[Any]) -> Floats:
+        """Return candidates (…, A), held for a chunk, or (…, K), as actions (…, stride, A)."""
         width, stride = len(self._own.names), self._own.stride
         held = candidates.shape[-1] == width
         rows = candidates[..., None, :] if held else candidates.reshape(*candidates.shape[:-1], stride, width)
-        commands = self._own.clip(self._mean + self._std * rows).astype(np.float32)
-        return commands.repeat(stride, axis=-2) if held and stride > 1 else commands
+        actions = self._own.clip(self._mean + self._std * rows).astype(np.float32)
+        return actions.repeat(stride, axis=-2) if held and stride > 1 else actions
 
-    def imagine(self, sessions: Sequence[int], candidates: NDArray[Any]) -> Picture:
-        """Return the pictures (N, C, H, S, S, 3) that candidates (N, C, H, A or K) lead to from sessions."""
+    def imagine(self, sessions: Sequence[int], candidates: NDArray[Any]) -> Image:
+        """Return the images (N, C, H, S, S, 3) that candidates (N, C, H, A or K) lead to from sessions."""
         count, tried, horizon = candidates.shape[:3]
-        commands = self.commands(candidates).reshape(count * tried, horizon, self._own.stride, -1)
+        actions = self.actions(candidates).reshape(count * tried, horizon, self._own.stride, -1)
         world = self.world.fork(sessions, tried)
-        made = [world.step(dict(enumerate(commands[:, ahead]))) for ahead in range(horizon)]
-        pictures = np.stack([[one[row] for row in range(count * tried)] for one in made], axis=1)
-        return pictures.reshape(count, tried, *pictures.shape[1:])
+        made = [world.step(dict(enumerate(actions[:, ahead]))) for ahead in range(horizon)]
+        images = np.stack([[one[row] for row in range(count * tried)] for one in made], axis=1)
+        return images.reshape(count, tried, *images.shape[1:])
 
     @torch.no_grad()
     def get_cost(self, info_dict: dict[str, Any], action_candidates: torch.Tensor) -> torch.Tensor:
         """Return the costs (N, C) of candidates (N, C, H, A or K), in standard deviations from the mean.
 
         Args:
-            info_dict: "scene" (N, C): numbers of `sessions`; or "pixels" (N, C, T, S', S', 3) uint8: pictures
-                to begin from, at the model's rate. Without a judge also "goal", one such picture.
-            action_candidates: of the commands.
+            info_dict: "scene" (N, C): numbers of `sessions`; or "pixels" (N, C, T, S', S', 3) uint8: images
+                to begin from, at the model's rate. Without a judge also "goal", one such image.
+            action_candidates: of the actions.
         """
         if "scene" in info_dict:
             scenes = info_dict["scene"][:, 0].tolist()
@@ -101,12 +101,12 @@ class Cost:
             self.open([(one, None) for one in shown])
             scenes = list(range(len(shown)))
         sessions = [self.sessions[scene] for scene in scenes]
-        pictures = self.imagine(sessions, action_candidates.cpu().numpy())
+        images = self.imagine(sessions, action_candidates.cpu().numpy())
         if self.judge is None:
-            costs = goal_distance(pictures[:, :, -1], np.asarray(info_dict["goal"][:, 0]))
+            costs = goal_distance(images[:, :, -1], np.asarray(info_dict["goal"][:, 0]))
         else:
             assert self.first is not None
-            costs = self._judged(self.judge, self.first[scenes], pictures)
+            costs = self._judged(self.judge, self.first[scenes], images)
         return torch.from_numpy(costs).to(action_candidates)
 
     criterion = get_cost
@@ -117,20 +117,20 @@ class Cost:
             self.world.close(session)
         made = [self.world.open(self.embodiment, *prompt, seed=row) for row, prompt in enumerate(prompts)]
         self.sessions = made
-        self.first = np.stack([self.world.picture(session) for session in made])
+        self.first = np.stack([self.world.image(session) for session in made])
 
-    def _judged(self, judge: "StateJudge", first: Picture, pictures: Picture) -> NDArray[np.float64]:
+    def _judged(self, judge: "StateJudge", first: Image, images: Image) -> NDArray[np.float64]:
         """Return how far the judge finds imagined episodes (N, C, H, …) from a success; negative beyond."""
-        count, tried = pictures.shape[:2]
+        count, tried = images.shape[:2]
         begun = np.broadcast_to(first[:, None, None], (count, tried, 1, *first.shape[1:]))
-        episodes = np.concatenate([begun, pictures], axis=2).reshape(count * tried, -1, *first.shape[1:])
+        episodes = np.concatenate([begun, images], axis=2).reshape(count * tried, -1, *first.shape[1:])
         return -judge.score(episodes).reshape(count, tried)
 
 
-def goal_distance(pictures: Picture, goals: Picture) -> NDArray[np.float64]:
-    """Return the mean squared distances (N, C) of pictures (N, C, S, S, 3) from goals (N, …, S', S', 3)."""
-    shape = pictures.shape[:2]
-    coarse = resize(pictures.reshape(-1, *pictures.shape[2:]), COARSE).astype(np.float64)
+def goal_distance(images: Image, goals: Image) -> NDArray[np.float64]:
+    """Return the mean squared distances (N, C) of images (N, C, S, S, 3) from goals (N, …, S', S', 3)."""
+    shape = images.shape[:2]
+    coarse = resize(images.reshape(-1, *images.shape[2:]), COARSE).astype(np.float64)
     wanted = resize(goals.reshape(len(goals), -1, *goals.shape[-3:])[:, -1], COARSE).astype(np.float64)
     squares = np.square(coarse.reshape(*shape, *coarse.shape[1:]) - wanted[:, None])
     return np.asarray(squares.mean(axis=(2, 3, 4)))
@@ -179,21 +179,21 @@ class Planning:
 
     def begin(self, arena: Arena) -> None:
         self._follower.begin(arena)
-        self.cost.sessions, self.cost.first = self._follower.sessions, arena.pictures
-        self._solver = self._made(len(arena.pictures))
+        self.cost.sessions, self.cost.first = self._follower.sessions, arena.images
+        self._solver = self._made(len(arena.images))
         self._ahead: list[Floats] = []
         self._rest: torch.Tensor | None = None
 
     def act(self, arena: Arena) -> Floats:
         self._follower.look(arena)
         if not self._ahead:
-            scenes = torch.arange(len(arena.pictures))
+            scenes = torch.arange(len(arena.images))
             with contextlib.redirect_stdout(io.StringIO()):  # solvers print their time
-                actions = self._solver({"scene": scenes}, init_action=self._rest)["actions"]
+                planned = self._solver({"scene": scenes}, init_action=self._rest)["actions"]
             receding = self._sizes[3]
-            self._rest = actions[:, receding:]
-            commands = self.cost.commands(actions[:, :receding].numpy())  # (N, receding, stride, A)
-            self._ahead = list(commands.reshape(len(commands), -1, commands.shape[-1]).swapaxes(0, 1))
+            self._rest = planned[:, receding:]
+            actions = self.cost.actions(planned[:, :receding].numpy())  # (N, receding, stride, A)
+            self._ahead = list(actions.reshape(len(actions), -1, actions.shape[-1]).swapaxes(0, 1))
         return self._follower.take(self._ahead.pop(0))
 
     def _made(self, count: int) -> Any:

@@ -1,4 +1,4 @@
-"""Show an evaluation of policies: as a table on a terminal, and as a page with pictures of episodes."""
+"""Show an evaluation of policies: as a table on a terminal, and as a page with images of episodes."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
 from hma_model.policies.scores import WORK, Correlation, PolicyEvaluation, Scored
 
-COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same commands, sim.")
+COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same actions, sim.")
 GOOD = 0.75  # balanced accuracy; an interval that holds chance and this says nothing
 CHOSEN = 2  # episodes of each kind on the page
 KINDS = {  # (success in the simulator, in the model) -> title
@@ -69,10 +69,10 @@ def sentences(found: PolicyEvaluation) -> list[str]:
     scores = "the way it moved" if found.judge.task.name == "moved" else "minus the distance, 0 is best"
     said = [
         f"success: {found.judge.task.text}; shares with 95 % intervals over episodes; scores in px: {scores}",
-        "alike: episodes with the same outcome in both; same commands, sim.: the simulator, under the "
-        "commands that the policy gave in the model",
+        "alike: episodes with the same outcome in both; same actions, sim.: the simulator, under the "
+        "actions that the policy gave in the model",
         f"judge on held-out true episodes: {found.judge.held_out}",
-        f"judge on generated frames, against the simulator under the same commands: {found.generated}; "
+        f"judge on generated frames, against the simulator under the same actions: {found.generated}; "
         f"correlation of the scores {share}",
     ]
     correlated = {"success rates": found.success, "mean scores": found.score}
@@ -196,7 +196,7 @@ def _caption(one: Scored, number: int) -> str:
 
 
 def _strip(one: Scored, number: int) -> bytes:
-    return png_bytes(grid([list(one.true_pictures[number]), list(one.model_pictures[number])]))
+    return png_bytes(grid([list(one.true_images[number]), list(one.model_images[number])]))
 
 
 def _plot(found: PolicyEvaluation) -> bytes:

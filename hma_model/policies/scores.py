@@ -4,9 +4,9 @@
     found.success.spearman            # of the policies' success rates
 
 Every policy acts in the same scenes of a laboratory robot: once in its simulator, which knows the outcome,
-and once in the world model from the same frames, where a judge reads the outcome off the pictures. The
-commands that it gave in the model are also played to the simulator. So the judge's word on generated frames
-is compared with what truly comes of the same commands.
+and once in the world model from the same frames, where a judge reads the outcome off the images. The
+actions that it gave in the model are also played to the simulator. So the judge's word on generated frames
+is compared with what truly comes of the same actions.
 
 With an output folder, what came of each policy lies in a folder of it until the page is written, so the same
 call continues. A policy that was changed in between is scored again.
@@ -42,7 +42,7 @@ from hma_model.evaluation.agreement import (
     share_interval,
 )
 from hma_model.generation.commands import OutsideRangeWarning
-from hma_model.policies.arenas import Arena, Floats, ModelArena, Picture, Scenes, TrueArena
+from hma_model.policies.arenas import Arena, Floats, Image, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy, begin, checked
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import begun, digests, object_sha256, policy_facts, world_facts
@@ -54,7 +54,7 @@ Progress = Callable[[float, str], None]
 EPISODES, FRAMES = 32, 40
 WORK = ".policies"  # folder of finished policies in an output
 OUTCOMES = ("true", "model", "replayed")
-SHOWN = 8  # pictures that are kept of an episode
+SHOWN = 8  # images that are kept of an episode
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,9 @@ class Scored:
     Attributes:
         true: in the simulator.
         model: in the world model, as judged.
-        replayed: in the simulator, under the commands that the policy gave in the model.
-        shown: frames of which pictures are kept.
-        true_pictures, model_pictures: (N, len(shown), S, S, 3).
+        replayed: in the simulator, under the actions that the policy gave in the model.
+        shown: frames of which images are kept.
+        true_images, model_images: (N, len(shown), S, S, 3).
     """
 
     policy: str
@@ -82,8 +82,8 @@ class Scored:
     model: Outcomes
     replayed: Outcomes
     shown: tuple[int, ...]
-    true_pictures: Picture
-    model_pictures: Picture
+    true_images: Image
+    model_images: Image
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,9 @@ class PolicyEvaluation:
     Attributes:
         sampling: how the world drew its frames.
         success, score: correlation over policies of the success rates, and of the mean scores.
-        generated: accuracy of the judge on generated frames, against the simulator under the same commands.
+        generated: accuracy of the judge on generated frames, against the simulator under the same actions.
         followed: how the scores of single episodes, as judged on generated frames, correlate with the true
-            ones under the same commands; None if they do not vary or are few.
+            ones under the same actions; None if they do not vary or are few.
     """
 
     embodiment: str
@@ -225,7 +225,7 @@ def evaluate_policies(
         keys = [""] * len(made) if folder is None else _keys(policies, world, embodiment, judge)
         for name, policy in made:  # what it returns is refused before minutes of work
             if not isinstance(policy, Judged):
-                _try(name, policy, TrueArena(scenes.take(range(1)), world.picture_shape[0]))
+                _try(name, policy, TrueArena(scenes.take(range(1)), world.image_shape[0]))
         if not isinstance(judge, StateJudge):
             task = task_of(embodiment, judge)
             judge = train_judge(
@@ -314,60 +314,60 @@ def score_policy(
     tell: Progress = lambda done, where: None,
 ) -> Scored:
     """Return what comes of one policy in the simulator and in the model."""
-    size, limit = world.picture_shape[0], judge.task.limit
+    size, limit = world.image_shape[0], judge.task.limit
     shown = tuple(sorted({round(frame) for frame in np.linspace(0, frames, SHOWN)}))
     true = TrueArena(scenes, size)
-    true_pictures, _ = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
+    true_images, _ = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
     model = ModelArena(world, true, judge.probe)
     try:
-        model_pictures, commands = run(name, policy, model, frames, lambda done: tell(done, "in the model"))
+        model_images, actions = run(name, policy, model, frames, lambda done: tell(done, "in the model"))
     finally:
         model.close()
     again = TrueArena(scenes, size, drawn=False)
-    for command in commands:
-        again.step(command)
+    for action in actions:
+        again.step(action)
     scores = [judge.true_score(np.stack(arena.parts, axis=1)) for arena in (true, again)]
-    read = judge.score(np.stack(model_pictures, axis=1))
+    read = judge.score(np.stack(model_images, axis=1))
     return Scored(
         name,
         Outcomes(scores[0], scores[0] >= limit),
         Outcomes(read, judge.success(read)),
         Outcomes(scores[1], scores[1] >= limit),
         shown,
-        np.stack([true_pictures[frame] for frame in shown], axis=1),
-        np.stack([model_pictures[frame] for frame in shown], axis=1),
+        np.stack([true_images[frame] for frame in shown], axis=1),
+        np.stack([model_images[frame] for frame in shown], axis=1),
     )
 
 
 def run(
     name: str, policy: Policy, arena: Arena, frames: int, tell: Callable[[float], None] = lambda done: None
-) -> tuple[list[Picture], list[Floats]]:
+) -> tuple[list[Image], list[Floats]]:
     """Let a policy act for so many frames.
 
     Returns:
-        The T + 1 pictures (N, S, S, 3), the last one of the prompt first; and all commands (N, A).
+        The T + 1 images (N, S, S, 3), the last one of the prompt first; and all actions (N, A).
 
     Raises:
         HMAError: the policy fails.
     """
-    pictures, commands, said = [arena.pictures], list[Floats](), ""
+    images, actions, said = [arena.images], list[Floats](), ""
     begin(name, policy, arena)
     for _ in range(frames * arena.scenes.stride):
-        commands.append(checked(name, policy, arena))
-        if not said and isinstance(arena, ModelArena) and (said := arena.outside(commands[-1])):
-            guess = "what the model shows of such commands is a guess"
+        actions.append(checked(name, policy, arena))
+        if not said and isinstance(arena, ModelArena) and (said := arena.outside(actions[-1])):
+            guess = "what the model shows of such actions is a guess"
             warnings.warn(f"policy {name}: {said}; {guess}", OutsideRangeWarning, stacklevel=2)
-        arena.step(commands[-1])
+        arena.step(actions[-1])
         if arena.fresh:
-            pictures.append(arena.pictures)
-            tell((len(pictures) - 1) * len(arena.pictures))
-    return pictures, commands
+            images.append(arena.images)
+            tell((len(images) - 1) * len(arena.images))
+    return images, actions
 
 
 def _keep(one: Scored, path: Path) -> None:
     outcomes = {name: getattr(one, name) for name in OUTCOMES}
     arrays = {f"{name}_{key}": value for name in OUTCOMES for key, value in vars(outcomes[name]).items()}
-    shown = {"true_pictures": one.true_pictures, "model_pictures": one.model_pictures}
+    shown = {"true_images": one.true_images, "model_images": one.model_images}
     with atomic_path(path) as part, part.open("wb") as file:
         np.savez(file, **(arrays | shown | {"shown": np.array(one.shown)}))
 
@@ -378,8 +378,8 @@ def _kept(name: str, path: Path) -> Scored | None:
     if arrays is None:
         return None
     outcomes: Any = {key: Outcomes(arrays[f"{key}_scores"], arrays[f"{key}_success"]) for key in OUTCOMES}
-    pictures: Any = {key: arrays[key] for key in ("true_pictures", "model_pictures")}
-    return Scored(name, shown=tuple(arrays["shown"].tolist()), **outcomes, **pictures)
+    images: Any = {key: arrays[key] for key in ("true_images", "model_images")}
+    return Scored(name, shown=tuple(arrays["shown"].tolist()), **outcomes, **images)
 
 
 def _matrices(scored: Sequence[Scored], key: str) -> list[Scores]:

@@ -15,7 +15,7 @@ from hma_model.policies.arenas import Arena, Floats
 
 
 class Still:
-    """The commands that leave the robot as it is: no velocity, or the last target."""
+    """The actions that leave the robot as it is: no velocity, or the last target."""
 
     def begin(self, arena: Arena) -> None:
         pass
@@ -25,7 +25,7 @@ class Still:
 
 
 class Random:
-    """A uniform command in the range of training, another one for each chunk."""
+    """A uniform action in the range of training, another one for each chunk."""
 
     def begin(self, arena: Arena) -> None:
         self._rng = arena.scenes.rng(1)
@@ -36,19 +36,19 @@ class Random:
     def act(self, arena: Arena) -> Floats:
         if arena.fresh:
             drawn = [rng.uniform(self._low, self._high) for rng in self._rng]
-            self._command = np.stack(drawn).astype(np.float32)
-        return self._command
+            self._action = np.stack(drawn).astype(np.float32)
+        return self._action
 
 
 class Scripted:
     """The manoeuvres of the recorder, or a reach for the nearest block; a share of the chunks is random.
 
     They go by the robot's state: in the simulator by the true one, in the model by what a probe reads off its
-    pictures. Robots of which no state can be read so are driven by the simulator's own driver, and in the
-    model its commands are replayed.
+    images. Robots of which no state can be read so are driven by the simulator's own driver, and in the
+    model its actions are replayed.
 
     Args:
-        noise: the share of chunks with random commands.
+        noise: the share of chunks with random actions.
         reach: go to the nearest block, rather than by random manoeuvres.
     """
 
@@ -60,7 +60,7 @@ class Scripted:
         self._coins = arena.scenes.rng(2)
         self._drivers: list[Callable[..., Floats]] = []
         if self.reach:
-            self._drivers = [reacher(arena.scenes.name) for _ in arena.pictures]
+            self._drivers = [reacher(arena.scenes.name) for _ in arena.images]
         elif steerable(arena.scenes.name):
             begun = zip(arena.states(), arena.scenes.rng(3), strict=True)
             self._drivers = [driver(arena.scenes.name, state.pose, rng) for state, rng in begun]
@@ -71,14 +71,14 @@ class Scripted:
             self._thrown = np.array([coin.random() < self.noise for coin in self._coins])[:, None]
         if self._drivers:
             pairs = zip(self._drivers, arena.states(), strict=True)
-            commands = np.stack([drive(state) for drive, state in pairs])
+            actions = np.stack([drive(state) for drive, state in pairs])
         else:
-            commands = arena.recorded()
-        return np.where(self._thrown, noisy, commands).astype(np.float32)
+            actions = arena.recorded()
+        return np.where(self._thrown, noisy, actions).astype(np.float32)
 
 
 class Called:
-    """A Python function from a picture (S, S, 3) to a command (A,), or a class or object of such.
+    """A Python function from an image (S, S, 3) to an action (A,), or a class or object of such.
 
     Each scene has its own: an instance of a class, or a copy of an object, so that what it remembers belongs
     to one episode. Its `reset()`, if there is one, is called when an episode begins.
@@ -92,7 +92,7 @@ class Called:
     def begin(self, arena: Arena) -> None:
         made = (
             self._given() if isinstance(self._given, type) else copy.deepcopy(self._given)
-            for _ in arena.pictures
+            for _ in arena.images
         )
         self._functions = list(made)
         for function in self._functions:
@@ -100,9 +100,9 @@ class Called:
                 function.reset()
 
     def act(self, arena: Arena) -> Floats:
-        pairs = zip(self._functions, arena.pictures, strict=True)
-        commands = [np.asarray(function(picture.copy())) for function, picture in pairs]
-        shapes = {command.shape for command in commands}
+        pairs = zip(self._functions, arena.images, strict=True)
+        actions = [np.asarray(function(image.copy())) for function, image in pairs]
+        shapes = {action.shape for action in actions}
         if len(shapes) > 1:
-            raise ValueError(f"it returned commands of the shapes {shapes}")
-        return np.stack(commands)
+            raise ValueError(f"it returned actions of the shapes {shapes}")
+        return np.stack(actions)

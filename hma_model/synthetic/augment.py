@@ -1,4 +1,4 @@
-"""Make synthetic episodes: the world model continues real frames under replayed, perturbed or other commands.
+"""Make synthetic episodes: the world model continues real frames under replayed, perturbed or other actions.
 
 Of the episodes made, the share is kept of which the model was least unsure, and of these, if a judge is
 given, the successes. `synthetic` writes them as a shard set of the model's own tokens.
@@ -55,7 +55,7 @@ from hma_model.worlds.world import World, load_world
 WORK = ".augment"
 BATCH = 16  # episodes that step in one pass
 MEASURES = {"discrete": "millinats", "continuous": "millilatents"}  # flags: thousandths of `uncertainty`
-DRAWS = 100  # of a beginning, until one is found whose commands are all known
+DRAWS = 100  # of a beginning, until one is found whose actions are all known
 
 
 @dataclass(frozen=True)
@@ -94,12 +94,12 @@ class Augmentation:
 
     @property
     def recorded(self) -> bool:
-        """Check whether the commands are recorded ones, also with noise, rather than a policy's."""
+        """Check whether the actions are recorded ones, also with noise, rather than a policy's."""
         return self.commands.partition("=")[0] in ("replay", "perturb")
 
     @property
     def looked_at(self) -> bool:
-        """Check whether a probe that was trained on the simulator's pictures looks at those of the model."""
+        """Check whether a probe that was trained on the simulator's images looks at those of the model."""
         stateful = self.commands.startswith(("scripted", "reach", "lerobot:")) and simulated(self.embodiment)
         return bool(self.judge) or stateful
 
@@ -108,7 +108,7 @@ class Augmentation:
 class Batch:
     """Episodes of one pass: stored frames (n, P + T, …), chunks (n, P + T - 1, K), and what to choose by.
 
-    Of a policy's episodes P is one: what was commanded before is none of its own.
+    Of a policy's episodes P is one: what was actioned before is none of its own.
 
     Attributes:
         uncertainty: (n,) how unsure the model was of the generated frames, their mean; see `Rollout`.
@@ -135,10 +135,10 @@ class Recorded:
 
 
 class Replay:
-    """The recorded commands, to which noise is added.
+    """The recorded actions, to which noise is added.
 
     Args:
-        share: of the commands' standard deviation; the noise is held for a chunk.
+        share: of the actions' standard deviation; the noise is held for a chunk.
     """
 
     def __init__(self, share: float, std: Sequence[float]) -> None:
@@ -152,10 +152,10 @@ class Replay:
     def act(self, arena: Arena) -> Floats:
         if arena.fresh:
             self._noise = np.stack([rng.normal(0, self._std) for rng in self._rng])
-        commands = arena.recorded()
+        actions = arena.recorded()
         if not self._std.any():
-            return commands
-        return np.clip(commands + self._noise, self._low, self._high).astype(np.float32)
+            return actions
+        return np.clip(actions + self._noise, self._low, self._high).astype(np.float32)
 
 
 def augment(
@@ -176,9 +176,9 @@ def augment(
         out: its folder.
         settings: what to make.
         checkpoint: as `load_world` takes it.
-        shards: shard set whose episodes give first frames and commands; by default the simulator does.
+        shards: shard set whose episodes give first frames and actions; by default the simulator does.
         lerobot: folder for the same episodes as a LeRobotDataset v3.0; one that is finished is kept. Its
-            state is read off the pictures, if the shards or the simulator have one to learn it from.
+            state is read off the images, if the shards or the simulator have one to learn it from.
         world: a world instead of a checkpoint.
         device: of the world made from the checkpoint, and of policies that are networks.
         compile: of that world, as of `World`.
@@ -236,7 +236,7 @@ def _stated(
     cameras: Sequence[str],
     tell: Callable[[str], None],
 ) -> tuple[Embodiment, Reader] | None:
-    """Return the real robot, and what reads its state off pictures; None if no state is known."""
+    """Return the real robot, and what reads its state off images; None if no state is known."""
     if shards is None:
         robot = truth.embodiment(settings.embodiment)
         if robot.state is None:
@@ -266,21 +266,21 @@ class _Maker:
         else:
             self.cameras = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
 
-    def _policy(self, commands: str) -> Policy:
-        kind, _, number = commands.partition("=")
+    def _policy(self, actions: str) -> Policy:
+        kind, _, number = actions.partition("=")
         std = self.world.model.embodiments[self.robot.id].std
         if not self.settings.recorded:
-            policy = read_policy(commands, self.scenes, self.world)
+            policy = read_policy(actions, self.scenes, self.world)
             if isinstance(policy, Judged) and not self.settings.judge:
-                fault = f"{commands!r} plans for what a judge calls success"
+                fault = f"{actions!r} plans for what a judge calls success"
                 raise UsageError("--commands", fault, "add --judge moved, or another task")
             return policy
-        share = 0.0 if commands == "replay" else np.nan
+        share = 0.0 if actions == "replay" else np.nan
         if kind == "perturb":
             with suppress(ValueError):
                 share = float(number)
         if not 0 <= share < np.inf:
-            raise UsageError("--commands", f"{commands!r} is unknown", "give replay, or perturb=0.3")
+            raise UsageError("--commands", f"{actions!r} is unknown", "give replay, or perturb=0.3")
         return Replay(share, std)
 
     def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:
@@ -357,18 +357,18 @@ class _Maker:
 
         self.world.measure = True
         try:
-            pictures, commands = run(self.settings.commands, self.policy, arena, self.settings.frames, look)
+            images, actions = run(self.settings.commands, self.policy, arena, self.settings.frames, look)
         finally:
             self.world.measure = False
             arena.close()
         count, width = len(numbers), self.robot.chunk_dim
-        own = np.stack(commands, axis=1).reshape(count, -1, width)
+        own = np.stack(actions, axis=1).reshape(count, -1, width)
         success: NDArray[np.bool_] = np.ones(count, np.bool_)
         if self.judge is not None:
-            success = self.judge.success(self.judge.score(np.stack(pictures, axis=1)))
+            success = self.judge.success(self.judge.score(np.stack(images, axis=1)))
         first = np.stack([self.world.encoded(self.robot.id, prompt.frames) for prompt in begun.prompts])
         first, before = first.astype(kept[0].dtype), [prompt.chunks for prompt in begun.prompts]
-        if not self.settings.recorded:  # what was commanded before is none of the policy's
+        if not self.settings.recorded:  # what was actioned before is none of the policy's
             first, before = first[:, -1:], [chunks[:0] for chunks in before]
         return Batch(
             np.concatenate([first, np.stack(kept, axis=1)], axis=1),
@@ -379,16 +379,16 @@ class _Maker:
         )
 
     def _simulated(self, numbers: range) -> Recorded:
-        """Return beginnings from the simulator, with the commands of its driver."""
+        """Return beginnings from the simulator, with the actions of its driver."""
         scenes = self.scenes.take(numbers)
-        true = TrueArena(scenes, self.world.picture_shape[0], drawn=False)
+        true = TrueArena(scenes, self.world.image_shape[0], drawn=False)
         for _ in range(self.settings.frames * scenes.stride):
             true.step(true.recorded())
         groups = [f"{scenes.name}/{number}" for number in scenes.numbers]
         return Recorded(scenes, true.prompts, true.held, true.told, groups)
 
     def _recorded(self, shards: ShardSet, numbers: range) -> Recorded:
-        """Return beginnings from episodes of shards, with their commands."""
+        """Return beginnings from episodes of shards, with their actions."""
         scenes, known = self.scenes.take(numbers), self.prompt_frames
         prompts, told, groups = [], [], []
         for number in numbers:
@@ -403,7 +403,7 @@ class _Maker:
     def _window(self, shards: ShardSet, number: int) -> tuple[dict[str, Any], NDArray[Any], Floats]:
         """Return a row of an episode, and a window of it: frames (P + T, …) and chunks (P + T - 1, K).
 
-        The commands are known: those of the window, or for a policy's episodes those up to its first one.
+        The actions are known: those of the window, or for a policy's episodes those up to its first one.
 
         Raises:
             UsageError: there is hardly such a window.
@@ -419,8 +419,8 @@ class _Maker:
             assert chunks is not None
             if np.isfinite(chunks[:needed]).all():
                 return row, frames, chunks
-        fault = f"has hardly a window of {length} frames whose commands are all known"
-        raise UsageError(shards.folder, fault, "give fewer --frames, or shards with more of the commands")
+        fault = f"has hardly a window of {length} frames whose actions are all known"
+        raise UsageError(shards.folder, fault, "give fewer --frames, or shards with more of the actions")
 
 
 # -- what is kept
@@ -451,7 +451,7 @@ def _each(batches: Sequence[Batch], settings: Augmentation, measure: str) -> Ite
         ):
             counts = {
                 "prompt_frames": len(stored) - settings.frames,
-                "generated_frames": settings.frames - 1,  # the last one has no commands after it
+                "generated_frames": settings.frames - 1,  # the last one has no actions after it
                 measure: round(1000 * float(unsure)),
             }
             judged = True if settings.judge else None

@@ -1,7 +1,7 @@
-"""Infer the commands of film that has none, by inverse dynamics, and write them as shards marked inferred.
+"""Infer the actions of film that has none, by inverse dynamics, and write them as shards marked inferred.
 
     found = label_actions("film", "labelled", "mover_04", checkpoint="runs/inverse")
-    print(found.error.explained)      # on held-out film whose commands are known
+    print(found.error.explained)      # on held-out film whose actions are known
 
 Film is a shard set, of any robot or of people, or a folder of video files. Its frames are taken at the rate
 of the robot's model. What lies between two pauses of a set's episode is an episode of its own. An episode
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 WORK = ".label"
-ORIGIN = "inferred: the commands are a model's, by inverse dynamics from the pictures"
+ORIGIN = "inferred: the actions are a model's, by inverse dynamics from the images"
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 BATCH = 16  # windows of a pass
 CHECKED = 64  # labelled episodes that the error is measured on, at most
@@ -57,14 +57,14 @@ RATE = 0.1  # share by which the film's rate may differ from the model's
 
 @dataclass(frozen=True)
 class LabelError:
-    """The error of inferred commands on labelled film.
+    """The error of inferred actions on labelled film.
 
     Attributes:
         source: the film's shard set.
         split: of its episodes.
         names: A names with units.
         rmse: (A,) in these units.
-        spread: (A,) standard deviation of the true commands: the error of always giving their mean.
+        spread: (A,) standard deviation of the true actions: the error of always giving their mean.
         commands: how many were compared.
     """
 
@@ -88,7 +88,7 @@ class LabelError:
 
 @dataclass(frozen=True)
 class Labelled:
-    """Labelled shards, and the error of their commands."""
+    """Labelled shards, and the error of their actions."""
 
     manifest: Manifest
     error: LabelError
@@ -120,12 +120,12 @@ def label_actions(
     device: str = "cpu",
     on_progress: Callable[[float, str, float], None] = lambda done, words, total: None,
 ) -> Labelled:
-    """Infer the commands of film, and write a shard set of the robot.
+    """Infer the actions of film, and write a shard set of the robot.
 
     Args:
         film: a shard set of the model's tokens, or a folder of video files.
         out: folder of the shards.
-        embodiment: the robot whose commands they are.
+        embodiment: the robot whose actions they are.
         checkpoint: with the objective `inverse`.
         check: labelled shards to measure the error on, their val split if they have one; by default those
             that the checkpoint's training run held out.
@@ -134,8 +134,8 @@ def label_actions(
         on_progress: called with the episodes done, what is done, and the episodes in all.
 
     Raises:
-        HMAError: the model does not infer commands, film or output do not fit, or on labelled film the
-            inferred commands are no better than their mean.
+        HMAError: the model does not infer actions, film or output do not fit, or on labelled film the
+            inferred actions are no better than their mean.
     """
     folder = as_path(out)
     find_film(film)
@@ -145,15 +145,15 @@ def label_actions(
     model = world.model
     trained = [OBJECTIVES[name].readout for name, weight in model.config.objectives.items() if weight]
     if INVERSE not in trained:
-        fault = f"was not trained to infer commands, but for {', '.join(model.config.objectives)}"
+        fault = f"was not trained to infer actions, but for {', '.join(model.config.objectives)}"
         raise HMAError(checkpoint, fault, "train one with objectives={inverse: 1.0}")
-    commands = world.commands(embodiment)
+    spec = world.action_spec(embodiment)
     robot = described(model, embodiment)
     if robot is None:
-        raise HMAError(embodiment, "has no YAML that describes its commands", "load a checkpoint")
+        raise HMAError(embodiment, "has no YAML that describes its actions", "load a checkpoint")
     with locked(folder):
         shown = film_of(world, film, embodiment, robot.effective_hz)
-        error = measure(world, commands, _labelled(model, embodiment, check), on_progress)
+        error = measure(world, spec, _labelled(model, embodiment, check), on_progress)
         made_by: dict[str, Any] = {
             "by": "hma label-actions",
             "inferred_actions": True,
@@ -166,10 +166,10 @@ def label_actions(
         manifest = finished(folder, whole)
         if manifest is None:
             work = begun(folder, WORK, made_by, model)  # what is kept of other film does no harm there
-            episodes, refused = _label(world, commands, shown, keys, work, on_progress)
+            episodes, refused = _label(world, spec, shown, keys, work, on_progress)
             cameras = seen_cameras(trained_cameras(card(model, embodiment)), recorded_cameras(robot))
-            spec = world.tokenizer.spec
-            manifest = write_shards(folder, episodes, spec, robot, whole, ORIGIN, refused, cameras)
+            tokens = world.tokenizer.spec
+            manifest = write_shards(folder, episodes, tokens, robot, whole, ORIGIN, refused, cameras)
             shutil.rmtree(work)
     return Labelled(manifest, error)
 
@@ -177,7 +177,7 @@ def label_actions(
 # -- inference
 
 
-def infer(model: "HMA", commands: Commands, stored: NDArray[Any]) -> Floats:
+def infer(model: "HMA", spec: Commands, stored: NDArray[Any]) -> Floats:
     """Return the chunks (T - 1, K) that led from each stored frame (T, …) to the next.
 
     A chunk is read off a window in whose later half it lies, except those of the first window.
@@ -186,53 +186,53 @@ def infer(model: "HMA", commands: Commands, stored: NDArray[Any]) -> Floats:
     hop = max(1, width // 2)
     starts = sorted({*range(0, count - width, hop), count - width})
     frames = torch.from_numpy(stored.astype(np.int64 if model.config.kind == "discrete" else np.float32))
-    made = np.empty((count - 1, commands.stride * len(commands.names)), np.float32)
+    made = np.empty((count - 1, spec.stride * len(spec.names)), np.float32)
     for begin in range(0, len(starts), BATCH):
         some = starts[begin : begin + BATCH]
         windows = torch.stack([frames[at : at + width] for at in some]).to(model.device)
-        read = model.predict_actions(windows, commands.embodiment, readout=INVERSE.name)
+        read = model.predict_actions(windows, spec.embodiment, readout=INVERSE.name)
         for at, chunks in zip(some, read.numpy(force=True)):
             known = 0 if at == 0 else (width - 1) // 2  # later windows overwrite what had less of a past
             made[at + known : at + width - 1] = chunks[known : width - 1]
-    return commands.clip(made.reshape(count - 1, commands.stride, -1)).reshape(made.shape)
+    return spec.clip(made.reshape(count - 1, spec.stride, -1)).reshape(made.shape)
 
 
 def measure(
     world: World,
-    commands: Commands,
+    spec: Commands,
     shards: ShardSet,
     on_progress: Callable[[float, str, float], None] = lambda done, words, total: None,
 ) -> LabelError:
-    """Return the error of inferred commands on labelled shards.
+    """Return the error of inferred actions on labelled shards.
 
     Raises:
-        HMAError: of no value of the command it is better than the mean.
+        HMAError: of no value of the action it is better than the mean.
     """
-    film = ShardFilm(world, shards, shards.row_stride, commands.embodiment)
+    film = ShardFilm(world, shards, shards.row_stride, spec.embodiment)
     splits = film.splits()
     split = "val" if "val" in splits else "train"
     chosen = [number for number, name in enumerate(splits) if name == split][:CHECKED]
-    width, misses, true = len(commands.names), [], []
+    width, misses, true = len(spec.names), [], []
     for done, number in enumerate(chosen):
         on_progress(done, "checking on labelled film", len(chosen))
         stored, actions, known = film.labelled(number)
         if len(stored) > 1:
-            made = infer(world.model, commands, stored)
+            made = infer(world.model, spec, stored)
             misses.append((made - actions[:-1])[known[:-1]].reshape(-1, width))
             true.append(actions[:-1][known[:-1]].reshape(-1, width))
     if not sum(map(len, true)):
-        raise HMAError(shards.folder, "has no known commands to compare with", "name labelled shards")
+        raise HMAError(shards.folder, "has no known actions to compare with", "name labelled shards")
     values = np.concatenate(true).astype(np.float64)
     rmse = np.sqrt(np.square(np.concatenate(misses).astype(np.float64)).mean(axis=0))
-    robot = described(world.model, commands.embodiment)
+    robot = described(world.model, spec.embodiment)
     assert robot is not None
     units = [part.unit or "" for part in robot.action.components for _ in range(part.dims)]
-    names = tuple(f"{name} {unit}".strip() for name, unit in zip(commands.names, units, strict=True))
+    names = tuple(f"{name} {unit}".strip() for name, unit in zip(spec.names, units, strict=True))
     spread = tuple(values.std(axis=0).tolist())
     found = LabelError(shards.folder.name, split, names, tuple(rmse.tolist()), spread, len(values))
     if not any(share is not None and share > 0 for share in found.explained):
-        fault = "inferred commands are no better than their mean on labelled film"
-        raise HMAError(commands.embodiment, fault, "train the inverse model longer, or on more film")
+        fault = "inferred actions are no better than their mean on labelled film"
+        raise HMAError(spec.embodiment, fault, "train the inverse model longer, or on more film")
     return found
 
 
@@ -260,20 +260,20 @@ def _keys(film: Film) -> list[str]:
 
 def _label(
     world: World,
-    commands: Commands,
+    spec: Commands,
     film: Film,
     keys: Sequence[str],
     work: Path,
     on_progress: Callable[[float, str, float], None],
 ) -> "tuple[_Kept, list[Refused]]":
-    """Infer the commands of all episodes that are not in the folder yet."""
+    """Infer the actions of all episodes that are not in the folder yet."""
     heads, kept, refused = film.heads(), [], list[Refused]()
     for number, (name, group, instruction) in enumerate(heads):
         path = work / f"{keys[number][:32]}.npz"
         found = kept_arrays(path)
         if found is None:
             on_progress(number, "labelling", len(heads))
-            found = _labels_of(world.model, commands, film, number)
+            found = _labels_of(world.model, spec, film, number)
             with atomic_path(path) as part, part.open("wb") as file:
                 np.savez(file, **found)
         if fault := str(found.get("fault", "")):
@@ -288,7 +288,7 @@ def _label(
     return _Kept(kept), refused
 
 
-def _labels_of(model: "HMA", commands: Commands, film: Film, number: int) -> dict[str, Any]:
+def _labels_of(model: "HMA", spec: Commands, film: Film, number: int) -> dict[str, Any]:
     """Return the frames and the inferred chunks of an episode, or why it cannot be used."""
     try:
         stored = film.read(number)
@@ -296,7 +296,7 @@ def _labels_of(model: "HMA", commands: Commands, film: Film, number: int) -> dic
             raise EpisodeError(film.heads()[number][0], "has fewer than two frames at the model's rate")
     except EpisodeError as fault:
         return {"fault": np.array(str(fault))}
-    return {"stored": stored, "chunks": infer(model, commands, stored)}
+    return {"stored": stored, "chunks": infer(model, spec, stored)}
 
 
 @dataclass(frozen=True)
@@ -373,7 +373,7 @@ class ShardFilm:
         world: of the model.
         shards: the set.
         step: rows from one frame to the next.
-        embodiment: the robot whose commands are inferred; by default that of the set.
+        embodiment: the robot whose actions are inferred; by default that of the set.
 
     Raises:
         UsageError: the set lacks a camera that the model sees, and is of the robot or the model sees several.
@@ -427,7 +427,7 @@ class ShardFilm:
 
 
 class VideoFilm:
-    """Video files, an episode each; their pictures are resized like those of the robot's camera."""
+    """Video files, an episode each; their images are resized like those of the robot's camera."""
 
     def __init__(self, world: World, folder: Path, files: list[Path], embodiment: str, hz: float) -> None:
         self.name, self._world, self._folder, self._files = folder.name, world, folder, files
@@ -453,8 +453,8 @@ class VideoFilm:
         video, made = VideoFile(path), []
         some = iter(nearest.tolist())
         while indices := list(islice(some, 4 * BATCH)):
-            pictures = fitted(video.frames(indices), self._world.model.config, self._robot)
-            made.append(self._world.tokenizer.encode(pictures))
+            images = fitted(video.frames(indices), self._world.model.config, self._robot)
+            made.append(self._world.tokenizer.encode(images))
         video.close()
         return np.concatenate(made)
 

@@ -1,4 +1,4 @@
-"""Write episodes that a model made, or whose commands it inferred, as a shard set or LeRobotDataset.
+"""Write episodes that a model made, or whose actions it inferred, as a shard set or LeRobotDataset.
 
 The plan of the shards, which is in the manifest and in the footer of every shard, says `synthetic: true` or
 `inferred_actions: true`, and by which checkpoint and with which settings they were made.
@@ -39,12 +39,12 @@ FACTS = "synthetic.json"  # of a LeRobotDataset: the facts of its plan
 
 @dataclass(frozen=True)
 class Made:
-    """An episode that a model made, or whose commands it inferred.
+    """An episode that a model made, or whose actions it inferred.
 
     Attributes:
         id: of the episode.
         stored: (T, V·h, w) or (T, c, V·h, w) frames as the model has them.
-        chunks: (T - 1, K) raw commands between them.
+        chunks: (T - 1, K) raw actions between them.
         counts: its flags.
         group: id of the real episode that it begins with, or of the recording that it is from.
         success: as judged; None if nobody says.
@@ -88,7 +88,7 @@ def write_shards(
     refused: Sequence[Refused] = (),
     cameras: Sequence[str] = (),
 ) -> Manifest:
-    """Write the shards of episodes; a frame without commands after it, the last one, is no row.
+    """Write the shards of episodes; a frame without actions after it, the last one, is no row.
 
     Args:
         folder: of the shard set.
@@ -97,7 +97,7 @@ def write_shards(
         made_by: facts for the plan.
         origin: how the episodes came about, in words.
         refused: other episodes, which go to quarantine; the first shard states them.
-        cameras: V names, whose pictures they show from the top; the primary one by default.
+        cameras: V names, whose images they show from the top; the primary one by default.
     """
     own = described_as(robot, origin)
     refs = [
@@ -170,7 +170,7 @@ def write_as_lerobot(
         folder: of the dataset; what an interrupted call left of it is removed.
         shards: the synthetic ones.
         tokenizer: of the shards.
-        stated: the real robot, and what reads its state off the pictures; None for a dataset without one.
+        stated: the real robot, and what reads its state off the images; None for a dataset without one.
         on_progress: as of `write_lerobot`.
     """
     made, size = ShardSet(shards), tokenizer.spec.image_size
@@ -194,15 +194,15 @@ def write_as_lerobot(
 
 
 def how_read(robot: Embodiment, reader: Reader) -> str:
-    """Return in words how well each value of a state is read off pictures."""
+    """Return in words how well each value of a state is read off images."""
     assert robot.state is not None
     units = [f" {one.unit}" if one.unit else "" for one in robot.state.components for _ in range(one.dims)]
     own = set(reader.readable.tolist())
     errors = reader.error * reader.std
     read = [f"{name} {errors[i]:.3g}{units[i]}" for i, name in enumerate(robot.state.names()) if i in own]
     rest = [name for i, name in enumerate(robot.state.names()) if i not in own]
-    said = f"read off the pictures, mean error {', '.join(read)}" if read else ""
-    left = f"not seen in the pictures, always the mean: {', '.join(rest)}" if rest else ""
+    said = f"read off the images, mean error {', '.join(read)}" if read else ""
+    left = f"not seen in the images, always the mean: {', '.join(rest)}" if rest else ""
     return "; ".join(part for part in (said, left) if part)
 
 
@@ -215,10 +215,10 @@ def _decoded(
     for row in made.episodes.to_pylist():
         stored, columns = seen_frames(made, opened, row, names)
         shown = [tokenizer.decode(view) for view in np.split(stored, len(names), axis=-2)]
-        pictures = {camera.key: view for camera, view in zip(own.cameras, shown, strict=True)}
+        images = {camera.key: view for camera, view in zip(own.cameras, shown, strict=True)}
         actions = columns["action"].reshape(-1, own.action_dim)
         state = None
         if reader is not None:
             state = reader.read(np.concatenate(shown, axis=2)).astype(np.float32).repeat(own.stride, axis=0)
         # one task: it is what a policy is told
-        yield LeRobotEpisode(pictures, actions, state, ORIGIN, hold=own.stride)
+        yield LeRobotEpisode(images, actions, state, ORIGIN, hold=own.stride)

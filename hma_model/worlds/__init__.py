@@ -1,5 +1,5 @@
-"""Drive a world model: sessions in pictures and commands, and gymnasium environments of them.
+"""Drive a world model: sessions in images and actions, and gymnasium environments of them.
 
-In come a checkpoint, a prompt and commands, out come pictures.
+In come a checkpoint, a prompt and actions, out come images.
 `hma_model.simulate` registers the environments.
 """

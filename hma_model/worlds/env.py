@@ -2,10 +2,10 @@
 
     import gymnasium, hma_model.simulate
     env = gymnasium.make("hma/WorldModel-v0", embodiment="pusht_fast", clip=True)
-    picture, _ = env.reset(seed=0)
-    picture, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+    image, _ = env.reset(seed=0)
+    image, reward, terminated, truncated, _ = env.step(env.action_space.sample())
 
-S pixels a side, V views side by side, A action dims, T pictures of an episode, N environments.
+S pixels a side, V views side by side, A action dims, T images of an episode, N environments.
 """
 
 import os
@@ -27,7 +27,7 @@ from hma_data.errors import HMAError, UsageError
 from hma_data.storage.paths import StrPath
 from hma_model.generation.commands import Floats, OutsideRangeWarning
 from hma_model.worlds.prompts import Prompt, read_prompt
-from hma_model.worlds.world import Picture, World, load_world
+from hma_model.worlds.world import Image, World, load_world
 
 # An OpenMP pool does not survive a fork, as in gymnasium's "async" vectors; one thread needs none.
 os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
@@ -36,14 +36,14 @@ CONTROLS = ("frame", "chunk")
 
 
 class Judge(Protocol):
-    """A function that scores an episode after each new picture."""
+    """A function that scores an episode after each new image."""
 
-    def __call__(self, pictures: Picture, commands: Floats) -> tuple[float, bool]:
-        """Return the reward of the newest picture, and whether the episode ends there.
+    def __call__(self, images: Image, actions: Floats) -> tuple[float, bool]:
+        """Return the reward of the newest image, and whether the episode ends there.
 
         Args:
-            pictures: (T, S, V·S, 3) of the episode so far; the first is the last one of the prompt.
-            commands: (T - 1, stride, A) raw commands between them.
+            images: (T, S, V·S, 3) of the episode so far; the first is the last one of the prompt.
+            actions: (T - 1, stride, A) raw actions between them.
         """
         ...
 
@@ -71,29 +71,29 @@ class Episodes:
     def __post_init__(self) -> None:
         if self.control not in CONTROLS:
             raise UsageError("control", f"{self.control!r} is unknown", f"give {' or '.join(CONTROLS)}")
-        self.commands = self.world.commands(self.embodiment)
-        if self.size is not None and self.world.picture_shape[0] != self.world.picture_shape[1]:
+        self.spec = self.world.action_spec(self.embodiment)
+        if self.size is not None and self.world.image_shape[0] != self.world.image_shape[1]:
             raise UsageError("size", "is for models of one view", "leave it out")
 
     @property
     def observation_space(self) -> gymnasium.spaces.Box:
-        """Return the space of the pictures."""
-        shape = self.world.picture_shape if self.size is None else (self.size, self.size, 3)
+        """Return the space of the images."""
+        shape = self.world.image_shape if self.size is None else (self.size, self.size, 3)
         return gymnasium.spaces.Box(0, 255, shape, np.uint8)
 
     @property
     def action_space(self) -> gymnasium.spaces.Box:
         """Return the space of the actions: (A,), or (stride, A)."""
-        low, high = self.commands.low, self.commands.high
+        low, high = self.spec.low, self.spec.high
         if self.control == "chunk":
-            low, high = (np.tile(bound, (self.commands.stride, 1)) for bound in (low, high))
+            low, high = (np.tile(bound, (self.spec.stride, 1)) for bound in (low, high))
         return gymnasium.spaces.Box(low, high, dtype=np.float32)
 
     @property
     def fps(self) -> float:
         """Return the rate of the steps in Hz; 10 if nobody states it."""
-        rate = self.commands.rate_hz or 10.0
-        return rate if self.control == "frame" else rate / self.commands.stride
+        rate = self.spec.rate_hz or 10.0
+        return rate if self.control == "frame" else rate / self.spec.stride
 
     def start(self, rng: np.random.Generator, prompt: Any = None) -> Prompt:
         """Return the prompt of an episode: the reset's, else the environment's, else a drawn one."""
@@ -104,37 +104,37 @@ class Episodes:
             self.read[seed] = read_prompt(self.world.model, self.embodiment, self.prompt, seed=seed or 0)
         return self.read[seed]
 
-    def commanded(self, action: Any) -> Floats:
-        """Return an action as commands (n, A): checked, clipped if wanted; warn once of a strange range."""
+    def checked(self, action: Any) -> Floats:
+        """Return an action as actions (n, A): checked, clipped if wanted; warn once of a strange range."""
         if self.control == "frame":
-            values = self.commands.one(action)[None]
+            values = self.spec.one(action)[None]
         else:
             values = np.asarray(action, np.float32)
-            self.commands.read(values)
-            values = values.reshape(self.commands.stride, -1)
-        outside = self.commands.outside(values)
+            self.spec.read(values)
+            values = values.reshape(self.spec.stride, -1)
+        outside = self.spec.outside(values)
         if outside and self.clip:
-            return self.commands.clip(values)
+            return self.spec.clip(values)
         if outside and not self.warned:
             self.warned = True
             said = f"{outside}, so what the model shows is a guess; clip=True clips actions to it"
             warnings.warn(f"{said}. This is said once", OutsideRangeWarning, stacklevel=4)
         return values
 
-    def seen(self, picture: Picture) -> Picture:
-        """Return a picture as it is observed; a copy, which its receiver may change."""
-        return picture.copy() if self.size is None else resize(picture[None], self.size)[0]
+    def seen(self, image: Image) -> Image:
+        """Return an image as it is observed; a copy, which its receiver may change."""
+        return image.copy() if self.size is None else resize(image[None], self.size)[0]
 
 
 class Drive:
-    """One session as episodes: commands gather to chunks, pictures become observations and rewards."""
+    """One session as episodes: actions gather to chunks, images become observations and rewards."""
 
     def __init__(self, episodes: Episodes) -> None:
         self.episodes, self.world = episodes, episodes.world
         self.session: int | None = None
-        self.picture: Picture = np.zeros(self.world.picture_shape, np.uint8)
+        self.image: Image = np.zeros(self.world.image_shape, np.uint8)
 
-    def begin(self, rng: np.random.Generator, prompt: Any = None) -> Picture:
+    def begin(self, rng: np.random.Generator, prompt: Any = None) -> Image:
         """Start an episode, and return its first observation."""
         frames, chunks = self.episodes.start(rng, prompt)
         seed = int(rng.integers(2**31))
@@ -142,19 +142,19 @@ class Drive:
             self.session = self.world.open(self.episodes.embodiment, frames, chunks, seed=seed)
         else:
             self.world.reset(self.session, frames, chunks, seed=seed)
-        self.picture = self.world.picture(self.session)
+        self.image = self.world.image(self.session)
         self.steps, self.frames = 0, 0
         self.waiting: list[Floats] = []
-        self.past: Picture = self.picture[None]  # grows by doubling; kept for a judge only
+        self.past: Image = self.image[None]  # grows by doubling; kept for a judge only
         self.chunks: list[Floats] = []
-        return self.episodes.seen(self.picture)
+        return self.episodes.seen(self.image)
 
     def take(self, action: Any) -> dict[int, Floats]:
         """Take an action; return the session's chunk once it is whole."""
         if self.session is None:
             raise HMAError("step", "there is no episode", "call reset() first")
-        self.waiting += list(self.episodes.commanded(action))
-        if len(self.waiting) < self.episodes.commands.stride:
+        self.waiting += list(self.episodes.checked(action))
+        if len(self.waiting) < self.episodes.spec.stride:
             return {}
         chunk = np.stack(self.waiting)
         self.waiting = []
@@ -162,23 +162,23 @@ class Drive:
             self.chunks.append(chunk)
         return {self.session: chunk}
 
-    def finish(self, made: dict[int, Picture]) -> tuple[Picture, float, bool, bool, dict[str, Any]]:
+    def finish(self, made: dict[int, Image]) -> tuple[Image, float, bool, bool, dict[str, Any]]:
         """End a step: return observation, reward, whether it is terminated or truncated, and facts."""
         assert self.session is not None
         self.steps += 1
         reward, terminated = 0.0, False
         if self.session in made:
-            self.picture = made[self.session]
+            self.image = made[self.session]
             self.frames += 1
             if self.episodes.judge is not None:
                 if self.frames == len(self.past):
                     self.past = np.concatenate([self.past, np.empty_like(self.past)])
-                self.past[self.frames] = self.picture
+                self.past[self.frames] = self.image
                 seen = self.past[: self.frames + 1]
                 reward, terminated = self.episodes.judge(seen, np.stack(self.chunks))
         truncated = self.episodes.horizon is not None and self.steps >= self.episodes.horizon
         facts = {"frames": self.frames}
-        return self.episodes.seen(self.picture), float(reward), bool(terminated), truncated, facts
+        return self.episodes.seen(self.image), float(reward), bool(terminated), truncated, facts
 
     def close(self) -> None:
         """End the session."""
@@ -218,7 +218,7 @@ class _Environment:
         self.world, self.render_mode = world, render_mode
         self.episodes = Episodes(world, embodiment, prompt, control, horizon, judge, clip, size)
         self.metadata = {**type(self).metadata, "render_fps": self.episodes.fps}
-        self.action_names = self.episodes.commands.names
+        self.action_names = self.episodes.spec.names
         self.action_space: gymnasium.Space[Any] = self.episodes.action_space
         self.observation_space: gymnasium.Space[Any] = self.episodes.observation_space
         self.drive = Drive(self.episodes)
@@ -232,25 +232,25 @@ def _known(options: dict[str, Any] | None, *keys: str) -> dict[str, Any]:
     return options
 
 
-class WorldModelEnv(_Environment, gymnasium.Env[Picture, Floats]):
+class WorldModelEnv(_Environment, gymnasium.Env[Image, Floats]):
     """One robot in a world model, as a gymnasium environment.
 
-    An observation is the newest picture (S, V·S, 3) uint8. Actions outside the range seen in training cause
-    one warning. An action of NaN is an unknown command, which the model was trained to do without.
+    An observation is the newest image (S, V·S, 3) uint8. Actions outside the range seen in training cause
+    one warning. An action of NaN is an unknown action, which the model was trained to do without.
 
     Args:
         checkpoint: as `load_world` takes it.
         embodiment: an id of the checkpoint.
         prompt: what every episode starts from, as `read_prompt` takes it; `reset(options={"prompt": …})`
             takes another for one episode. By default one of those that come along is drawn.
-        control: "frame": steps at the control rate; an action is a command (A,), and the picture changes
+        control: "frame": steps at the control rate; an action is an action (A,), and the image changes
             after every `stride` of them. "chunk": steps at the rate of the model's frames; an action is
             (stride, A).
         horizon: steps after which an episode is truncated; None for never.
         judge: gives the reward and ends episodes, see `Judge`; without one the reward is 0.
         render_mode: "rgb_array" or None.
         clip: clip actions to the range seen in training.
-        size: side in pixels of the observations; None for that of the model's pictures.
+        size: side in pixels of the observations; None for that of the model's images.
         world: a world to open the session in, instead of a checkpoint.
         device: of the network.
         settings: of `World`: unmask_steps, temperature, order, sample_steps, compile, precision.
@@ -261,26 +261,26 @@ class WorldModelEnv(_Environment, gymnasium.Env[Picture, Floats]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Picture, dict[str, Any]]:
+    ) -> tuple[Image, dict[str, Any]]:
         """Start an episode; `options["prompt"]` is what it starts from, as `read_prompt` takes it."""
         given = _known(options, "prompt")
         super().reset(seed=seed)
         return self.drive.begin(self.np_random, given.get("prompt")), {"frames": 0}
 
-    def step(self, action: Floats) -> tuple[Picture, float, bool, bool, dict[str, Any]]:
-        """Send a command, or a chunk; between chunks the last picture is shown."""
+    def step(self, action: Floats) -> tuple[Image, float, bool, bool, dict[str, Any]]:
+        """Send an action, or a chunk; between chunks the last image is shown."""
         return self.drive.finish(self.world.step(self.drive.take(action)))
 
-    def render(self) -> Picture | None:
-        """Return the newest picture (S, V·S, 3) as the model makes it."""
-        return self.drive.picture if self.render_mode == "rgb_array" else None
+    def render(self) -> Image | None:
+        """Return the newest image (S, V·S, 3) as the model makes it."""
+        return self.drive.image if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         """End the session."""
         self.drive.close()
 
 
-class WorldModelVectorEnv(_Environment, VectorEnv[Picture, Floats, NDArray[Any]]):
+class WorldModelVectorEnv(_Environment, VectorEnv[Image, Floats, NDArray[Any]]):
     """N robots in a world model, whose sessions step in one pass and begin and end independently.
 
     Args:
@@ -309,7 +309,7 @@ class WorldModelVectorEnv(_Environment, VectorEnv[Picture, Floats, NDArray[Any]]
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Picture, dict[str, Any]]:
+    ) -> tuple[Image, dict[str, Any]]:
         """Start episodes.
 
         Args:
@@ -327,10 +327,8 @@ class WorldModelVectorEnv(_Environment, VectorEnv[Picture, Floats, NDArray[Any]]
         self.ended[chosen] = False
         return self.observations.copy(), infos
 
-    def step(
-        self, actions: Floats
-    ) -> tuple[Picture, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Send a command, or a chunk, to each environment; those that get a picture get it in one pass."""
+    def step(self, actions: Floats) -> tuple[Image, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Send an action, or a chunk, to each environment; those that get an image get it in one pass."""
         again = self.ended & (self.autoreset_mode == AutoresetMode.NEXT_STEP)
         if self.autoreset_mode == AutoresetMode.DISABLED and self.ended.any():
             fault = f"the episodes of {np.flatnonzero(self.ended).tolist()} have ended"
@@ -354,9 +352,9 @@ class WorldModelVectorEnv(_Environment, VectorEnv[Picture, Floats, NDArray[Any]]
         self.ended = np.logical_or(terminated, truncated)
         return self.observations.copy(), rewards, terminated, truncated, infos
 
-    def render(self) -> tuple[Picture, ...] | None:
-        """Return the newest picture of each environment."""
-        return tuple(drive.picture for drive in self.drives) if self.render_mode == "rgb_array" else None
+    def render(self) -> tuple[Image, ...] | None:
+        """Return the newest image of each environment."""
+        return tuple(drive.image for drive in self.drives) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the sessions."""

@@ -1,6 +1,6 @@
-"""Read pictures to begin from: files, and the sample of a checkpoint; fit them to a model.
+"""Read images to begin from: files, and the sample of a checkpoint; fit them to a model.
 
-P pictures, H×W pixels, S pixels a side of the tokenizer's pictures, V views side by side.
+P images, H×W pixels, S pixels a side of the tokenizer's images, V views side by side.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,31 +22,31 @@ from hma_model.config import HMAConfig
 if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
 
-Picture = NDArray[np.uint8]
-REMEDY = "give a PNG, a JPEG or another still picture"
+Image = NDArray[np.uint8]
+REMEDY = "give a PNG, a JPEG or another still image"
 
 
-def read_picture(path: StrPath, remedy: str = REMEDY) -> Picture:
-    """Return the picture (H, W, 3) RGB of a file.
+def read_image(path: StrPath, remedy: str = REMEDY) -> Image:
+    """Return the image (H, W, 3) RGB of a file.
 
     Args:
         remedy: what the error says can be given.
 
     Raises:
-        UsageError: it cannot be read, or is no picture.
+        UsageError: it cannot be read, or is no image.
     """
     path = as_path(path)
     try:
         return decode_image(path.read_bytes(), str(path))
     except OSError as fault:
-        text = "is a folder, not a picture" if path.is_dir() else f"cannot be read: {fault.strerror}"
-        raise UsageError(path, *(misplaced(path, "a picture") or (text, remedy))) from fault
+        text = "is a folder, not an image" if path.is_dir() else f"cannot be read: {fault.strerror}"
+        raise UsageError(path, *(misplaced(path, "an image") or (text, remedy))) from fault
     except EpisodeError as fault:
-        raise UsageError(path, *(misplaced(path, "a picture") or ("is not a picture", remedy))) from fault
+        raise UsageError(path, *(misplaced(path, "an image") or ("is not an image", remedy))) from fault
 
 
-def picture_shape(config: HMAConfig) -> tuple[int, int, int]:
-    """Return (S, V·S, 3) of a model's pictures."""
+def image_shape(config: HMAConfig) -> tuple[int, int, int]:
+    """Return (S, V·S, 3) of a model's images."""
     size = TokenizerSpec.from_json(dict(config.tokenizer)).image_size
     return size, config.views * size, 3
 
@@ -58,7 +58,7 @@ def trained_cameras(card: Mapping[str, Any]) -> Cameras:
 
 
 def seen_cameras(cameras: Cameras, stored: Sequence[str]) -> list[str]:
-    """Return the names of the V cameras that a model's picture shows.
+    """Return the names of the V cameras that a model's image shows.
 
     Args:
         cameras: those that it was trained on, see `hma_data.loading.views`.
@@ -74,32 +74,32 @@ def recorded_cameras(robot: "Embodiment") -> list[str]:
     return [primary, *(camera.name for camera in robot.cameras if camera.name != primary)]
 
 
-def fitted(pictures: NDArray[Any], config: HMAConfig, robot: "Embodiment | None") -> Picture:
-    """Return pictures (P, H, W, 3) uint8 as (P, S, V·S, 3), resized as in a conversion.
+def fitted(images: NDArray[Any], config: HMAConfig, robot: "Embodiment | None") -> Image:
+    """Return images (P, H, W, 3) uint8 as (P, S, V·S, 3), resized as in a conversion.
 
     Args:
         robot: whose camera they are of; None crops them to squares.
 
     Raises:
-        HMAError: they are no such pictures, or show several views in another size.
+        HMAError: they are no such images, or show several views in another size.
     """
-    if pictures.ndim != 4 or pictures.shape[-1] != 3 or pictures.dtype != np.uint8 or not len(pictures):
-        fault = f"frames are {pictures.dtype} of the shape {pictures.shape}"
-        raise HMAError("prompt", fault, "give pictures (P, H, W, 3) uint8, or stored tokens")
-    spec, shape = TokenizerSpec.from_json(dict(config.tokenizer)), picture_shape(config)
-    if pictures.shape[1:] == shape:
-        return pictures
+    if images.ndim != 4 or images.shape[-1] != 3 or images.dtype != np.uint8 or not len(images):
+        fault = f"frames are {images.dtype} of the shape {images.shape}"
+        raise HMAError("prompt", fault, "give images (P, H, W, 3) uint8, or stored tokens")
+    spec, shape = TokenizerSpec.from_json(dict(config.tokenizer)), image_shape(config)
+    if images.shape[1:] == shape:
+        return images
     if config.views > 1:
-        fault = f"pictures are {pictures.shape[2]}×{pictures.shape[1]}"
+        fault = f"images are {images.shape[2]}×{images.shape[1]}"
         raise HMAError("prompt", fault, f"give {config.views} views side by side, {shape[1]}×{shape[0]}")
     rule = "short_side_crop" if robot is None else robot.primary_camera.resize
-    return resize(pictures, spec.image_size, rule, spec.resize_filter)
+    return resize(images, spec.image_size, rule, spec.resize_filter)
 
 
-def sample_picture(checkpoint: Checkpoint, embodiment: str) -> Picture | None:
-    """Return the first true picture (S, V·S, 3) of an embodiment's sample sheet; None without a sheet."""
+def sample_image(checkpoint: Checkpoint, embodiment: str) -> Image | None:
+    """Return the first true image (S, V·S, 3) of an embodiment's sample sheet; None without a sheet."""
     path = checkpoint.folder / "embodiments" / embodiment / SAMPLE
     if not path.is_file():
         return None
-    sheet, (height, width, _) = read_picture(path), picture_shape(checkpoint.config)
+    sheet, (height, width, _) = read_image(path), image_shape(checkpoint.config)
     return first_of_grid(sheet, height, width)

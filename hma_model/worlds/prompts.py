@@ -1,6 +1,6 @@
-"""Read the frames that a session starts from: shards, pictures, recordings, simulators.
+"""Read the frames that a session starts from: shards, images, recordings, simulators.
 
-A prompt is pictures (P, H, W, 3) uint8, or tokens as a shard set stores them, at the rate of the model's
+A prompt is images (P, H, W, 3) uint8, or tokens as a shard set stores them, at the rate of the model's
 frames, and the chunks (P - 1, K) between them, NaN where they are unknown.
 """
 
@@ -29,14 +29,14 @@ from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.generation.commands import card, described
 from hma_model.generation.decode import cameras_for
-from hma_model.worlds.images import read_picture, recorded_cameras, seen_cameras, trained_cameras
+from hma_model.worlds.images import read_image, recorded_cameras, seen_cameras, trained_cameras
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 Prompt = tuple[NDArray[Any], NDArray[np.float32] | None]
 WAYS = (
-    "give a picture or pictures, a picture's file, a folder of shards or of a LeRobotDataset, an environment "
+    "give an image or images, an image's file, a folder of shards or of a LeRobotDataset, an environment "
     "with render(), or a mapping; hma_model.simulate.read_prompt describes them"
 )
 LEROBOT = "meta/info.json"
@@ -101,13 +101,13 @@ def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int 
         embodiment: its id.
         prompt: one of
             None: what comes along, see `starting_window`;
-            pictures (H, W, 3) or (P, H, W, 3) uint8, or the str or path of a picture's file, or several;
+            images (H, W, 3) or (P, H, W, 3) uint8, or the str or path of an image's file, or several;
             the str or path of a shard set, or of a LeRobotDataset: the first frames of its first episode;
             a mapping: "shards" or "lerobot": that folder, and if wanted "episode": number or id, "start": its
             first frame as recorded, "frames": P; they may cross no pause;
-            a mapping: "frames": pictures at the model's rate, and "chunks": (P - 1, K);
-            a mapping: "frames": pictures at the control rate, T of them, and "actions": (T - 1, A);
-            an environment whose render() returns a picture.
+            a mapping: "frames": images at the model's rate, and "chunks": (P - 1, K);
+            a mapping: "frames": images at the control rate, T of them, and "actions": (T - 1, A);
+            an environment whose render() returns an image.
         seed: of a simulated prompt.
 
     Raises:
@@ -127,12 +127,12 @@ def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int 
             return _of_lerobot(model, embodiment, folder, Part())
         prompt = [folder]
     if isinstance(prompt, Sequence) and prompt and isinstance(prompt[0], str | PathLike):
-        prompt = [read_picture(path, WAYS) for path in prompt]
+        prompt = [read_image(path, WAYS) for path in prompt]
     try:
-        pictures = np.asarray(prompt)
+        images = np.asarray(prompt)
     except ValueError as fault:
-        raise HMAError("prompt", "its pictures differ in size", "give pictures of one size") from fault
-    return (pictures[None] if pictures.ndim in (2, 3) else pictures), None
+        raise HMAError("prompt", "its images differ in size", "give images of one size") from fault
+    return (images[None] if images.ndim in (2, 3) else images), None
 
 
 def starting_window(model: "HMA", embodiment: str, seed: int = 0) -> Prompt:
@@ -166,13 +166,13 @@ def _of_mapping(model: "HMA", embodiment: str, prompt: Mapping[str, Any]) -> Pro
 def _strided(model: "HMA", embodiment: str, frames: NDArray[Any], actions: ArrayLike) -> Prompt:
     """Return every stride-th frame, the last one included, and the chunks between them."""
     described(model, embodiment)
-    space, commands = model.embodiments[embodiment], np.asarray(actions, np.float32)
-    if commands.shape != (len(frames) - 1, space.action_dim):
-        fault = f"has actions of the shape {commands.shape} for {len(frames)} frames"
+    space, values = model.embodiments[embodiment], np.asarray(actions, np.float32)
+    if values.shape != (len(frames) - 1, space.action_dim):
+        fault = f"has actions of the shape {values.shape} for {len(frames)} frames"
         raise HMAError("prompt", fault, f"give ({len(frames) - 1}, {space.action_dim})")
     steps = (len(frames) - 1) // space.stride
     first = len(frames) - 1 - steps * space.stride
-    return frames[first :: space.stride], commands[first:].reshape(steps, space.chunk_dim)
+    return frames[first :: space.stride], values[first:].reshape(steps, space.chunk_dim)
 
 
 # -- episodes
@@ -248,7 +248,7 @@ def _of_recording(model: "HMA", robot: Embodiment, recording: Path, part: Part) 
     ids = source.episode_ids(recording)
     clip = to_clip(source.read(recording, ids[part.number(ids, recording)], robot), robot)
     at = part.rows(model, pieces(pauses(clip.timestamps), len(clip), robot.stride), robot.stride)
-    return _pictures(model, robot, clip, at), _chunks(clip.actions, clip.action_known, at, robot.stride)
+    return _images(model, robot, clip, at), _chunks(clip.actions, clip.action_known, at, robot.stride)
 
 
 def _chunks(
@@ -262,7 +262,7 @@ def _chunks(
     return chunks
 
 
-def _pictures(model: "HMA", robot: Embodiment, clip: Clip, at: NDArray[np.int64]) -> NDArray[np.uint8]:
+def _images(model: "HMA", robot: Embodiment, clip: Clip, at: NDArray[np.int64]) -> NDArray[np.uint8]:
     spec = TokenizerSpec.from_json(dict(model.config.tokenizer))
     cameras = trained_cameras(card(model, robot.id))
     views = [

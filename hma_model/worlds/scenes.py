@@ -1,8 +1,8 @@
 """Offer robots to drive, and scenes in which to begin.
 
-A scene gives the prompt of a world model, and then tells what truly happens under further commands. The
-laboratory's simulators know it for any commands; a recording knows it for its own commands alone; nobody
-knows it for a robot that begins from pictures.
+A scene gives the prompt of a world model, and then tells what truly happens under further actions. The
+laboratory's simulators know it for any actions; a recording knows it for its own actions alone; nobody
+knows it for a robot that begins from images.
 
 P frames of a prompt, H×W pixels, A action dims, K = stride * A values of a chunk.
 """
@@ -26,11 +26,11 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.worlds.images import (
-    Picture,
+    Image,
     fitted,
-    picture_shape,
+    image_shape,
     recorded_cameras,
-    sample_picture,
+    sample_image,
     seen_cameras,
     trained_cameras,
 )
@@ -48,7 +48,7 @@ RETURNING = ("joint_velocity", "base_velocity", "joint_delta", "eef_delta")  # s
 
 @dataclass(frozen=True)
 class Dimension:
-    """One value of a command.
+    """One value of an action.
 
     Attributes:
         low, high: range to drive in.
@@ -67,7 +67,7 @@ class Dimension:
 class Prompt:
     """Known frames (P, H, W, 3) uint8, and the chunks (P - 1, K) float32 between them; NaN is unknown."""
 
-    frames: Picture
+    frames: Image
     chunks: Floats
 
 
@@ -79,17 +79,17 @@ class Scene(Protocol):
         """Return the beginning."""
 
     @property
-    def command(self) -> Floats:
-        """Return the command (A,) that leaves the robot as it is after the prompt."""
+    def action(self) -> Floats:
+        """Return the action (A,) that leaves the robot as it is after the prompt."""
 
-    def advance(self, chunk: Floats | None) -> tuple[Floats, Picture | None] | None:
+    def advance(self, chunk: Floats | None) -> tuple[Floats, Image | None] | None:
         """Take the next chunk.
 
         Args:
-            chunk: (K,) commands; None for the recorded ones.
+            chunk: (K,) actions; None for the recorded ones.
 
         Returns:
-            The chunk, and the true picture (H, W, 3) after it if it is known; None at a recording's end.
+            The chunk, and the true image (H, W, 3) after it if it is known; None at a recording's end.
         """
 
 
@@ -99,7 +99,7 @@ class Drivable(Protocol):
     Attributes:
         key: tells it from others; letters, digits, `_`, `-`, `.` and `:`.
         dimensions: A of them.
-        cameras: the names of those that its pictures show, side by side.
+        cameras: the names of those that its images show, side by side.
     """
 
     key: str
@@ -109,7 +109,7 @@ class Drivable(Protocol):
 
     @property
     def source(self) -> str:
-        """Return "simulator", "recordings" or "pictures"."""
+        """Return "simulator", "recordings" or "images"."""
 
     def scene(self, number: int) -> Scene:
         """Return the scene of that number; there is one for every number from 0 on."""
@@ -119,7 +119,7 @@ class Drivable(Protocol):
 
 
 class LabRobot:
-    """A robot of the laboratory, with its simulator; its pictures have `size` pixels a side."""
+    """A robot of the laboratory, with its simulator; its images have `size` pixels a side."""
 
     source = "simulator"
 
@@ -148,22 +148,22 @@ class LabScene:
             chunks.append(chunk)
         self.prompt = Prompt(np.stack(frames), np.stack(chunks))
         held = self.prompt.chunks[-1][-self.width :]
-        self.command = np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
+        self.action = np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
 
-    def advance(self, chunk: Floats | None) -> tuple[Floats, Picture]:
+    def advance(self, chunk: Floats | None) -> tuple[Floats, Image]:
         taken = []
         for step in range(self.stride):
-            command = (
+            action = (
                 self.simulator.recorded()
                 if chunk is None
                 else chunk[step * self.width : (step + 1) * self.width]
             )
-            self.simulator.advance(command)
-            taken.append(command)
+            self.simulator.advance(action)
+            taken.append(action)
         return np.concatenate(taken).astype(np.float32), self._fitted(self.simulator.picture())
 
-    def _fitted(self, picture: Picture) -> Picture:
-        return picture if len(picture) == self.size else resize(picture[None], self.size)[0]
+    def _fitted(self, image: Image) -> Image:
+        return image if len(image) == self.size else resize(image[None], self.size)[0]
 
 
 SEED = 1_000_000  # of scenes; recordings for training have small seeds
@@ -228,14 +228,14 @@ def apart(count: int) -> int:
 class RecordedScene:
     """A window of a recording: frames (T, H, W, 3) and chunks (T, K)."""
 
-    def __init__(self, dims: tuple[Dimension, ...], frames: Picture, chunks: Floats) -> None:
+    def __init__(self, dims: tuple[Dimension, ...], frames: Image, chunks: Floats) -> None:
         self._frames, self._chunks, self._at = frames, chunks, PROMPT
-        self._followed = True  # whether all commands were the recorded ones
+        self._followed = True  # whether all actions were the recorded ones
         self.prompt = Prompt(frames[:PROMPT], chunks[: PROMPT - 1])
         held = chunks[PROMPT - 2, -len(dims) :]
-        self.command = np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
+        self.action = np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
 
-    def advance(self, chunk: Floats | None) -> tuple[Floats, Picture | None] | None:
+    def advance(self, chunk: Floats | None) -> tuple[Floats, Image | None] | None:
         if chunk is not None:
             self._followed = False
             return chunk, None
@@ -245,48 +245,48 @@ class RecordedScene:
         return self._chunks[self._at - 2], self._frames[self._at - 1] if self._followed else None
 
 
-# -- pictures
+# -- images
 
 
-class PicturedRobot:
-    """A robot that begins from pictures (P, H, W, 3); from a single one it begins at rest.
+class ImagedRobot:
+    """A robot that begins from images (P, H, W, 3); from a single one it begins at rest.
 
-    The commands before several pictures are unknown, and so is the resting command of a robot with targets.
+    The actions before several images are unknown, and so is the resting action of a robot with targets.
     """
 
-    source = "pictures"
+    source = "images"
 
     def __init__(
         self,
         embodiment: Embodiment,
         stats: Mapping[str, Any],
-        pictures: Picture,
+        images: Image,
         cameras: Cameras = FIRST,
     ) -> None:
-        self.embodiment, self.key = embodiment, f"{embodiment.id}:pictures"
+        self.embodiment, self.key = embodiment, f"{embodiment.id}:images"
         self.cameras = seen_cameras(cameras, recorded_cameras(embodiment))
         self.dimensions = dims = dimensions(embodiment, stats)
         means = stats["action"]["mean"]
         rest = [{"rate": 0.0, "switch": dim.low}.get(dim.kind, mean) for dim, mean in zip(dims, means)]
-        self._command = np.array(rest, np.float32)
-        before = np.full_like(self._command, np.nan)
-        if len(pictures) == 1:
-            pictures = pictures.repeat(PROMPT, axis=0)
+        self._action = np.array(rest, np.float32)
+        before = np.full_like(self._action, np.nan)
+        if len(images) == 1:
+            images = images.repeat(PROMPT, axis=0)
             if all(dim.kind != "target" for dim in dims):
-                before = self._command
-        self._prompt = Prompt(pictures, np.tile(before, (len(pictures) - 1, embodiment.stride)))
+                before = self._action
+        self._prompt = Prompt(images, np.tile(before, (len(images) - 1, embodiment.stride)))
 
-    def scene(self, number: int) -> "PicturedScene":
+    def scene(self, number: int) -> "ImagedScene":
         """Return the one scene that there is."""
-        return PicturedScene(self._prompt, self._command)
+        return ImagedScene(self._prompt, self._action)
 
 
 @dataclass(frozen=True)
-class PicturedScene:
-    """Pictures, after which nobody knows what truly happens."""
+class ImagedScene:
+    """Images, after which nobody knows what truly happens."""
 
     prompt: Prompt
-    command: Floats
+    action: Floats
 
     def advance(self, chunk: Floats | None) -> tuple[Floats, None] | None:
         return None if chunk is None else (chunk, None)
@@ -299,22 +299,22 @@ def drivable(
     checkpoint: Checkpoint,
     sets: Iterable[ShardSet],
     tokenizer: Callable[[], "Tokenizer"],
-    pictures: Sequence[Picture] = (),
+    images: Sequence[Image] = (),
 ) -> dict[str, Drivable]:
     """Return the robots of a checkpoint that can be driven, by key.
 
-    A robot without simulator and shards begins from the first picture of its sample in the checkpoint.
+    A robot without simulator and shards begins from the first image of its sample in the checkpoint.
 
     Args:
         sets: shard sets of its robots.
         tokenizer: returns the checkpoint's, which decodes them.
-        pictures: (H, W, 3) of one size, in their order at the rate of the model's frames; every robot begins
+        images: (H, W, 3) of one size, in their order at the rate of the model's frames; every robot begins
             from them too.
 
     Raises:
         UsageError: there is none, or the checkpoint lacks the robot of a shard set.
         CheckpointError: the shard set has other tokens than the checkpoint was trained on.
-        HMAError: the pictures do not fit the model.
+        HMAError: the images do not fit the model.
     """
     found: dict[str, Drivable] = {}
     for shards in sets:
@@ -332,17 +332,17 @@ def drivable(
     for name in checkpoint.embodiments:
         embodiment, stats = checkpoint.embodiment(name), checkpoint.stats(name)
         cameras = trained_cameras(checkpoint.card(name))
-        begun = list(pictures)
+        begun = list(images)
         if simulated(name):
-            found[name] = LabRobot(embodiment, stats, picture_shape(checkpoint.config)[0])
-        elif not begun and name not in recorded and (sample := sample_picture(checkpoint, name)) is not None:
+            found[name] = LabRobot(embodiment, stats, image_shape(checkpoint.config)[0])
+        elif not begun and name not in recorded and (sample := sample_image(checkpoint, name)) is not None:
             begun = [sample]
         if begun:
             shown = fitted(np.stack(begun), checkpoint.config, embodiment)
-            pictured = PicturedRobot(embodiment, stats, shown, cameras)
-            found[pictured.key] = pictured
+            imaged = ImagedRobot(embodiment, stats, shown, cameras)
+            found[imaged.key] = imaged
     if not found:
-        remedy = "give shards of it, hma play CHECKPOINT SHARDS, or a picture of it, --prompt PICTURE"
+        remedy = "give shards of it, hma play CHECKPOINT SHARDS, or an image of it, --prompt PICTURE"
         raise UsageError(checkpoint.folder, "no robot of it has a simulator to begin from", remedy)
     return found
 
@@ -376,7 +376,7 @@ def trained_on(checkpoint: Checkpoint) -> list[ShardSet]:
 
 
 def dimensions(embodiment: Embodiment, stats: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    """Return the values of a robot's command, with the range of the commands seen in training."""
+    """Return the values of a robot's action, with the range of the actions seen in training."""
     action = stats["action"]
     mean, std = np.array(action["mean"]), np.array(action["std"])
     low = np.array(action.get("min", mean - 2 * std))

@@ -1,13 +1,13 @@
-"""Keep sessions of a world model side by side, in pictures and commands.
+"""Keep sessions of a world model side by side, in images and actions.
 
     world = load_world("embedded")
     session = world.open("pusht_fast", *starting_window(world.model, "pusht_fast"))
-    pictures = world.step({session: commands})   # the picture that the commands lead to
-    commands = world.act([session])              # those of the model itself, if it was trained to act
+    images = world.step({session: actions})   # the image that the actions lead to
+    actions = world.act([session])              # those of the model itself, if it was trained to act
 
 A session is a row of a rollout. Rows are added as sessions open, and used again as sessions close.
 
-P frames of a prompt, H×W pixels, S pixels a side of the tokenizer's pictures, V views side by side, A action
+P frames of a prompt, H×W pixels, S pixels a side of the tokenizer's images, V views side by side, A action
 dims, K = stride · A, n sessions of a step.
 """
 
@@ -30,7 +30,7 @@ from hma_model.generation.engine import products_in
 from hma_model.generation.rollout import Rollout
 from hma_model.generation.state import Snapshot as Snapshot
 from hma_model.generation.unmask import Decoding, check, default_temperature
-from hma_model.worlds.images import Picture, fitted, picture_shape
+from hma_model.worlds.images import Image, fitted, image_shape
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -60,7 +60,7 @@ class World:
         unmask_steps, temperature, order, sample_steps: may be set between steps; they count for all sessions.
         measure: set it to know how unsure the model is, see `uncertainty`; latents are then drawn twice.
         uncertainty: session → that of the newest frame as of `Rollout`, if it is measured.
-        picture_shape: (S, V·S, 3) of every picture.
+        image_shape: (S, V·S, 3) of every image.
     """
 
     def __init__(
@@ -83,22 +83,22 @@ class World:
         self.measure, self.uncertainty = False, dict[int, float]()
         products_in(precision, model.device, compile)  # checks that the device has them
         self._decoding()
-        self.picture_shape = picture_shape(model.config)
+        self.image_shape = image_shape(model.config)
         self._rollout: Rollout | None = None
         self._sessions: dict[int, _Session] = {}
         self._opened = 0
-        self._commands: dict[str, Commands] = {}
+        self._specs: dict[str, Commands] = {}
 
     @property
     def sessions(self) -> dict[int, str]:
         """Return the open sessions and their embodiments."""
         return {number: one.embodiment for number, one in self._sessions.items()}
 
-    def commands(self, embodiment: str) -> Commands:
-        """Return what commands an embodiment takes; an HMAError says that the model lacks it."""
-        if embodiment not in self._commands:
-            self._commands[embodiment] = Commands.of(self.model, embodiment)
-        return self._commands[embodiment]
+    def action_spec(self, embodiment: str) -> Commands:
+        """Return what actions an embodiment takes; an HMAError says that the model lacks it."""
+        if embodiment not in self._specs:
+            self._specs[embodiment] = Commands.of(self.model, embodiment)
+        return self._specs[embodiment]
 
     def open(
         self, embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None = None, *, seed: int = 0
@@ -107,9 +107,9 @@ class World:
 
         Args:
             embodiment: an id of the model.
-            frames: pictures (P, H, W, 3) uint8 RGB, at the rate of the model's frames; another size is
+            frames: images (P, H, W, 3) uint8 RGB, at the rate of the model's frames; another size is
                 resized as in a conversion. Or tokens or latents as stored, (P, h, w) or (P, c, h, w).
-            chunks: (P - 1, K) raw; chunk k holds the commands from frame k to k+1. NaN where they are
+            chunks: (P - 1, K) raw; chunk k holds the actions from frame k to k+1. NaN where they are
                 unknown. None: all are.
             seed: of the session's random numbers.
 
@@ -139,20 +139,20 @@ class World:
         self._at(session)
         del self._sessions[session]
 
-    def step(self, commands: Mapping[int, ArrayLike]) -> dict[int, Picture]:
-        """Generate the next picture of some sessions, in one pass.
+    def step(self, actions: Mapping[int, ArrayLike]) -> dict[int, Image]:
+        """Generate the next image of some sessions, in one pass.
 
         Args:
-            commands: session → (K,) or (stride, A) raw commands from its newest picture to the next one. A
-                command of NaN is unknown, and then the whole chunk is.
+            actions: session → (K,) or (stride, A) raw actions from its newest image to the next one. A
+                action of NaN is unknown, and then the whole chunk is.
 
         Returns:
             session → (S, V·S, 3) uint8 RGB.
         """
-        if not commands:
+        if not actions:
             return {}
-        order, rows = self._ordered(commands)
-        chunks, known = self._chunks(order, commands)
+        order, rows = self._ordered(actions)
+        chunks, known = self._chunks(order, actions)
         rollout = self._running()
         rollout.decoding = self._decoding()
         frames = rollout.step(chunks, known=known, rows=rows)
@@ -161,7 +161,7 @@ class World:
         return dict(zip(order, decode(self.tokenizer, frames.unsqueeze(1))[:, 0]))
 
     def act(self, sessions: Iterable[int]) -> dict[int, Floats]:
-        """Return the commands (stride, A) that the model itself gives after the newest pictures of sessions.
+        """Return the actions (stride, A) that the model itself gives after the newest images of sessions.
 
         Raises:
             HMAError: the model was not trained to act.
@@ -175,24 +175,24 @@ class World:
             for session, chunk, space in zip(order, made, spaces)
         }
 
-    def observe(self, pictures: Mapping[int, Picture], commands: Mapping[int, ArrayLike]) -> None:
-        """Add the pictures that truly came next to sessions, in one pass.
+    def observe(self, images: Mapping[int, Image], actions: Mapping[int, ArrayLike]) -> None:
+        """Add the images that truly came next to sessions, in one pass.
 
         Args:
-            pictures: session → (H, W, 3) uint8 RGB, all of one size.
-            commands: session → as in `step`, those that led to its picture.
+            images: session → (H, W, 3) uint8 RGB, all of one size.
+            actions: session → as in `step`, those that led to its image.
         """
-        order, rows = self._ordered(pictures)
-        chunks, known = self._chunks(order, commands)
-        stored = self._encoded(self._at(order[0]).embodiment, np.stack([pictures[one] for one in order]))
+        order, rows = self._ordered(images)
+        chunks, known = self._chunks(order, actions)
+        stored = self._encoded(self._at(order[0]).embodiment, np.stack([images[one] for one in order]))
         self._running().observe(torch.from_numpy(stored), chunks, known=known, rows=rows)
 
-    def picture(self, session: int) -> Picture:
-        """Return the newest picture of a session; after `open`, the last of its prompt."""
+    def image(self, session: int) -> Image:
+        """Return the newest image of a session; after `open`, the last of its prompt."""
         return decode(self.tokenizer, self._newest(session).unsqueeze(1))[0, 0]
 
-    def shown(self, frames: NDArray[Any]) -> Picture:
-        """Return the pictures (P, S, V·S, 3) of frames as a prompt takes them; pictures stay as they are."""
+    def shown(self, frames: NDArray[Any]) -> Image:
+        """Return the images (P, S, V·S, 3) of frames as a prompt takes them; images stay as they are."""
         if frames.ndim == 4 and frames.dtype == np.uint8:
             return frames
         return decode(self.tokenizer, torch.from_numpy(np.asarray(frames)).unsqueeze(0))[0]
@@ -200,7 +200,7 @@ class World:
     def encoded(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:
         """Return the tokens (P, h, w) int64 or latents (P, c, h, w) float32 of frames as a prompt takes them.
 
-        Pictures are encoded, those of another size resized as in a conversion of the embodiment.
+        Images are encoded, those of another size resized as in a conversion of the embodiment.
         """
         config = self.model.config
         if len(frames) and frames.shape[1:] == config.frame_shape:
@@ -255,10 +255,10 @@ class World:
         return order, [self._at(session).row for session in order]
 
     def _chunks(
-        self, order: Sequence[int], commands: Mapping[int, ArrayLike]
+        self, order: Sequence[int], actions: Mapping[int, ArrayLike]
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the commands of sessions as chunks (n, K), and which are known (n,)."""
-        read = [self.commands(self._at(one).embodiment).read(commands[one]) for one in order]
+        """Return the actions of sessions as chunks (n, K), and which are known (n,)."""
+        read = [self.action_spec(self._at(one).embodiment).read(actions[one]) for one in order]
         chunks = np.zeros((len(order), max(len(chunk) for chunk, _ in read)), np.float32)
         for row, (chunk, _) in zip(chunks, read):
             row[: len(chunk)] = chunk
@@ -301,11 +301,11 @@ class World:
         self, embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return stored frames (P, ...), chunks (P - 1, K), and which are known (P - 1,)."""
-        commands = self.commands(embodiment)
+        spec = self.action_spec(embodiment)
         stored = self.encoded(embodiment, np.asarray(frames)[-self.model.config.frames :])
-        rows = [] if chunks is None else [commands.read(chunk) for chunk in np.asarray(chunks)]
+        rows = [] if chunks is None else [spec.read(chunk) for chunk in np.asarray(chunks)]
         if chunks is None:
-            rows = [(np.zeros(commands.stride * len(commands.names), np.float32), False)] * (len(stored) - 1)
+            rows = [(np.zeros(spec.stride * len(spec.names), np.float32), False)] * (len(stored) - 1)
         elif len(rows) != len(frames) - 1:
             fault = f"has {len(rows)} chunks for {len(frames)} frames"
             raise HMAError("prompt", fault, f"give {len(frames) - 1}, one from each frame to the next")
@@ -315,7 +315,7 @@ class World:
         return torch.from_numpy(stored), torch.from_numpy(values), known
 
     def _encoded(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:
-        """Return pictures (n, H, W, 3) as the model stores them."""
+        """Return images (n, H, W, 3) as the model stores them."""
         config = self.model.config
         frames = fitted(frames, config, described(self.model, embodiment))
         views = [self.tokenizer.encode(view) for view in np.split(frames, config.views, axis=2)]
@@ -323,7 +323,7 @@ class World:
 
 
 def require_actor(config: "HMAConfig", where: str) -> None:
-    """Check that a model was trained to command; an HMAError says how that is done."""
+    """Check that a model was trained to action; an HMAError says how that is done."""
     trained = [OBJECTIVES[name] for name, weight in config.objectives.items() if weight > 0]
     if not any(one.readout == POLICY for one in trained):
         fault = f"was not trained to act, but for {', '.join(one.name for one in trained)}"

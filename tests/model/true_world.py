@@ -60,23 +60,23 @@ class TrueWorld:
                     self._advance(first, chunk)
                 self.rows[session] = first
 
-    def step(self, commands: Mapping[int, NDArray[np.float32]]) -> dict[int, NDArray[np.uint8]]:
-        self.steps.append(dict(commands))
+    def step(self, actions: Mapping[int, NDArray[np.float32]]) -> dict[int, NDArray[np.uint8]]:
+        self.steps.append(dict(actions))
         self.sampling.append((self.unmask_steps, self.temperature, self.order))
-        for row, chunk in commands.items():
+        for row, chunk in actions.items():
             self._advance(self.rows[row], chunk)
-        pictures = {row: self.rows[row].picture() for row in commands}
-        return {row: one * 0 if row in self.blind else one for row, one in pictures.items()}
+        images = {row: self.rows[row].image() for row in actions}
+        return {row: one * 0 if row in self.blind else one for row, one in images.items()}
 
-    def picture(self, session: int) -> NDArray[np.uint8]:
-        return self.rows[session].picture()
+    def image(self, session: int) -> NDArray[np.uint8]:
+        return self.rows[session].image()
 
     def close(self, session: int) -> None:
         del self.rows[session]
 
     def _advance(self, simulator: LabSimulator, chunk: NDArray[np.float32]) -> None:
-        for command in chunk.reshape(-1, simulator.embodiment.action_dim):
-            simulator.advance(command)
+        for action in chunk.reshape(-1, simulator.embodiment.action_dim):
+            simulator.advance(action)
 
 
 class Watcher:
@@ -110,7 +110,7 @@ def tiny_model(robot: str, *objectives: str) -> HMA:
 
 
 class BlockLatents(BlockTokenizer):
-    """The mean colours of 8×8 blocks of a 64-pixel picture as latents."""
+    """The mean colours of 8×8 blocks of a 64-pixel image as latents."""
 
     spec = TokenizerSpec("latents", 1, "continuous", 64, (8, 8), channels=3, dtype="float16")
 

@@ -54,10 +54,10 @@ class StillWorld(TrueWorld):
     def reset(self, session: int, frames: Any, chunks: Any = None, *, seed: int | None = None) -> None:
         self.rows[session] = frames[-1]
 
-    def step(self, commands: Any) -> Any:
-        return {row: self.rows[row] for row in commands}
+    def step(self, actions: Any) -> Any:
+        return {row: self.rows[row] for row in actions}
 
-    def picture(self, session: int) -> Any:
+    def image(self, session: int) -> Any:
         return self.rows[session]
 
 
@@ -65,7 +65,7 @@ class StillWorld(TrueWorld):
 def recorded(
     toy_arm: Embodiment, toy_recording: Path, block_tokenizer: BlockTokenizer, tmp_path: Path
 ) -> Iterator[Engine]:
-    """A robot of recordings whose YAML names no value of the command."""
+    """A robot of recordings whose YAML names no value of the action."""
     values = toy_arm.to_dict()
     (part,) = values["action"]["components"]
     with h5py.File(toy_recording, "a") as file:
@@ -169,7 +169,7 @@ def test_a_short_press_of_a_key_is_not_lost(page: "Page", engine: Engine) -> Non
     session = session_of(engine, page)
     page.keyboard.press("ArrowDown")  # up at once, between two frames
     frames(page, session.count + 4)
-    driven = [frame.commands[0, 1] for frame in session.frames]
+    driven = [frame.actions[0, 1] for frame in session.frames]
     assert max(driven) > 0 and driven[-1] == 0
 
 
@@ -204,7 +204,7 @@ def test_a_clicked_setting_leaves_the_keys_to_the_robot(page: "Page", engine: En
     page.keyboard.up("ArrowRight")
 
 
-def test_the_mouse_steers_by_dragging_on_the_picture(page: "Page", engine: Engine) -> None:
+def test_the_mouse_steers_by_dragging_on_the_image(page: "Page", engine: Engine) -> None:
     box = page.locator("#stage").bounding_box()
     assert box
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -231,7 +231,7 @@ def test_touch_sets_the_target_of_a_robot_that_follows_one(
     page.touchscreen.tap(box["x"] + box["width"] * 0.75, box["y"] + box["height"] * 0.25)
     frames(page, 2)
     held = session_of(engine, page).held
-    assert held.tolist() == pytest.approx([96, 32], abs=1)  # px of the picture of 128
+    assert held.tolist() == pytest.approx([96, 32], abs=1)  # px of the image of 128
     context.close()
 
 
@@ -390,7 +390,7 @@ def test_a_closed_session_offers_to_start_again(page: "Page", engine: Engine) ->
     frames(page, 2)
 
 
-def test_the_picture_says_how_to_begin_and_that_it_stands_still(page: "Page") -> None:
+def test_the_image_says_how_to_begin_and_that_it_stands_still(page: "Page") -> None:
     assert page.text_content("#start") == "←→↑↓ or drag here to drive"
     assert page.text_content("#driven") == "nothing yet"
     page.keyboard.press("ArrowRight")
@@ -441,7 +441,7 @@ def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", en
     page.wait_for_selector("#sync:not(.call)")
 
 
-def test_a_picture_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(
+def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(
     page: "Page", engine: Engine
 ) -> None:
     session = session_of(engine, page)
@@ -466,7 +466,7 @@ def test_a_picture_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(
     page.keyboard.press("y")
     page.wait_for_selector("#sync:not(.call)")
     bright = "Math.max(...$('model-view').getContext('2d').getImageData(5, 5, 1, 1).data.slice(0, 3)) > 50"
-    for _ in range(100):  # until the true picture is there, where the model of before was black
+    for _ in range(100):  # until the true image is there, where the model of before was black
         if page.evaluate(bright):
             break
         page.wait_for_timeout(100)
@@ -495,7 +495,7 @@ def test_a_page_whose_server_stopped_says_so_and_goes_on_when_it_is_back(
 
 
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (667, 375), (820, 1180), (1024, 600)])
-def test_the_pictures_and_the_run_button_fit_on_the_screen_side_by_side(
+def test_the_images_and_the_run_button_fit_on_the_screen_side_by_side(
     browser: "Browser", address: str, width: int, height: int
 ) -> None:
     context = browser.new_context(viewport={"width": width, "height": height})
@@ -517,7 +517,7 @@ def test_the_question_mark_explains_the_page_and_the_keys_rest_meanwhile(
     page: "Page", engine: Engine
 ) -> None:
     page.keyboard.press("?")
-    page.wait_for_selector("#about:has-text('A neural network predicts every picture')")
+    page.wait_for_selector("#about:has-text('A neural network predicts every image')")
     page.keyboard.press("ArrowRight")
     page.keyboard.press("p")
     page.wait_for_timeout(100)

@@ -32,30 +32,30 @@ def served(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
 
 
 @pytest.fixture
-def picture(tmp_path: Path) -> str:
-    write_png(tmp_path / "a picture.png", np.zeros((40, 30, 3), np.uint8))
-    return str(tmp_path / "a picture.png")
+def image(tmp_path: Path) -> str:
+    write_png(tmp_path / "an image.png", np.zeros((40, 30, 3), np.uint8))
+    return str(tmp_path / "an image.png")
 
 
 @pytest.mark.parametrize("address", [REPO, f"{REPO}@main", f"hf://{REPO}"])
 def test_a_published_checkpoint_is_fetched(
-    published: Hub, served: list[Any], picture: str, address: str
+    published: Hub, served: list[Any], image: str, address: str
 ) -> None:
-    assert main(["play", address, "--prompt", picture, "--no-browser"]) == 0
+    assert main(["play", address, "--prompt", image, "--no-browser"]) == 0
     ((checkpoint, name, robots, *_),) = served
-    assert name == address and set(robots) == {f"{robot}:pictures" for robot in ROBOTS}
+    assert name == address and set(robots) == {f"{robot}:images" for robot in ROBOTS}
     assert set(Checkpoint.open(checkpoint.folder).embodiments) == set(ROBOTS)
 
 
 def test_a_damaged_trunk_is_refused(
-    tmp_path: Path, served: list[Any], picture: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, served: list[Any], image: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save(tmp_path / "model", {"arm": 2})
     trunk = tmp_path / "model/trunk.safetensors"
     data = bytearray(trunk.read_bytes())
     data[len(data) // 2] ^= 1
     trunk.write_bytes(data)
-    assert main(["play", str(tmp_path / "model"), "--prompt", picture, "--no-browser"]) == 1
+    assert main(["play", str(tmp_path / "model"), "--prompt", image, "--no-browser"]) == 1
     assert "is another trunk than config.json names — pull" in capsys.readouterr().err and not served
 
 
@@ -65,7 +65,7 @@ def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, request: pytest
     yaml.write_text(Checkpoint.open("embedded").embodiment("mover_10").to_yaml().replace("mover_10", "rover"))
     words = ["convert", "-e", str(yaml), "--source", str(record("mover_10", tmp_path, 2)), "--tokenizer"]
     assert main([*words, "fsq-lab", "--out", str(tmp_path / "shards"), "--workers", "1"]) == 0
-    small = ["steps=1", "pictures=0", "report=false", "batch_size=1", "device=cpu", "eval_windows=1"]
+    small = ["steps=1", "images=0", "report=false", "batch_size=1", "device=cpu", "eval_windows=1"]
     data, out = str(tmp_path / "shards"), str(tmp_path / "run")
     assert main(["finetune", "--from", "embedded", "--data", data, "--out", out, *small]) == 0
     assert json.loads((tmp_path / "run/recipe.json").read_text())["data"] == [data]
@@ -74,18 +74,18 @@ def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, request: pytest
     assert list(served[0][2]) == ["rover:recordings"]
 
 
-def test_the_page_opens_with_the_robot_that_was_named_or_the_picture_that_was_given(
-    published: Hub, served: list[Any], picture: str, capsys: pytest.CaptureFixture[str]
+def test_the_page_opens_with_the_robot_that_was_named_or_the_image_that_was_given(
+    published: Hub, served: list[Any], image: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words, last = ["play", REPO, "--prompt", picture, "--no-browser"], list(ROBOTS)[-1]
+    words, last = ["play", REPO, "--prompt", image, "--no-browser"], list(ROBOTS)[-1]
     assert main([*words, "-e", last]) == 0
     assert main(words) == 0
     assert "-e ROBOT opens the page with yours" in capsys.readouterr().err
     assert main(["play", "-e", "mover_04", "--no-browser"]) == 0
     assert main(["play", "--no-browser"]) == 0
     assert [kept[-1]["first"] for kept in served] == [
-        f"{last}:pictures",
-        f"{next(iter(ROBOTS))}:pictures",
+        f"{last}:images",
+        f"{next(iter(ROBOTS))}:images",
         "mover_04",
         None,
     ]
@@ -94,10 +94,10 @@ def test_the_page_opens_with_the_robot_that_was_named_or_the_picture_that_was_gi
 
 
 def test_the_device_and_precision_reach_the_world(
-    tmp_path: Path, served: list[Any], picture: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, served: list[Any], image: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hma_model.training.runtime.choose_device", lambda name: name)
     save(tmp_path / "model", {"arm": 2})
-    words = ["play", str(tmp_path / "model"), "--prompt", picture, "--no-browser"]
+    words = ["play", str(tmp_path / "model"), "--prompt", image, "--no-browser"]
     assert main([*words, "--precision", "bf16", "--device", "cuda", "--compile"]) == 0
-    assert served[0][-1] == {"device": "cuda", "precision": "bf16", "compile": True, "first": "arm:pictures"}
+    assert served[0][-1] == {"device": "cuda", "precision": "bf16", "compile": True, "first": "arm:images"}

@@ -54,7 +54,7 @@ class Page:
                 return message
 
     def frame(self) -> tuple[dict[str, Any], list[np.ndarray[Any, Any]]]:
-        """Return the header and the pictures of the next frame."""
+        """Return the header and the images of the next frame."""
         while True:
             data = self.socket.receive().get("bytes")
             if data:
@@ -88,37 +88,37 @@ def test_the_page_allows_no_script_but_its_own(client: TestClient) -> None:
     assert answer.text.count(f'nonce="{nonce}"') == 2 and "NONCE" not in answer.text
 
 
-def test_a_page_opens_drives_and_sees_both_pictures(client: TestClient) -> None:
+def test_a_page_opens_drives_and_sees_both_images(client: TestClient) -> None:
     with client.websocket_connect(DRIVE) as socket:
         page = Page(socket)
         assert {robot["key"] for robot in page.message("hello")["robots"]} == {"mover_04", "arm2_12"}
         opened = page.open()
         assert [d["name"] for d in opened["robot"]["dimensions"]] == ["vx", "vy"] and opened["paused"]
-        page.send("drive", command=[20, -10], input=7)
+        page.send("drive", action=[20, -10], input=7)
         page.send("run", on=True)
         for number in (1, 2, 3):
-            header, pictures = page.frame()
+            header, images = page.frame()
             page.see(header)
-            assert header["frame"] == number and header["input"] == 7 and header["command"] == [20, -10]
-            assert [picture.shape for picture in pictures] == [(128, 128, 3)] * 2 and header["psnr"] == 60
+            assert header["frame"] == number and header["input"] == 7 and header["action"] == [20, -10]
+            assert [image.shape for image in images] == [(128, 128, 3)] * 2 and header["psnr"] == 60
         page.send("run", on=False)
         assert page.message("status")["paused"]
 
 
-def test_a_command_far_outside_the_range_seen_in_training_is_told_once(client: TestClient) -> None:
+def test_a_action_far_outside_the_range_seen_in_training_is_told_once(client: TestClient) -> None:
     with client.websocket_connect(DRIVE) as socket:
         page = Page(socket)
         ends = page.open()["robot"]["dimensions"][0]
-        page.send("drive", command=[2 * ends["high"], 0], input=1)
+        page.send("drive", action=[2 * ends["high"], 0], input=1)
         assert f"vx {ends['low']:g} to {ends['high']:g}" in page.message("error")["text"]
-        page.send("drive", command=[3 * ends["high"], 0], input=2)
+        page.send("drive", action=[3 * ends["high"], 0], input=2)
         page.send("step")
         received = []
         while not (data := socket.receive()).get("bytes"):
             received.append(json.loads(data["text"])["kind"])
         assert "error" not in received
         (size,) = struct.unpack(">H", data["bytes"][:2])
-        assert json.loads(data["bytes"][2 : 2 + size])["command"][0] == pytest.approx(3 * ends["high"])
+        assert json.loads(data["bytes"][2 : 2 + size])["action"][0] == pytest.approx(3 * ends["high"])
 
 
 def test_a_reload_goes_on_where_it_was(client: TestClient) -> None:
@@ -160,9 +160,9 @@ WRONG = {
     "no object": "[]",
     "unknown": '{"do": "remove"}',
     "another field": '{"do": "step", "path": "/etc"}',
-    "NaN": '{"do": "drive", "command": [NaN, 0], "input": 1}',
-    "infinite": '{"do": "drive", "command": [1e999, 0], "input": 1}',
-    "text": '{"do": "drive", "command": ["1", "2"], "input": 1}',
+    "NaN": '{"do": "drive", "action": [NaN, 0], "input": 1}',
+    "infinite": '{"do": "drive", "action": [1e999, 0], "input": 1}',
+    "text": '{"do": "drive", "action": ["1", "2"], "input": 1}',
     "deep": "[" * 5000,
     "huge": '{"do": "resume", "session": "' + "x" * MOST_BYTES + '"}',
     "passes": '{"do": "sample", "passes": 1000000, "temperature": 0, "order": "random"}',
@@ -224,7 +224,7 @@ def test_wrong_values_are_told_and_the_session_goes_on(client: TestClient) -> No
         page.send("open", robot="nobody")
         assert "there is no 'nobody'" in page.message("error")["text"]
         page.open()
-        page.send("drive", command=[1, 2, 3], input=1)
+        page.send("drive", action=[1, 2, 3], input=1)
         assert "has 3 values, this robot takes 2" in page.message("error")["text"]
         page.works()
 

@@ -35,7 +35,7 @@ class Bench:
             self.engine.step()
 
 
-def test_sessions_that_are_due_share_a_pass_and_hold_their_own_commands() -> None:
+def test_sessions_that_are_due_share_a_pass_and_hold_their_own_actions() -> None:
     bench = Bench()
     sessions = [bench.open(robot)[0] for robot in ROBOTS]
     for number, session in enumerate(sessions):
@@ -50,12 +50,12 @@ def test_sessions_that_are_due_share_a_pass_and_hold_their_own_commands() -> Non
 def test_a_session_steps_at_the_rate_of_its_robot_or_as_fast_as_it_can() -> None:
     bench = Bench()
     session, viewer = bench.open("mover_04")  # 10 frames a second
-    picture = bench.world.picture(session.row)
+    image = bench.world.image(session.row)
     due = []
     for now in (100.02, 100.15, 105.0):  # the third is late; what was missed is not made up for
         session.due = due[-1] if due else 100.0
         session.next_chunk()
-        session.take(picture, now, 0.0)
+        session.take(image, now, 0.0)
         due.append(session.due)
     assert due == pytest.approx([100.1, 100.2, 105.0])
     assert not session.ready(104.9) and session.ready(105.0)
@@ -83,7 +83,7 @@ def test_a_paused_session_makes_single_frames_and_one_without_viewer_none() -> N
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_the_simulator_runs_beside_under_the_same_commands(robot: str) -> None:
+def test_the_simulator_runs_beside_under_the_same_actions(robot: str) -> None:
     bench = Bench()
     session, viewer = bench.open(robot, scene=1)
     rng = np.random.default_rng(0)
@@ -94,19 +94,19 @@ def test_the_simulator_runs_beside_under_the_same_commands(robot: str) -> None:
     assert session.parted is None
 
 
-def test_replay_gives_the_commands_of_the_recorded_episode() -> None:
+def test_replay_gives_the_actions_of_the_recorded_episode() -> None:
     bench = Bench()
     session, viewer = bench.open("arm3_04", scene=2)
     session.replays = True
     bench.step(5)
     simulator = LabSimulator("arm3_04")
     simulator.reset(SEED, 2)
-    commands = []
+    actions = []
     for _ in range((PROMPT - 1 + 5) * session.robot.embodiment.stride):
-        commands.append(simulator.recorded())
-        simulator.advance(commands[-1])
-    driven = np.concatenate([frame.commands for frame in viewer.frames])
-    np.testing.assert_array_equal(driven, commands[-len(driven) :])
+        actions.append(simulator.recorded())
+        simulator.advance(actions[-1])
+    driven = np.concatenate([frame.actions for frame in viewer.frames])
+    np.testing.assert_array_equal(driven, actions[-len(driven) :])
 
 
 def test_they_part_when_for_a_second_a_still_is_as_near_to_the_truth_as_the_model() -> None:
@@ -126,14 +126,14 @@ def test_they_part_when_for_a_second_a_still_is_as_near_to_the_truth_as_the_mode
 def test_a_model_that_is_wrong_but_nearer_to_the_truth_than_a_still_has_not_parted() -> None:
     bench = Bench()
     session, viewer = bench.open()
-    session._best = 80.0  # every picture of the model counts as wrong
+    session._best = 80.0  # every image of the model counts as wrong
     session.held = np.array([60, 60], np.float32)
     bench.step(15)
     last = viewer.frames[-1]
     assert session.parted is None and last.psnr == 60 and last.still is not None and last.still < 30
 
 
-def test_sync_restarts_the_model_from_the_true_frames_and_their_commands() -> None:
+def test_sync_restarts_the_model_from_the_true_frames_and_their_actions() -> None:
     bench = Bench()
     session, _ = bench.open()
     bench.world.blind.add(session.row)
@@ -141,7 +141,7 @@ def test_sync_restarts_the_model_from_the_true_frames_and_their_commands() -> No
     bench.step(6)
     session.sync()
     frames, chunks = bench.world.begun[-1]
-    np.testing.assert_array_equal(frames[-1], bench.world.rows[session.row].picture())
+    np.testing.assert_array_equal(frames[-1], bench.world.rows[session.row].image())
     np.testing.assert_array_equal(chunks[-6:], np.tile(session.held, (6, 1)))
     assert len(frames) == len(chunks) + 1 and frames.max() > 0
 

@@ -1,4 +1,4 @@
-"""A model acts in scenes: it commands what `predict_actions` says of all that it saw and did."""
+"""A model acts in scenes: it actions what `predict_actions` says of all that it saw and did."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def actor(*objectives: str) -> World:
     return World(tiny_model(ROBOT, *objectives), get_tokenizer("fsq-8"), temperature=0.0)
 
 
-def test_it_commands_what_the_history_of_pictures_and_commands_says() -> None:
+def test_it_actions_what_the_history_of_images_and_actions_says() -> None:
     world = actor("policy")
     arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
     policy, stride = Acting(world, arena.scenes), arena.scenes.stride
@@ -36,22 +36,23 @@ def test_it_commands_what_the_history_of_pictures_and_commands_says() -> None:
         wanted = world.model.predict_actions(
             torch.from_numpy(tokens)[:, first:], ROBOT, told[:, first:], known[:, first:]
         )[:, -1].numpy()
-        low, high = world.commands(ROBOT).low, world.commands(ROBOT).high
+        spec = world.action_spec(ROBOT)
+        low, high = spec.low, spec.high
         given = []
         for _ in range(stride):
             given.append(checked("it", policy, arena))
             arena.step(given[-1])
         made = np.stack(given, axis=1)
-        if world.commands(ROBOT).seen is not None:
+        if spec.seen is not None:
             wanted = np.clip(wanted.reshape(made.shape), low, high)
         np.testing.assert_allclose(made.reshape(2, -1), wanted.reshape(2, -1), atol=1e-3)
-        frames.append(arena.pictures[:, None])
+        frames.append(arena.images[:, None])
         chunks.append(made.reshape(2, 1, -1))
-    assert not np.allclose(given[0], given[0][:1])  # the scenes differ, and so do the commands
+    assert not np.allclose(given[0], given[0][:1])  # the scenes differ, and so do the actions
 
 
 @pytest.mark.parametrize("memory", [1, 3])
-def test_with_a_short_memory_it_goes_by_the_newest_pictures_alone(memory: int) -> None:
+def test_with_a_short_memory_it_goes_by_the_newest_images_alone(memory: int) -> None:
     world = actor("policy")
     arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
     policy, stride = Acting(world, arena.scenes, memory=memory), arena.scenes.stride
@@ -68,11 +69,12 @@ def test_with_a_short_memory_it_goes_by_the_newest_pictures_alone(memory: int) -
             given.append(checked("it", policy, arena))
             arena.step(given[-1])
         made = np.stack(given, axis=1).reshape(2, -1)
-        low, high = (np.tile(end, stride) for end in (world.commands(ROBOT).low, world.commands(ROBOT).high))
+        spec = world.action_spec(ROBOT)
+        low, high = np.tile(spec.low, stride), np.tile(spec.high, stride)
         said = wanted[:, -1].numpy()
-        said = np.clip(said, low, high) if world.commands(ROBOT).seen is not None else said
+        said = np.clip(said, low, high) if spec.seen is not None else said
         np.testing.assert_allclose(made, said, atol=1e-3)
-        frames = np.concatenate([frames, arena.pictures[:, None]], axis=1)
+        frames = np.concatenate([frames, arena.images[:, None]], axis=1)
         chunks = np.concatenate([chunks, made[:, None]], axis=1)
 
 
@@ -85,13 +87,13 @@ def test_what_it_imagines_ahead_is_forgotten() -> None:
         begin("it", policy, arena)
         runs.append([])
         for _ in range(3 * scenes.stride):
-            command = checked("it", policy, arena)
-            runs[-1].append(command)
-            arena.step(command * 0)
-            policy._follower._taken[-1] = command * 0  # both do the same, whatever they say
+            action = checked("it", policy, arena)
+            runs[-1].append(action)
+            arena.step(action * 0)
+            policy._follower._taken[-1] = action * 0  # both do the same, whatever they say
     runs[0], runs[1] = ([np.stack(part) for part in np.array_split(one, 3)] for one in runs)
     np.testing.assert_allclose(runs[0][0], runs[1][0], atol=1e-3)
-    assert not np.allclose(runs[0][1], runs[1][1], atol=1e-3)  # of an imagined picture, not of the true one
+    assert not np.allclose(runs[0][1], runs[1][1], atol=1e-3)  # of an imagined image, not of the true one
 
 
 def test_it_acts_in_a_world_model_too() -> None:

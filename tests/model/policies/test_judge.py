@@ -14,25 +14,25 @@ SIDE = 8
 
 
 class WrittenPlaces:
-    """A probe of pictures that hold the places of the parts in their first pixels."""
+    """A probe of images that hold the places of the parts in their first pixels."""
 
     driven, own, loose = 1, np.array([0]), np.array([1, 2])
 
     def __init__(self, blind: bool = False) -> None:
         self.rng = np.random.default_rng(0) if blind else None
 
-    def read(self, pictures: np.ndarray) -> np.ndarray:
-        places = pictures[..., :3, 0, :2].astype(float)
+    def read(self, images: np.ndarray) -> np.ndarray:
+        places = images[..., :3, 0, :2].astype(float)
         return places if self.rng is None else self.rng.normal(64, 5, places.shape)
 
-    def areas(self, pictures: np.ndarray) -> np.ndarray:
-        return np.ones((*pictures.shape[:-3], 3))
+    def areas(self, images: np.ndarray) -> np.ndarray:
+        return np.ones((*images.shape[:-3], 3))
 
 
 def written(parts: np.ndarray) -> np.ndarray:
-    pictures = np.zeros((len(parts), SIDE, SIDE, 3), np.uint8)
-    pictures[:, :3, 0, :2] = parts.round()
-    return pictures
+    images = np.zeros((len(parts), SIDE, SIDE, 3), np.uint8)
+    images[:, :3, 0, :2] = parts.round()
+    return images
 
 
 @pytest.fixture

@@ -46,19 +46,19 @@ def saved(folder: Path, actions: int = 2, **inputs: int) -> Any:
     wide = {
         key: {"mean": torch.zeros(n), "std": torch.ones(n)} for key, n in ((STATE, 2), ("action", actions))
     }
-    picture = {"mean": torch.full((3, 1, 1), 0.5), "std": torch.full((3, 1, 1), 0.3)}
+    image = {"mean": torch.full((3, 1, 1), 0.5), "std": torch.full((3, 1, 1), 0.3)}
     wide["action"]["mean"] += 5
-    before, after = make_pre_post_processors(config, dataset_stats=wide | dict.fromkeys(cameras, picture))
+    before, after = make_pre_post_processors(config, dataset_stats=wide | dict.fromkeys(cameras, image))
     for part in (policy, before, after):
         part.save_pretrained(folder)
     return policy, before, after
 
 
-def test_it_commands_what_lerobot_itself_does(tmp_path: Path) -> None:
+def test_it_actions_what_lerobot_itself_does(tmp_path: Path) -> None:
     own, before, after = saved(tmp_path, state=2)
     policy, arena = read_policy(f"lerobot:{tmp_path}", scenes()), TrueArena(scenes(), 64)
     begin("it", policy, arena)
-    given = {CAMERA: torch.from_numpy(arena.pictures).permute(0, 3, 1, 2) / 255}
+    given = {CAMERA: torch.from_numpy(arena.images).permute(0, 3, 1, 2) / 255}
     given[STATE] = torch.from_numpy(arena.observed())
     with torch.inference_mode():
         wanted = after(own.select_action(before(given))).numpy()
@@ -69,7 +69,7 @@ def test_it_commands_what_lerobot_itself_does(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("inputs", "said"),
     [
-        ({"cameras": 2}, f"takes {CAMERA}, {CAMERA}_0 — a world model gives the picture of one camera"),
+        ({"cameras": 2}, f"takes {CAMERA}, {CAMERA}_0 — a world model gives the image of one camera"),
         ({"actions": 3}, "gives actions of 3 values — rails_03 takes 2"),
     ],
 )
@@ -80,13 +80,11 @@ def test_other_inputs_and_actions_are_refused(tmp_path: Path, inputs: dict[str, 
     assert said in str(fault.value)
 
 
-def test_a_state_that_pictures_do_not_tell_is_refused(tmp_path: Path) -> None:
+def test_a_state_that_images_do_not_tell_is_refused(tmp_path: Path) -> None:
     saved(tmp_path, state=7)
     policy, arena = read_policy(f"lerobot:{tmp_path}", scenes()), TrueArena(scenes(), 64)
     begin("it", policy, arena)
-    with pytest.raises(
-        HMAError, match="takes a state of 7 values, and of rails_03 the pictures tell one of 2"
-    ):
+    with pytest.raises(HMAError, match="takes a state of 7 values, and of rails_03 the images tell one of 2"):
         checked("it", policy, arena)
 
 

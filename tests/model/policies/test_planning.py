@@ -21,22 +21,22 @@ from tests.model.true_world import tiny_model
 ROBOT, SIDE = "rails_03", 64
 
 
-def test_imagined_pictures_are_those_of_sessions_that_take_the_commands() -> None:
+def test_imagined_images_are_those_of_sessions_that_take_the_actions() -> None:
     world = World(tiny_model(ROBOT), get_tokenizer("fsq-8"), unmask_steps=1, temperature=0.0)
     arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
     cost = Cost(world, ROBOT)
     cost.open([(prompt.frames, prompt.chunks) for prompt in arena.prompts])
     candidates = np.random.default_rng(0).normal(size=(2, 3, 2, 2)).astype(np.float32)
-    pictures = cost.imagine(cost.sessions, candidates)
-    assert pictures.shape == (2, 3, 2, 128, 128, 3)
-    commands = cost.commands(candidates)
+    images = cost.imagine(cost.sessions, candidates)
+    assert images.shape == (2, 3, 2, 128, 128, 3)
+    actions = cost.actions(candidates)
     for scene, session in enumerate(cost.sessions):
         kept = world.snapshot(session)
         for candidate in range(3):
             world.restore(session, kept)
             for ahead in range(2):
-                made = world.step({session: commands[scene, candidate, ahead]})[session]
-                np.testing.assert_array_equal(pictures[scene, candidate, ahead], made)
+                made = world.step({session: actions[scene, candidate, ahead]})[session]
+                np.testing.assert_array_equal(images[scene, candidate, ahead], made)
 
 
 def test_a_robot_that_the_model_lacks_is_named() -> None:
@@ -46,14 +46,14 @@ def test_a_robot_that_the_model_lacks_is_named() -> None:
 
 
 class DotWorld:
-    """A world whose picture shows a dot, which commands move."""
+    """A world whose image shows a dot, which actions move."""
 
     def __init__(self) -> None:
         space = SimpleNamespace(mean=(0.0, 0.0), std=(4.0, 4.0))
         self.model: Any = SimpleNamespace(embodiments={"dot": space})
         self.at: dict[int, np.ndarray] = {}
 
-    def commands(self, embodiment: str) -> Any:
+    def actions(self, embodiment: str) -> Any:
         low, high = np.full(2, -8.0, np.float32), np.full(2, 8.0, np.float32)
         return SimpleNamespace(
             names=("x", "y"), stride=1, low=low, high=high, clip=lambda x: x.clip(low, high)
@@ -71,12 +71,12 @@ class DotWorld:
         other.at = dict(enumerate(self.at[session] for session in sessions for _ in range(n)))
         return other
 
-    def step(self, commands: Any) -> dict[int, np.ndarray]:
-        for session, chunk in commands.items():
+    def step(self, actions: Any) -> dict[int, np.ndarray]:
+        for session, chunk in actions.items():
             self.at[session] = (self.at[session] + chunk[0]).clip(6, SIDE - 6)
-        return {session: self.picture(session) for session in commands}
+        return {session: self.image(session) for session in actions}
 
-    def picture(self, session: int) -> np.ndarray:
+    def image(self, session: int) -> np.ndarray:
         x, y = self.at[session].round().astype(int)
         made = np.zeros((SIDE, SIDE, 3), np.uint8)
         made[y - 5 : y + 6, x - 5 : x + 6] = 255
@@ -86,7 +86,7 @@ class DotWorld:
 def dots(*places: tuple[int, int]) -> torch.Tensor:
     world = DotWorld()
     world.at = {number: np.array(place) for number, place in enumerate(places)}
-    return torch.from_numpy(np.stack([world.picture(number)[None] for number in world.at]))
+    return torch.from_numpy(np.stack([world.image(number)[None] for number in world.at]))
 
 
 def test_the_distance_from_a_goal_is_least_at_the_goal() -> None:
@@ -110,7 +110,7 @@ def test_a_solver_of_stable_worldmodel_finds_the_way(kind: str) -> None:
     solver.configure(action_space=box, n_envs=2, config=config(3, 1))
     info = {"pixels": dots((20, 20), (40, 30)), "goal": dots((32, 24), (30, 40))}
     actions = solver(info)["actions"]
-    ends = np.array([[20, 20], [40, 30]]) + cost.commands(actions.numpy())[:, :, 0].sum(axis=1)
+    ends = np.array([[20, 20], [40, 30]]) + cost.actions(actions.numpy())[:, :, 0].sum(axis=1)
     assert np.abs(ends - [[32, 24], [30, 40]]).max() < 4
 
 
@@ -124,9 +124,9 @@ def test_a_plan_asks_the_judge_about_each_candidate() -> None:
     asked: list[tuple[int, ...]] = []
 
     class Judge:
-        def score(self, pictures: np.ndarray) -> np.ndarray:
-            asked.append(pictures.shape)
-            return -pictures[:, -1].mean(axis=(1, 2, 3))
+        def score(self, images: np.ndarray) -> np.ndarray:
+            asked.append(images.shape)
+            return -images[:, -1].mean(axis=(1, 2, 3))
 
     policy.judged(Judge())  # type: ignore[arg-type]
     begin("plan", policy, arena)

@@ -36,29 +36,29 @@ POLICIES = ["scripted", "scripted:noise=0.5", "random", "still"]
 
 
 class KnownPlaces:
-    """A probe that knows the places in every picture that a simulator drew."""
+    """A probe that knows the places in every image that a simulator drew."""
 
     own, loose, driven = np.array([0, 1]), np.array([2, 3]), 2
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.known: dict[bytes, np.ndarray] = {}
-        draw = LabSimulator.picture
+        draw = LabSimulator.image
 
-        def picture(simulator: LabSimulator) -> np.ndarray:
+        def image(simulator: LabSimulator) -> np.ndarray:
             drawn = draw(simulator)
             self.known[drawn.tobytes()] = truth.parts_of(simulator.simulation)[1]
             return drawn
 
-        monkeypatch.setattr(LabSimulator, "picture", picture)
+        monkeypatch.setattr(LabSimulator, "image", image)
 
-    def read(self, pictures: np.ndarray) -> np.ndarray:
-        flat = pictures.reshape(-1, *pictures.shape[-3:])
+    def read(self, images: np.ndarray) -> np.ndarray:
+        flat = images.reshape(-1, *images.shape[-3:])
         blank = np.full((4, 2), 64.0)
         found = np.stack([self.known.get(one.tobytes(), blank) for one in flat])
-        return found.reshape(*pictures.shape[:-3], *found.shape[1:])
+        return found.reshape(*images.shape[:-3], *found.shape[1:])
 
-    def areas(self, pictures: np.ndarray) -> np.ndarray:
-        return np.ones((*pictures.shape[:-3], 4))
+    def areas(self, images: np.ndarray) -> np.ndarray:
+        return np.ones((*images.shape[:-3], 4))
 
     def __reduce__(self) -> Any:
         return KnownPlaces, ()  # what it has seen so far makes no other judge of it
@@ -75,8 +75,8 @@ class FlawlessWorld(TrueWorld):
 
     def __init__(self, world: World) -> None:
         super().__init__()
-        self.model, self.tokenizer, self.picture_shape = world.model, world.tokenizer, world.picture_shape
-        self.commands, self.shown, self.precision = world.commands, world.shown, world.precision
+        self.model, self.tokenizer, self.image_shape = world.model, world.tokenizer, world.image_shape
+        self.actions, self.shown, self.precision = world.actions, world.shown, world.precision
 
 
 def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJudge) -> None:
@@ -87,7 +87,7 @@ def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJu
         if one.policy != "scripted":  # it steers by places, whose pose is found to a few digits
             np.testing.assert_allclose(one.model.scores, one.true.scores, atol=1.0)
     assert (found.policies[2].model.scores == found.policies[2].true.scores).all()
-    assert np.array_equal(found.policies[2].true_pictures, found.policies[2].model_pictures)
+    assert np.array_equal(found.policies[2].true_images, found.policies[2].model_images)
     assert found.policies[3].true.scores.max() == 0 and found.policies[0].true.scores.max() > 2
     assert found.generated.balanced == 1 and found.followed == pytest.approx(1)
     (reason,) = [one for one in sentences(found) if "correlation" in one and "policies" in one]
@@ -104,7 +104,7 @@ def test_policies_of_gym_pusht_are_told_where_the_disc_is(monkeypatch: pytest.Mo
     for step in range(2 * arena.scenes.stride + 1):
         told = arena.observed()
         assert told is not None and told.shape == (2, 2)
-        near = 1 if arena.fresh else 25  # of 512 px; between pictures it is estimated
+        near = 1 if arena.fresh else 25  # of 512 px; between images it is estimated
         np.testing.assert_allclose(told, true.observed(), atol=near)
         for one in (true, arena):
             one.step(np.array([[100, 400], [250, 60 + 5 * step]], np.float32))
@@ -179,7 +179,7 @@ def test_a_policy_that_was_edited_is_scored_again(
 
     def written(value: int) -> list[str]:
         sys.modules.pop("mine", None)
-        (tmp_path / "mine.py").write_text(f"act = lambda picture: [{value}, 0]\n")
+        (tmp_path / "mine.py").write_text(f"act = lambdan image: [{value}, 0]\n")
         before = len(begun)
         given: Any = {"world": world, "judge": judge, "episodes": 2, "frames": 4, "out": tmp_path / "out"}
         evaluate_policies(ROBOT, ["mine:act", "still"], **given)
@@ -200,36 +200,36 @@ def test_a_policy_that_was_edited_is_scored_again(
 def test_both_arenas_begin_with_the_same_frames_and_numbers_follow_the_seed(world: World) -> None:
     scenes = Scenes.of(world, ROBOT, 2, 1)
     one, other = (TrueArena(scenes, 128) for _ in range(2))
-    assert np.array_equal(one.pictures, other.pictures)
-    assert not np.array_equal(one.pictures[0], one.pictures[1])
-    assert not np.array_equal(one.pictures, TrueArena(Scenes.of(world, ROBOT, 2, 2), 128).pictures)
+    assert np.array_equal(one.images, other.images)
+    assert not np.array_equal(one.images[0], one.images[1])
+    assert not np.array_equal(one.images, TrueArena(Scenes.of(world, ROBOT, 2, 2), 128).images)
 
 
-def test_a_random_command_is_held_for_a_chunk_and_stays_in_range(world: World) -> None:
+def test_a_random_action_is_held_for_a_chunk_and_stays_in_range(world: World) -> None:
     arena = TrueArena(Scenes.of(world, ROBOT, 3, 0), 128)
     policy = read_policy("random", arena.scenes)
     begin("random", policy, arena)
-    commands = []
+    actions = []
     for _ in range(2 * arena.scenes.stride):
-        commands.append(checked("random", policy, arena))
-        arena.step(commands[-1])
-    chunks = np.array(commands).reshape(2, arena.scenes.stride, 3, -1)
+        actions.append(checked("random", policy, arena))
+        arena.step(actions[-1])
+    chunks = np.array(actions).reshape(2, arena.scenes.stride, 3, -1)
     assert (chunks == chunks[:, :1]).all() and (chunks[0] != chunks[1]).all()
     high = np.array([dim.high for dim in arena.scenes.dimensions])
     assert (np.abs(chunks) <= high).all()
 
 
 class Wild:
-    """A policy that commands what no robot was trained on."""
+    """A policy that actions what no robot was trained on."""
 
-    def __call__(self, picture: np.ndarray) -> list[float]:
+    def __call__(self, image: np.ndarray) -> list[float]:
         return [900, 0]
 
 
 def test_a_policy_that_leaves_the_range_of_training_is_named_once(world: World, judge: StateJudge) -> None:
-    seen = replace(world.commands(ROBOT), seen=np.array([[-50, -50], [50, 50]], np.float32))
+    seen = replace(world.action_spec(ROBOT), seen=np.array([[-50, -50], [50, 50]], np.float32))
     flawless: Any = FlawlessWorld(world)
-    flawless.commands = lambda name: seen
+    flawless.actions = lambda name: seen
     with pytest.warns(OutsideRangeWarning) as warned:
         found = evaluate_policies(
             ROBOT, [("wild", Called(Wild)), "still"], world=flawless, judge=judge, episodes=2, frames=4
@@ -240,7 +240,7 @@ def test_a_policy_that_leaves_the_range_of_training_is_named_once(world: World, 
 
 
 class Counter:
-    """A policy with a memory: its command is the number of its calls in this episode."""
+    """A policy with a memory: its action is the number of its calls in this episode."""
 
     def __init__(self) -> None:
         self.calls = -99
@@ -248,8 +248,8 @@ class Counter:
     def reset(self) -> None:
         self.calls = 0
 
-    def __call__(self, picture: np.ndarray) -> list[float]:
-        assert picture.shape == (128, 128, 3) and picture.dtype == np.uint8
+    def __call__(self, image: np.ndarray) -> list[float]:
+        assert image.shape == (128, 128, 3) and image.dtype == np.uint8
         self.calls += 1
         return [self.calls, 0]
 
@@ -257,15 +257,15 @@ class Counter:
 SHARED = Counter()
 
 
-def short(picture: np.ndarray) -> np.ndarray:
+def short(image: np.ndarray) -> np.ndarray:
     return np.zeros(3)
 
 
-def nan(picture: np.ndarray) -> np.ndarray:
+def nan(image: np.ndarray) -> np.ndarray:
     return np.array([0, np.nan])
 
 
-def broken(picture: np.ndarray) -> np.ndarray:
+def broken(image: np.ndarray) -> np.ndarray:
     raise KeyError("left")
 
 
@@ -283,7 +283,7 @@ def test_what_a_policy_remembers_belongs_to_one_episode(world: World, name: str)
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("short", "returns commands of the shape (3,) — rails_03 takes (2,): "),
+        ("short", "returns actions of the shape (3,) — rails_03 takes (2,): "),
         ("nan", "returns NaN or infinite values"),
         ("broken", "raised KeyError: 'left'"),
         ("missing", "cannot be imported: AttributeError"),
@@ -326,7 +326,7 @@ def test_a_file_in_place_of_the_folder_is_refused_before_the_work(tmp_path: Path
 
 def _world_of(model: HMA) -> World:
     made = object.__new__(World)
-    made.model, made._commands = model, {}
+    made.model, made._actions = model, {}
     return made
 
 

@@ -41,7 +41,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def latents() -> World:
-    """A world of latents, whose pictures have half the size of the simulator's."""
+    """A world of latents, whose images have half the size of the simulator's."""
     return World(latent_model(ROBOT), BlockLatents())
 
 
@@ -55,7 +55,7 @@ def episodes(folder: Path) -> list[dict[str, Any]]:
     return [reader.episode(row, shards.manifest.cameras[0]) for row in shards.episodes.to_pylist()]
 
 
-def test_replayed_episodes_hold_the_recorders_commands_and_say_that_they_are_synthetic(
+def test_replayed_episodes_hold_the_recorders_actions_and_say_that_they_are_synthetic(
     world: World, tmp_path: Path
 ) -> None:
     manifest = augment(tmp_path / "out", asked(), world=world)
@@ -69,13 +69,13 @@ def test_replayed_episodes_hold_the_recorders_commands_and_say_that_they_are_syn
     for _ in range(FRAMES * true.scenes.stride - 1):
         true.step(wanted[-1])
         wanted.append(true.recorded())
-    commands = np.stack(wanted, axis=1).reshape(4, FRAMES, -1)
+    actions = np.stack(wanted, axis=1).reshape(4, FRAMES, -1)
     found = episodes(tmp_path / "out")
     assert len(found) == 4
     for number, columns in enumerate(found):
         prompt = true.prompts[number]
         known = len(prompt.frames)
-        np.testing.assert_array_equal(columns["action"][known - 1 :], commands[number])
+        np.testing.assert_array_equal(columns["action"][known - 1 :], actions[number])
         np.testing.assert_array_equal(columns["action"][: known - 1], prompt.chunks)
         stored = world.tokenizer.encode(prompt.frames)
         np.testing.assert_array_equal(columns["tokens"][:known].reshape(stored.shape), stored)
@@ -110,7 +110,7 @@ def test_synthetic_episodes_merge_with_recorded_ones_and_the_whole_says_so(
 
 
 @pytest.mark.slow
-def test_perturbed_commands_lie_around_the_recorded_ones(world: World, tmp_path: Path) -> None:
+def test_perturbed_actions_lie_around_the_recorded_ones(world: World, tmp_path: Path) -> None:
     augment(tmp_path / "one", asked(), world=world)
     augment(tmp_path / "other", asked(commands="perturb=0.2"), world=world)
     pairs = zip(episodes(tmp_path / "one"), episodes(tmp_path / "other"), strict=True)
@@ -181,11 +181,11 @@ def test_the_surest_episodes_are_kept(kind: str, request: pytest.FixtureRequest,
 )
 def test_noise_without_a_share_is_refused(words: str, world: World, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--commands: .* is unknown . give replay, or perturb=0.3"):
-        augment(tmp_path / "out", asked(commands=words), world=world)
+        augment(tmp_path / "out", asked(actions=words), world=world)
 
 
 @pytest.mark.slow
-def test_first_frames_and_commands_come_from_shards(world: World, tmp_path: Path) -> None:
+def test_first_frames_and_actions_come_from_shards(world: World, tmp_path: Path) -> None:
     recording = record(ROBOT, tmp_path, 1)
     convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "real")
     augment(tmp_path / "out", asked(source="real", episodes=2), world=world, shards=tmp_path / "real")
@@ -248,7 +248,7 @@ def test_episodes_of_the_same_beginning_differ(
 
 
 @pytest.mark.slow
-def test_windows_with_unknown_commands_are_left_out(
+def test_windows_with_unknown_actions_are_left_out(
     world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read, unknown = augment_module.read_prompt, [True]
@@ -260,7 +260,7 @@ def test_windows_with_unknown_commands_are_left_out(
         return frames, chunks
 
     monkeypatch.setattr(augment_module, "read_prompt", gaps)
-    with pytest.raises(UsageError, match="hardly a window of 6 frames whose commands are all known"):
+    with pytest.raises(UsageError, match="hardly a window of 6 frames whose actions are all known"):
         augment(tmp_path / "none", asked(source="real"), world=world, shards=real)
     unknown.append(False)
     augment(tmp_path / "out", asked(source="real"), world=world, shards=real)
@@ -270,7 +270,7 @@ def test_windows_with_unknown_commands_are_left_out(
 
 
 @pytest.mark.slow
-def test_a_policy_of_pictures_acts_after_stored_frames(world: World, real: Path, tmp_path: Path) -> None:
+def test_a_policy_of_images_acts_after_stored_frames(world: World, real: Path, tmp_path: Path) -> None:
     seen = []
 
     class Looks:
@@ -284,8 +284,8 @@ def test_a_policy_of_pictures_acts_after_stored_frames(world: World, real: Path,
     maker.policy = Looks()
     maker._make(range(2), lambda done: None)
     stored = maker._recorded(ShardSet(real), range(2)).prompts
-    for pictures, prompt in zip(seen, stored, strict=True):
-        assert pictures.dtype == np.uint8 and np.array_equal(pictures, world.tokenizer.decode(prompt.frames))
+    for images, prompt in zip(seen, stored, strict=True):
+        assert images.dtype == np.uint8 and np.array_equal(images, world.tokenizer.decode(prompt.frames))
 
 
 @pytest.mark.slow
@@ -315,7 +315,7 @@ def test_episodes_of_several_cameras_hold_each_in_its_place(
             augment(tmp_path / "no", **({"settings": settings} | given | {"lerobot": None} | wrong))
     one = World(trained_on("top", real, tmp_path / "one", "policy", 4).model, tokenizer)
     monkeypatch.setattr(augment_module, "read_policy", lambda _, scenes, world: Acting(one, scenes, 1, "it"))
-    with pytest.raises(HMAError, match="it: sees 1 views, and the pictures show 2"):
+    with pytest.raises(HMAError, match="it: sees 1 views, and the images show 2"):
         augment(tmp_path / "no", replace(settings, commands="hma:it"), **(given | {"lerobot": None}))
     made = ShardSet(tmp_path / "out")
     assert made.manifest.cameras == ["side", "top"] and verify(made.folder) == []
@@ -333,8 +333,8 @@ def test_episodes_of_several_cameras_hold_each_in_its_place(
 
 def test_the_camera_that_is_shown_is_the_one_that_is_named(tmp_path: Path) -> None:
     arm, tokenizer = three.arm(), BlockTokenizer()
-    pictures = np.zeros((4, 64, 64, 3), np.uint8)
-    made = Made("one", tokenizer.encode(pictures), np.zeros((3, arm.chunk_dim), np.float32), {}, "a")
+    images = np.zeros((4, 64, 64, 3), np.uint8)
+    made = Made("one", tokenizer.encode(images), np.zeros((3, arm.chunk_dim), np.float32), {}, "a")
     given: Any = {"made_by": {"synthetic": True}, "cameras": ["wrist"]}
     (tmp_path / "out").mkdir()
     manifest = write_shards(tmp_path / "out", [made], tokenizer.spec, arm, **given)
@@ -375,7 +375,7 @@ def test_lerobot_loads_the_dataset(world: World, tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.slow
-def test_a_policy_of_lerobot_trains_on_the_dataset_with_the_state_in_its_pictures(tmp_path: Path) -> None:
+def test_a_policy_of_lerobot_trains_on_the_dataset_with_the_state_in_its_images(tmp_path: Path) -> None:
     import torch
     from lerobot.configs.types import FeatureType
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -388,7 +388,7 @@ def test_a_policy_of_lerobot_trains_on_the_dataset_with_the_state_in_its_picture
     augment(tmp_path / "out", asked(), world=world, lerobot=tmp_path / "rails")
     robot = Embodiment.load(tmp_path / "rails" / "embodiment.yaml")
     said = robot.provenance["state"]
-    assert "read off the pictures, mean error slider_1 " in said and robot.state is not None
+    assert "read off the images, mean error slider_1 " in said and robot.state is not None
     step = {"action": [row / robot.rate_hz for row in range(4)]}
     loaded = LeRobotDataset("lab/rails", root=tmp_path / "rails", delta_timestamps=step)
     assert loaded.meta.features["observation.state"]["names"] == robot.state.names()
@@ -451,7 +451,7 @@ def test_a_robot_without_simulator_needs_shards(tmp_path: Path) -> None:
     from tests.model.robots import make_model
 
     world = object.__new__(World)
-    world.model, world._commands, world.precision = make_model({"arm": 2}), {}, "float32"
+    world.model, world._actions, world.precision = make_model({"arm": 2}), {}, "float32"
     with pytest.raises(HMAError, match="arm: has no true simulator"):
         augment(tmp_path / "out", Augmentation("arm"), world=world)
 
@@ -464,8 +464,8 @@ def test_a_policy_that_plans_gets_the_judge(
             self.judge = judge
 
     class Judge:
-        def score(self, pictures: np.ndarray) -> np.ndarray:
-            return pictures[:, 0, 0, 0, 0]
+        def score(self, images: np.ndarray) -> np.ndarray:
+            return images[:, 0, 0, 0, 0]
 
         def success(self, scores: np.ndarray) -> np.ndarray:
             return np.ones(len(scores), np.bool_)

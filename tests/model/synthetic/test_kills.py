@@ -26,7 +26,7 @@ def run(words: list[str], folder: Path, until: str = "") -> None:
 
 
 @pytest.mark.timeout(900)
-def test_killed_commands_continue_and_give_the_same_bytes(tmp_path: Path) -> None:
+def test_killed_actions_continue_and_give_the_same_bytes(tmp_path: Path) -> None:
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     for folder, killed in ((whole, False), (cut, True)):
         folder.mkdir()

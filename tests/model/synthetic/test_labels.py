@@ -1,4 +1,4 @@
-"""Film gets commands: shards that verify and say that they are inferred, with their true error."""
+"""Film gets actions: shards that verify and say that they are inferred, with their true error."""
 
 import shutil
 from pathlib import Path
@@ -18,7 +18,7 @@ from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import get_tokenizer
-from hma_model.generation import commands
+from hma_model.generation import commands as generation_commands
 from hma_model.simulate import World, read_prompt
 from hma_model.synthetic import labels
 from hma_model.synthetic.labels import ShardFilm, VideoFilm, infer, label_actions
@@ -49,7 +49,7 @@ def real(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Oracle:
-    """An inference that knows the commands of the shards, and errs by a share of their deviation."""
+    """An inference that knows the actions of the shards, and errs by a share of their deviation."""
 
     def __init__(self, film: ShardFilm, share: float) -> None:
         self.known, self.rng, self.share, self.calls = {}, np.random.default_rng(0), share, 0
@@ -57,7 +57,7 @@ class Oracle:
             stored, actions, _ = film.labelled(number)
             self.known[stored.tobytes()] = actions[:-1]
 
-    def __call__(self, model: Any, commands: Any, stored: np.ndarray) -> np.ndarray:
+    def __call__(self, model: Any, actions: Any, stored: np.ndarray) -> np.ndarray:
         self.calls += 1
         true = self.known[stored.tobytes()]
         return (true + self.share * true.std() * self.rng.normal(size=true.shape)).astype(np.float32)
@@ -107,16 +107,14 @@ def test_labelled_shards_verify_and_say_what_they_are(
 
 
 def test_inference_reads_each_chunk_off_a_window_around_it(world: World) -> None:
-    commands = world.commands(ROBOT)
+    actions = world.action_spec(ROBOT)
     stored = np.random.default_rng(0).integers(0, 8**6, (11, 8, 8))
-    made, width = infer(world.model, commands, stored), world.model.config.frames
+    made, width = infer(world.model, actions, stored), world.model.config.frames
     tokens = torch.from_numpy(stored.astype(np.int64))
     for number, start in enumerate([0, 0, 0, 2, 2, 4, 4, 6, 7, 7]):
         window = tokens[None, start : start + width]
         read = world.model.predict_actions(window, ROBOT, readout="inverse")[0, number - start]
-        np.testing.assert_allclose(
-            made[number], commands.clip(read.numpy().reshape(-1, 2)).ravel(), atol=1e-3
-        )
+        np.testing.assert_allclose(made[number], actions.clip(read.numpy().reshape(-1, 2)).ravel(), atol=1e-3)
     assert len(made) == 10
 
 
@@ -147,7 +145,7 @@ def test_film_that_pauses_is_labelled_in_parts(world: World, real: Path, tmp_pat
 
 
 def film(folder: Path) -> np.ndarray:
-    """Write a video of thirty grey pictures at 30 Hz, and return their levels."""
+    """Write a video of thirty grey images at 30 Hz, and return their levels."""
     levels = np.linspace(20, 230, 30).astype(np.uint8)
     write_mp4(folder / "long.mp4", [np.full((96, 128, 3), level, np.uint8) for level in levels], 30)
     return levels
@@ -159,7 +157,7 @@ def test_what_cannot_be_labelled_is_refused(world: World, tmp_path: Path) -> Non
         label_actions(place, tmp_path / "out", ROBOT, **given)
 
     film(tmp_path)
-    with pytest.raises(HMAError, match="run: was not trained to infer commands, but for forward"):
+    with pytest.raises(HMAError, match="run: was not trained to infer actions, but for forward"):
         run(world=World(tiny_model(ROBOT), get_tokenizer("fsq-8")))
     with pytest.raises(UsageError, match="no labelled film of it is known — .*--check SHARDS"):
         run()
@@ -203,7 +201,7 @@ def test_film_that_cannot_be_read_goes_to_quarantine(
 
 
 def grey(folder: Path, **levels: int) -> None:
-    """Write videos of eight grey pictures at 10 Hz, by name."""
+    """Write videos of eight grey images at 10 Hz, by name."""
     folder.mkdir(exist_ok=True)
     for name, level in levels.items():
         write_mp4(folder / f"{name}.mp4", [np.full((128, 128, 3), level, np.uint8)] * 8, 10)
@@ -288,10 +286,10 @@ def test_film_shows_the_cameras_that_the_model_was_trained_on(
 
 @pytest.mark.parametrize("views", ["wrist", ["side", "top"]])
 @pytest.mark.parametrize("three", [BlockTokenizer], indirect=True)
-def test_labelled_shards_name_the_cameras_that_their_pictures_are_of(
+def test_labelled_shards_name_the_cameras_that_their_images_are_of(
     three: ShardSet, views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(labels, "described", commands.described)
+    monkeypatch.setattr(labels, "described", generation_commands.described)
     known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
     monkeypatch.setattr(labels, "measure", lambda *_: known)
     world: Any = World(trained_on(views, three, tmp_path / "model", "inverse").model, BlockTokenizer())

@@ -75,25 +75,25 @@ def test_steps_show_what_the_world_shows(world: World, window: tuple[Any, Any], 
     first, _ = env.reset(seed=3)
     chunks = actions(2, 4)
     session = world.open(PUSH, *window, seed=world._sessions[env.drive.session].seed)  # type: ignore[index]
-    assert np.array_equal(first, world.picture(session))
+    assert np.array_equal(first, world.image(session))
     made = [world.step({session: chunk})[session] for chunk in chunks]
     seen = [env.step(action) for action in (chunks if control == "chunk" else chunks.reshape(-1, 2))]
-    pictures = [picture for picture, *_ in seen]
-    if control == "frame":  # a picture comes with every fourth command; the last one is shown between
-        assert all(np.array_equal(picture, first) for picture in pictures[:3])
-        assert all(np.array_equal(picture, made[0]) for picture in pictures[3:7])
-        pictures = [pictures[3], pictures[7]]
+    images = [image for image, *_ in seen]
+    if control == "frame":  # an image comes with every fourth action; the last one is shown between
+        assert all(np.array_equal(image, first) for image in images[:3])
+        assert all(np.array_equal(image, made[0]) for image in images[3:7])
+        images = [images[3], images[7]]
         assert [truncated for *_, truncated, _ in seen] == [False] * 7 + [True]
-    assert all(np.array_equal(a, b) for a, b in zip(pictures, made, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(images, made, strict=True))
     assert np.array_equal(env.render(), made[-1])  # type: ignore[arg-type]
 
 
 def test_a_judge_sees_the_episode_and_ends_it(world: World, window: tuple[Any, Any]) -> None:
     shapes = []
 
-    def judge(pictures: np.ndarray, commands: np.ndarray) -> tuple[float, bool]:
-        shapes.append((pictures.shape, commands.shape))
-        return float(commands[-1, 0, 0]), len(commands) == 2
+    def judge(images: np.ndarray, actions: np.ndarray) -> tuple[float, bool]:
+        shapes.append((images.shape, actions.shape))
+        return float(actions[-1, 0, 0]), len(actions) == 2
 
     env = WorldModelEnv(embodiment=PUSH, world=world, prompt=prompt(window), control="chunk", judge=judge)
     chunks = actions(2, 4)
@@ -110,8 +110,8 @@ def test_a_judge_sees_the_episode_and_ends_it(world: World, window: tuple[Any, A
 def test_a_vector_steps_as_gymnasium_steps_environments_one_by_one(
     model: HMA, window: tuple[Any, Any], mode: AutoresetMode
 ) -> None:
-    def judge(pictures: np.ndarray, commands: np.ndarray) -> tuple[float, bool]:
-        return float(pictures[-1].mean()), bool(commands[-1, 0, 0] > 300)  # episodes end at different steps
+    def judge(images: np.ndarray, actions: np.ndarray) -> tuple[float, bool]:
+        return float(images[-1].mean()), bool(actions[-1, 0, 0] > 300)  # episodes end at different steps
 
     tokenizer = get_tokenizer(model.config.tokenizer["name"])
     how: dict[str, Any] = {
@@ -159,29 +159,29 @@ def test_a_vector_without_autoreset_starts_those_that_are_asked_for(
 def test_a_policy_of_gym_pusht_runs_unchanged(world: World) -> None:
     import gym_pusht  # noqa: F401
 
-    def policy(picture: np.ndarray) -> np.ndarray:
-        """Go to the darkest place of the picture."""
-        y, x = np.unravel_index(picture.sum(axis=-1).argmin(), picture.shape[:2])
-        return (np.array([x, y]) * (512 / len(picture))).astype(np.float32)
+    def policy(image: np.ndarray) -> np.ndarray:
+        """Go to the darkest place of the image."""
+        y, x = np.unravel_index(image.sum(axis=-1).argmin(), image.shape[:2])
+        return (np.array([x, y]) * (512 / len(image))).astype(np.float32)
 
     def run(env: gymnasium.Env) -> list[np.ndarray]:
-        picture, _ = env.reset(seed=1)
-        seen = [picture]
+        image, _ = env.reset(seed=1)
+        seen = [image]
         for _ in range(8):
-            picture, *_ = env.step(policy(picture))
-            seen.append(picture)
+            image, *_ = env.step(policy(image))
+            seen.append(image)
         return seen
 
     real = gymnasium.make("gym_pusht/PushT-v0", obs_type="pixels", render_mode="rgb_array")
     dreamt = WorldModelEnv(embodiment=PUSH, world=world, prompt=real, size=96)
     assert dreamt.action_space == real.action_space and dreamt.observation_space == real.observation_space
-    pictures = [run(env) for env in (real, dreamt)]
-    assert all(seen[0].shape == (96, 96, 3) for seen in pictures)
-    moved = [np.abs(seen[-1].astype(int) - seen[0]).mean() for seen in pictures]
-    assert min(moved) > 0.1 and np.abs(pictures[0][0].astype(int) - pictures[1][0]).mean() < 12
+    images = [run(env) for env in (real, dreamt)]
+    assert all(seen[0].shape == (96, 96, 3) for seen in images)
+    moved = [np.abs(seen[-1].astype(int) - seen[0]).mean() for seen in images]
+    assert min(moved) > 0.1 and np.abs(images[0][0].astype(int) - images[1][0]).mean() < 12
 
 
-def test_gymnasium_records_a_film_of_the_pictures(
+def test_gymnasium_records_a_film_of_the_images(
     world: World, window: tuple[Any, Any], tmp_path: Path
 ) -> None:
     env: Any = WorldModelEnv(
@@ -194,19 +194,19 @@ def test_gymnasium_records_a_film_of_the_pictures(
     )
     env = RecordVideo(env, str(tmp_path), episode_trigger=lambda number: True)
     env.reset(seed=0)
-    pictures = [env.step(chunk)[0] for chunk in actions(2, 4)]
+    images = [env.step(chunk)[0] for chunk in actions(2, 4)]
     env.close()
     with av.open(tmp_path / "rl-video-episode-0.mp4") as film:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
         assert film.streams.video[0].average_rate == 2.5 and len(frames) == 3
-    assert np.abs(np.stack(frames[1:]) - np.stack(pictures).astype(float)).mean() < 6
+    assert np.abs(np.stack(frames[1:]) - np.stack(images).astype(float)).mean() < 6
 
 
 def test_actions_outside_the_training_range_warn_once_and_are_clipped_only_if_asked(
     world: World, window: tuple[Any, Any]
 ) -> None:
     how: dict[str, Any] = {"embodiment": PUSH, "world": world, "prompt": prompt(window), "control": "chunk"}
-    wild, edge = np.full((4, 2), 700.0), np.tile(world.commands(PUSH).seen[1], (4, 1))  # type: ignore[index]
+    wild, edge = np.full((4, 2), 700.0), np.tile(world.action_spec(PUSH).seen[1], (4, 1))  # type: ignore[index]
     free, clipped, at_edge = (WorldModelEnv(**how, clip=clip) for clip in (False, True, False))
     for env in (free, clipped, at_edge):
         env.reset(seed=0)
@@ -215,18 +215,18 @@ def test_actions_outside_the_training_range_warn_once_and_are_clipped_only_if_as
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         free.step(wild)
-        pictures = [clipped.step(wild)[0], at_edge.step(edge)[0]]
-    assert np.array_equal(*pictures)
+        images = [clipped.step(wild)[0], at_edge.step(edge)[0]]
+    assert np.array_equal(*images)
 
 
-def test_an_unknown_command_is_nan(world: World, window: tuple[Any, Any]) -> None:
+def test_an_unknown_action_is_nan(world: World, window: tuple[Any, Any]) -> None:
     env = WorldModelEnv(embodiment=PUSH, world=world, prompt=prompt(window))
     env.reset(seed=0)
     session = world.open(PUSH, *window, seed=world._sessions[env.drive.session].seed)  # type: ignore[index]
-    command = np.array([300.0, 200.0])
-    for action in (command, command, np.full(2, np.nan), command):
-        picture, *_ = env.step(action)
-    assert np.array_equal(picture, world.step({session: np.full(8, np.nan)})[session])
+    one = np.array([300.0, 200.0])
+    for action in (one, one, np.full(2, np.nan), one):
+        image, *_ = env.step(action)
+    assert np.array_equal(image, world.step({session: np.full(8, np.nan)})[session])
 
 
 @pytest.mark.parametrize(
@@ -262,9 +262,9 @@ def test_bad_settings_are_refused(world: World, change: dict[str, Any], message:
         WorldModelEnv(**{"embodiment": PUSH, "world": world, **change})
 
 
-def test_a_gray_picture_is_refused_with_its_shape(world: World) -> None:
+def test_a_gray_image_is_refused_with_its_shape(world: World) -> None:
     env = WorldModelEnv(embodiment=PUSH, world=world)
-    with pytest.raises(HMAError, match=r"uint8 of the shape \(1, 96, 96\) — give pictures \(P, H, W, 3\)"):
+    with pytest.raises(HMAError, match=r"uint8 of the shape \(1, 96, 96\) — give images \(P, H, W, 3\)"):
         env.reset(options={"prompt": np.zeros((96, 96), np.uint8)})
 
 

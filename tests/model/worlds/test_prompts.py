@@ -49,8 +49,8 @@ def test_a_laboratory_robot_comes_with_a_prompt(model: HMA, name: str) -> None:
 
 @pytest.mark.slow
 def test_shards_give_the_tokens_and_chunks_of_the_recording(model: HMA, shards: Path) -> None:
-    pictures, chunks = starting_window(model, MOVER)
-    tokens = get_tokenizer("fsq-lab").encode(pictures)
+    images, chunks = starting_window(model, MOVER)
+    tokens = get_tokenizer("fsq-lab").encode(images)
     whole = read_prompt(model, MOVER, shards)
     later = read_prompt(model, MOVER, {"shards": str(shards), "episode": 0, "start": 2, "frames": 3})
     assert np.array_equal(whole[0], tokens) and np.array_equal(whole[1], chunks)
@@ -58,21 +58,21 @@ def test_shards_give_the_tokens_and_chunks_of_the_recording(model: HMA, shards: 
     assert not np.array_equal(read_prompt(model, MOVER, {"shards": shards, "episode": 1})[0], tokens)
 
 
-def test_pictures_come_as_arrays_files_and_from_environments(model: HMA, tmp_path: Path) -> None:
-    pictures, _ = starting_window(model, MOVER)
+def test_images_come_as_arrays_files_and_from_environments(model: HMA, tmp_path: Path) -> None:
+    images, _ = starting_window(model, MOVER)
     for i in range(2):
-        write_png(tmp_path / f"{i}.png", pictures[i])
+        write_png(tmp_path / f"{i}.png", images[i])
 
     class Environment:
         def render(self) -> np.ndarray:
-            return pictures[0]
+            return images[0]
 
-    one = [pictures[0], tmp_path / "0.png", str(tmp_path / "0.png"), Environment()]
-    several = [pictures[:2], [tmp_path / "0.png", tmp_path / "1.png"], {"frames": pictures[:2]}]
+    one = [images[0], tmp_path / "0.png", str(tmp_path / "0.png"), Environment()]
+    several = [images[:2], [tmp_path / "0.png", tmp_path / "1.png"], {"frames": images[:2]}]
     for prompts, count in ((one, 1), (several, 2)):
         for prompt in prompts:
             frames, chunks = read_prompt(model, MOVER, prompt)
-            assert np.array_equal(frames, pictures[:count]) and chunks is None
+            assert np.array_equal(frames, images[:count]) and chunks is None
 
 
 def test_frames_at_the_control_rate_become_chunks_that_end_at_the_last_frame(model: HMA) -> None:
@@ -88,22 +88,22 @@ def test_a_lerobot_episode_is_a_prompt_of_the_same_robot_recorded_elsewhere(
     model: HMA, tmp_path: Path
 ) -> None:
     dataset = record("planar_arm_lerobot", tmp_path, 2)
-    pictures, chunks = starting_window(model, ARM)
+    images, chunks = starting_window(model, ARM)
     frames, found = read_prompt(model, ARM, dataset)
-    assert np.array_equal(found, chunks) and np.abs(frames.astype(int) - pictures).mean() < 8  # lossy video
+    assert np.array_equal(found, chunks) and np.abs(frames.astype(int) - images).mean() < 8  # lossy video
     other, _ = read_prompt(model, ARM, {"lerobot": dataset, "episode": 1, "start": 3})
-    assert other.shape == frames.shape and np.abs(other.astype(int) - pictures).mean() > 8
+    assert other.shape == frames.shape and np.abs(other.astype(int) - images).mean() > 8
 
 
 @pytest.mark.parametrize(
     ("prompt", "message"),
     [
-        ({"pictures": 3}, "has the keys pictures — give a picture or pictures"),
+        ({"images": 3}, "has the keys images — give an image or images"),
         ({"lerobot": "data", "episde": 1}, "has the keys lerobot, episde"),
-        ([np.zeros((8, 8, 3), np.uint8), np.zeros((9, 8, 3), np.uint8)], "its pictures differ in size"),
-        ("tests", "tests: is a folder, not a picture — give a picture or pictures"),
-        ("README.md", "README.md: is not a picture — give a picture or pictures"),
-        ("no/such.png", "cannot be read: No such file or directory — give a picture"),
+        ([np.zeros((8, 8, 3), np.uint8), np.zeros((9, 8, 3), np.uint8)], "its images differ in size"),
+        ("tests", "tests: is a folder, not an image — give an image or images"),
+        ("README.md", "README.md: is not an image — give an image or images"),
+        ("no/such.png", "cannot be read: No such file or directory — give an image"),
         ({"frames": np.zeros((3, 8, 8, 3), np.uint8), "actions": np.zeros((3, 2))}, r"give \(2, 2\)"),
     ],
 )
@@ -139,5 +139,5 @@ def test_a_prompt_crosses_no_pause(model: HMA, shards: Path, tmp_path: Path) -> 
 
 
 def test_another_robot_needs_a_prompt() -> None:
-    with pytest.raises(HMAError, match="none comes along: it is no robot of the laboratory — give a picture"):
+    with pytest.raises(HMAError, match="none comes along: it is no robot of the laboratory — give an image"):
         starting_window(small_model(), "arm")

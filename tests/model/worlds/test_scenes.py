@@ -1,4 +1,4 @@
-"""Scenes to drive in: what the values of a command are, prompts, recordings, and what is saved of a drive."""
+"""Scenes to drive in: what the values of an action are, prompts, recordings, and what is saved of a drive."""
 
 import io
 import zipfile
@@ -34,7 +34,7 @@ from tests.model.true_world import TrueWorld, lab_robots
 
 RIGHT_DOWN, UP = (False, False), (False, True)
 HALVES = (0.0, 0.0, 0.5, 1.0), (0.5, 0.0, 1.0, 1.0)
-KINDS: dict[str, tuple[list[str], list[Pad]]] = {  # robot -> kinds of its values, and its picture's pads
+KINDS: dict[str, tuple[list[str], list[Pad]]] = {  # robot -> kinds of its values, and its image's pads
     "mover_04": (["rate"] * 2, [Pad(0, 1)]),
     "mover_02": (["target"] * 2, [Pad(0, 1, RIGHT_DOWN, (0, 0), (128, 128))]),
     "mover_10": (["rate"] * 2, [Pad(1, 0, UP)]),
@@ -49,7 +49,7 @@ KINDS: dict[str, tuple[list[str], list[Pad]]] = {  # robot -> kinds of its value
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_each_value_of_a_command_rests_or_stays_as_its_robot_means_it(name: str) -> None:
+def test_each_value_of_a_action_rests_or_stays_as_its_robot_means_it(name: str) -> None:
     (robot,) = lab_robots(name).values()
     kinds, dragged = KINDS[name]
     assert [dim.kind for dim in robot.dimensions] == kinds
@@ -77,16 +77,16 @@ def test_a_drag_to_the_right_or_down_moves_a_part_there(name: str) -> None:
     moved = [k for k, i in enumerate((pad.x, pad.y)) if i == 0 or (i and not name.startswith("arm"))]
     assert moved  # of an arm, the first link
     for k in moved:
-        command = np.where([dim.kind == "rate" for dim in robot.dimensions], 0.0, pose)
-        command[(pad.x, pad.y)[k]] += -0.1 if pad.flips[k] else 0.1
-        before, after = (body.mechanism.tip(one)[0] for one in (pose, body.moved(pose, command)))
+        action = np.where([dim.kind == "rate" for dim in robot.dimensions], 0.0, pose)
+        action[(pad.x, pad.y)[k]] += -0.1 if pad.flips[k] else 0.1
+        before, after = (body.mechanism.tip(one)[0] for one in (pose, body.moved(pose, action)))
         assert after[k] > before[k]
 
 
-def test_a_robot_says_what_a_drag_on_its_picture_does() -> None:
+def test_a_robot_says_what_a_drag_on_its_image_does() -> None:
     said = {name: hint(robot) for name, robot in lab_robots("mover_04", "rails_03", "arm4_04").items()}
-    assert said["mover_04"] == "Drag on the picture to steer"
-    assert said["rails_03"] == "Drag on the picture, along either rail"
+    assert said["mover_04"] == "Drag on the image to steer"
+    assert said["rails_03"] == "Drag on the image, along either rail"
     assert said["arm4_04"].endswith(
         "on its left half joint 1 and joint 2, on its right half joint 3 and joint 4"
     )
@@ -120,12 +120,12 @@ def test_all_robots_of_the_embedded_model_can_be_driven() -> None:
 
 
 @pytest.mark.parametrize("name", ["mover_02", "pusht_fast", "arm2_12", "pusht_slow"])
-def test_a_scene_begins_with_a_prompt_and_a_command_that_leaves_the_robot_there(name: str) -> None:
+def test_a_scene_begins_with_a_prompt_and_a_action_that_leaves_the_robot_there(name: str) -> None:
     (robot,) = lab_robots(name).values()
     scene = robot.scene(3)
     assert scene.prompt.frames.shape == (PROMPT, 128, 128, 3)
     assert scene.prompt.chunks.shape == (PROMPT - 1, robot.embodiment.chunk_dim)
-    chunk = np.tile(scene.command, robot.embodiment.stride)
+    chunk = np.tile(scene.action, robot.embodiment.stride)
     for _ in range(25):  # a target is reached
         still = scene.advance(chunk)
     again = scene.advance(chunk)
@@ -135,10 +135,10 @@ def test_a_scene_begins_with_a_prompt_and_a_command_that_leaves_the_robot_there(
 
 
 @pytest.mark.parametrize("size", [96, 256])
-def test_what_truly_happens_is_shown_in_the_size_of_the_models_pictures(size: int) -> None:
+def test_what_truly_happens_is_shown_in_the_size_of_the_models_images(size: int) -> None:
     class Scaled(TrueWorld):
-        def picture(self, session: int) -> np.ndarray:
-            return resize(super().picture(session)[None], size)[0]
+        def image(self, session: int) -> np.ndarray:
+            return resize(super().image(session)[None], size)[0]
 
     robots = drivable(Checkpoint.open(EMBEDDED), (), pytest.fail)
     plain = robots["mover_04"]
@@ -153,7 +153,7 @@ def test_what_truly_happens_is_shown_in_the_size_of_the_models_pictures(size: in
 def test_a_session_that_cannot_begin_leaves_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
     (robot,) = lab_robots("mover_04").values()
     world = TrueWorld()
-    monkeypatch.setattr(world, "picture", lambda row: np.zeros((3, 3, 3), np.uint8))
+    monkeypatch.setattr(world, "image", lambda row: np.zeros((3, 3, 3), np.uint8))
     with pytest.raises(ValueError, match="broadcast"):
         Session("s", robot, 0, world, Sampling(2, 0.0, "random"), 0.0)
     assert not world.rows
@@ -167,7 +167,7 @@ def shards(
     return ShardSet(tmp_path / "shards")
 
 
-def test_a_recordings_truth_is_known_for_its_own_commands(
+def test_a_recordings_truth_is_known_for_its_own_actions(
     shards: ShardSet, block_tokenizer: BlockTokenizer
 ) -> None:
     robot = RecordedRobot(shards, lambda: block_tokenizer, shards.manifest.stats, "first")
@@ -176,11 +176,11 @@ def test_a_recordings_truth_is_known_for_its_own_commands(
     assert [(dim.name, dim.kind) for dim in robot.dimensions] == [("a", "rate"), ("b", "rate"), ("c", "rate")]
     frames, count = [*one.prompt.frames], 0
     while (step := one.advance(None)) is not None:
-        chunk, picture = step
-        assert picture is not None
-        shown = picture[0, 0, 1] // 17  # the toy's picture and commands tell its frame
+        chunk, image = step
+        assert image is not None
+        shown = image[0, 0, 1] // 17  # the toy's image and actions tell its frame
         assert shown == (chunk.reshape(2, 3)[-1, 1] + 1) % 16
-        frames.append(picture)
+        frames.append(image)
         count += 1
     assert count == len(frames) - PROMPT > 0
     assert other.advance(np.zeros(6, np.float32)) is not None
@@ -217,26 +217,26 @@ def test_a_robot_without_simulator_and_shards_of_another_model_are_refused(
         drivable(Checkpoint.open(EMBEDDED), [shards], pytest.fail)
 
 
-def test_a_robot_without_simulator_begins_from_its_sample_or_from_pictures(tmp_path: Path) -> None:
+def test_a_robot_without_simulator_begins_from_its_sample_or_from_images(tmp_path: Path) -> None:
     save(tmp_path / "model", {"arm_a": 2, "arm_b": 2})
     opened = Checkpoint.open(tmp_path / "model")
     with pytest.raises(UsageError, match="no robot of it has a simulator to begin from — give shards of it"):
         drivable(opened, (), pytest.fail)
     rng = np.random.default_rng(0)
-    pictures = rng.integers(0, 256, (6, 16, 16, 3), dtype=np.uint8)
-    sheet = png_bytes(grid([list(pictures)] * 3, ["truth", "predicted", "other"]))
+    images = rng.integers(0, 256, (6, 16, 16, 3), dtype=np.uint8)
+    sheet = png_bytes(grid([list(images)] * 3, ["truth", "predicted", "other"]))
     (opened.folder / "embodiments/arm_a/sample.png").write_bytes(sheet)
     (robot,) = drivable(opened, (), pytest.fail).values()
     scene = robot.scene(0)
-    assert (robot.embodiment.id, robot.source) == ("arm_a", "pictures")
-    assert np.array_equal(scene.prompt.frames, pictures[:1].repeat(PROMPT, axis=0))
+    assert (robot.embodiment.id, robot.source) == ("arm_a", "images")
+    assert np.array_equal(scene.prompt.frames, images[:1].repeat(PROMPT, axis=0))
     chunk = np.ones(robot.embodiment.chunk_dim, np.float32)
     assert scene.advance(chunk) == (chunk, None) and scene.advance(None) is None
-    large = pictures[:2].repeat(2, axis=1).repeat(2, axis=2)
+    large = images[:2].repeat(2, axis=1).repeat(2, axis=2)
     robots = drivable(opened, (), pytest.fail, list(large))
-    assert list(robots) == ["arm_a:pictures", "arm_b:pictures"]
-    begun = robots["arm_b:pictures"].scene(1).prompt
-    assert np.array_equal(begun.frames, pictures[:2]) and np.isnan(begun.chunks).all()
+    assert list(robots) == ["arm_a:images", "arm_b:images"]
+    begun = robots["arm_b:images"].scene(1).prompt
+    assert np.array_equal(begun.frames, images[:2]) and np.isnan(begun.chunks).all()
 
 
 def test_a_saved_dataset_names_the_cameras_that_the_model_shows(
@@ -251,12 +251,12 @@ def test_a_saved_dataset_names_the_cameras_that_the_model_shows(
     def saved(cameras: object) -> list[str]:
         robot = RecordedRobot(shards, lambda: block_tokenizer, stats, cameras)
         views = [np.full((16, 16, 3), 90 * view, np.uint8) for view in range(len(robot.cameras))]
-        picture, commands = jpeg(np.concatenate(views, axis=1)), np.zeros((arm.stride, 2), np.float32)
+        image, actions = jpeg(np.concatenate(views, axis=1)), np.zeros((arm.stride, 2), np.float32)
         state = np.zeros(3, np.float32)  # of which the robot's YAML knows nothing
-        frames = [Frame(i, picture, None, commands, state, None) for i in range(3)]
+        frames = [Frame(i, image, None, actions, state, None) for i in range(3)]
         episode, own = lerobot_episode(robot, frames)
         assert episode.state is None and own.state is None
-        shown = [episode.pictures[camera.key] for camera in own.cameras]
+        shown = [episode.images[camera.key] for camera in own.cameras]
         assert all(np.abs(np.stack(view) - 90.0 * i).max() < 3 for i, view in enumerate(shown))
         assert {len(view) for view in shown} == {3} and episode.hold == arm.stride == len(episode.action) // 3
         return [camera.name for camera in own.cameras]
@@ -293,12 +293,12 @@ def test_a_saved_dataset_reads_as_what_was_driven(name: str, tmp_path: Path) -> 
     clip = to_clip(source.read(str(tmp_path / name), identity, own), own)
     stride = robot.embodiment.stride
     assert own.stride == stride and len(clip) == 6 * stride
-    driven = np.concatenate([frame.commands for frame in session.frames])
+    driven = np.concatenate([frame.actions for frame in session.frames])
     np.testing.assert_array_equal(clip.actions[: len(driven)], driven)
     assert clip.states is not None and clip.states.shape[1] == len(session.start.state)  # type: ignore[arg-type]
     shown = [clip.frames_at(camera.name, np.arange(0, len(clip), stride)) for camera in own.cameras]
     assert (
         len(shown) == 2 and np.abs(shown[0].astype(int) - shown[1]).mean() < 2
     )  # the world is without error
-    newest = world.rows[session.row].picture()
+    newest = world.rows[session.row].image()
     assert np.abs(shown[0][-1].astype(int) - newest).mean() < 4

@@ -1,4 +1,4 @@
-"""Sessions in pictures: side by side as alone, and as `HMA.generate` makes them."""
+"""Sessions in images: side by side as alone, and as `HMA.generate` makes them."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ def drawn(model: HMA, name: str, count: int, seed: int = 0) -> np.ndarray:
     return values.reshape(count, -1).astype(np.float32)
 
 
-def test_sessions_get_the_pictures_that_they_get_alone(model: HMA, windows: dict[str, Any]) -> None:
+def test_sessions_get_the_images_that_they_get_alone(model: HMA, windows: dict[str, Any]) -> None:
     world, made = make(model, temperature=0.5), {}
     names = [PUSH, ARM, ARM, PUSH]
     chunks = {seed: drawn(model, name, 5, seed) for seed, name in enumerate(names)}
@@ -46,10 +46,10 @@ def test_sessions_get_the_pictures_that_they_get_alone(model: HMA, windows: dict
     for seed, name in enumerate(names):  # one more in each step, beyond the rows that there are
         session = world.open(name, *windows[name], seed=seed)
         sessions[session], made[seed] = seed, []
-        for number, picture in world.step(
+        for number, image in world.step(
             {one: chunks[of][len(made[of])] for one, of in sessions.items()}
         ).items():
-            made[sessions[number]].append(picture)
+            made[sessions[number]].append(image)
         if seed == 1:
             world.close(session)
             del sessions[session]
@@ -57,22 +57,22 @@ def test_sessions_get_the_pictures_that_they_get_alone(model: HMA, windows: dict
     for seed, name in enumerate(names):
         alone = make(model, temperature=0.5)
         session = alone.open(name, *windows[name], seed=seed)
-        for chunk, picture in zip(chunks[seed], made[seed]):
-            assert np.array_equal(alone.step({session: chunk})[session], picture)
+        for chunk, image in zip(chunks[seed], made[seed]):
+            assert np.array_equal(alone.step({session: chunk})[session], image)
 
 
 def test_a_session_of_stored_tokens_goes_on_as_generation_does(model: HMA, windows: dict[str, Any]) -> None:
     world = make(model, **SURE)
-    pictures, before = windows[PUSH]
-    tokens, chunks = world.tokenizer.encode(pictures), drawn(model, PUSH, 3)
+    images, before = windows[PUSH]
+    tokens, chunks = world.tokenizer.encode(images), drawn(model, PUSH, 3)
     session = world.open(PUSH, tokens, before)
-    assert np.array_equal(world.picture(session), world.tokenizer.decode(tokens[-1:])[0])
+    assert np.array_equal(world.image(session), world.tokenizer.decode(tokens[-1:])[0])
     made = [world.step({session: chunk.reshape(4, 2)})[session] for chunk in chunks]
     actions = torch.from_numpy(np.concatenate([before, chunks]))[None]
     stored = torch.from_numpy(tokens.astype(np.int64))[None]
     expected = decode(world.tokenizer, model.generate(stored, actions, PUSH, 3, **SURE))[0]
     assert np.array_equal(np.stack(made), expected)
-    assert np.array_equal(world.picture(session), made[-1])
+    assert np.array_equal(world.image(session), made[-1])
 
 
 def test_a_snapshot_brings_a_session_back(model: HMA, windows: dict[str, Any]) -> None:
@@ -84,14 +84,14 @@ def test_a_snapshot_brings_a_session_back(model: HMA, windows: dict[str, Any]) -
     made = [world.step({second: chunk})[second] for chunk in chunks]
     world.restore(first, kept)
     world.restore(second, kept)
-    for chunk, picture in zip(chunks, made):
+    for chunk, image in zip(chunks, made):
         assert all(
-            np.array_equal(again, picture) for again in world.step({first: chunk, second: chunk}).values()
+            np.array_equal(again, image) for again in world.step({first: chunk, second: chunk}).values()
         )
     assert world.sessions == {first: ARM, second: ARM}
 
 
-def test_a_reset_gives_the_same_pictures_again_and_settings_count_at_once(
+def test_a_reset_gives_the_same_images_again_and_settings_count_at_once(
     model: HMA, windows: dict[str, Any]
 ) -> None:
     world = make(model)
@@ -108,17 +108,17 @@ def test_a_reset_gives_the_same_pictures_again_and_settings_count_at_once(
         world.step({session: chunk})
 
 
-def test_a_command_of_nan_is_unknown_and_not_zero(model: HMA, windows: dict[str, Any]) -> None:
+def test_a_action_of_nan_is_unknown_and_not_zero(model: HMA, windows: dict[str, Any]) -> None:
     world = make(model, **SURE)
-    pictures, before = windows[PUSH]
+    images, before = windows[PUSH]
     (chunk,) = drawn(model, PUSH, 1)
     hidden = np.where(np.arange(4)[:, None] == 2, np.nan, chunk.reshape(4, 2))
     cases = {"unknown": (hidden, before), "zero": (np.zeros(8), before), "no chunks": (hidden, None)}
     made = {}
-    for name, (commands, chunks) in cases.items():
-        session = world.open(PUSH, pictures, chunks)
-        made[name] = world.step({session: commands})[session]
-    stored = torch.from_numpy(world.tokenizer.encode(pictures).astype(np.int64))[None]
+    for name, (actions, chunks) in cases.items():
+        session = world.open(PUSH, images, chunks)
+        made[name] = world.step({session: actions})[session]
+    stored = torch.from_numpy(world.tokenizer.encode(images).astype(np.int64))[None]
     actions = torch.from_numpy(np.concatenate([before, chunk[None]]))[None]
     for name, known in (("unknown", [True] * len(before) + [False]), ("no chunks", [False] * 4)):
         masks = torch.tensor([known])
@@ -127,29 +127,29 @@ def test_a_command_of_nan_is_unknown_and_not_zero(model: HMA, windows: dict[str,
     assert not np.array_equal(made["unknown"], made["zero"])
 
 
-def test_pictures_of_another_size_are_resized_as_in_a_conversion(model: HMA, windows: dict[str, Any]) -> None:
+def test_images_of_another_size_are_resized_as_in_a_conversion(model: HMA, windows: dict[str, Any]) -> None:
     world = make(model)
     wide = np.zeros((2, 160, 200, 3), np.uint8)
     wide[:, ::7, ::5] = 200
     one, other = (world.open(PUSH, frames) for frames in (wide, resize(wide, 128)))
-    assert np.array_equal(world.picture(one), world.picture(other))
+    assert np.array_equal(world.image(one), world.image(other))
 
 
 @pytest.mark.parametrize(
-    ("commands", "message"),
+    ("actions", "message"),
     [
-        (np.zeros(7), r"commands: of pusht_fast have the shape \(7,\) — give \(8,\) or \(4, 2\)"),
+        (np.zeros(7), r"actions: of pusht_fast have the shape \(7,\) — give \(8,\) or \(4, 2\)"),
         (np.full(8, np.inf), "not finite"),
         (np.array([[0, np.nan]] * 4), "not finite"),
     ],
 )
-def test_commands_that_do_not_fit_are_refused(
-    model: HMA, windows: dict[str, Any], commands: np.ndarray, message: str
+def test_actions_that_do_not_fit_are_refused(
+    model: HMA, windows: dict[str, Any], actions: np.ndarray, message: str
 ) -> None:
     world = make(model)
     session, other = (world.open(PUSH, *windows[PUSH]) for _ in range(2))
     with pytest.raises(HMAError, match=message):
-        world.step({session: commands, other: np.zeros(8)})
+        world.step({session: actions, other: np.zeros(8)})
 
 
 @pytest.mark.parametrize(
@@ -178,8 +178,8 @@ def test_what_is_not_there_is_said(model: HMA, windows: dict[str, Any]) -> None:
 
 def test_the_embedded_world_opens_without_arguments() -> None:
     world = load_world(unmask_steps=3)
-    commands = world.commands(PUSH)
-    assert commands.names == ("x", "y") and commands.stride == 4 and commands.rate_hz == 10
-    assert commands.low.tolist() == [0, 0] and commands.high.tolist() == [512, 512]
-    assert commands.seen is not None and (commands.seen[0] >= 15).all() and (commands.seen[1] <= 497).all()
+    actions = world.action_spec(PUSH)
+    assert actions.names == ("x", "y") and actions.stride == 4 and actions.rate_hz == 10
+    assert actions.low.tolist() == [0, 0] and actions.high.tolist() == [512, 512]
+    assert actions.seen is not None and (actions.seen[0] >= 15).all() and (actions.seen[1] <= 497).all()
     assert world.unmask_steps == 3 and len(world.model.embodiments) > 10
