@@ -11,8 +11,6 @@ import platform
 import shutil
 import threading
 import uuid
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -119,17 +117,6 @@ def sync_folder(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def kept_arrays(path: Path) -> dict[str, Any] | None:
-    """Return the arrays of an .npz file that an interrupted command kept; None if it is absent or damaged."""
-    import numpy as np
-
-    try:
-        with np.load(path) as arrays:
-            return dict(arrays)
-    except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error):
-        return None
 
 
 def file_sha256(path: Path) -> str:

@@ -30,7 +30,8 @@ from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import finite, kept_arrays, to_json, write_atomic
+from hma_data.storage.files import finite, to_json, write_atomic
+from hma_data.storage.kept import kept_arrays
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.evaluate import Settings, measure

@@ -28,7 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import UsageError
-from hma_data.storage.files import atomic_path, kept_arrays
+from hma_data.storage.files import atomic_path
+from hma_data.storage.kept import kept_arrays
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.agreement import (

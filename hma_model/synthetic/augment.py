@@ -27,7 +27,8 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
-from hma_data.storage.files import atomic_path, kept_arrays
+from hma_data.storage.files import atomic_path
+from hma_data.storage.kept import kept_arrays
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.probe import Probe, train_probe

@@ -32,7 +32,8 @@ from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import Refused
 from hma_data.shards.windows import episode_pieces
 from hma_data.sources.common.video_file import VideoFile, frame_table
-from hma_data.storage.files import atomic_path, file_sha256, kept_arrays
+from hma_data.storage.files import atomic_path, file_sha256
+from hma_data.storage.kept import kept_arrays
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import require_tokenizer

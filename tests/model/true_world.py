@@ -65,11 +65,11 @@ class TrueWorld:
         self.sampling.append((self.unmask_steps, self.temperature, self.order))
         for row, chunk in actions.items():
             self._advance(self.rows[row], chunk)
-        images = {row: self.rows[row].image() for row in actions}
+        images = {row: self.rows[row].picture() for row in actions}
         return {row: one * 0 if row in self.blind else one for row, one in images.items()}
 
     def image(self, session: int) -> NDArray[np.uint8]:
-        return self.rows[session].image()
+        return self.rows[session].picture()
 
     def close(self, session: int) -> None:
         del self.rows[session]

@@ -141,7 +141,7 @@ def test_sync_restarts_the_model_from_the_true_frames_and_their_actions() -> Non
     bench.step(6)
     session.sync()
     frames, chunks = bench.world.begun[-1]
-    np.testing.assert_array_equal(frames[-1], bench.world.rows[session.row].image())
+    np.testing.assert_array_equal(frames[-1], bench.world.rows[session.row].picture())
     np.testing.assert_array_equal(chunks[-6:], np.tile(session.held, (6, 1)))
     assert len(frames) == len(chunks) + 1 and frames.max() > 0
 

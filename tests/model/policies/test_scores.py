@@ -42,14 +42,14 @@ class KnownPlaces:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.known: dict[bytes, np.ndarray] = {}
-        draw = LabSimulator.image
+        draw = LabSimulator.picture
 
         def image(simulator: LabSimulator) -> np.ndarray:
             drawn = draw(simulator)
             self.known[drawn.tobytes()] = truth.parts_of(simulator.simulation)[1]
             return drawn
 
-        monkeypatch.setattr(LabSimulator, "image", image)
+        monkeypatch.setattr(LabSimulator, "picture", image)
 
     def read(self, images: np.ndarray) -> np.ndarray:
         flat = images.reshape(-1, *images.shape[-3:])
@@ -76,7 +76,7 @@ class FlawlessWorld(TrueWorld):
     def __init__(self, world: World) -> None:
         super().__init__()
         self.model, self.tokenizer, self.image_shape = world.model, world.tokenizer, world.image_shape
-        self.actions, self.shown, self.precision = world.actions, world.shown, world.precision
+        self.action_spec, self.shown, self.precision = world.action_spec, world.shown, world.precision
 
 
 def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJudge) -> None:
@@ -179,7 +179,7 @@ def test_a_policy_that_was_edited_is_scored_again(
 
     def written(value: int) -> list[str]:
         sys.modules.pop("mine", None)
-        (tmp_path / "mine.py").write_text(f"act = lambdan image: [{value}, 0]\n")
+        (tmp_path / "mine.py").write_text(f"act = lambda image: [{value}, 0]\n")
         before = len(begun)
         given: Any = {"world": world, "judge": judge, "episodes": 2, "frames": 4, "out": tmp_path / "out"}
         evaluate_policies(ROBOT, ["mine:act", "still"], **given)
@@ -229,7 +229,7 @@ class Wild:
 def test_a_policy_that_leaves_the_range_of_training_is_named_once(world: World, judge: StateJudge) -> None:
     seen = replace(world.action_spec(ROBOT), seen=np.array([[-50, -50], [50, 50]], np.float32))
     flawless: Any = FlawlessWorld(world)
-    flawless.actions = lambda name: seen
+    flawless.action_spec = lambda name: seen
     with pytest.warns(OutsideRangeWarning) as warned:
         found = evaluate_policies(
             ROBOT, [("wild", Called(Wild)), "still"], world=flawless, judge=judge, episodes=2, frames=4
@@ -326,7 +326,7 @@ def test_a_file_in_place_of_the_folder_is_refused_before_the_work(tmp_path: Path
 
 def _world_of(model: HMA) -> World:
     made = object.__new__(World)
-    made.model, made._actions = model, {}
+    made.model, made._specs = model, {}
     return made
 
 

@@ -181,7 +181,7 @@ def test_the_surest_episodes_are_kept(kind: str, request: pytest.FixtureRequest,
 )
 def test_noise_without_a_share_is_refused(words: str, world: World, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--commands: .* is unknown . give replay, or perturb=0.3"):
-        augment(tmp_path / "out", asked(actions=words), world=world)
+        augment(tmp_path / "out", asked(commands=words), world=world)
 
 
 @pytest.mark.slow
@@ -451,7 +451,7 @@ def test_a_robot_without_simulator_needs_shards(tmp_path: Path) -> None:
     from tests.model.robots import make_model
 
     world = object.__new__(World)
-    world.model, world._actions, world.precision = make_model({"arm": 2}), {}, "float32"
+    world.model, world._specs, world.precision = make_model({"arm": 2}), {}, "float32"
     with pytest.raises(HMAError, match="arm: has no true simulator"):
         augment(tmp_path / "out", Augmentation("arm"), world=world)
 

@@ -256,7 +256,7 @@ def test_a_saved_dataset_names_the_cameras_that_the_model_shows(
         frames = [Frame(i, image, None, actions, state, None) for i in range(3)]
         episode, own = lerobot_episode(robot, frames)
         assert episode.state is None and own.state is None
-        shown = [episode.images[camera.key] for camera in own.cameras]
+        shown = [episode.pictures[camera.key] for camera in own.cameras]
         assert all(np.abs(np.stack(view) - 90.0 * i).max() < 3 for i, view in enumerate(shown))
         assert {len(view) for view in shown} == {3} and episode.hold == arm.stride == len(episode.action) // 3
         return [camera.name for camera in own.cameras]
@@ -300,5 +300,5 @@ def test_a_saved_dataset_reads_as_what_was_driven(name: str, tmp_path: Path) -> 
     assert (
         len(shown) == 2 and np.abs(shown[0].astype(int) - shown[1]).mean() < 2
     )  # the world is without error
-    newest = world.rows[session.row].image()
+    newest = world.rows[session.row].picture()
     assert np.abs(shown[0][-1].astype(int) - newest).mean() < 4

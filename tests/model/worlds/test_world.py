@@ -138,7 +138,7 @@ def test_images_of_another_size_are_resized_as_in_a_conversion(model: HMA, windo
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        (np.zeros(7), r"actions: of pusht_fast have the shape \(7,\) — give \(8,\) or \(4, 2\)"),
+        (np.zeros(7), r"of pusht_fast have the shape \(7,\) — give \(8,\) or \(4, 2\)"),
         (np.full(8, np.inf), "not finite"),
         (np.array([[0, np.nan]] * 4), "not finite"),
     ],

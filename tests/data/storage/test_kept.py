@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hma_data.storage.files import kept_arrays
+from hma_data.storage.kept import kept_arrays
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
