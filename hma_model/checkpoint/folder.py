@@ -1,22 +1,21 @@
-"""Open and check a checkpoint's folder without reading weights (DESIGN section 9).
+"""Open and check a checkpoint's folder without reading weights.
 
     config.json                  format version, architecture, tokenizer spec
     trunk.safetensors            tensors that all embodiments share
     embodiments/<id>/            stem.safetensors, head.safetensors, embodiment.yaml, stats.json, card.json
     README.md                    the model card, made from the card.json files
-    training/                    optimizer and the sampler's place; never published
+    training/                    optimizer and sampler state; never published
 
 Every card and every stem holds the SHA-256 of the trunk, and the digests of the tokenizer and of the
 statistics that the stem was trained on. Parts that do not belong together are therefore refused.
-
 Files of another `FORMAT_VERSION` are refused.
 """
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,11 +36,12 @@ STEM, HEAD, YAML, STATS, CARD = (
     "stem.safetensors", "head.safetensors", "embodiment.yaml", "stats.json", "card.json",
 )  # fmt: skip
 PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card is last: its presence means that the others are there
-SAMPLE, FILM = "sample.png", "sample.gif"  # optional, shown in the model card
-SHOWN = (SAMPLE, FILM)
-EMBEDDED, EMBEDDED_NAME = Path(__file__).parents[1] / "embedded", "embedded"  # comes along with the package
-_APART = "pull the embodiment and its trunk together, or finetune it on this trunk"
+SAMPLE, FILM = "sample.png", "sample.gif"
+PICTURES = (SAMPLE, FILM)  # optional, shown in the model card
+EMBEDDED, EMBEDDED_NAME = Path(__file__).parents[1] / "embedded", "embedded"  # bundled with the package
+_OTHER_TRUNK = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was cut short: do it again"
+_OTHER_YAML = "put the one back that it was trained with; facts for readers can be changed in the card"
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,8 @@ class ActionStats:
 class Checkpoint:
     """A checkpoint's folder, checked as far as possible without reading weights.
 
+    It is opened once and passed on: each file is hashed once for each object.
+
     Attributes:
         config: of the network; the tokenizer's spec is in it.
         embodiments: ids present, sorted.
@@ -72,29 +74,37 @@ class Checkpoint:
     embodiments: tuple[str, ...]
     trunk_sha256: str
     tokenizer: str
+    _hashes: dict[Path, str] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
-    def open(cls, folder: StrPath) -> "Checkpoint":
+    def open(cls, checkpoint: "StrPath | Checkpoint") -> "Checkpoint":
         """Open the checkpoint in a folder, or the newest one in the folder of a training run.
 
         Args:
-            folder: str or path of it.
+            checkpoint: str or path of it; an open one is returned as it is.
 
         Raises:
             CheckpointError: there is none, it is damaged, or of a format this release does not read.
         """
-        folder = resolve(folder)
+        if isinstance(checkpoint, Checkpoint):
+            return checkpoint
+        folder = resolve(checkpoint)
         values = read_json(inside(folder, CONFIG))
         config = parse_config(values, folder / CONFIG)
-        home = folder / "embodiments"
-        found = sorted(path.name for path in home.iterdir()) if home.is_dir() else []
-        present = tuple(name for name in found if (home / name / CARD).is_file())
-        return cls(folder, config, present, str(values.get("trunk_sha256")), digest(values["tokenizer"]))
+        homes = folder / "embodiments"
+        present = sorted(path.parent.name for path in homes.glob(f"*/{CARD}") if path.is_file())
+        tokenizer = digest(values["tokenizer"])
+        return cls(folder, config, tuple(present), str(values.get("trunk_sha256")), tokenizer)
 
     @property
     def name(self) -> str:
         """Return its folder, or `embedded`, as an error names it."""
         return EMBEDDED_NAME if self.folder == EMBEDDED else str(self.folder)
+
+    def _sha256(self, path: Path) -> str:
+        if path not in self._hashes:
+            self._hashes[path] = file_sha256(path)
+        return self._hashes[path]
 
     def trunk(self) -> Path:
         """Return the path of trunk.safetensors, after checking its SHA-256.
@@ -103,10 +113,24 @@ class Checkpoint:
             CheckpointError: it is not the file that config.json names.
         """
         path = inside(self.folder, TRUNK)
-        if file_sha256(path) != self.trunk_sha256:
+        if self._sha256(path) != self.trunk_sha256:
             remedy = "pull the checkpoint again, into a new folder"
             raise CheckpointError(path, *unreadable(path, f"is another trunk than {CONFIG} names", remedy))
         return path
+
+    def chosen(self, embodiments: Iterable[str] | None) -> list[str]:
+        """Return the requested embodiments, each once; None requests all.
+
+        Raises:
+            CheckpointError: not an id, or it has no such embodiment.
+        """
+        wanted = list(dict.fromkeys(self.embodiments if embodiments is None else embodiments))
+        for name in wanted:
+            check_id(name, self.name)
+            if name not in self.embodiments:
+                known = f"it has: {', '.join(self.embodiments) or 'none'}"
+                raise CheckpointError(self.name, f"has no embodiment {name!r}", known)
+        return wanted
 
     def path(self, embodiment: str, part: str) -> Path:
         """Return the path of a file of an embodiment.
@@ -114,10 +138,7 @@ class Checkpoint:
         Raises:
             CheckpointError: not an id, or no such embodiment or file.
         """
-        check_id(embodiment, self.folder)
-        if embodiment not in self.embodiments:
-            known = f"it has: {', '.join(self.embodiments) or 'none'}"
-            raise CheckpointError(self.name, f"has no embodiment {embodiment!r}", known)
+        self.chosen([embodiment])
         return inside(self.folder, f"embodiments/{embodiment}/{part}")
 
     def card(self, embodiment: str) -> dict[str, Any]:
@@ -126,6 +147,15 @@ class Checkpoint:
         values = read_json(path)
         _require_version(values, path)
         return values
+
+    def cards(self, embodiments: Iterable[str] | None = None) -> dict[str, dict[str, Any]]:
+        """Return the cards of embodiments by id; None means all."""
+        return {name: self.card(name) for name in self.chosen(embodiments)}
+
+    def pictures(self, embodiment: str) -> list[str]:
+        """Return the names of the sample picture and film that an embodiment has."""
+        home = self.folder / "embodiments" / embodiment
+        return [name for name in PICTURES if (home / name).is_file()]
 
     def embodiment(self, embodiment: str) -> Embodiment:
         """Return the embodiment as it was at training."""
@@ -142,33 +172,35 @@ class Checkpoint:
         """Open the shard sets of the run that wrote this checkpoint, as far as they are still here."""
         from hma_data.shards.reader import ShardSet  # imports pyarrow
 
-        path, sets = self.folder.parent.parent / "recipe.json", []
-        if self.folder.parent.name == "checkpoints" and path.is_file():
-            for folder in read_json(path).get("data", ()):
-                with suppress(HMAError):  # it was moved or removed
-                    sets.append(ShardSet(folder))
+        recipe = self.folder.parent.parent / "recipe.json"
+        if self.folder.parent.name != "checkpoints" or not recipe.is_file():
+            return []
+        sets = []
+        for folder in read_json(recipe).get("data", ()):
+            with suppress(HMAError):  # it was moved or removed
+                sets.append(ShardSet(folder))
         return [one for one in sets if one.embodiment.id in self.embodiments]
 
     def check(self, embodiment: str) -> None:
-        """Raise unless the embodiment's parts belong to this trunk, tokenizer and statistics.
+        """Check that an embodiment's parts belong to this trunk, tokenizer and statistics.
 
         Raises:
             CheckpointError: a part does not belong to them; it names the first such part and the reason.
         """
         path, card = self.path(embodiment, STEM), self.card(embodiment)
         stem = read_metadata(path)
-        stats = file_sha256(self.path(embodiment, STATS))
-        _same(path, stem, "embodiment", embodiment, "was saved for another embodiment")
+        stats = self._sha256(self.path(embodiment, STATS))
+        _require_same(path, stem, "embodiment", embodiment, "was saved for another embodiment")
         for where, facts in ((path, stem), (self.path(embodiment, CARD), card)):
-            _same(where, facts, "trunk_sha256", self.trunk_sha256, "belongs to another trunk")
-            _same(where, facts, "tokenizer", self.tokenizer, "was trained on another tokenizer")
+            _require_same(where, facts, "trunk_sha256", self.trunk_sha256, "belongs to another trunk")
+            _require_same(where, facts, "tokenizer", self.tokenizer, "was trained on another tokenizer")
             other = f"was trained with other statistics than {STATS}"
-            _same(where, facts, "stats_sha256", stats, other, _CUT_SHORT)
+            _require_same(where, facts, "stats_sha256", stats, other, _CUT_SHORT)
         files = card.get("files")
-        for part in (STEM, HEAD):
+        for part, remedy in ((STEM, _CUT_SHORT), (HEAD, _CUT_SHORT), (YAML, _OTHER_YAML)):
             path = self.path(embodiment, part)
-            if not isinstance(files, dict) or files.get(part) != file_sha256(path):
-                raise CheckpointError(path, f"is not the file that {CARD} names", _CUT_SHORT)
+            if not isinstance(files, dict) or files.get(part) != self._sha256(path):
+                raise CheckpointError(path, f"is not the file that {CARD} names", remedy)
 
 
 def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
@@ -201,7 +233,7 @@ def resolve(folder: StrPath) -> Path:
     """Return the folder of a checkpoint: the path itself, or the newest of a run's `checkpoints/`.
 
     Args:
-        folder: str or path of it; `embedded` is the checkpoint that comes along with the package.
+        folder: str or path of it; `embedded` is the checkpoint bundled with the package.
 
     Raises:
         CheckpointError: there is none.
@@ -292,8 +324,8 @@ def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:
         raise CheckpointError(where, "lacks action.mean or action.std as lists of numbers") from fault
 
 
-def _same(
-    where: Path, facts: Mapping[str, Any], key: str, expected: str, fault: str, remedy: str = _APART
+def _require_same(
+    where: Path, facts: Mapping[str, Any], key: str, expected: str, fault: str, remedy: str = _OTHER_TRUNK
 ) -> None:
     found = facts.get(key)
     if found != expected:

@@ -22,7 +22,6 @@ from hma_model.checkpoint.folder import (
     PARTS,
     README,
     SAMPLE,
-    SHOWN,
     STATS,
     STEM,
     TRAINING,
@@ -102,11 +101,13 @@ def save(
     return Checkpoint.open(folder)
 
 
-def load(folder: StrPath, embodiments: Iterable[str] | None = None, device: str = "cpu") -> "HMA":
+def load(
+    checkpoint: StrPath | Checkpoint, embodiments: Iterable[str] | None = None, device: str = "cpu"
+) -> "HMA":
     """Return the model of a checkpoint with the chosen embodiments; read nothing else.
 
     Args:
-        folder: str or path of a checkpoint, or of a training run.
+        checkpoint: an open one, or str or path of a checkpoint or of a training run.
         embodiments: ids; None for all of the checkpoint.
         device: where the model goes.
 
@@ -115,11 +116,12 @@ def load(folder: StrPath, embodiments: Iterable[str] | None = None, device: str 
     """
     from hma_model.network.model import HMA
 
-    checkpoint = Checkpoint.open(folder)
+    checkpoint = Checkpoint.open(checkpoint)
+    wanted = checkpoint.chosen(embodiments)
     trunk = weights.trunk(checkpoint)
     model = HMA(checkpoint.config)
-    model.load_trunk(trunk, checkpoint.trunk())
-    for name in checkpoint.embodiments if embodiments is None else dict.fromkeys(embodiments):
+    model.load_trunk(trunk, checkpoint.folder / TRUNK)
+    for name in wanted:
         add_embodiment(model, checkpoint, name)
     model.source = checkpoint
     return model.to(device).eval()
@@ -157,15 +159,13 @@ def read_embodiment(
     return space, *weights.embodiment(checkpoint, embodiment, space)
 
 
-def write_readme(folder: StrPath) -> None:
-    """Write README.md from the cards in a checkpoint's folder."""
-    folder = as_path(folder)
-    checkpoint = Checkpoint.open(folder)
-    cards = {name: checkpoint.card(name) for name in checkpoint.embodiments}
-    homes = folder / "embodiments"
-    samples = {f"{name}/{part}" for name in cards for part in SHOWN if (homes / name / part).is_file()}
+def write_readme(checkpoint: StrPath | Checkpoint) -> None:
+    """Write README.md from the cards of a checkpoint (str or path of its folder, or an open one)."""
+    checkpoint = Checkpoint.open(checkpoint)
+    cards = checkpoint.cards()
+    samples = {f"{name}/{part}" for name in cards for part in checkpoint.pictures(name)}
     text = render(config_json(checkpoint.config, checkpoint.trunk_sha256), cards, samples=samples)
-    write_atomic(folder / README, text)
+    write_atomic(checkpoint.folder / README, text)
 
 
 def remove(folder: StrPath) -> None:
@@ -192,11 +192,10 @@ def config_json(config: HMAConfig, trunk_sha256: str) -> dict[str, Any]:
 
 def _take_over(base: Checkpoint, new: Path, besides: set[str]) -> str:
     """Link or copy a checkpoint's trunk and embodiments, except `besides`; return the trunk's hash."""
-    kept = [name for name in base.embodiments if name not in besides]
     names = [CONFIG, TRUNK]
-    for name in kept:
-        home = base.folder / "embodiments" / name
-        names += [f"embodiments/{name}/{part}" for part in (*PARTS, *SHOWN) if (home / part).is_file()]
+    for name in base.embodiments:
+        if name not in besides:
+            names += [f"embodiments/{name}/{part}" for part in (*PARTS, *base.pictures(name))]
     for name in names:
         (new / name).parent.mkdir(parents=True, exist_ok=True)
         try:

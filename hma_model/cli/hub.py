@@ -3,13 +3,16 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
 
 from hma_data.cli.options import Folder, Json
 from hma_data.console import human_bytes, human_count, print_json, print_lines, print_table
+
+if TYPE_CHECKING:
+    from hma_model.checkpoint.folder import Checkpoint
 
 Embodiments = Annotated[
     list[str] | None, Option("--embodiment", "-e", help="Only this robot; repeat for more.")
@@ -37,11 +40,13 @@ def push(
 
     Example: hma hub push runs/first ./my-hub/team/model -e my_arm
     """
+    from hma_model.checkpoint.folder import Checkpoint
     from hma_model.hub import publish as hub
 
+    opened = Checkpoint.open(checkpoint)
     if film or sample:
-        _add_films(checkpoint, sample, embodiment)
-    address = hub.push(checkpoint, target, embodiment, private, _print_files)
+        _add_films(opened, sample, embodiment)
+    address = hub.push(opened, target, embodiment, private, _print_files)
     print(f"published to {address}")
     robots = "".join(f" -e {shlex.quote(name)}" for name in embodiment or ())
     print(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {_folder_for(target)}")
@@ -69,7 +74,7 @@ def _folder_for(target: str) -> str:
     return shlex.quote(f"{target.rstrip('/').rsplit('/', 1)[-1]}-pulled")
 
 
-def _add_films(checkpoint: Path, sample: list[Path] | None, embodiments: list[str] | None) -> None:
+def _add_films(checkpoint: "Checkpoint", sample: list[Path] | None, embodiments: list[str] | None) -> None:
     """Add films of the given shards; or those that can be made of the run's own shards."""
     from hma_data.errors import HMAError
     from hma_model.hub.sample import add_samples, at_hand

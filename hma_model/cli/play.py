@@ -51,7 +51,7 @@ def play(
     import asyncio
 
     from hma_data.shards.reader import ShardSet
-    from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+    from hma_model.checkpoint.folder import EMBEDDED
     from hma_model.hub.publish import located
     from hma_model.worlds.images import read_image
     from hma_model.worlds.scenes import drivable, opening, trained_on
@@ -59,7 +59,7 @@ def play(
     # what is wrong with it, the data or the pictures is said before torch is imported
     sets, pictures = list(map(ShardSet, data or ())), list(map(read_image, prompt or ()))
     require_checkpoint(checkpoint)
-    opened, device = Checkpoint.open(located(checkpoint)[0]), device_name(device)
+    opened, device = located(checkpoint)[0], device_name(device)
 
     @cache
     def tokenizer() -> Any:

@@ -16,7 +16,7 @@ from hma_data.storage.yaml_io import write_yaml
 from hma_data.tables import Table
 from hma_data.tokenizers.catalog import other_weights
 from hma_model.checkpoint.model_card import licence, line, number
-from hma_model.hub.publish import Store, open_store
+from hma_model.hub.stores import Store, open_store
 
 _OURS = {*SMALL, MANIFEST, *BESIDE}
 _AGAIN = "pull again; if it stays so, have it pushed again"
@@ -46,7 +46,6 @@ def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str
     store = _open(as_address(target), write=True, private=private)
     page = _page(manifest, store.repo)
     _refuse_others(store, manifest)
-    store.check_card(page)
     return publish(store, folder, lambda: _refuse_others(store, manifest), page=page)
 
 

@@ -18,11 +18,11 @@ from hma_model.checkpoint.folder import (
     digest,
     parse_config,
 )  # fmt: skip
-from hma_model.hub.publish import Store, embodiment_ids, open_store
+from hma_model.hub.stores import Store, embodiment_ids, open_store
 
 RELEASED_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 FIGURES = ("val_loss", "baseline_loss", "psnr", "ssim")
-MOST = 200  # maximum number of checkpoints shown of a folder
+MAX_LISTED = 200  # checkpoints of one folder
 
 
 def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
@@ -46,13 +46,18 @@ def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]
     roots = sorted(name.removesuffix(CONFIG) for name in files if f"/{name}".endswith(f"/{CONFIG}"))
     found = [
         one | {"from_cache": store.from_cache}
-        for root in roots[:MOST]
+        for root in roots[:MAX_LISTED]
         if (one := _checkpoint(store, files, root))
     ]
     if not found:
         fault = f"has no {CONFIG} of a checkpoint of {LIBRARY} or of the release"
         raise HubError(store.name, fault, "check the name: it is not of hma-toolkit")
     return found
+
+
+def list_embodiments(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
+    """Return a row for each published embodiment; see `survey`."""
+    return [row for found in survey(source, revision) for row in found["embodiments"]]
 
 
 def _checkpoint(store: Store, files: Mapping[str, int], root: str) -> dict[str, Any] | None:

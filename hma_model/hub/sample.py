@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 COLUMNS, SIDE = 6, 128  # pictures in a row, and pixels of a side
 
 
-def add_samples(checkpoint: StrPath, data: Iterable[StrPath]) -> list[Path]:
+def add_samples(checkpoint: StrPath | Checkpoint, data: Iterable[StrPath]) -> list[Path]:
     """Write sample.png and sample.gif for the embodiment of each shard set, and update the model card.
 
     Args:
-        checkpoint: str or path of its folder, or of the folder of a training run.
+        checkpoint: an open one, or str or path of its folder, or of the folder of a training run.
         data: str or path of shard sets, one an embodiment.
 
     Returns:
@@ -51,28 +51,25 @@ def add_samples(checkpoint: StrPath, data: Iterable[StrPath]) -> list[Path]:
             known = ", ".join(source.embodiments) or "none"
             raise CheckpointError(source.folder, f"has no embodiment {name!r}", f"it has: {known}")
         home = source.folder / "embodiments" / name
-        for part, content in zip((SAMPLE, FILM), _shown(source.folder, shards)):
+        for part, content in zip((SAMPLE, FILM), _shown(source, shards)):
             write_atomic(home / part, content)
             made.append(home / part)
-    checkpoints.write_readme(source.folder)
+    checkpoints.write_readme(source)
     return made
 
 
-def at_hand(checkpoint: StrPath, embodiments: Iterable[str] | None = None) -> list[RemotePath | Path]:
+def at_hand(checkpoint: Checkpoint, embodiments: Iterable[str] | None = None) -> list[RemotePath | Path]:
     """Return the shard sets of a run that are still here, of the robots that have no film yet.
 
     Args:
-        checkpoint: str or path of its folder, or of the folder of a training run.
         embodiments: ids; None for all.
     """
-    source = Checkpoint.open(checkpoint)
-    wanted = set(source.embodiments if embodiments is None else embodiments)
-    lacking = {name for name in wanted if not (source.folder / "embodiments" / name / FILM).is_file()}
-    sets = source.shards() if source.config.predicts_video else []
+    lacking = {name for name in checkpoint.chosen(embodiments) if FILM not in checkpoint.pictures(name)}
+    sets = checkpoint.shards() if checkpoint.config.predicts_video else []
     return [shards.folder for shards in sets if shards.embodiment.id in lacking]
 
 
-def _shown(checkpoint: Path, shards: "ShardSet") -> tuple[bytes, bytes]:
+def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
     """Return a PNG of truth and predictions over a window, and a GIF of both with the commands."""
     from hma_data.episodes.sheets import gif_bytes, grid, png_bytes
     from hma_data.shards.preview import tokenizer_of

@@ -423,7 +423,7 @@ async def serve(
     from hma_model.worlds.world import World
 
     names = sorted({robot.embodiment.id for robot in robots.values()})
-    model = load(checkpoint.folder, names, device)
+    model = load(checkpoint, names, device)
     confidence = ("confidence",) if checkpoint.config.kind == "discrete" else ()
     engine = Engine(World(model, tokenizer, **settings), robots, orders=("random", *confidence))
     engine.start()

@@ -117,7 +117,7 @@ def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[
         raise CheckpointError(out, "is there already", "choose another folder")
     opened = Checkpoint.open(checkpoint)
     values = config_to_released(opened.config, opened.folder)
-    model = load(opened.folder, embodiments)
+    model = load(opened, embodiments)
     domains = _domains(model, opened.folder)
     values |= {"init_actions": bool(domains), "use_actions": bool(domains)}
     values["action_domains"] = list(domains) or None

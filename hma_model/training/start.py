@@ -190,13 +190,14 @@ def _robots(
     recipe: Recipe, sets: Mapping[str, ShardSet], source: str, revision: str | None, local: bool
 ) -> tuple[set[str], set[str]]:
     """Return the robots of a checkpoint that the run takes, and those with whose stem a new one may begin."""
-    from hma_model.hub import publish as hub
+    from hma_model.hub.listing import list_embodiments
+    from hma_model.hub.stores import embodiment_ids, open_published
 
-    known = hub.embodiment_ids(hub.open_published(source, revision)[1])
+    known = embodiment_ids(open_published(source, revision)[1])
     wanted = {name for name in known if name in sets or (recipe.freeze == "trunk" and local)}
     fresh, likes = set(sets) - set(known), set[str]()
     if fresh and recipe.new_stem == "like":
-        rows = [row for row in hub.list_embodiments(source, revision) if not row["problems"]]
+        rows = [row for row in list_embodiments(source, revision) if not row["problems"]]
         cards = {row["embodiment"]: {**row, "effective_hz": row["hz"]} for row in rows}
         for name in fresh:
             some = [one for one in candidates(cards, sets[name].embodiment) if one in known]

@@ -73,7 +73,7 @@ def _rolled(out: Path, checkpoint: Checkpoint, shards: ShardSet, window: int) ->
     from hma_model.generation.decode import cameras_for
 
     robot, frames = shards.embodiment, checkpoint.config.frames
-    model = load(checkpoint.folder, [robot.id]).eval()
+    model = load(checkpoint, [robot.id]).eval()
     windows = WindowDataset(shards, "val", frames, cameras=cameras_for(model, shards))
     if window >= len(windows):
         fault = f"{shards.folder} has {len(windows)} held-out windows of {frames} frames, the first is 0"

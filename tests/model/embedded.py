@@ -9,13 +9,12 @@ from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint import folder, io
 from hma_model.checkpoint.folder import CONFIG
 from hma_model.config import ActionSpace, HMAConfig
-from hma_model.hub import publish
 from hma_model.network.model import HMA
 
 
 def use(made: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Make `embedded` the name of the checkpoint in a folder."""
-    for module in (folder, publish):
+    for module in (folder,):
         monkeypatch.setattr(module, "EMBEDDED", made)
     return made
 

@@ -12,10 +12,10 @@ import yaml as plain_yaml
 from hma_data.errors import CheckpointError, HubError
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.io import Checkpoint
-from hma_model.hub import folder as hub_folder
 from hma_model.hub import publish as hub
-from hma_model.hub.folder import FolderStore
-from hma_model.hub.listing import survey
+from hma_model.hub import stores as hub_folder
+from hma_model.hub.listing import list_embodiments, survey
+from hma_model.hub.stores import FolderStore
 from hma_model.network.model import HMA
 from tests.model.robots import make_model, save
 from tests.model.robots import yaml as robot_yaml
@@ -46,7 +46,7 @@ def target(request, tmp_path: Path):
 
 
 def published(target) -> list[str]:
-    return [row["embodiment"] for row in hub.list_embodiments(target)]
+    return [row["embodiment"] for row in list_embodiments(target)]
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -313,7 +313,7 @@ def test_what_is_published_is_described(source, target):
 
 def test_the_list_has_a_row_for_each_embodiment_with_the_same_columns(source, target):
     hub.push(source, target)
-    rows = hub.list_embodiments(target)
+    rows = list_embodiments(target)
     assert [(row["embodiment"], row["action_dim"], row["val_loss"]) for row in rows] == [
         ("arm", 2, 1.5),
         ("hand", 3, 1.5),
@@ -324,7 +324,7 @@ def test_the_list_has_a_row_for_each_embodiment_with_the_same_columns(source, ta
 def test_a_loaded_model_is_pushed_with_what_it_was_loaded_with(source, target):
     model = HMA.from_pretrained(str(source))
     model.push_to_hub(target, embodiments=["arm"])
-    (row,) = hub.list_embodiments(target)
+    (row,) = list_embodiments(target)
     assert row["robot"] == "an arm" and row["val_loss"] == 1.5
 
 

@@ -33,7 +33,7 @@ def fit(folder: Path) -> None:
     edit(folder / "config.json", lambda values: values.update(trunk_sha256=trunk))
     for home in (folder / "embodiments").iterdir():
         rewrite(home / "stem.safetensors", lambda name: name, trunk_sha256=trunk)
-        digests = {part.name: file_sha256(part) for part in home.glob("*.safetensors")}
+        digests = {part.name: file_sha256(part) for part in home.iterdir() if part.name != "card.json"}
         edit(home / "card.json", lambda values, d=digests: values.update(trunk_sha256=trunk, files=d))
 
 
@@ -128,6 +128,7 @@ def test_a_config_that_asks_for_too_much_is_refused_before_anything_is_built(fol
 def test_an_embodiment_that_asks_for_too_much_is_refused(folder, monkeypatch):
     path = folder / "embodiments/arm/embodiment.yaml"
     path.write_text(path.read_text().replace("stride: 2", "stride: 100000000"))
+    fit(folder)
     with pytest.raises(HMAError, match=r"too small for chunks|stride"):
         checkpoint.load(folder, ["arm"])
 

@@ -12,6 +12,7 @@ from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import read_metadata
 from hma_model.hub import publish as hub
 from hma_model.hub.datasets import pull_data, push_data
+from hma_model.hub.listing import list_embodiments
 from tests.model.robots import save
 from tests.model.shards import make_shards
 
@@ -101,7 +102,7 @@ def test_names_with_spaces_and_signs_are_names(tmp_path, begin, place):
     save(tmp_path / "mein Modell é", {"arm": 2})
     shards = make_shards(tmp_path / "Sätze", "arm")
     hub.push(tmp_path / "mein Modell é", target)
-    assert [row["embodiment"] for row in hub.list_embodiments(target)] == ["arm"]
+    assert [row["embodiment"] for row in list_embodiments(target)] == ["arm"]
     pulled = hub.pull(target, ["arm"], tmp_path / "aus gabe ü")
     assert list(checkpoint.load(pulled).embodiments) == ["arm"]
     push_data(shards, f"{target} data")

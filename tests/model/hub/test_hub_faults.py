@@ -18,6 +18,7 @@ from hma_data.storage.files import part_of
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.io import PARTS
 from hma_model.hub import publish as hub
+from hma_model.hub.listing import list_embodiments
 from tests.hub_server import Hub
 from tests.hub_state import EVERY, REPO, sha256
 from tests.model.robots import make_model, save
@@ -419,7 +420,7 @@ def test_a_store_that_refuses_is_one_line(source, address, monkeypatch, tmp_path
         monkeypatch.setenv(name, str(tmp_path / "none"))
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
     s3fs.S3FileSystem.clear_instance_cache()
-    for act in (lambda: hub.push(source, address), lambda: hub.list_embodiments(address)):
+    for act in (lambda: hub.push(source, address), lambda: list_embodiments(address)):
         with pytest.raises(HubError) as found:
             act()
         assert found.value.remedy and "\n" not in str(found.value)

@@ -22,7 +22,7 @@ from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.io import PARTS
 from hma_model.cli import app
 from hma_model.hub import publish as hub
-from hma_model.hub.listing import survey
+from hma_model.hub.listing import list_embodiments, survey
 from hma_model.network.model import HMA
 from tests.hub_server import Hub
 from tests.hub_state import REPO, ROBOTS, TOKEN
@@ -68,7 +68,7 @@ def test_two_pushes_at_once_both_land(server, source):
     assert server.count("POST .*/commit/") == 4  # trunk, hand, arm refused, arm again
     page = server.model(REPO).files["README.md"].decode()
     assert "| `arm` |" in page and "| `hand` |" in page
-    assert [row["embodiment"] for row in hub.list_embodiments(REPO)] == ["arm", "hand"]
+    assert [row["embodiment"] for row in list_embodiments(REPO)] == ["arm", "hand"]
 
 
 def test_pushes_from_threads_all_land(server, source):
@@ -217,8 +217,8 @@ def test_a_revision_is_the_one_named(published, source, tmp_path):
     ):
         model = HMA.from_pretrained(address, embodiments=["arm"], revision=revision)
         assert all(torch.equal(value, theirs[name]) for name, value in model.state_dict().items())
-        assert len(hub.list_embodiments(address, revision)) == len(ROBOTS)
-    assert len(hub.list_embodiments(REPO)) == len(ROBOTS) + 1
+        assert len(list_embodiments(address, revision)) == len(ROBOTS)
+    assert len(list_embodiments(REPO)) == len(ROBOTS) + 1
 
 
 def test_a_listing_in_pages_is_read_whole(published):
@@ -278,7 +278,7 @@ def test_what_was_pulled_is_there_offline(published, monkeypatch):
     published.log.clear()
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     assert list(HMA.from_pretrained(REPO, embodiments=["arm"]).embodiments) == ["arm"]
-    assert [row["embodiment"] for row in hub.list_embodiments(REPO)] == ["arm"]
+    assert [row["embodiment"] for row in list_embodiments(REPO)] == ["arm"]
     assert published.log == []
 
 
@@ -298,7 +298,7 @@ def test_what_was_never_pulled_is_not_there_offline(published, monkeypatch):
 
 
 def test_what_was_only_listed_is_not_there_offline(published, monkeypatch):
-    (row,) = [row for row in hub.list_embodiments(REPO) if row["embodiment"] == "arm"]
+    (row,) = [row for row in list_embodiments(REPO) if row["embodiment"] == "arm"]
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     said = r"is out of reach, and trunk\.safetensors is not in the cache — go online and pull again"
     for act in (hub.pull, HMA.from_pretrained):
@@ -400,7 +400,7 @@ def test_a_repository_of_another_library_is_called_so(server, source, files, mes
     with pytest.raises(HubError, match=message):
         hub.pull(REPO)
     with pytest.raises(HubError, match=r"has no config\.json of a checkpoint"):
-        hub.list_embodiments(REPO)
+        list_embodiments(REPO)
     if files:
         with pytest.raises(HubError, match=message):
             hub.push(source, REPO)
@@ -447,7 +447,7 @@ def test_a_huge_config_is_not_read(published):
 def test_names_that_lead_elsewhere_are_left_there(published, tmp_path, name):
     published.model(REPO).commit({name: b"{}", "embodiments/arm/weights.pkl": b"cos\nsystem\n(S'true'\ntR."})
     hub.pull(REPO, out=tmp_path / "out")
-    assert [row["embodiment"] for row in hub.list_embodiments(REPO)] == ["arm", "hand"]
+    assert [row["embodiment"] for row in list_embodiments(REPO)] == ["arm", "hand"]
     assert all(path.name != "x" and "escaped" not in str(path) for path in tmp_path.rglob("*"))
     assert not list(tmp_path.rglob("*.pkl"))
 

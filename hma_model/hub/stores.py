@@ -1,19 +1,23 @@
-"""Publish to and pull from a folder, on this machine or at any fsspec URI.
+"""Open hubs: folders of this machine, fsspec URIs, and repositories of the Hugging Face Hub.
 
-A push writes its files under temporary names and renames them one by one: config and trunk first, then the
-parts of each embodiment with its card last. An embodiment without a card counts as absent. The same push
-again completes one that was killed. Pushes to a folder of this machine wait for one another. In a store
-nothing is locked: the first config.json stays, and the digests in the cards reveal a mixture of two pushes.
+A push to a folder writes its files under temporary names and renames them one by one: config and trunk
+first, then the parts of each embodiment with its card last. An embodiment without a card counts as absent.
+The same push again completes one that was killed. Pushes to a folder of this machine wait for one another. In
+a store nothing is locked: the first config.json stays, and the digests in the cards reveal a mixture of two
+pushes.
 """
 
 import fcntl
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from hma_data.errors import HubError, MissingDependencyError, OutputError, StorageAwayError, StorageError
+from hma_data.hub.repository import Repository
+from hma_data.registry.embodiment import ID_PATTERN
 from hma_data.storage.files import (
     MAX_JSON_BYTES,
     PART,
@@ -24,13 +28,13 @@ from hma_data.storage.files import (
     sync_folder,
     write_atomic,
 )  # fmt: skip
-from hma_data.storage.paths import StrPath, as_text
+from hma_data.storage.paths import StrPath, addressed, as_address, as_text, is_repository
 from hma_data.storage.remote import WHOLE_PUTS, RemotePath, attempt, create_bytes, place
-from hma_model.checkpoint.folder import CONFIG, README, TRUNK
+from hma_model.checkpoint.folder import CARD, CONFIG, README, TRUNK
 
 
 class FolderStore:
-    """A hub in a folder; it has the methods of `hma_data.hub.repository.Repository`.
+    """A hub in a folder, with the methods of `hma_data.hub.repository.Repository`.
 
     Args:
         address: a path or an fsspec URI.
@@ -73,9 +77,6 @@ class FolderStore:
                 fault = f"is larger than {MAX_JSON_BYTES:,} bytes"
                 raise HubError(f"{self.name}/{name}", fault, "this is not a file of ours")
             return (self._root / name).read_bytes()
-
-    def check_card(self, page: bytes) -> None:
-        """Do nothing: a folder accepts any card."""
 
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
         """Check whether a file has this content already; return False in a store, where reading is slow."""
@@ -167,6 +168,58 @@ class FolderStore:
                 return self._root.listing()
         files = (path for path in self._root.rglob("*") if path.is_file())
         return {path.relative_to(self._root).as_posix(): path.stat().st_size for path in files}
+
+
+Store = FolderStore | Repository  # a place where a checkpoint or a shard set is published
+
+
+def open_store(
+    address: StrPath,
+    revision: str | None = None,
+    write: bool = False,
+    private: bool | None = None,
+    kind: str = "model",
+) -> Store:
+    """Open the hub at an address.
+
+    Args:
+        address: str or path: `org/name`, a folder or a URI; `org/name@revision` too unless `write` is true.
+        private: make a new repository a private one.
+        kind: of a repository: model or dataset.
+
+    Raises:
+        HubError: the hub does not exist, or cannot be reached.
+    """
+    place = as_address(address)
+    if not write:
+        place, revision = addressed(place, revision)
+    if is_repository(place):
+        return Repository(str(place).removeprefix("hf://"), revision, write, kind, private)
+    if revision is not None:
+        raise HubError(place, f"is a folder, and has no revision {revision!r}", "leave the revision out")
+    return FolderStore(place, write)
+
+
+def open_published(source: StrPath, revision: str | None) -> tuple[Store, dict[str, int]]:
+    """Return a hub and its files; the error for `org/name` says that no such folder is here either."""
+    try:
+        store = open_store(source, revision)
+        return store, store.files()
+    except HubError as fault:
+        name = as_text(source)
+        if not is_repository(source) or "://" in name:
+            raise
+        if revision:
+            raise HubError(f"{name}@{revision}", fault.fault, fault.remedy) from fault
+        both = f"is no folder here; as a repository of the hub: {fault.fault}"
+        remedy = f"give the path of a checkpoint or run, or: {fault.remedy}"
+        raise HubError(name, both, remedy) from fault
+
+
+def embodiment_ids(files: Iterable[str]) -> list[str]:
+    """Return the ids that have a card, which is written last, in a listing of a checkpoint's files."""
+    found = {path.split("/")[1] for path in files if fnmatchcase(path, f"embodiments/*/{CARD}")}
+    return sorted(name for name in found if ID_PATTERN.fullmatch(name) and ".." not in name)
 
 
 @contextmanager
