@@ -6,7 +6,6 @@ LFS uploads by signed address, downloads of LFS files by redirect to another hos
 """
 
 import base64
-import fnmatch
 import json
 import re
 import threading
@@ -333,8 +332,7 @@ class _Handler(BaseHTTPRequestHandler):
         for file in json.loads(self.content)["files"]:
             path, there = file["path"], commit.files.get(file["path"])
             lfs = self.server.habits.by_lfs(path, file["size"])
-            ignored = any(fnmatch.fnmatch(path, name) for name in self.server.habits.ignored)
-            answer = {"path": path, "uploadMode": "lfs" if lfs else "regular", "shouldIgnore": ignored}
+            answer = {"path": path, "uploadMode": "lfs" if lfs else "regular", "shouldIgnore": False}
             if there is not None and self.server.habits.tells_oids:
                 answer["oid"] = sha256(there) if lfs else oid(there)
             answers.append(answer)

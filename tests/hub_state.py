@@ -27,7 +27,6 @@ class Habits:
         tells_oids: say before an upload what is there already.
         weak: mark ETags as weak.
         ranges: send parts of files.
-        ignored: names that a .gitignore there leaves out.
         siblings: list the files in a repository's facts.
         codes: say by X-Error-Code what is missing.
         folders: type of an entry without a path that it lists for each folder; "" for none.
@@ -41,7 +40,6 @@ class Habits:
     tells_oids: bool = True
     weak: bool = False
     ranges: bool = True
-    ignored: tuple[str, ...] = ()
     siblings: bool = True
     codes: bool = True
     folders: str = ""

@@ -45,6 +45,10 @@ def explain(where: str, fault: BaseException) -> HubError:
     match fault:
         case errors.HfHubHTTPError():
             return _answered(where, fault)
+        case ValueError() if isinstance(cause, errors.BadRequestError) and "README.md" in str(fault):
+            remedy = 'correct "license" in the card.json of a checkpoint, in the embodiment of a shard set'
+            said = shown(str(fault).partition("\n")[2])
+            return HubError(where, f"the hub refuses the card: {said}", remedy)
         case errors.LocalEntryNotFoundError() if not isinstance(cause, errors.HfHubHTTPError):
             return HubError(
                 where, "is out of reach, and not in the cache", "check the name, go online, run it again"
@@ -91,17 +95,33 @@ def waiting(fault: BaseException, attempt: int) -> float | None:
     return seconds if seconds <= LONGEST_WAIT else None
 
 
-def failed_by_xet(fault: BaseException) -> bool:
-    """Check whether an upload by Xet failed, as behind some firewalls; if so, upload by LFS from now on."""
+def is_missing(fault: HubError) -> bool:
+    """Check whether a repository does not exist, as far as its hub tells."""
+    from huggingface_hub import errors
+
+    cause = fault.__cause__
+    if isinstance(cause, errors.GatedRepoError | errors.RevisionNotFoundError):
+        return False
+    # Some hubs answer 404 without the code that states what is missing.
+    return isinstance(cause, errors.RepositoryNotFoundError) or status(fault) == 404
+
+
+def is_away(fault: HubError) -> bool:
+    """Check whether the hub is out of reach."""
     import httpx
-    from huggingface_hub import constants
+    from huggingface_hub import errors
+
+    away = (errors.OfflineModeIsEnabled, httpx.ConnectError, httpx.TimeoutException)
+    return isinstance(fault.__cause__, away)
+
+
+def is_of_xet(fault: BaseException) -> bool:
+    """Check whether the hub's library for transfers by Xet failed, and not an HTTP request of the client."""
+    import httpx
 
     chain = list(causes(fault))
     of_library = any(isinstance(item, ConnectionError | TimeoutError | RuntimeError) for item in chain)
-    if constants.HF_HUB_DISABLE_XET or not of_library or any(isinstance(c, httpx.HTTPError) for c in chain):
-        return False
-    constants.HF_HUB_DISABLE_XET = True
-    return True
+    return of_library and not any(isinstance(item, httpx.HTTPError) for item in chain)
 
 
 def _response(fault: BaseException) -> Any:

@@ -13,22 +13,20 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any
-from urllib.parse import quote
+from typing import Any, BinaryIO
 
 from hma_data.errors import HubError
-from hma_data.hub.errors import LOG_IN, explained, failed_by_xet, shown, status, waiting
+from hma_data.hub.errors import LOG_IN, explained, is_away, is_missing, is_of_xet, status, waiting
 from hma_data.storage.files import MAX_JSON_BYTES, PART
 
 ATTEMPTS = 8  # attempts to commit; half as many for any other call
 LISTING_S, SILENCE_S = 30.0, 300.0  # seconds; the hub needs minutes for a commit of many files
 AT_ONCE = 4  # downloads at a time
 LARGE = 1_000_000  # bytes of a file; from here on a bar shows the progress
-CARD = "README.md"
-_ABSENT = object()
 _CONFLICTS = (409, 412)
 _COMMIT = re.compile(r"[0-9a-f]{40}|[0-9a-f]{64}")
 
@@ -101,6 +99,7 @@ class Repository:
         self._api = HfApi(library_name="hma-toolkit")
         self.address = f"{self._api.endpoint}/{prefix}{repo}"
         self._write, self._private, self._absent = write, private, False
+        self._by_xet = True  # False once an upload by Xet has failed, as behind some firewalls
         self._commit: str | None = None
         self._cached: Path | None = None
         self._entries: dict[str, Entry] = {}
@@ -120,16 +119,22 @@ class Repository:
 
         A repository that is to be written and does not exist yet has no files.
         """
-        info = self._info()
-        self._absent = info is _ABSENT
-        if info is None:
-            self._commit, self._entries = None, self._of_cache()
+        self._commit, self._cached, self._absent = None, None, False
+        try:
+            asked: dict[str, Any] = {"revision": self._revision, "timeout": LISTING_S}
+            self._commit = self._ask(lambda: self._api.repo_info(**self._place, **asked).sha)
+        except HubError as fault:
+            if self._write and is_missing(fault):
+                self._absent = True
+            elif self._write or not is_away(fault):
+                raise
+        if self._commit is not None and not _COMMIT.fullmatch(self._commit):
+            named = f"names a commit {self._commit[:60]!r}"
+            raise HubError(self.name, named, "check HF_ENDPOINT and your proxy")
+        if self._commit:
+            self._entries = self._ask(self._listing)
         else:
-            self._commit, self._cached = getattr(info, "sha", None), None
-            if self._commit is not None and not _COMMIT.fullmatch(self._commit):
-                fault = f"names a commit {self._commit[:60]!r}"
-                raise HubError(self.name, fault, "check HF_ENDPOINT and your proxy")
-            self._entries = self._ask(self._listing) if self._commit else {}
+            self._entries = {} if self._write else self._of_cache()
         return {name: entry.size for name, entry in self._entries.items()}
 
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
@@ -138,28 +143,6 @@ class Repository:
         if entry and entry.sha256 and sha256:
             return entry.sha256 == sha256
         return entry is not None and entry.states(content)
-
-    def _info(self) -> Any:
-        """Return the client's facts; None if the hub is out of reach, `_ABSENT` if the repository is new."""
-        import httpx
-        from huggingface_hub import errors
-
-        def ask() -> Any:
-            try:
-                return self._api.repo_info(**self._place, revision=self._revision, timeout=LISTING_S)
-            except (errors.OfflineModeIsEnabled, httpx.ConnectError, httpx.TimeoutException):
-                if self._write:
-                    raise
-                return None
-            except errors.HfHubHTTPError as fault:
-                # some hubs answer 404 without the code that states what is missing
-                missing = isinstance(fault, errors.RepositoryNotFoundError) or status(fault) == 404
-                there = isinstance(fault, errors.GatedRepoError | errors.RevisionNotFoundError)
-                if there or not (missing and self._write):
-                    raise
-                return _ABSENT
-
-        return self._ask(ask)
 
     def _listing(self) -> dict[str, Entry]:
         from huggingface_hub import RepoFile
@@ -172,6 +155,7 @@ class Repository:
         }
 
     def _of_cache(self) -> dict[str, Entry]:
+        """Return the files that earlier pulls have left in the client's cache."""
         from huggingface_hub import snapshot_download
 
         with explained(self.name):
@@ -269,18 +253,15 @@ class Repository:
         Raises:
             HubError: the token may not write a file of this name.
         """
+        from huggingface_hub import CommitOperationAdd
+
         self._make()
         if branch := self._revision:
             self._ask(lambda: self._api.create_branch(**self._place, branch=branch, exist_ok=True))
-        self._ask(lambda: self._upload_modes([name]))
-
-    def check_card(self, page: bytes) -> None:
-        """Raise HubError if the hub would refuse a card."""
-        asked = {"content": page.decode(), "repoType": self.kind}
-        answered = self._ask(lambda: self._posted("validate-yaml", asked, (400,)).get("errors"))
-        if said := shown("; ".join(str(fault.get("message")) for fault in answered or ())):
-            remedy = 'correct "license" in the card.json of a checkpoint, in the embodiment of a shard set'
-            raise HubError(self.name, f"the hub refuses the card: {said}", remedy)
+        # The hub answers the request before an upload only to those who may write.
+        probe = [CommitOperationAdd(name, b"{}")]
+        given: dict[str, Any] = {"additions": probe, "revision": self._revision}
+        self._ask(lambda: self._api.preupload_lfs_files(**self._place, **given))
 
     def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
         """Commit changes and return the page's address; prepare them again if others commit first.
@@ -292,8 +273,6 @@ class Repository:
             HubError: the hub refuses the commit, or others keep committing.
         """
         files = changes()
-        if isinstance(page := files.get(CARD), bytes):
-            self.check_card(page)
         if self._absent:
             self._make()
             files = changes()  # somebody else may have written in the meantime
@@ -303,22 +282,13 @@ class Repository:
                     self._commit_changes(files, message)
                 return self.address
             except HubError as fault:
-                self._pause(fault, attempt)
+                if self._by_xet and is_of_xet(fault):
+                    log.info("%s; uploading by LFS from now on", fault)
+                    self._by_xet = False
+                else:
+                    _pause(fault, attempt)
             files = changes()
         raise HubError(self.name, f"others committed first {ATTEMPTS} times", "push again later")
-
-    def _pause(self, fault: HubError, attempt: int) -> None:
-        """Wait before a request is made again; raise the fault if that would not help."""
-        if failed_by_xet(fault):
-            seconds: float | None = 0.0
-        elif status(fault) in _CONFLICTS:
-            seconds = min(0.2 * 2**attempt, 10.0) * (0.5 + random.random())
-        else:
-            seconds = waiting(fault, attempt) if attempt < ATTEMPTS // 2 else None
-        if seconds is None:
-            raise fault
-        log.info("%s; trying again", fault)
-        time.sleep(seconds)
 
     def _commit_changes(self, files: Mapping[str, Path | bytes | None], message: str) -> None:
         """Commit what differs from the listed commit, all of it or nothing."""
@@ -328,68 +298,30 @@ class Repository:
         deleted = [name for name, new in files.items() if new is None and name in self._entries]
         if not added and not deleted:
             return
-        self._refuse_ignored(added)
-        self._choose_transfer()
-        self._api.create_commit(
-            operations=[
-                *(CommitOperationAdd(n, str(c) if isinstance(c, Path) else c) for n, c in added.items()),
-                *(CommitOperationDelete(name) for name in deleted),
-            ],
-            **self._place,
-            revision=self._revision,
-            commit_message=message,
-            parent_commit=self._commit,
-        )
+        with ExitStack() as opened:
 
-    def _refuse_ignored(self, names: Iterable[str]) -> None:
-        """Raise HubError if a .gitignore there would silently leave files out of the commit."""
-        if not any(PurePosixPath(name).name == ".gitignore" for name in self._entries):
-            return
-        for facts in self._upload_modes(names):
-            if facts.get("shouldIgnore"):
-                fault = f"leaves out {facts['path']}, by its .gitignore"
-                raise HubError(self.name, fault, "delete that line there, and push again")
+            def source(content: Path | bytes) -> str | bytes | BinaryIO:
+                if isinstance(content, bytes):
+                    return content
+                # The client uploads open files by LFS over HTTP, also where it has Xet.
+                return str(content) if self._by_xet else opened.enter_context(content.open("rb"))
 
-    def _choose_transfer(self) -> None:
-        """Upload by LFS where the hub gives no Xet token; the client would ask for one for minutes."""
-        from huggingface_hub import constants
-
-        if not constants.HF_HUB_DISABLE_XET:
-            answer = self._request("GET", f"{self.kind}s/{self.repo}/xet-write-token/{self._branch}")
-            if not answer.is_success or b"accessToken" not in answer.content:
-                constants.HF_HUB_DISABLE_XET = True
-
-    def _upload_modes(self, names: Iterable[str]) -> list[dict[str, Any]]:
-        """Return how the hub would take files; it answers only those who may write."""
-        asked = {"files": [{"path": name, "size": 1, "sample": "ew=="} for name in names]}
-        return list(self._posted(f"{self.kind}s/{self.repo}/preupload/{self._branch}", asked)["files"])
+            self._api.create_commit(
+                operations=[
+                    *(CommitOperationAdd(name, source(content)) for name, content in added.items()),
+                    *(CommitOperationDelete(name) for name in deleted),
+                ],
+                **self._place,
+                revision=self._revision,
+                commit_message=message,
+                parent_commit=self._commit,
+            )
 
     def _make(self) -> None:
         private = self._private or None
         self._ask(lambda: self._api.create_repo(**self._place, private=private, exist_ok=True))
 
     # -- asking
-
-    @property
-    def _branch(self) -> str:
-        return quote(self._revision or "main", safe="")
-
-    def _request(self, method: str, place: str, value: Any = None) -> Any:
-        """Return the hub's answer to a request that the client has no function for."""
-        from huggingface_hub import get_session
-        from huggingface_hub.utils import build_hf_headers
-
-        headers = build_hf_headers(library_name="hma-toolkit")
-        return get_session().request(method, f"{self._api.endpoint}/api/{place}", json=value, headers=headers)
-
-    def _posted(self, place: str, value: Any, accepted: tuple[int, ...] = ()) -> Any:
-        """Post JSON to the hub and return the JSON of its answer; `accepted` lists error states to accept."""
-        from huggingface_hub.utils import hf_raise_for_status
-
-        answer = self._request("POST", place, value)
-        if answer.status_code not in accepted:
-            hf_raise_for_status(answer)
-        return answer.json()
 
     def _ask[T](self, call: Callable[[], T], where: str = "", attempt: int = 0) -> T:
         """Return the result of a client's call; repeat it if the hub is busy or the connection was cut."""
@@ -399,8 +331,20 @@ class Repository:
         except HubError as fault:
             if status(fault) in _CONFLICTS:
                 raise
-            self._pause(fault, attempt)
+            _pause(fault, attempt)
         return self._ask(call, where, attempt + 1)
+
+
+def _pause(fault: HubError, attempt: int) -> None:
+    """Wait before a request is made again; raise the fault if that would not help."""
+    if status(fault) in _CONFLICTS:
+        seconds: float | None = min(0.2 * 2**attempt, 10.0) * (0.5 + random.random())
+    else:
+        seconds = waiting(fault, attempt) if attempt < ATTEMPTS // 2 else None
+    if seconds is None:
+        raise fault
+    log.info("%s; trying again", fault)
+    time.sleep(seconds)
 
 
 @cache

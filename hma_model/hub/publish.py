@@ -76,12 +76,7 @@ def push(
     """
     source = Checkpoint.open(checkpoint)
     ids = sorted(source.chosen(embodiments))
-    source.trunk()
-    for name in ids:
-        checkpoints.read_embodiment(source, name)  # others must be able to load it
-        if (stated := source.card(name).get("id", name)) != name:
-            fault = f"is the card of {str(stated)[:60]!r}"
-            raise CheckpointError(source.path(name, CARD), fault, "save the checkpoint again")
+    _require_publishable(source, ids)
     store = open_store(target, write=True, private=private)
     listeners = [told] if told else []
 
@@ -134,6 +129,17 @@ def _has_trunk(model: "HMA", stored: Checkpoint) -> bool:
     return own.keys() == theirs.keys() and all(
         bool((own[name].cpu() == theirs[name].to(own[name].dtype)).all()) for name in own
     )
+
+
+def _require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
+    """Raise unless others can load the embodiments."""
+    source.trunk()
+    for name in embodiments:
+        checkpoints.read_embodiment(source, name)
+        stated = source.card(name).get("id", name)
+        if stated != name:
+            fault = f"is the card of {str(stated)[:60]!r}"
+            raise CheckpointError(source.path(name, CARD), fault, "save the checkpoint again")
 
 
 def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content | None]:
@@ -250,6 +256,7 @@ def located(
     if is_repository(address) or "://" in str(address):
         return _pull(address, embodiments, None, revision)
     checkpoint = Checkpoint.open(Path(address).expanduser())
+    checkpoint.trunk()
     try:
         return checkpoint, checkpoint.chosen(embodiments)
     except CheckpointError as fault:

@@ -140,14 +140,6 @@ def test_a_branch_gets_the_set_and_main_none_of_it(toy_arm, toy_recording, hub, 
         run(toy_arm, toy_recording, replace(SMALL, seed=3), out=out)
 
 
-def test_a_file_that_a_gitignore_leaves_out_stops_the_upload(toy_arm, toy_recording, hub) -> None:
-    hub.create("team/arm", "datasets").commit({".gitignore": b"episodes.parquet"})
-    hub.habits.ignored = ("*/episodes.parquet",)
-    with pytest.raises(HubError, match=rf"{OUT}: leaves out sets/one/episodes\.parquet, by its \.gitignore"):
-        run(toy_arm, toy_recording)
-    assert "manifest.json" not in published(hub)
-
-
 def test_no_token_and_no_rights_are_clear_errors(toy_arm, toy_recording, hub, monkeypatch) -> None:
     monkeypatch.delenv("HF_TOKEN")
     with pytest.raises(HubError, match=f"{OUT}: needs a token to be written — log in with hf auth login"):

@@ -14,7 +14,6 @@ from hma_model.hub.datasets import pull_data, push_data
 from tests.conftest import contents
 from tests.hub_server import Hub
 from tests.hub_state import EVERY
-from tests.model.robots import yaml as yaml_of
 from tests.model.shards import make_shards
 
 pytest_plugins = ["tests.hub_fixtures"]
@@ -192,17 +191,6 @@ def test_a_set_with_another_file_than_its_manifest_names_is_not_published(server
     with pytest.raises(ShardError, match=rf"{name}.*hma shards restat"):
         push_data(shards, REPO)
     assert server.log == []
-
-
-def test_a_licence_that_the_hub_refuses_is_told_before_any_shard_is_sent(server, tmp_path, monkeypatch):
-    monkeypatch.setattr(publish, "FILES", 1)
-    other = "cc-by-2.5"  # which this hub does not know
-    monkeypatch.setattr("tests.model.shards.yaml", lambda *a: yaml_of(*a).replace("apache-2.0", other))
-    with pytest.raises(
-        HubError, match=r"refuses the card: .*must be one of.*in the embodiment of a shard set"
-    ):
-        push_data(make_shards(tmp_path / "shards", "arm"), REPO)
-    assert server.repositories == {} and server.count("POST ") == 1
 
 
 def test_pushes_of_one_set_at_once_both_end_well(server, shards):
