@@ -12,7 +12,7 @@ from typer import Argument, Option
 
 def robots(incomplete: str) -> list[str]:
     """Return the ids of the registry that begin so."""
-    from hma_data.registry.catalog import file_id, registry_files
+    from hma_data.registry.folders import file_id, registry_files
 
     return _begun(map(file_id, registry_files()), incomplete)
 

@@ -118,7 +118,8 @@ def registry_validate(
     Example: hma registry validate my_robot.yaml
     """
     from hma_data.errors import RegistryError
-    from hma_data.registry.catalog import entries, registry_files
+    from hma_data.registry.catalog import entries
+    from hma_data.registry.folders import registry_files
 
     files: list[Path] = []
     for path in paths or []:

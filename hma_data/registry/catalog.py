@@ -7,8 +7,7 @@ judged them, never a time stamp; an entry cannot be out of date.
 
 import hashlib
 import json
-import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -17,43 +16,10 @@ from typing import Any
 
 from hma_data.errors import HMAError, RegistryError
 from hma_data.registry import FORMATS
+from hma_data.registry.folders import file_id, registry_files, registry_folders
 from hma_data.storage.files import cache_folder, write_atomic
-from hma_data.storage.paths import StrPath, as_path, shipped
+from hma_data.storage.paths import StrPath, as_path
 from hma_data.storage.yaml_io import decode_yaml, parse_yaml, read_bytes
-
-
-def registry_folders(beside: StrPath | None = None) -> list[Path]:
-    """Return the folders searched for an id, in order: ./registry, $HMA_REGISTRY, a checkpoint's, shipped.
-
-    Args:
-        beside: str or path of the checkpoint.
-    """
-    folders = [Path("registry")]
-    folders += [Path(entry) for entry in os.environ.get("HMA_REGISTRY", "").split(os.pathsep) if entry]
-    if beside:
-        folders.append(as_path(beside) / "embodiments")
-    folders.append(shipped("registry"))
-    return list(dict.fromkeys(folder.resolve() for folder in folders if folder.is_dir()))
-
-
-def registry_files(folders: Iterable[StrPath] | None = None) -> Iterator[Path]:
-    """Yield every YAML of the registry (or of those folders, each a str or path), in search order."""
-    for folder in registry_folders() if folders is None else map(as_path, folders):
-        found = [
-            f"{root}/{name}"
-            for root, _, names in os.walk(folder)
-            for name in names
-            if name.endswith((".yaml", ".yml"))
-        ]
-        yield from map(Path, sorted(found))
-
-
-def file_id(path: Path) -> str:
-    """Return the id by which a registry file is found.
-
-    It is the file's name, or for `embodiment.yaml`, as in a checkpoint, the name of its folder.
-    """
-    return path.parent.name if path.stem == "embodiment" else path.stem
 
 
 @dataclass(frozen=True)
@@ -175,7 +141,7 @@ class _Cache:
 
     def __init__(self) -> None:
         code = hashlib.blake2b(f"{version('pydantic')} {version('pyyaml')}".encode(), digest_size=12)
-        for module in ("__init__", "catalog", "components", "embodiment", "../storage/yaml_io"):
+        for module in ("__init__", "catalog", "components", "embodiment", "folders", "../storage/yaml_io"):
             code.update((Path(__file__).parent / f"{module}.py").read_bytes())
         self._path = cache_folder() / f"registry-{code.hexdigest()}.json"
         self._kept: dict[str, dict[str, Any]] = {}

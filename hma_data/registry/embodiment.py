@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
 from hma_data.errors import RegistryError
-from hma_data.registry.catalog import file_id, registry_files, registry_folders
 from hma_data.registry.components import (
     LAYOUTS,
     Action,
@@ -35,6 +34,7 @@ from hma_data.registry.components import (
     Sync,
     Vector,
 )
+from hma_data.registry.folders import file_id, registry_files, registry_folders
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.storage.yaml_io import parse_yaml, plain_fault, read_yaml, write_yaml

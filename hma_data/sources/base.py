@@ -2,7 +2,7 @@
 
 A source must be cheap to make, because every worker makes its own. Between calls it keeps no file open
 that would not survive a fork. `open_source` finds a source by the name of its format;
-`hma_data.sources.detect` finds the format of a recording. Formats are listed in `hma_data.registry.catalog`;
+`hma_data.sources.detect` finds the format of a recording. Formats are listed in `hma_data.registry`;
 installed packages may add some.
 """
 

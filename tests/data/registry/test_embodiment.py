@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hma_data.errors import RegistryError
-from hma_data.registry.embodiment import Embodiment, find, problems, registry_files, schema, todos
+from hma_data.registry.embodiment import Embodiment, find, problems, schema, todos
+from hma_data.registry.folders import registry_files
 from hma_data.storage.yaml_io import MAX_BYTES, parse_yaml, read_yaml, write_yaml
 
 BASE: dict[str, Any] = {

@@ -10,8 +10,9 @@ import pytest
 import yaml
 
 from hma_data.episodes.align import to_clip
-from hma_data.registry.catalog import entries, registry_files
+from hma_data.registry.catalog import entries
 from hma_data.registry.embodiment import Embodiment, find, schema
+from hma_data.registry.folders import registry_files
 from hma_data.sources.base import open_source
 from hma_data.storage.paths import shipped
 from tests.data import rlds_files
