@@ -45,9 +45,10 @@ class KeptParts:
         """Return the arrays of a part: those kept, else those that `make` returns, which are then kept."""
         found = kept_arrays(self.path(key))
         if found is None:
-            found = dict(make())
+            arrays: Any = dict(make())
             with atomic_path(self.path(key)) as part, part.open("wb") as file:
-                np.savez(file, **found)
+                np.savez(file, **arrays)
+            found = arrays
         return found
 
     def remove(self) -> None:

@@ -5,7 +5,6 @@ policy that was edited or trained again is scored again.
 """
 
 import hashlib
-import json
 import pickle
 import sys
 import uuid
@@ -15,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from hma_data.errors import HMAError, OutputError
-from hma_data.storage.files import atomic_path, file_sha256
+from hma_data.errors import HMAError
+from hma_data.storage.files import file_sha256
 from hma_model.checkpoint.folder import HEAD, STATS, STEM, YAML, Checkpoint
 from hma_model.policies.acting import OPTIONS
 from hma_model.policies.base import split_options
@@ -24,8 +23,6 @@ from hma_model.policies.base import split_options
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
     from hma_model.worlds.world import World
-
-SETTINGS = "settings.json"
 
 
 def policy_facts(words: str, embodiment: str) -> dict[str, str]:
@@ -60,42 +57,29 @@ def _checkpoint_facts(checkpoint: str, embodiment: str) -> dict[str, str]:
 def world_facts(world: "World") -> dict[str, Any]:
     """Return what changes the frames of a world, beside its checkpoint, unmask steps and temperature."""
     facts = {"order": world.order, "sample_steps": world.sample_steps, "precision": world.precision}
-    in_memory = world.model.source is None
-    return facts | ({"weights": object_sha256(world.model.state_dict())} if in_memory else {})
-
-
-class _Digest:
-    """A file to pickle into, of which nothing but the SHA-256 is kept."""
-
-    def __init__(self) -> None:
-        self.sha256 = hashlib.sha256()
-
-    def write(self, data: Any) -> int:
-        self.sha256.update(data)
-        return memoryview(data).nbytes
-
-
-class _Pickler(pickle.Pickler):
-    """A pickler to the same bytes in every process: torch pickles equal tensors differently."""
-
-    def reducer_override(self, value: Any) -> Any:
-        if not isinstance(value, torch.Tensor):
-            return NotImplemented
-        values = value.detach().cpu().reshape(-1).view(torch.uint8).numpy()
-        return tuple, ((str(value.dtype), tuple(value.shape), values),)
+    if world.model.source is None:
+        facts["weights"] = _weights_sha256(world.model)
+    return facts
 
 
 def object_sha256(value: Any) -> str:
     """Return the SHA-256 of an object as pickled; of one that cannot be pickled, another one in each call."""
-    digest = _Digest()
     try:
-        _Pickler(digest, protocol=5).dump(value)
+        return hashlib.sha256(pickle.dumps(value, protocol=5)).hexdigest()
     except Exception:  # an object's own methods may raise anything
         return uuid.uuid4().hex
-    return digest.sha256.hexdigest()
 
 
-def digests(world: "World", embodiment: str) -> dict[str, str]:
+def _weights_sha256(model: "HMA") -> str:
+    digest = hashlib.sha256()
+    for name, tensor in model.state_dict().items():
+        values = tensor.detach().cpu().contiguous()
+        digest.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
+        digest.update(values.reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+def world_digests(world: "World", embodiment: str) -> dict[str, str]:
     """Return what tells the checkpoint of a world from others."""
     kept = world.model.source
     if kept is None:
@@ -103,14 +87,6 @@ def digests(world: "World", embodiment: str) -> dict[str, str]:
     return {"checkpoint_sha256": kept.trunk_sha256, "stem_sha256": file_sha256(kept.path(embodiment, STEM))}
 
 
-def begun(folder: Path, name: str, made_by: dict[str, Any], model: "HMA") -> Path:
-    """Return the folder of finished work in an output; refuse that of other settings or another device."""
-    device = {} if model.device.type == "cpu" else {"device": model.device.type}
-    work, text = folder / name, json.dumps(made_by | device, indent=1)
-    work.mkdir(exist_ok=True)
-    path = work / SETTINGS
-    if any(work.glob("*.npz")) and path.exists() and path.read_text(encoding="utf-8") != text:
-        raise OutputError(folder, "was begun with other settings", "give the same ones, or another folder")
-    with atomic_path(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return work
+def device_facts(model: "HMA") -> dict[str, str]:
+    """Return the device of a model, on which its numbers depend; nothing for a CPU."""
+    return {} if model.device.type == "cpu" else {"device": model.device.type}

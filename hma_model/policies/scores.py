@@ -21,15 +21,13 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import UsageError
-from hma_data.storage.files import atomic_path
-from hma_data.storage.kept import kept_arrays
+from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.agreement import (
@@ -46,7 +44,13 @@ from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.policies.arenas import Arena, Floats, Image, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy, begin, checked
 from hma_model.policies.catalog import read_policy
-from hma_model.policies.fingerprints import begun, digests, object_sha256, policy_facts, world_facts
+from hma_model.policies.fingerprints import (
+    device_facts,
+    object_sha256,
+    policy_facts,
+    world_digests,
+    world_facts,
+)
 from hma_model.policies.judge import StateJudge, task_of, train_judge
 from hma_model.worlds.world import World, load_world
 
@@ -213,39 +217,47 @@ def evaluate_policies(
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise UsageError(f"policy {twice}", "is given twice", "give each once")
     folder = None if out is None else as_path(out)
+    tell = on_progress or (lambda done, words: None)
     with locked(folder) if folder else nullcontext():
-        tell = on_progress or (lambda done, words: None)
         world = world or load_world(
             checkpoint, device=device, unmask_steps=unmask_steps, temperature=temperature,
             precision=precision, compile=compile,
         )  # fmt: skip
         sampling = f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}"
-        sampling += "" if world.precision == "float32" else f",precision={world.precision}"
+        if world.precision != "float32":
+            sampling += f",precision={world.precision}"
         scenes = Scenes.of(world, embodiment, episodes, seed)
-        made = [(one, read_policy(one, scenes, world)) if isinstance(one, str) else one for one in policies]
+        made = [read_policy(one, scenes, world) if isinstance(one, str) else one[1] for one in policies]
         keys = [""] * len(made) if folder is None else _keys(policies, world, embodiment, judge)
-        for name, policy in made:  # what it returns is refused before minutes of work
+        for name, policy in zip(names, made, strict=True):
             if not isinstance(policy, Judged):
-                _try(name, policy, TrueArena(scenes.take(range(1)), world.image_shape[0]))
+                # What it returns is refused here, before minutes of work.
+                arena = TrueArena(scenes.take(range(1)), world.image_shape[0])
+                begin(name, policy, arena)
+                checked(name, policy, arena)
         if not isinstance(judge, StateJudge):
             task = task_of(embodiment, judge)
             judge = train_judge(
                 embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed, tell=partial(tell, 0)
             )
-        for _, policy in made:
-            if isinstance(policy, Judged):
-                policy.judged(judge)
-        work = None
+        kept = None
         if folder:
             facts = {"embodiment": embodiment, "episodes": episodes, "frames": frames, "seed": seed}
-            facts |= {"judge": asdict(judge.task), "sampling": sampling, **digests(world, embodiment)}
-            work = begun(folder, WORK, facts, world.model)
+            facts |= {"judge": asdict(judge.task), "sampling": sampling}
+            facts |= world_digests(world, embodiment) | device_facts(world.model)
+            kept = KeptParts(folder / WORK, facts)
         tell(0, "episodes")  # the clock of the time left starts here
         scored: list[Scored] = []
-        for (name, policy), key in zip(made, keys, strict=True):
-            told = partial(_tell, tell, len(scored) * frames * episodes, name)
+        for name, policy, key in zip(names, made, keys, strict=True):
+            if isinstance(policy, Judged):
+                policy.judged(judge)
+            before = len(scored) * frames * episodes
+
+            def told(done: float, where: str, before: int = before, name: str = name) -> None:
+                tell(before + done, f"{name}, {where}")
+
             score = partial(score_policy, name, policy, world, scenes, judge, frames, told)
-            scored.append(_once(name, key, work, score))
+            scored.append(_kept_or_new(name, kept, key, score))
         success, scores = _matrices(scored, "success"), _matrices(scored, "scores")
         return PolicyEvaluation(
             embodiment,
@@ -277,25 +289,8 @@ def _keys(
     return [hashlib.sha256(json.dumps([one, shared]).encode()).hexdigest()[:32] for one in own]
 
 
-def _once(name: str, key: str, work: Path | None, score: Callable[[], Scored]) -> Scored:
-    """Return the results of a policy: those kept in a folder of work, else new ones, which are kept there."""
-    if work is None:
-        return score()
-    path = work / f"{key}.npz"
-    found = _kept(name, path)
-    if found is None:
-        found = score()
-        _keep(found, path)
-    return found
-
-
-def _try(name: str, policy: Policy, arena: Arena) -> None:
-    begin(name, policy, arena)
-    checked(name, policy, arena)
-
-
-def _tell(tell: Progress, begun: float, name: str, done: float, where: str) -> None:
-    tell(begun + done, f"{name}, {where}")
+def _kept_or_new(name: str, kept: KeptParts | None, key: str, score: Callable[[], Scored]) -> Scored:
+    return score() if kept is None else _scored(name, kept.part(key, lambda: _arrays(score())))
 
 
 def _correlation(one: Scores, other: Scores) -> float | None:
@@ -365,19 +360,16 @@ def run(
     return images, actions
 
 
-def _keep(one: Scored, path: Path) -> None:
-    outcomes = {name: getattr(one, name) for name in OUTCOMES}
-    arrays = {f"{name}_{key}": value for name in OUTCOMES for key, value in vars(outcomes[name]).items()}
-    shown = {"true_images": one.true_images, "model_images": one.model_images}
-    with atomic_path(path) as part, part.open("wb") as file:
-        np.savez(file, **(arrays | shown | {"shown": np.array(one.shown)}))
+def _arrays(one: Scored) -> dict[str, NDArray[Any]]:
+    """Return the results of a policy as arrays to keep; `_scored` reads them."""
+    arrays: dict[str, NDArray[Any]] = {"shown": np.array(one.shown)}
+    for name in OUTCOMES:
+        outcomes: Outcomes = getattr(one, name)
+        arrays |= {f"{name}_scores": outcomes.scores, f"{name}_success": outcomes.success}
+    return arrays | {"true_images": one.true_images, "model_images": one.model_images}
 
 
-def _kept(name: str, path: Path) -> Scored | None:
-    """Return the results of a policy that are kept in a file; None if there are none, or they are damaged."""
-    arrays = kept_arrays(path)
-    if arrays is None:
-        return None
+def _scored(name: str, arrays: dict[str, NDArray[Any]]) -> Scored:
     outcomes: Any = {key: Outcomes(arrays[f"{key}_scores"], arrays[f"{key}_success"]) for key in OUTCOMES}
     images: Any = {key: arrays[key] for key in ("true_images", "model_images")}
     return Scored(name, shown=tuple(arrays["shown"].tolist()), **outcomes, **images)

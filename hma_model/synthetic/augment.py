@@ -9,12 +9,10 @@ N episodes, P frames of a prompt, T generated frames, A action dims, K = stride 
 """
 
 import hashlib
-import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,8 +25,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
-from hma_data.storage.files import atomic_path
-from hma_data.storage.kept import kept_arrays
+from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.probe import Probe, train_probe
@@ -37,7 +34,7 @@ from hma_model.generation.decode import cameras_for
 from hma_model.policies.arenas import Arena, Floats, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy
 from hma_model.policies.catalog import read_policy
-from hma_model.policies.fingerprints import begun, digests
+from hma_model.policies.fingerprints import device_facts, world_digests
 from hma_model.policies.judge import StateJudge, task_of, train_judge
 from hma_model.policies.scores import Progress, run
 from hma_model.synthetic.recorder import (
@@ -200,30 +197,29 @@ def augment(
         fault = f"the laboratory's simulator shows one camera, and the model sees {views}"
         remedy = "name shards with --from, and leave out --judge and policies that read the robot's state"
         raise UsageError("augment", fault, remedy)
-    told = asdict(settings) | {"precision": world.precision}
-    if world.precision == "float32":  # plans of earlier versions do not name it
-        del told["precision"]
-    made_by = {"by": "hma augment", "synthetic": True} | told | digests(world, settings.embodiment)
+    made_by: dict[str, Any] = {"by": "hma augment", "synthetic": True, **asdict(settings)}
+    made_by |= {"precision": world.precision} | world_digests(world, settings.embodiment)
     begins = None if shards is None else ShardSet(shards)
     if begins is not None:
-        made_by |= {"source_sha256": hashlib.sha256(begins.manifest.to_text().encode()).hexdigest()}
+        made_by["source_sha256"] = hashlib.sha256(begins.manifest.to_text().encode()).hexdigest()
     dataset = None if lerobot is None else as_path(lerobot)
     with locked(folder):
         done = dataset is None or holds_dataset(dataset, made_by)  # before anything is made
         found = finished(folder, made_by)
         if found is None:
             maker = _Maker(world, settings, begins)
-            batches = maker.run(begun(folder, WORK, made_by, world.model), on_progress)
+            kept = KeptParts(folder / WORK, made_by | device_facts(world.model))
+            batches = maker.run(kept, on_progress)
             spec = world.tokenizer.spec
             chosen = _chosen(batches, settings, MEASURES[spec.kind])
             found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
-            shutil.rmtree(folder / WORK)
+            kept.remove()
         if dataset is not None and not done:
             made = settings.episodes * settings.frames
-            kept = sum(split["frames"] for split in found.splits.values()) * found.frame_stride
+            total = sum(split["frames"] for split in found.splits.values()) * found.frame_stride
 
             def tell(at: int, words: str) -> None:
-                on_progress(made, f"LeRobot: {at:,} of {kept:,} frames, {words}")
+                on_progress(made, f"LeRobot: {at:,} of {total:,} frames, {words}")
 
             stated = _stated(world, settings, begins, found.cameras, partial(on_progress, made))
             write_as_lerobot(dataset, folder, world.tokenizer, stated, tell)
@@ -305,23 +301,21 @@ class _Maker:
             raise UsageError(shards.folder, fault, "give fewer --frames")
         return found
 
-    def run(self, work: Path, on_progress: Progress) -> list[Batch]:
-        """Return all batches; those in the folder are not made again."""
+    def run(self, kept: KeptParts, on_progress: Progress) -> list[Batch]:
+        """Return all batches; those that are kept are not made again."""
         count, frames = self.settings.episodes, self.settings.frames
         batches = []
         for begin in range(0, count, BATCH):
-            path = work / f"batch-{begin:06d}.npz"
-            arrays = kept_arrays(path)
-            if arrays is None or arrays.keys() != Batch.__annotations__.keys():  # or of an older release
+            numbers = range(begin, min(begin + BATCH, count))
+
+            def make(numbers: range = numbers) -> dict[str, NDArray[Any]]:
                 self._train(on_progress)
-                on_progress(begin * frames, "")  # the clock of the time left starts here
-                numbers = range(begin, min(begin + BATCH, count))
-                batch = self._make(numbers, lambda at, b=begin: on_progress(b * frames + at, ""))  # type: ignore[misc]
-                arrays = vars(batch)
-                with atomic_path(path) as part, part.open("wb") as file:
-                    np.savez(file, **arrays)
-            batches.append(Batch(**arrays))
-            on_progress(min(begin + BATCH, count) * frames, "")
+                before = numbers.start * frames
+                on_progress(before, "")  # the clock of the time left starts here
+                return vars(self._make(numbers, lambda done: on_progress(before + done, "")))
+
+            batches.append(Batch(**kept.part(f"batch-{begin:06d}", make)))
+            on_progress(numbers.stop * frames, "")
         return batches
 
     def _train(self, on_progress: Progress) -> None:
@@ -329,20 +323,15 @@ class _Maker:
         settings = self.settings
         if self.probe is not None or not settings.looked_at:
             return
-        name, stride, tell = settings.embodiment, self.scenes.stride, partial(on_progress, 0)
-        self.probe = train_probe(name, self.world.tokenizer, stride, settings.seed, tell)
+        name, seed = settings.embodiment, settings.seed
+        tokenizer, stride, tell = self.world.tokenizer, self.scenes.stride, partial(on_progress, 0)
+        self.probe = train_probe(name, tokenizer, stride, seed, tell)
         if settings.judge:
-            task, frames = task_of(name, settings.judge), settings.frames + 1
+            task = task_of(name, settings.judge)
+            frames = settings.frames + 1
             self.judge = train_judge(
-                name,
-                self.world.tokenizer,
-                stride,
-                frames,
-                task,
-                seed=settings.seed,
-                probe=self.probe,
-                tell=tell,
-            )
+                name, tokenizer, stride, frames, task, seed=seed, probe=self.probe, tell=tell
+            )  # fmt: skip
             if isinstance(self.policy, Judged):
                 self.policy.judged(self.judge)
 
@@ -362,18 +351,19 @@ class _Maker:
         finally:
             self.world.measure = False
             arena.close()
-        count, width = len(numbers), self.robot.chunk_dim
-        own = np.stack(actions, axis=1).reshape(count, -1, width)
-        success: NDArray[np.bool_] = np.ones(count, np.bool_)
+        success: NDArray[np.bool_] = np.ones(len(numbers), np.bool_)
         if self.judge is not None:
             success = self.judge.success(self.judge.score(np.stack(images, axis=1)))
-        first = np.stack([self.world.encoded(self.robot.id, prompt.frames) for prompt in begun.prompts])
-        first, before = first.astype(kept[0].dtype), [prompt.chunks for prompt in begun.prompts]
-        if not self.settings.recorded:  # what was actioned before is none of the policy's
-            first, before = first[:, -1:], [chunks[:0] for chunks in before]
+        generated = np.stack(kept, axis=1)
+        prompts = [self.world.encoded(self.robot.id, prompt.frames) for prompt in begun.prompts]
+        first = np.stack(prompts).astype(generated.dtype)
+        before = np.stack([prompt.chunks for prompt in begun.prompts])
+        own = np.stack(actions, axis=1).reshape(len(numbers), -1, self.robot.chunk_dim)
+        if not self.settings.recorded:  # the actions of the prompt are none of the policy's
+            first, before = first[:, -1:], before[:, :0]
         return Batch(
-            np.concatenate([first, np.stack(kept, axis=1)], axis=1),
-            np.concatenate([np.stack(before), own], axis=1),
+            np.concatenate([first, generated], axis=1),
+            np.concatenate([before, own], axis=1),
             np.stack(uncertainty).mean(axis=0),
             success,
             np.array(begun.groups),
@@ -434,27 +424,22 @@ def _chosen(batches: Sequence[Batch], settings: Augmentation, measure: str) -> l
     """
     unsure = np.concatenate([batch.uncertainty for batch in batches])
     success = np.concatenate([batch.success for batch in batches])
-    kept = np.zeros(len(unsure), np.bool_)
-    kept[np.argsort(unsure, kind="stable")[: max(1, round(settings.keep * len(unsure)))]] = True
-    if not (kept & success).any():
-        fault = f"none of the {kept.sum()} surest of {len(unsure)} episodes is judged a success"
+    chosen = np.zeros(len(unsure), np.bool_)
+    chosen[np.argsort(unsure, kind="stable")[: max(1, round(settings.keep * len(unsure)))]] = True
+    if not (chosen & success).any():
+        fault = f"none of the {chosen.sum()} surest of {len(unsure)} episodes is judged a success"
         raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")
-    every = zip(_each(batches, settings, measure), kept & success, strict=True)
-    return [one for one, chosen in every if chosen]
-
-
-def _each(batches: Sequence[Batch], settings: Augmentation, measure: str) -> Iterator[Made]:
-    """Yield all episodes, numbered through."""
-    number = 0
+    chosen &= success
+    judged = True if settings.judge else None
+    found, number = [], 0
     for batch in batches:
-        for stored, chunks, group, unsure in zip(
-            batch.stored, batch.chunks, batch.groups, batch.uncertainty, strict=True
-        ):
-            counts = {
-                "prompt_frames": len(stored) - settings.frames,
-                "generated_frames": settings.frames - 1,  # the last one has no actions after it
-                measure: round(1000 * float(unsure)),
-            }
-            judged = True if settings.judge else None
-            yield Made(f"synthetic_{number:06d}", stored, chunks, counts, str(group), judged)
+        for stored, chunks, group in zip(batch.stored, batch.chunks, batch.groups, strict=True):
+            if chosen[number]:
+                counts = {
+                    "prompt_frames": len(stored) - settings.frames,
+                    "generated_frames": settings.frames - 1,  # the last one has no actions after it
+                    measure: round(1000 * float(unsure[number])),
+                }
+                found.append(Made(f"synthetic_{number:06d}", stored, chunks, counts, str(group), judged))
             number += 1
+    return found

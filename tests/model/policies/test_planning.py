@@ -53,7 +53,7 @@ class DotWorld:
         self.model: Any = SimpleNamespace(embodiments={"dot": space})
         self.at: dict[int, np.ndarray] = {}
 
-    def actions(self, embodiment: str) -> Any:
+    def action_spec(self, embodiment: str) -> Any:
         low, high = np.full(2, -8.0, np.float32), np.full(2, 8.0, np.float32)
         return SimpleNamespace(
             names=("x", "y"), stride=1, low=low, high=high, clip=lambda x: x.clip(low, high)

@@ -84,7 +84,7 @@ def test_replayed_episodes_hold_the_recorders_actions_and_say_that_they_are_synt
 def test_the_plan_names_a_precision_that_changes_tokens(
     world: World, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    assert "precision" not in augment(tmp_path / "whole", asked(), world=world).plan["made_by"]
+    assert augment(tmp_path / "whole", asked(), world=world).plan["made_by"]["precision"] == "float32"
     monkeypatch.setattr(world, "precision", "bf16")
     assert augment(tmp_path / "half", asked(), world=world).plan["made_by"]["precision"] == "bf16"
 

@@ -21,7 +21,8 @@ from hma_data.tokenizers.base import get_tokenizer
 from hma_model.generation import commands as generation_commands
 from hma_model.simulate import World, read_prompt
 from hma_model.synthetic import labels
-from hma_model.synthetic.labels import ShardFilm, VideoFilm, infer, label_actions
+from hma_model.synthetic.film import ShardFilm, _seen_by, read_film
+from hma_model.synthetic.labels import infer, label_actions
 from tests.conftest import BlockTokenizer
 from tests.data import cameras
 from tests.model.shards import state_pauses
@@ -53,7 +54,7 @@ class Oracle:
 
     def __init__(self, film: ShardFilm, share: float) -> None:
         self.known, self.rng, self.share, self.calls = {}, np.random.default_rng(0), share, 0
-        for number in range(len(film.heads())):
+        for number in range(len(film.episodes())):
             stored, actions, _ = film.labelled(number)
             self.known[stored.tobytes()] = actions[:-1]
 
@@ -99,7 +100,7 @@ def test_labelled_shards_verify_and_say_what_they_are(
     shown = ShardFilm(world, ShardSet(real), ShardSet(real).row_stride)
     for row in shards.episodes.to_pylist():
         columns = reader.episode(row, shards.manifest.cameras[0])
-        names = [head[0] for head in shown.heads()]
+        names = [episode.id for episode in shown.episodes()]
         stored, actions, _ = shown.labelled(names.index(row["id"]))
         np.testing.assert_array_equal(columns["tokens"].reshape(len(stored) - 1, 8, 8), stored[:-1])
         assert np.abs(columns["action"] - actions[:-1]).max() < 4 * actions.std()
@@ -132,16 +133,16 @@ def test_film_that_pauses_is_labelled_in_parts(world: World, real: Path, tmp_pat
     state_pauses(paused, {10: 90})
     film = ShardFilm(world, ShardSet(paused), shards.row_stride)
     name = row["id"]
-    assert [head[:2] for head in film.heads()][:2] == [
+    assert [(episode.id, episode.group) for episode in film.episodes()][:2] == [
         (f"{name}_from_0", row["group"] or name),
         (f"{name}_from_11", row["group"] or name),
     ]
-    assert len(film.heads()) == len(whole.heads()) + 1 == len(film.splits())
+    assert len(film.episodes()) == len(whole.episodes()) + 1
     stored, actions, known = film.labelled(0)
     steps = -(-11 // shards.row_stride)
     np.testing.assert_array_equal(stored, whole.labelled(0)[0][:steps])
     assert len(actions) == steps and known.all() == (11 % shards.row_stride == 0)
-    assert len(film.read(1)) == -(-(row["length"] - 11) // shards.row_stride)
+    assert len(film.stored(1)) == -(-(row["length"] - 11) // shards.row_stride)
 
 
 def film(folder: Path) -> np.ndarray:
@@ -173,9 +174,9 @@ def test_what_cannot_be_labelled_is_refused(world: World, tmp_path: Path) -> Non
 
 def test_video_files_are_taken_at_the_rate_of_the_model(world: World, tmp_path: Path) -> None:
     levels = film(tmp_path)
-    found = labels.film_of(world, tmp_path, ROBOT, 10.0)
-    assert isinstance(found, VideoFilm) and found.heads() == [("long", "", "")]
-    shown = world.tokenizer.decode(found.read(0)).mean(axis=(1, 2, 3))
+    (found,) = read_film(world, tmp_path, ROBOT, 10.0)
+    assert (found.id, found.group, found.instruction) == ("long", "", "")
+    shown = world.tokenizer.decode(found.frames()).mean(axis=(1, 2, 3))
     assert len(shown) == 10 and np.abs(shown - levels[::3]).max() < 12
 
 
@@ -222,7 +223,7 @@ def test_film_that_has_grown_or_changed_is_never_taken_for_what_was_labelled(
 ) -> None:
     known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
     monkeypatch.setattr(labels, "measure", lambda *_: known)
-    monkeypatch.setattr(labels, "_labelled", lambda *_: None)
+    monkeypatch.setattr(labels, "_check_set", lambda *_: None)
     labelled = list[int]()
 
     def infer_and_count(*given: Any) -> np.ndarray:
@@ -274,7 +275,7 @@ def test_film_shows_the_cameras_that_the_model_was_trained_on(
 ) -> None:
     world = trained_on(views, three, tmp_path / "model")
     film = ShardFilm(world, three, three.row_stride)
-    stored = film.read(1)
+    stored = film.stored(1)
     red = stored[:, 0] % 16 if three.spec.kind == "continuous" else stored % 16
     for view, name in enumerate(seen):
         assert (red[:, 8 * view : 8 * view + 8] == 1 + 4 * list(cameras.SIZES).index(name)).all()
@@ -309,7 +310,7 @@ def test_films_of_one_camera_are_refused_by_a_model_of_several(three: ShardSet, 
     (tmp_path / "film").mkdir()
     (tmp_path / "film" / "a.mp4").touch()
     with pytest.raises(UsageError, match="has films of one camera, and the model sees 2 at once"):
-        labels.film_of(world, tmp_path / "film", three.embodiment.id, 5.0)
+        read_film(world, tmp_path / "film", three.embodiment.id, 5.0)
 
 
 @pytest.mark.parametrize("views", ["nose", ["nose"]])
@@ -331,5 +332,5 @@ def test_videos_are_cut_as_the_camera_that_the_model_was_trained_on() -> None:
     values = cameras.arm().to_dict()
     values["cameras"][1] |= {"resize": "stretch"}
     values["sync"] = {"primary": "top"}
-    robot = labels._seen_by(type(cameras.arm()).from_values(values, "arm"), "wrist")
+    robot = _seen_by(type(cameras.arm()).from_values(values, "arm"), "wrist")
     assert robot.primary_camera.name == "wrist" and robot.primary_camera.resize == "stretch"
