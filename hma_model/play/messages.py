@@ -1,6 +1,6 @@
 """Define the messages of a page, and the bytes of a frame.
 
-A page sends JSON, at most MOST_BYTES a message. The server sends JSON, and binary messages with a frame:
+A page sends JSON of at most MAX_MESSAGE_BYTES. The server sends JSON, and binary messages with a frame:
 
     2 bytes   length of the header, big-endian
     header    JSON: serial, frame, psnr, still, ms, rate, input, action, parted, bytes of the model's JPEG
@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, Val
 from hma_data.errors import UsageError
 from hma_model.play.session import Frame
 
-MOST_BYTES = 8192
+MAX_MESSAGE_BYTES = 8192
 Number = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
@@ -24,7 +24,7 @@ class _Message(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
-class Open(_Message):
+class OpenMessage(_Message):
     """Open a session of a robot."""
 
     do: Literal["open"]
@@ -32,14 +32,14 @@ class Open(_Message):
     scene: Number = 0
 
 
-class Resume(_Message):
+class ResumeMessage(_Message):
     """Go on with a session after a reload."""
 
     do: Literal["resume"]
     session: str = Field(max_length=64)
 
 
-class Drive(_Message):
+class DriveMessage(_Message):
     """Hold an action (A,) from now on; `input` numbers it."""
 
     do: Literal["drive"]
@@ -47,54 +47,54 @@ class Drive(_Message):
     input: int = Field(ge=0)
 
 
-class Seen(_Message):
+class SeenMessage(_Message):
     """A frame has been shown."""
 
     do: Literal["seen"]
     serial: int = Field(ge=0)
 
 
-class Run(_Message):
+class RunMessage(_Message):
     """Run or pause."""
 
     do: Literal["run"]
     on: bool
 
 
-class Step(_Message):
+class StepMessage(_Message):
     """Make a single frame."""
 
     do: Literal["step"]
 
 
-class Scene(_Message):
+class SceneMessage(_Message):
     """Begin a scene, or the same anew."""
 
     do: Literal["scene"]
     number: Number
 
 
-class Sync(_Message):
+class SyncMessage(_Message):
     """Restart the model from the true last frames."""
 
     do: Literal["sync"]
 
 
-class Clock(_Message):
+class ClockMessage(_Message):
     """Run as fast as possible, or at the robot's rate."""
 
     do: Literal["clock"]
     fast: bool
 
 
-class Replay(_Message):
+class ReplayMessage(_Message):
     """Follow the recorded actions, or those of the page."""
 
     do: Literal["replay"]
     on: bool
 
 
-class Sample(_Message):
+class SampleMessage(_Message):
     """Change how frames are decoded."""
 
     do: Literal["sample"]
@@ -103,7 +103,19 @@ class Sample(_Message):
     order: Literal["random", "confidence"]
 
 
-Message = Open | Resume | Drive | Seen | Run | Step | Scene | Sync | Clock | Replay | Sample
+Message = (
+    OpenMessage
+    | ResumeMessage
+    | DriveMessage
+    | SeenMessage
+    | RunMessage
+    | StepMessage
+    | SceneMessage
+    | SyncMessage
+    | ClockMessage
+    | ReplayMessage
+    | SampleMessage
+)
 _MESSAGES: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discriminator="do")])
 
 
@@ -113,8 +125,8 @@ def parse(text: str) -> Message:
     Raises:
         UsageError: it is too long, or none of the messages; the text says why.
     """
-    if len(text) > MOST_BYTES:
-        raise UsageError("message", f"is longer than {MOST_BYTES} bytes")
+    if len(text) > MAX_MESSAGE_BYTES:
+        raise UsageError("message", f"is longer than {MAX_MESSAGE_BYTES} bytes")
     try:
         return _MESSAGES.validate_json(text)
     except ValidationError as fault:

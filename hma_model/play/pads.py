@@ -19,9 +19,9 @@ from hma_data.lab.family.mechanisms import Arm, Gantry, Rails
 from hma_data.lab.simulator import SIZE
 from hma_model.worlds.scenes import Dimension, Drivable
 
-ARENAS = {"pusht_fast": 512.0}  # side of the image in units of the action, for targets in the plane
-EDGE = 1.0  # rad: farthest that the first joint of an arm turns that stands at the image's edge
-MOST_SHARED = 2  # pads side by side for values that no image shows
+PLANE_SIDES = {"pusht_fast": 512.0}  # side of the image in units of the action, for targets in the plane
+EDGE_TURN = 1.0  # rad: farthest that the first joint of an arm turns that stands at the image's edge
+MAX_SHARED_PADS = 2  # pads side by side for values that no image shows
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ def _plane(robot: Drivable, x: int, y: int, up: bool) -> Pad:
     dims = robot.dimensions[x], robot.dimensions[y]
     if dims[0].kind == "rate":
         return Pad(x, y, flips)
-    side = ARENAS.get(robot.embodiment.id, float(SIZE))
-    if robot.embodiment.id in ARENAS or FAMILY.fullmatch(robot.embodiment.id):
+    side = PLANE_SIDES.get(robot.embodiment.id, float(SIZE))
+    if robot.embodiment.id in PLANE_SIDES or FAMILY.fullmatch(robot.embodiment.id):
         return Pad(x, y, flips, (0.0, 0.0), (side, side))
     return Pad(x, y, flips, (dims[0].low, dims[1].low), (dims[0].high, dims[1].high))
 
@@ -88,7 +88,7 @@ def _rails(mechanism: Rails, dims: Sequence[Dimension]) -> list[Pad]:
 
 def _shared(values: Sequence[int]) -> list[Pad]:
     """Return pads side by side for values of which nobody knows where the image shows them."""
-    pairs = [values[start : start + 2] for start in range(0, len(values), 2)][:MOST_SHARED]
+    pairs = [values[start : start + 2] for start in range(0, len(values), 2)][:MAX_SHARED_PADS]
     width = 1 / max(1, len(pairs))
     zones = [(n * width, 0.0, (n + 1) * width, 1.0) for n in range(len(pairs))]
     return [
@@ -99,7 +99,7 @@ def _shared(values: Sequence[int]) -> list[Pad]:
 
 def _arm(mechanism: Arm, found: list[Pad]) -> list[Pad]:
     """Return pads in which a drag moves the first link the way that it goes, if the arm stands at an edge."""
-    if mechanism.axes[0].high > EDGE:
+    if mechanism.axes[0].high > EDGE_TURN:
         return found  # it turns about: no way is its own
     first, (across, along) = found[0], (-np.sin(mechanism.facing), np.cos(mechanism.facing))
     if abs(across) > abs(along):

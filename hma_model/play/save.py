@@ -18,7 +18,7 @@ from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 from hma_model.play.session import Frame, Session
 from hma_model.worlds.scenes import Drivable, Image
 
-KINDS = {  # name -> media type and ending
+FILE_KINDS = {  # name -> media type and ending
     "mp4": ("video/mp4", ".mp4"),
     "gif": ("image/gif", ".gif"),
     "lerobot": ("application/zip", ".zip"),
@@ -41,7 +41,7 @@ def film(
     """Return a file of frames.
 
     Args:
-        kind: a key of KINDS.
+        kind: a key of FILE_KINDS.
         robot: that was driven.
         frames: in their order.
         on_progress: called with what is done, and how many frames of how many are.

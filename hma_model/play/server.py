@@ -31,9 +31,9 @@ from hma_data.errors import HMAError, UsageError
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.play import messages
 from hma_model.play.pads import describe, labels
-from hma_model.play.save import KINDS, film, told_by
-from hma_model.play.session import Frame, Sampling, Session
-from hma_model.play.stepper import Engine
+from hma_model.play.save import FILE_KINDS, film, told_by
+from hma_model.play.session import Frame, FrameSampling, Session
+from hma_model.play.stepper import Stepper
 from hma_model.worlds.scenes import Drivable
 
 if TYPE_CHECKING:
@@ -43,11 +43,11 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-FIRST = "rails_03"  # the robot that a page opens with: it follows its actions longest (docs/results.md)
-MOST_VIEWERS = 32
-RATE, BURST = 200.0, 400.0  # messages of a viewer a second, and at once
-SCENE = 20.0  # messages that one counts as which begins a scene: all other sessions wait for it
-AHEAD = 2  # frames that are sent before a page says that it has shown one
+FIRST_ROBOT = "rails_03"  # the robot that a page opens with: it follows its actions longest (docs/results.md)
+MAX_VIEWERS = 32
+MESSAGES_PER_S, MESSAGE_BURST = 200.0, 400.0  # messages of a viewer a second, and at once
+SCENE_COST = 20.0  # messages that one counts as which begins a scene: all other sessions wait for it
+FRAMES_AHEAD = 2  # frames that are sent before a page says that it has shown one
 STALLED_S, SEND_S = 10.0, 20.0  # without a sign of reading: the session stands still; the viewer is dropped
 _GONE = (WebSocketDisconnect, TimeoutError, OSError)  # of a viewer that has left, or reads nothing
 
@@ -94,10 +94,10 @@ class Guard:
         return name == socket.gethostname()
 
 
-class Page:
+class PageViewer:
     """A viewer: what is still to be sent to one websocket.
 
-    `show` and `tell` are called in the engine's thread. Of frames only the latest waits, so that a page that
+    `show` and `tell` are called in the stepper's thread. Of frames only the latest waits, so that a page that
     reads slowly sees fewer.
     """
 
@@ -144,7 +144,7 @@ class Page:
                 text = json.dumps(self._messages.popleft())
                 with anyio.fail_after(SEND_S):
                     await self.websocket.send_text(text)
-            if self._latest and self._sent - self._shown < AHEAD:
+            if self._latest and self._sent - self._shown < FRAMES_AHEAD:
                 (frame, facts), self._latest = self._latest, None
                 if not self._sent - self._shown:
                     self._heard = time.monotonic()  # it had nothing to read before
@@ -155,7 +155,7 @@ class Page:
 
 
 class Server:
-    """The application of an engine.
+    """The application of an stepper.
 
     Args:
         model: a name for the model, shown on the page.
@@ -166,13 +166,13 @@ class Server:
 
     def __init__(
         self,
-        engine: Engine,
+        stepper: Stepper,
         model: str,
         host: str = LOOPBACK[0],
         token: str | None = None,
         first: str | None = None,
     ) -> None:
-        self.engine, self.model, self.first = engine, model, first or FIRST
+        self.stepper, self.model, self.first = stepper, model, first or FIRST_ROBOT
         self.viewers = 0
         self._page = files("hma_model.play").joinpath("page.html").read_text("utf-8")
         self._saving = asyncio.Semaphore(1)
@@ -201,10 +201,10 @@ class Server:
     async def save(self, request: Request) -> Response:
         """Return what was driven in a session as a file."""
         kind, name = request.query_params.get("kind", ""), request.query_params.get("session", "")
-        session = self.engine.sessions.get(name)
-        if session is None or kind not in KINDS:
+        session = self.stepper.sessions.get(name)
+        if session is None or kind not in FILE_KINDS:
             return PlainTextResponse("there is no such session, or no such kind of file\n", 404)
-        frames = await self._in_engine(session.film)
+        frames = await self._in_stepper(session.film)
         if len(frames) < 2:
             return PlainTextResponse("nothing was driven yet\n", 409)
         tell = told_by(session, kind)
@@ -215,7 +215,7 @@ class Server:
                 data = await asyncio.to_thread(film, kind, session.robot, frames, tell)
             except HMAError as fault:
                 return PlainTextResponse(f"{fault}\n", 500)
-        media, suffix = KINDS[kind]
+        media, suffix = FILE_KINDS[kind]
         file = f"{session.robot.embodiment.id}-scene-{session.number}{suffix}"
         headers = {"Content-Disposition": f'attachment; filename="{file}"', "Cache-Control": "no-store"}
         return Response(data, media_type=media, headers=headers)
@@ -223,7 +223,7 @@ class Server:
     async def drive(self, websocket: WebSocket) -> None:
         """Serve one viewer."""
         await websocket.accept()
-        if self.viewers >= MOST_VIEWERS:
+        if self.viewers >= MAX_VIEWERS:
             await websocket.close(1013, "too many pages are open; close one")
             return
         self.viewers += 1
@@ -245,8 +245,8 @@ class Server:
             with contextlib.suppress(*_GONE), anyio.fail_after(SEND_S):
                 await websocket.close(1008, reason)
 
-    async def _in_engine(self, function: Callable[[], T]) -> T:
-        return await asyncio.wrap_future(self.engine.call(function))
+    async def _in_stepper(self, function: Callable[[], T]) -> T:
+        return await asyncio.wrap_future(self.stepper.call(function))
 
 
 class Connection:
@@ -257,13 +257,13 @@ class Connection:
     """
 
     def __init__(self, server: Server, websocket: WebSocket) -> None:
-        self.server, self.engine, self.websocket = server, server.engine, websocket
-        self.page = Page(websocket)
+        self.server, self.stepper, self.websocket = server, server.stepper, websocket
+        self.page = PageViewer(websocket)
         self.session: Session | None = None
         self.fault = ""
-        self._credit, self._filled = BURST, time.monotonic()
-        robots = [describe(robot) for robot in self.engine.robots.values()]
-        orders = list(self.engine.orders)
+        self._credit, self._filled = MESSAGE_BURST, time.monotonic()
+        robots = [describe(robot) for robot in self.stepper.robots.values()]
+        orders = list(self.stepper.orders)
         hello = {"model": server.model, "robots": robots, "orders": orders, "first": server.first}
         self.page.tell({"kind": "hello", **hello})
 
@@ -285,9 +285,10 @@ class Connection:
 
     def _charge(self, message: messages.Message) -> None:
         """Take a message off the credit, which time restores; raise UsageError if none is left."""
-        begins = isinstance(message, messages.Open | messages.Scene | messages.Sync)
+        begins = isinstance(message, messages.OpenMessage | messages.SceneMessage | messages.SyncMessage)
         now = time.monotonic()
-        self._credit = min(BURST, self._credit + RATE * (now - self._filled)) - (SCENE if begins else 1)
+        restored = self._credit + MESSAGES_PER_S * (now - self._filled)
+        self._credit = min(MESSAGE_BURST, restored) - (SCENE_COST if begins else 1)
         self._filled = now
         if self._credit < 0:
             raise UsageError("messages", "come faster than a person sends them")
@@ -295,44 +296,44 @@ class Connection:
     def leave(self) -> None:
         """Let the session stand still."""
         if session := self.session:
-            self.engine.call(lambda: self.engine.detach(session.name, self.page))
+            self.stepper.call(lambda: self.stepper.detach(session.name, self.page))
 
     async def _do(self, message: messages.Message) -> None:
-        if isinstance(message, messages.Seen):
+        if isinstance(message, messages.SeenMessage):
             self.page.seen(message.serial)
-            self.engine.wake()
-        elif isinstance(message, messages.Open | messages.Resume):
+            self.stepper.wake()
+        elif isinstance(message, messages.OpenMessage | messages.ResumeMessage):
             await self._enter(message)
         elif self.session is None:
             raise UsageError("message", "open a session first")
         else:
-            self.engine.call(partial(self._change, self.session, message))
+            self.stepper.call(partial(self._change, self.session, message))
 
-    async def _enter(self, message: messages.Open | messages.Resume) -> None:
+    async def _enter(self, message: messages.OpenMessage | messages.ResumeMessage) -> None:
         def enter() -> Session:
-            if isinstance(message, messages.Resume):
-                session = self.engine.attach(message.session, self.page)
+            if isinstance(message, messages.ResumeMessage):
+                session = self.stepper.attach(message.session, self.page)
             else:
-                if self.session and self.session.name in self.engine.sessions:
-                    self.engine.close(self.session.name)
-                session = self.engine.open(message.robot, message.scene)
-                self.engine.attach(session.name, self.page)
+                if self.session and self.session.name in self.stepper.sessions:
+                    self.stepper.close(self.session.name)
+                session = self.stepper.open(message.robot, message.scene)
+                self.stepper.attach(session.name, self.page)
             self._show_all(session)
             return session
 
         try:
-            entered = await asyncio.wrap_future(self.engine.call(enter))
+            entered = await asyncio.wrap_future(self.stepper.call(enter))
         except HMAError as fault:
-            ended = isinstance(message, messages.Resume)
+            ended = isinstance(message, messages.ResumeMessage)
             self.page.tell({"kind": "gone" if ended else "error", "text": str(fault)})
             return
-        except Exception as fault:  # a bug of ours; the engine has logged it
+        except Exception as fault:  # a bug of ours; the stepper has logged it
             text = f"stopped with {type(fault).__name__}: {fault}; the terminal has more"
             self.page.tell({"kind": "error", "text": text})
             return
         if self.session and self.session.name != entered.name:
             left = self.session.name
-            self.engine.call(lambda: self.engine.detach(left, self.page))
+            self.stepper.call(lambda: self.stepper.detach(left, self.page))
         self.session = entered
 
     def _show_all(self, session: Session) -> None:
@@ -340,38 +341,38 @@ class Connection:
         self.page.show(session.last(), {})
 
     def _change(self, session: Session, message: messages.Message) -> None:
-        """Do what a message says, in the engine's thread."""
-        if session.name not in self.engine.sessions or session.viewer is not self.page:
+        """Do what a message says, in the stepper's thread."""
+        if session.name not in self.stepper.sessions or session.viewer is not self.page:
             return
         session.touched = time.monotonic()
         try:
             match message:
-                case messages.Drive():
+                case messages.DriveMessage():
                     self._hold(session, message)
                     return
-                case messages.Run():
+                case messages.RunMessage():
                     session.paused, session.due, session.steps = not message.on, session.touched, 0
-                case messages.Step():
+                case messages.StepMessage():
                     session.paused, session.steps, session.due = True, 1, session.touched
-                case messages.Scene():
+                case messages.SceneMessage():
                     session.begin(message.number)
                     self._show_all(session)
                     return
-                case messages.Sync():
+                case messages.SyncMessage():
                     session.sync()
                     self.page.show(session.last(), {})  # in the place of an older one that still waits
-                case messages.Clock():
+                case messages.ClockMessage():
                     session.fast, session.due = message.fast, session.touched
-                case messages.Replay():
+                case messages.ReplayMessage():
                     session.replays, session.ended = message.on, False
-                case messages.Sample():
-                    way = Sampling(message.passes, round(message.temperature, 1), message.order)
-                    self.engine.change(session, way)
+                case messages.SampleMessage():
+                    way = FrameSampling(message.passes, round(message.temperature, 1), message.order)
+                    self.stepper.change(session, way)
             self.page.tell(session.status())
         except HMAError as fault:
             self.page.tell({"kind": "error", "text": str(fault)})
 
-    def _hold(self, session: Session, message: messages.Drive) -> None:
+    def _hold(self, session: Session, message: messages.DriveMessage) -> None:
         if len(message.action) != len(session.held):
             fault = f"has {len(message.action)} values, this robot takes {len(session.held)}"
             self.page.tell({"kind": "error", "text": f"action: {fault}"})
@@ -425,12 +426,12 @@ async def serve(
     names = sorted({robot.embodiment.id for robot in robots.values()})
     model = load(checkpoint, names, device)
     confidence = ("confidence",) if checkpoint.config.kind == "discrete" else ()
-    engine = Engine(World(model, tokenizer, **settings), robots, orders=("random", *confidence))
-    engine.start()
+    stepper = Stepper(World(model, tokenizer, **settings), robots, orders=("random", *confidence))
+    stepper.start()
     try:
-        await run(Server(engine, name, host, token, first).app, listener, lambda server: ready())
+        await run(Server(stepper, name, host, token, first).app, listener, lambda server: ready())
     finally:
-        engine.stop()
+        stepper.stop()
 
 
 async def run(app: ASGIApp, listener: socket.socket, ready: Callable[["uvicorn.Server"], None]) -> None:
@@ -443,7 +444,7 @@ async def run(app: ASGIApp, listener: socket.socket, ready: Callable[["uvicorn.S
         access_log=False,
         lifespan="off",
         ws="websockets-sansio",
-        ws_max_size=messages.MOST_BYTES,
+        ws_max_size=messages.MAX_MESSAGE_BYTES,
         ws_per_message_deflate=False,
         timeout_graceful_shutdown=2,
     )

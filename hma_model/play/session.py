@@ -1,16 +1,15 @@
 """Drive one robot in a world model, with what truly happens beside it.
 
-A session lives in the engine's thread; `hma_model.play.stepper` steps all sessions that are due together.
+A session lives in the stepper's thread; `hma_model.play.stepper` steps all sessions that are due together.
 
 H×W pixels, A action dims, K = stride * A values of a chunk.
 """
 
 import math
 from collections import deque
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,31 +19,18 @@ from hma_data.errors import UsageError
 from hma_model.play.pads import describe
 from hma_model.worlds.scenes import Drivable, Floats, Image, LabScene
 
-WINDOW = 8  # frames that a restart of the model is given
-KEPT = 3000  # frames to save
-DROP = 6.0  # dB: twice the tokenizer's own error
-LEAST_ROW = 3  # frames that are bad in a row before model and truth have parted; a second of them
+if TYPE_CHECKING:
+    from hma_model.worlds.world import World
+
+RESTART_FRAMES = 8  # frames that a restart of the model is given
+KEPT_FRAMES = 3000  # frames to save
+PSNR_DROP = 6.0  # dB: twice the tokenizer's own error
+MIN_BAD_FRAMES = 3  # frames that are bad in a row before model and truth have parted; a second of them
 QUALITY = 92  # of JPEG
 
 
-class World(Protocol):
-    """The part of a world that the engine needs; the sampling is set before each step."""
-
-    unmask_steps: int
-    temperature: float
-    order: str
-
-    def open(self, embodiment: str, frames: Image, chunks: Floats | None = None, *, seed: int = 0) -> int: ...
-    def reset(
-        self, session: int, frames: Image, chunks: Floats | None = None, *, seed: int | None = None
-    ) -> None: ...
-    def step(self, actions: Mapping[int, Floats]) -> Mapping[int, Image]: ...
-    def image(self, session: int) -> Image: ...
-    def close(self, session: int) -> None: ...
-
-
 @dataclass(frozen=True)
-class Sampling:
+class FrameSampling:
     """The way in which a frame is decoded: passes, temperature, and the order random or confidence."""
 
     passes: int
@@ -73,7 +59,7 @@ class Frame:
 
 
 class Viewer(Protocol):
-    """The receiver of a session's images; the engine's thread calls its methods, which return at once."""
+    """The receiver of a session's images; the stepper's thread calls its methods, which return at once."""
 
     @property
     def stalled(self) -> bool:
@@ -101,7 +87,7 @@ class Session:
     """
 
     def __init__(
-        self, name: str, robot: Drivable, number: int, world: World, sampling: Sampling, now: float
+        self, name: str, robot: Drivable, number: int, world: "World", sampling: FrameSampling, now: float
     ) -> None:
         self.name, self.robot, self._world, self.sampling = name, robot, world, sampling
         self.viewer: Viewer | None = None
@@ -129,10 +115,10 @@ class Session:
     def _begin(self, number: int) -> None:
         self.number, self.scene = number, self.robot.scene(number)
         prompt = self.scene.prompt
-        self._true: deque[Image] = deque(prompt.frames, maxlen=WINDOW)
-        self._chunks: deque[Floats] = deque(prompt.chunks, maxlen=WINDOW - 1)
+        self._true: deque[Image] = deque(prompt.frames, maxlen=RESTART_FRAMES)
+        self._chunks: deque[Floats] = deque(prompt.chunks, maxlen=RESTART_FRAMES - 1)
         self.held = self.scene.action.copy()
-        self.frames: deque[Frame] = deque(maxlen=KEPT)
+        self.frames: deque[Frame] = deque(maxlen=KEPT_FRAMES)
         self.count, self.ended, self.steps = 0, False, 0
         self.parted: int | None = None
         self._bad = 0  # frames in a row in which the model is no better than a still
@@ -230,14 +216,14 @@ class Session:
         """
         if self.parted is not None:
             return
-        self._bad = self._bad + 1 if score <= still and score < self._best - DROP else 0
+        self._bad = self._bad + 1 if score <= still and score < self._best - PSNR_DROP else 0
         if self._bad == self.row_of_bad:
             self.parted = self.count - self._bad + 1
 
     @property
     def row_of_bad(self) -> int:
         """Return how many bad frames in a row it takes to say that model and truth have parted."""
-        return max(LEAST_ROW, round(self.robot.embodiment.rate_hz / self.robot.embodiment.stride))
+        return max(MIN_BAD_FRAMES, round(self.robot.embodiment.rate_hz / self.robot.embodiment.stride))
 
     def _rate(self, now: float) -> float:
         """Return the frames a second of the last 2 s or so."""

@@ -1,9 +1,9 @@
 """Step all sessions that are due together, in one thread that alone touches the model and the simulators.
 
-    engine = Engine(world, robots)
-    engine.start()
-    session = engine.call(lambda: engine.open("mover_04", 0)).result()
-    engine.call(lambda: engine.attach(session.name, viewer))
+    stepper = Stepper(world, robots)
+    stepper.start()
+    session = stepper.call(lambda: stepper.open("mover_04", 0)).result()
+    stepper.call(lambda: stepper.attach(session.name, viewer))
 
 Every session has its own clock. Sessions that are due at the same time, with the same sampling, share one
 pass of the model.
@@ -17,18 +17,21 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import HMAError, UsageError
-from hma_model.play.session import Sampling, Session, Viewer, World
+from hma_model.play.session import FrameSampling, Session, Viewer
 from hma_model.worlds.scenes import Drivable, Floats
 
-MOST_SESSIONS, IDLE_S = 8, 300.0
+if TYPE_CHECKING:
+    from hma_model.worlds.world import World
+
+MAX_SESSIONS, IDLE_S = 8, 300.0
 SLEEP_S = 1.0  # longest sleep between looks at idle sessions
 _log = logging.getLogger(__name__)
 
 
-class Engine:
+class Stepper:
     """The thread and its sessions.
 
     Args:
@@ -42,18 +45,18 @@ class Engine:
 
     def __init__(
         self,
-        world: World,
+        world: "World",
         robots: Mapping[str, Drivable],
         *,
         orders: Sequence[str] = ("random", "confidence"),
-        most: int = MOST_SESSIONS,
+        most: int = MAX_SESSIONS,
         idle_s: float = IDLE_S,
     ) -> None:
         self.robots, self.orders, self.most, self.idle_s = robots, orders, most, idle_s
-        self._world, self._sampling = world, Sampling(world.unmask_steps, world.temperature, world.order)
+        self._world, self._sampling = world, FrameSampling(world.unmask_steps, world.temperature, world.order)
         self.sessions: dict[str, Session] = {}
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="stepper", daemon=True)
 
     def start(self) -> None:
         """Start the thread."""
@@ -91,7 +94,9 @@ class Engine:
         Raises:
             UsageError: there is no such robot, or there are too many sessions.
         """
-        robot = self._robot(key)
+        robot = self.robots.get(key)
+        if robot is None:
+            raise UsageError("robot", f"there is no {key[:40]!r}", f"known: {', '.join(self.robots)}")
         if len(self.sessions) >= self.most:
             now = time.monotonic()
             left = [one for one in self.sessions.values() if one.viewer is None or self._idle(one, now)]
@@ -127,7 +132,7 @@ class Engine:
         if session and session.viewer is viewer:
             session.viewer = None
 
-    def change(self, session: Session, sampling: Sampling) -> None:
+    def change(self, session: Session, sampling: FrameSampling) -> None:
         """Go on with another sampling.
 
         Raises:
@@ -149,21 +154,6 @@ class Engine:
     def _idle(self, session: Session, now: float) -> bool:
         return now - session.touched > self.idle_s
 
-    def _rest(self, session: Session) -> None:
-        """Pause a session in which nobody does anything, or close it if nobody watches it."""
-        if session.viewer is None:
-            self.close(session.name)
-        elif not session.paused:
-            session.paused = True
-            session.viewer.tell(session.status())
-            text = f"Paused, because nothing was done for {self.idle_s / 60:.0f} minutes."
-            session.viewer.tell({"kind": "error", "text": text})
-
-    def _robot(self, key: str) -> Drivable:
-        if key not in self.robots:
-            raise UsageError("robot", f"there is no {key[:40]!r}", f"known: {', '.join(self.robots)}")
-        return self.robots[key]
-
     def _run(self) -> None:
         while True:
             wait = self.step()
@@ -180,10 +170,17 @@ class Engine:
         """Step the sessions that are due, and return the seconds until the next one is."""
         now = time.monotonic()
         for session in list(self.sessions.values()):
-            if self._idle(session, now):
-                self._rest(session)
+            if not self._idle(session, now):
+                continue
+            if session.viewer is None:
+                self.close(session.name)
+            elif not session.paused:
+                session.paused = True
+                session.viewer.tell(session.status())
+                text = f"Paused, because nothing was done for {self.idle_s / 60:.0f} minutes."
+                session.viewer.tell({"kind": "error", "text": text})
         due = [session for session in self.sessions.values() if session.ready(now)]
-        together: dict[Sampling, list[Session]] = {}
+        together: dict[FrameSampling, list[Session]] = {}
         for session in due:
             together.setdefault(session.sampling, []).append(session)
         for sampling, group in together.items():
@@ -193,7 +190,7 @@ class Engine:
         waiting = [s.due - now for s in self.sessions.values() if s.viewer and (s.steps or not s.paused)]
         return min([SLEEP_S, *(wait for wait in waiting if wait > 0)])
 
-    def _step_together(self, sampling: Sampling, sessions: list[Session]) -> None:
+    def _step_together(self, sampling: FrameSampling, sessions: list[Session]) -> None:
         world = self._world
         world.unmask_steps, world.temperature, world.order = vars(sampling).values()
         begun = time.monotonic()

@@ -17,7 +17,7 @@ import numpy as np
 from hma_data.errors import HMAError, UsageError
 from hma_model.policies.arenas import Arena, Floats, Scenes
 from hma_model.policies.base import split_options
-from hma_model.worlds.scenes import Prompt
+from hma_model.worlds.images import Prompt
 from hma_model.worlds.world import World, load_world, require_actor
 
 OPTIONS: dict[str, type] = {"horizon": int, "memory": int, "temperature": float, "unmask_steps": int}
@@ -57,8 +57,7 @@ class Follower:
         name, seed = arena.scenes.name, arena.scenes.seed
         self._prompts = [self._newest(prompt) for prompt in arena.prompts]
         self.sessions = [
-            self.world.open(name, prompt.frames, prompt.chunks, seed=seed + row)
-            for row, prompt in enumerate(self._prompts)
+            self.world.open(name, *prompt, seed=seed + row) for row, prompt in enumerate(self._prompts)
         ]
         self._taken: list[Floats] = []  # actions (N, A) since the last image
 
@@ -74,7 +73,7 @@ class Follower:
                 frames = np.concatenate([self._prompts[row].frames, arena.images[row][None]])
                 known = np.concatenate([self._prompts[row].chunks, chunks[row].reshape(1, -1)])
                 self._prompts[row] = prompt = self._newest(Prompt(frames, known))
-                self.world.reset(session, prompt.frames, prompt.chunks)
+                self.world.reset(session, *prompt)
         self._taken = []
 
     def take(self, actions: Floats) -> Floats:

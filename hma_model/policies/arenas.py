@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import resize
@@ -19,7 +20,8 @@ from hma_data.lab import FAMILY, truth
 from hma_data.lab.scripted import PUSHER, SeenState, State, seen_state, state_of
 from hma_data.lab.simulator import LabSimulator, simulated
 from hma_model.generation.commands import described
-from hma_model.worlds.scenes import Dimension, LabRobot, LabScene, Prompt
+from hma_model.worlds.images import Prompt
+from hma_model.worlds.scenes import Dimension, LabRobot, LabScene
 
 if TYPE_CHECKING:
     from hma_model.evaluation.probe import Probe
@@ -29,7 +31,7 @@ Floats = NDArray[np.float32]
 Places = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-SEEDS = 100_000  # scenes of a seed; those of the next seed are others
+SCENES_PER_SEED = 100_000  # scenes of a seed; those of the next seed are others
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class Scenes:
         action = {"mean": space.mean, "std": space.std}
         if spec.seen is not None:
             action |= {"min": spec.seen[0], "max": spec.seen[1]}
-        numbers = tuple(range(seed * SEEDS, seed * SEEDS + count))
+        numbers = tuple(range(seed * SCENES_PER_SEED, seed * SCENES_PER_SEED + count))
         robot = found or (LabSimulator(embodiment).embodiment if simulated(embodiment) else None)
         if robot is None:
             raise HMAError(embodiment, "has no YAML, which describes its actions", "load a checkpoint")
@@ -204,7 +206,7 @@ class Beginning(Protocol):
 
 
 class ModelArena:
-    """The world model, as a gymnasium vector environment.
+    """The world model: a session for each scene.
 
     Args:
         world: with the robot.
@@ -213,35 +215,26 @@ class ModelArena:
     """
 
     def __init__(self, world: "World", true: Beginning, probe: "Probe | None") -> None:
-        from hma_model.worlds.env import WorldModelVectorEnv
-
-        scenes, prompts = true.scenes, true.prompts
-        self.prompts: Sequence[Prompt] = [
-            Prompt(world.shown(prompt.frames), prompt.chunks) for prompt in prompts
-        ]
-        self.scenes, self.held, self._told, self._probe, self._steps = scenes, true.held, true.told, probe, 0
-        self._env = WorldModelVectorEnv(
-            len(prompts), embodiment=scenes.name, world=world, horizon=None, autoreset_mode="Disabled"
-        )
-        for row, prompt in enumerate(prompts):
-            mask = np.arange(len(prompts)) == row
-            given = {"frames": prompt.frames, "chunks": prompt.chunks}
-            seed = [scenes.seed + scenes.numbers[row]] * len(prompts)
-            self.images, _ = self._env.reset(seed=seed, options={"prompt": given, "reset_mask": mask})
+        self.scenes, self.held = true.scenes, true.held
+        self._world, self._told, self._probe = world, true.told, probe
+        self.prompts: Sequence[Prompt] = [Prompt(world.shown(one.frames), one.chunks) for one in true.prompts]
+        self._sessions: list[int] = []
+        for number, prompt in zip(self.scenes.numbers, true.prompts, strict=True):
+            # As the environment draws it: a reset with this seed gives the same frames there.
+            seed = int(np_random(self.scenes.seed + number)[0].integers(2**31))
+            self._sessions.append(world.open(self.scenes.name, *prompt, seed=seed))
+        self.images: Image = np.stack([world.image(session) for session in self._sessions])
+        self._steps = 0
+        self._waiting: list[Floats] = []  # actions (N, A) since the newest images
         self._seen: list[SeenState] | None = None
 
     def outside(self, actions: Floats) -> str:
-        """Say which of the actions (N, A) leave the range seen in training; "" for none.
-
-        The environment then says it no more.
-        """
-        said = self._env.episodes.spec.outside(actions)
-        self._env.episodes.warned |= bool(said)
-        return said
+        """Say which of the actions (N, A) leave the range seen in training; "" for none."""
+        return self._world.action_spec(self.scenes.name).outside(actions)
 
     @property
     def fresh(self) -> bool:
-        return self._steps % self.scenes.stride == 0
+        return not self._waiting
 
     def states(self) -> list[State]:
         """Return what the probe reads off the images, moved by the actions since the last one.
@@ -266,27 +259,30 @@ class ModelArena:
         return self._told[self._steps]
 
     def step(self, actions: Floats) -> None:
-        self.images, *_ = self._env.step(actions)
         self._steps += 1
-        if self._seen is not None and self._probe is not None:
-            places = self._probe.read(self.images) if self.fresh else None
-            for row, seen in enumerate(self._seen):
-                seen.move(actions[row])
-                if places is not None:
-                    seen.see(places[row])
+        self._waiting.append(actions)
+        if len(self._waiting) == self.scenes.stride:
+            chunks = np.stack(self._waiting, axis=1)
+            made = self._world.step(dict(zip(self._sessions, chunks, strict=True)))
+            self.images = np.stack([made[session] for session in self._sessions])
+            self._waiting = []
+        if self._seen is None or self._probe is None:
+            return
+        places = self._probe.read(self.images) if self.fresh else None
+        for row, seen in enumerate(self._seen):
+            seen.move(actions[row])
+            if places is not None:
+                seen.see(places[row])
 
     def stored(self) -> NDArray[Any]:
         """Return the newest frames (N, …) as shards store them."""
-        return np.stack([self._env.world.stored(session) for session in self._sessions])
+        return np.stack([self._world.stored(session) for session in self._sessions])
 
     def uncertainty(self) -> NDArray[np.float64]:
         """Return how unsure the model was of the newest frames (N,), if its world measures it."""
-        return np.array([self._env.world.uncertainty.get(session, 0.0) for session in self._sessions])
-
-    @property
-    def _sessions(self) -> list[int]:
-        return [drive.session for drive in self._env.drives if drive.session is not None]
+        return np.array([self._world.uncertainty.get(session, 0.0) for session in self._sessions])
 
     def close(self) -> None:
         """End the sessions."""
-        self._env.close()
+        for session in self._sessions:
+            self._world.close(session)

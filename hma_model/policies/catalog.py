@@ -16,7 +16,7 @@ from hma_model.policies.scripted import Called, Random, Scripted, Still
 if TYPE_CHECKING:
     from hma_model.worlds.world import World
 
-WAYS = (
+POLICY_FORMS = (
     "give scripted, scripted:noise=0.5, reach, random, still, hma:CHECKPOINT, plan:cem, "
     "lerobot:FOLDER_OR_REPO, or MODULE:NAME of a Python function or class"
 )
@@ -55,7 +55,7 @@ def read_policy(words: str, scenes: Scenes, world: "World | None" = None) -> Pol
         return Scripted(_noise(words, kind, rest), kind == "reach")
     if rest:
         return Called(_named(words), f"policy {words}")
-    raise UsageError("policy", f"{words!r} is unknown", WAYS)
+    raise UsageError("policy", f"{words!r} is unknown", POLICY_FORMS)
 
 
 def _noise(words: str, kind: str, rest: str) -> float:
@@ -78,7 +78,7 @@ def _named(words: str) -> Any:
         for part in name.split("."):
             found = getattr(found, part)
     except Exception as fault:
-        remedy = WAYS
+        remedy = POLICY_FORMS
         if isinstance(fault, ModuleNotFoundError) and fault.name == module.partition(".")[0]:
             remedy = f"run hma in the folder of {fault.name}.py, or install its package"
         raise HMAError(

@@ -28,11 +28,11 @@ Floats = NDArray[np.float64]
 Images = NDArray[np.uint8]
 Score = Callable[[Floats, int], Floats]
 
-SPAN = 3  # last frames over which a place is the median
+END_FRAMES = 3  # last frames over which a place is the median
 EXAMPLES = 96  # recorded episodes, of which half set the judge's limit and half test it
-MOVED = {"pusht_fast": 10.0, "pusht_slow": 10.0}  # px; the T wanders further than a small block
-BLOCK_MOVED, NEAR, AT_GOAL = 5.0, 12.0, 5.0  # px
-SEEN = 0.5  # share of a loose part's first pixels up to which it is there
+MOVED_LIMITS = {"pusht_fast": 10.0, "pusht_slow": 10.0}  # px; the T wanders further than a small block
+BLOCK_MOVED, NEAR_LIMIT, GOAL_LIMIT = 5.0, 12.0, 5.0  # px
+VISIBLE_SHARE = 0.5  # share of a loose part's first pixels up to which it is there
 
 
 def moved(parts: Floats, driven: int) -> Floats:
@@ -45,7 +45,7 @@ def moved(parts: Floats, driven: int) -> Floats:
     Returns:
         (N,) px.
     """
-    ends = np.median(parts[:, -SPAN:, driven:], axis=1)
+    ends = np.median(parts[:, -END_FRAMES:, driven:], axis=1)
     far: Floats = np.linalg.norm(ends - parts[:, 0, driven:], axis=-1).max(axis=-1)
     return far
 
@@ -59,7 +59,7 @@ def reached(parts: Floats, driven: int) -> Floats:
 
 def placed(parts: Floats, driven: int) -> Floats:
     """Return how far the T of a pusher ends from its goal (the further of its two places), negative; (N,)."""
-    ends = np.median(parts[:, -SPAN:, driven:], axis=1)
+    ends = np.median(parts[:, -END_FRAMES:, driven:], axis=1)
     far: Floats = np.linalg.norm(ends - truth.goal_of(truth.PUSHERS[0]), axis=-1).max(axis=-1)
     return -far
 
@@ -103,7 +103,7 @@ def task_of(robot: str, words: str = "moved") -> Task:
     try:
         if name not in TASKS:
             raise ValueError
-        usual = {"moved": MOVED.get(robot, BLOCK_MOVED), "reached": NEAR, "placed": AT_GOAL}
+        usual = {"moved": MOVED_LIMITS.get(robot, BLOCK_MOVED), "reached": NEAR_LIMIT, "placed": GOAL_LIMIT}
         limit = float(number) if given else usual[name]
         if not 0 < limit < truth.SIZE:
             raise ValueError
@@ -185,7 +185,9 @@ def train_judge(
     if not len(probe.loose) or unread.get(task.name):
         fault = f"cannot tell whether {task.text}: the probe does not read these parts"
         raise HMAError(f"judge of {robot}", fault, "judge another task or robot")
-    looked = set(range(frames)) if task.name == "reached" else {0, *range(max(frames - SPAN, 1), frames)}
+    looked = (
+        set(range(frames)) if task.name == "reached" else {0, *range(max(frames - END_FRAMES, 1), frames)}
+    )
     numbers = range(FIRST + EPISODES, FIRST + EPISODES + examples)
     true, read = np.empty(examples), np.empty(examples)
     for row, number in enumerate(numbers):
@@ -243,7 +245,7 @@ def _true_score(task: Task, probe: Probe, parts: Floats) -> Floats:
 
 def last_seen(places: Floats, areas: Floats) -> Floats:
     """Return places (N, T, P, 2), where a part stays as long as its area (N, T, P) is small."""
-    seen = areas >= SEEN * areas[:, :1]
+    seen = areas >= VISIBLE_SHARE * areas[:, :1]
     seen[:, 0] = True
     times = np.where(seen, np.arange(seen.shape[1])[:, None], 0)
     return np.take_along_axis(places, np.maximum.accumulate(times, axis=1)[..., None], axis=1)

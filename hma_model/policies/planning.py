@@ -35,8 +35,8 @@ SOLVERS = {"cem": "CEMSolver", "icem": "ICEMSolver", "mppi": "MPPISolver"}
 OPTIONS: dict[str, type] = {
     **dict.fromkeys(("horizon", "samples", "steps", "receding", "unmask_steps"), int), "temperature": float,
 }  # fmt: skip
-ROWS = 128  # that step in one pass; more cost memory and gain nothing
-COARSE = 32  # pixels a side at which images are compared with a goal
+MAX_ROWS = 128  # that step in one pass; more cost memory and gain nothing
+COARSE_SIZE = 32  # pixels a side at which images are compared with a goal
 ELITES = 8  # one candidate in so many is kept by CEM
 
 
@@ -130,8 +130,8 @@ class Cost:
 def goal_distance(images: Image, goals: Image) -> NDArray[np.float64]:
     """Return the mean squared distances (N, C) of images (N, C, S, S, 3) from goals (N, …, S', S', 3)."""
     shape = images.shape[:2]
-    coarse = resize(images.reshape(-1, *images.shape[2:]), COARSE).astype(np.float64)
-    wanted = resize(goals.reshape(len(goals), -1, *goals.shape[-3:])[:, -1], COARSE).astype(np.float64)
+    coarse = resize(images.reshape(-1, *images.shape[2:]), COARSE_SIZE).astype(np.float64)
+    wanted = resize(goals.reshape(len(goals), -1, *goals.shape[-3:])[:, -1], COARSE_SIZE).astype(np.float64)
     squares = np.square(coarse.reshape(*shape, *coarse.shape[1:]) - wanted[:, None])
     return np.asarray(squares.mean(axis=(2, 3, 4)))
 
@@ -201,7 +201,7 @@ class Planning:
         made, configured = solver_of(self._kind)
         given: dict[str, Any] = {"topk": max(2, samples // ELITES)}
         solver = made(
-            self.cost, batch_size=max(1, ROWS // samples), num_samples=samples, n_steps=steps,
+            self.cost, batch_size=max(1, MAX_ROWS // samples), num_samples=samples, n_steps=steps,
             seed=self._seed, **given,
         )  # fmt: skip
         one = self.cost.space

@@ -18,9 +18,9 @@ from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
 from hma_model.policies.scores import WORK, Correlation, PolicyEvaluation, Scored
 
 COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same actions, sim.")
-GOOD = 0.75  # balanced accuracy; an interval that holds chance and this says nothing
-CHOSEN = 2  # episodes of each kind on the page
-KINDS = {  # (success in the simulator, in the model) -> title
+GOOD_ACCURACY = 0.75  # balanced accuracy; an interval that holds chance and this says nothing
+SHOWN_EPISODES = 2  # episodes of each kind on the page
+OUTCOME_TITLES = {  # (success in the simulator, in the model) -> title
     (True, True): "Both say success",
     (False, False): "Both say failure",
     (True, False): "Success in the simulator only",
@@ -91,7 +91,7 @@ def doubt(found: PolicyEvaluation) -> list[str]:
         why = f"there are too few {judged.too_few} to tell whether the judge is better than chance"
     elif judged.better_than_chance:
         return []
-    elif judged.high is not None and judged.high >= GOOD:
+    elif judged.high is not None and judged.high >= GOOD_ACCURACY:
         why = "the judge may be no better than chance; more episodes would tell"
     else:
         why = "the judge is no better than chance"
@@ -155,8 +155,8 @@ def html(found: PolicyEvaluation) -> str:
         page.text(sentence[:1].upper() + sentence[1:] + ".")
     page.section("Success rates", "A policy is a point; bars are 95 % intervals over episodes.")
     page.picture(_plot(found), "svg+xml", "Success in the simulator and in the model")
-    for kind, title in KINDS.items():
-        chosen = list(_chosen(found, kind))[:CHOSEN]
+    for kind, title in OUTCOME_TITLES.items():
+        chosen = list(_chosen(found, kind))[:SHOWN_EPISODES]
         if chosen:
             page.section(title)
         for one, number in chosen:
@@ -182,7 +182,7 @@ def _chosen(found: PolicyEvaluation, kind: tuple[bool, bool]) -> Iterator[tuple[
         np.flatnonzero((one.true.success == kind[0]) & (one.model.success == kind[1]))
         for one in found.policies
     ]
-    for turn in range(CHOSEN):
+    for turn in range(SHOWN_EPISODES):
         for one, numbers in zip(found.policies, there, strict=True):
             if turn < len(numbers):
                 yield one, int(numbers[turn])

@@ -59,7 +59,7 @@ Progress = Callable[[float, str], None]
 EPISODES, FRAMES = 32, 40
 WORK = ".policies"  # folder of finished policies in an output
 OUTCOMES = ("true", "model", "replayed")
-SHOWN = 8  # images that are kept of an episode
+SHOWN_FRAMES = 8  # images that are kept of an episode
 
 
 @dataclass(frozen=True)
@@ -311,7 +311,7 @@ def score_policy(
 ) -> Scored:
     """Return what comes of one policy in the simulator and in the model."""
     size, limit = world.image_shape[0], judge.task.limit
-    shown = tuple(sorted({round(frame) for frame in np.linspace(0, frames, SHOWN)}))
+    shown = tuple(sorted({round(frame) for frame in np.linspace(0, frames, SHOWN_FRAMES)}))
     true = TrueArena(scenes, size)
     true_images, _ = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
     model = ModelArena(world, true, judge.probe)

@@ -38,22 +38,24 @@ from hma_model.policies.fingerprints import device_facts, world_digests
 from hma_model.policies.judge import StateJudge, task_of, train_judge
 from hma_model.policies.scores import Progress, run
 from hma_model.synthetic.recorder import (
-    Made,
+    SyntheticEpisode,
     finished,
     holds_dataset,
     require_dataset,
     write_as_lerobot,
     write_shards,
 )
-from hma_model.worlds.images import seen_cameras
+from hma_model.worlds.images import Prompt, seen_cameras
 from hma_model.worlds.prompts import default_frames, read_prompt
-from hma_model.worlds.scenes import Prompt
 from hma_model.worlds.world import World, load_world
 
 WORK = ".augment"
 BATCH = 16  # episodes that step in one pass
-MEASURES = {"discrete": "millinats", "continuous": "millilatents"}  # flags: thousandths of `uncertainty`
-DRAWS = 100  # of a beginning, until one is found whose actions are all known
+UNCERTAINTY_FLAGS = {
+    "discrete": "millinats",
+    "continuous": "millilatents",
+}  # flags: thousandths of `uncertainty`
+MAX_DRAWS = 100  # of a beginning, until one is found whose actions are all known
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class Augmentation:
 
 
 @dataclass(frozen=True)
-class Batch:
+class SyntheticBatch:
     """Episodes of one pass: stored frames (n, P + T, …), chunks (n, P + T - 1, K), and what to choose by.
 
     Of a policy's episodes P is one: what was actioned before is none of its own.
@@ -122,7 +124,7 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RealBeginnings:
     """Real beginnings from shards; a `Beginning`."""
 
     scenes: Scenes
@@ -132,7 +134,7 @@ class Recorded:
     groups: Sequence[str]
 
 
-class Replay:
+class ReplayPolicy:
     """The recorded actions, to which noise is added.
 
     Args:
@@ -211,7 +213,7 @@ def augment(
             kept = KeptParts(folder / WORK, made_by | device_facts(world.model))
             batches = maker.run(kept, on_progress)
             spec = world.tokenizer.spec
-            chosen = _chosen(batches, settings, MEASURES[spec.kind])
+            chosen = _chosen(batches, settings, UNCERTAINTY_FLAGS[spec.kind])
             found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
             kept.remove()
         if dataset is not None and not done:
@@ -278,7 +280,7 @@ class _Maker:
                 share = float(number)
         if not 0 <= share < np.inf:
             raise UsageError("--commands", f"{actions!r} is unknown", "give replay, or perturb=0.3")
-        return Replay(share, std)
+        return ReplayPolicy(share, std)
 
     def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:
         """Return the pieces of episodes that are long enough: rows, where they begin, and the room to start.
@@ -301,7 +303,7 @@ class _Maker:
             raise UsageError(shards.folder, fault, "give fewer --frames")
         return found
 
-    def run(self, kept: KeptParts, on_progress: Progress) -> list[Batch]:
+    def run(self, kept: KeptParts, on_progress: Progress) -> list[SyntheticBatch]:
         """Return all batches; those that are kept are not made again."""
         count, frames = self.settings.episodes, self.settings.frames
         batches = []
@@ -314,7 +316,7 @@ class _Maker:
                 on_progress(before, "")  # the clock of the time left starts here
                 return vars(self._make(numbers, lambda done: on_progress(before + done, "")))
 
-            batches.append(Batch(**kept.part(f"batch-{begin:06d}", make)))
+            batches.append(SyntheticBatch(**kept.part(f"batch-{begin:06d}", make)))
             on_progress(numbers.stop * frames, "")
         return batches
 
@@ -335,7 +337,7 @@ class _Maker:
             if isinstance(self.policy, Judged):
                 self.policy.judged(self.judge)
 
-    def _make(self, numbers: range, tell: Callable[[float], None]) -> Batch:
+    def _make(self, numbers: range, tell: Callable[[float], None]) -> SyntheticBatch:
         begun = self._simulated(numbers) if self.shards is None else self._recorded(self.shards, numbers)
         arena = ModelArena(self.world, begun, self.probe)
         kept, uncertainty = [], []
@@ -361,7 +363,7 @@ class _Maker:
         own = np.stack(actions, axis=1).reshape(len(numbers), -1, self.robot.chunk_dim)
         if not self.settings.recorded:  # the actions of the prompt are none of the policy's
             first, before = first[:, -1:], before[:, :0]
-        return Batch(
+        return SyntheticBatch(
             np.concatenate([first, generated], axis=1),
             np.concatenate([before, own], axis=1),
             np.stack(uncertainty).mean(axis=0),
@@ -369,29 +371,29 @@ class _Maker:
             np.array(begun.groups),
         )
 
-    def _simulated(self, numbers: range) -> Recorded:
+    def _simulated(self, numbers: range) -> RealBeginnings:
         """Return beginnings from the simulator, with the actions of its driver."""
         scenes = self.scenes.take(numbers)
         true = TrueArena(scenes, self.world.image_shape[0], drawn=False)
         for _ in range(self.settings.frames * scenes.stride):
             true.step(true.recorded())
         groups = [f"{scenes.name}/{number}" for number in scenes.numbers]
-        return Recorded(scenes, true.prompts, true.held, true.told, groups)
+        return RealBeginnings(scenes, true.prompts, true.held, true.told, groups)
 
-    def _recorded(self, shards: ShardSet, numbers: range) -> Recorded:
+    def _recorded(self, shards: ShardSet, numbers: range) -> RealBeginnings:
         """Return beginnings from episodes of shards, with their actions."""
         scenes, known = self.scenes.take(numbers), self.prompt_frames
         prompts, told, groups = [], [], []
         for number in numbers:
-            row, frames, chunks = self._window(shards, number)
+            row, (frames, chunks) = self._window(shards, number)
             prompts.append(Prompt(frames[:known], chunks[: known - 1]))
             told.append(np.nan_to_num(chunks[known - 1 :]).reshape(-1, len(scenes.dimensions)))
             groups.append(str(row["group"] or row["id"]))
         steps = list(np.stack(told, axis=1).astype(np.float32))
         held = np.where([dim.kind == "rate" for dim in scenes.dimensions], 0, steps[0]).astype(np.float32)
-        return Recorded(scenes, prompts, held, steps, groups)
+        return RealBeginnings(scenes, prompts, held, steps, groups)
 
-    def _window(self, shards: ShardSet, number: int) -> tuple[dict[str, Any], NDArray[Any], Floats]:
+    def _window(self, shards: ShardSet, number: int) -> tuple[dict[str, Any], Prompt]:
         """Return a row of an episode, and a window of it: frames (P + T, …) and chunks (P + T - 1, K).
 
         The actions are known: those of the window, or for a policy's episodes those up to its first one.
@@ -402,14 +404,13 @@ class _Maker:
         rng = np.random.default_rng((self.settings.seed, 5, number))
         length, every = self.prompt_frames + self.settings.frames, shards.manifest.frame_stride
         needed = None if self.settings.recorded else self.prompt_frames
-        for draw in range(DRAWS):
+        for draw in range(MAX_DRAWS):
             row = self._long[(number + draw) % len(self._long)]
             start = row["begin"] + int(rng.integers(row["room"])) // every * every
             given = {"shards": shards.folder, "episode": row["episode_index"], "start": start}
-            frames, chunks = read_prompt(self.world.model, self.scenes.name, given | {"frames": length})
-            assert chunks is not None
-            if np.isfinite(chunks[:needed]).all():
-                return row, frames, chunks
+            window = read_prompt(self.world.model, self.scenes.name, given | {"frames": length})
+            if np.isfinite(window.chunks[:needed]).all():
+                return row, window
         fault = f"has hardly a window of {length} frames whose actions are all known"
         raise UsageError(shards.folder, fault, "give fewer --frames, or shards with more of the actions")
 
@@ -417,7 +418,9 @@ class _Maker:
 # -- what is kept
 
 
-def _chosen(batches: Sequence[Batch], settings: Augmentation, measure: str) -> list[Made]:
+def _chosen(
+    batches: Sequence[SyntheticBatch], settings: Augmentation, measure: str
+) -> list[SyntheticEpisode]:
     """Return the episodes of which the model was least unsure, without those that are judged failures.
 
     `measure` is the name of the flag that says how unsure it was.
@@ -440,6 +443,8 @@ def _chosen(batches: Sequence[Batch], settings: Augmentation, measure: str) -> l
                     "generated_frames": settings.frames - 1,  # the last one has no actions after it
                     measure: round(1000 * float(unsure[number])),
                 }
-                found.append(Made(f"synthetic_{number:06d}", stored, chunks, counts, str(group), judged))
+                found.append(
+                    SyntheticEpisode(f"synthetic_{number:06d}", stored, chunks, counts, str(group), judged)
+                )
             number += 1
     return found

@@ -31,7 +31,7 @@ from hma_model.config import INVERSE, OBJECTIVES
 from hma_model.generation.commands import Commands, Floats, card, described
 from hma_model.policies.fingerprints import device_facts, world_digests
 from hma_model.synthetic.film import FilmEpisode, ShardFilm, find_film, read_film
-from hma_model.synthetic.recorder import Made, finished, write_shards
+from hma_model.synthetic.recorder import SyntheticEpisode, finished, write_shards
 from hma_model.worlds.images import recorded_cameras, seen_cameras, trained_cameras
 from hma_model.worlds.world import World, load_world
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 WORK = ".label"
 ORIGIN = "inferred: the actions are a model's, by inverse dynamics from the frames"
 BATCH = 16  # windows of a pass
-CHECKED = 64  # labelled episodes that the error is measured on, at most
+MAX_CHECKED = 64  # labelled episodes that the error is measured on, at most
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def measure(
     """
     film = ShardFilm(world, shards, shards.row_stride, spec.embodiment)
     split = "val" if film.numbers("val") else "train"
-    numbers, width = film.numbers(split)[:CHECKED], len(spec.names)
+    numbers, width = film.numbers(split)[:MAX_CHECKED], len(spec.names)
     misses, true = list[Floats](), list[Floats]()
     for done, number in enumerate(numbers):
         on_progress(done, "checking on labelled film", len(numbers))
@@ -269,7 +269,7 @@ def _labels_of(model: "HMA", spec: Commands, episode: FilmEpisode) -> dict[str, 
     return {"stored": stored, "chunks": infer(model, spec, stored)}
 
 
-class _Labelled(Sequence[Made]):
+class _Labelled(Sequence[SyntheticEpisode]):
     """Labelled episodes, each read from its file when it is asked for: together they may not fit memory."""
 
     def __init__(self, kept: KeptParts, film: Sequence[FilmEpisode]) -> None:
@@ -283,4 +283,6 @@ class _Labelled(Sequence[Made]):
         with np.load(self._kept.path(_part(episode))) as arrays:
             stored, chunks = arrays["stored"], arrays["chunks"]
         counts = {"inferred_actions": len(chunks)}
-        return Made(episode.id, stored, chunks, counts, episode.group, instruction=episode.instruction)
+        return SyntheticEpisode(
+            episode.id, stored, chunks, counts, episode.group, instruction=episode.instruction
+        )

@@ -38,7 +38,7 @@ FACTS = "synthetic.json"  # of a LeRobotDataset: the facts of its plan
 
 
 @dataclass(frozen=True)
-class Made:
+class SyntheticEpisode:
     """An episode that a model made, or whose actions it inferred.
 
     Attributes:
@@ -80,7 +80,7 @@ def finished(folder: Path, made_by: dict[str, Any]) -> Manifest | None:
 
 def write_shards(
     folder: Path,
-    episodes: Sequence[Made],
+    episodes: Sequence[SyntheticEpisode],
     spec: "TokenizerSpec",
     robot: Embodiment,
     made_by: dict[str, Any],

@@ -26,7 +26,8 @@ from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, UsageError
 from hma_data.storage.paths import StrPath
 from hma_model.generation.commands import Floats, OutsideRangeWarning
-from hma_model.worlds.prompts import Prompt, read_prompt
+from hma_model.worlds.images import Prompt
+from hma_model.worlds.prompts import read_prompt
 from hma_model.worlds.world import Image, World, load_world
 
 # An OpenMP pool does not survive a fork, as in gymnasium's "async" vectors; one thread needs none.
@@ -126,7 +127,7 @@ class Episodes:
         return image.copy() if self.size is None else resize(image[None], self.size)[0]
 
 
-class Drive:
+class EpisodeSession:
     """One session as episodes: actions gather to chunks, images become observations and rewards."""
 
     def __init__(self, episodes: Episodes) -> None:
@@ -136,12 +137,12 @@ class Drive:
 
     def begin(self, rng: np.random.Generator, prompt: Any = None) -> Image:
         """Start an episode, and return its first observation."""
-        frames, chunks = self.episodes.start(rng, prompt)
+        start = self.episodes.start(rng, prompt)
         seed = int(rng.integers(2**31))
         if self.session is None:
-            self.session = self.world.open(self.episodes.embodiment, frames, chunks, seed=seed)
+            self.session = self.world.open(self.episodes.embodiment, *start, seed=seed)
         else:
-            self.world.reset(self.session, frames, chunks, seed=seed)
+            self.world.reset(self.session, *start, seed=seed)
         self.image = self.world.image(self.session)
         self.steps, self.frames = 0, 0
         self.waiting: list[Floats] = []
@@ -221,7 +222,7 @@ class _Environment:
         self.action_names = self.episodes.spec.names
         self.action_space: gymnasium.Space[Any] = self.episodes.action_space
         self.observation_space: gymnasium.Space[Any] = self.episodes.observation_space
-        self.drive = Drive(self.episodes)
+        self.drive = EpisodeSession(self.episodes)
 
 
 def _known(options: dict[str, Any] | None, *keys: str) -> dict[str, Any]:
@@ -302,7 +303,7 @@ class WorldModelVectorEnv(_Environment, VectorEnv[Image, Floats, NDArray[Any]]):
         self.single_action_space, self.single_observation_space = self.action_space, self.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.drives = [self.drive, *(Drive(self.episodes) for _ in range(num_envs - 1))]
+        self.drives = [self.drive, *(EpisodeSession(self.episodes) for _ in range(num_envs - 1))]
         self.random = [seeding.np_random()[0] for _ in range(num_envs)]
         self.observations = np.zeros(self.observation_space.shape or (), np.uint8)
         self.ended: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)

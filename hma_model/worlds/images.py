@@ -4,7 +4,7 @@ P images, H×W pixels, S pixels a side of the tokenizer's images, V views side b
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,20 @@ if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
 
 Image = NDArray[np.uint8]
+
+
+class Prompt(NamedTuple):
+    """The frames that a session starts from.
+
+    Attributes:
+        frames: images (P, H, W, 3) uint8, or tokens or latents as stored, at the rate of the model's frames.
+        chunks: (P - 1, K) actions between them, NaN where they are unknown.
+    """
+
+    frames: NDArray[Any]
+    chunks: NDArray[np.float32]
+
+
 REMEDY = "give a PNG, a JPEG or another still image"
 
 

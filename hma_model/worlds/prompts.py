@@ -1,7 +1,6 @@
 """Read the frames that a session starts from: shards, images, recordings, simulators.
 
-A prompt is images (P, H, W, 3) uint8, or tokens as a shard set stores them, at the rate of the model's
-frames, and the chunks (P - 1, K) between them, NaN where they are unknown.
+P frames of a prompt, T frames of an episode, A action dims, K = stride · A.
 """
 
 import tempfile
@@ -15,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hma_data.episodes.align import pauses, to_clip
-from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepared
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import FAMILY, RECORDERS, record
@@ -29,13 +27,12 @@ from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.generation.commands import card, described
 from hma_model.generation.decode import cameras_for
-from hma_model.worlds.images import read_image, recorded_cameras, seen_cameras, trained_cameras
+from hma_model.worlds.images import Prompt, read_image, recorded_cameras, seen_cameras, trained_cameras
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
-Prompt = tuple[NDArray[Any], NDArray[np.float32] | None]
-WAYS = (
+PROMPT_FORMS = (
     "give an image or images, an image's file, a folder of shards or of a LeRobotDataset, an environment "
     "with render(), or a mapping; hma_model.simulate.read_prompt describes them"
 )
@@ -43,7 +40,7 @@ LEROBOT = "meta/info.json"
 
 
 @dataclass(frozen=True)
-class Part:
+class EpisodePart:
     """The part of a recording or shard set that a prompt takes.
 
     Attributes:
@@ -122,17 +119,17 @@ def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int 
     if isinstance(prompt, str | PathLike):
         folder = as_path(prompt)
         if (folder / MANIFEST).is_file():
-            return _of_shards(model, embodiment, folder, Part())
+            return _of_shards(model, embodiment, folder, EpisodePart())
         if (folder / LEROBOT).is_file():
-            return _of_lerobot(model, embodiment, folder, Part())
+            return _of_lerobot(model, embodiment, folder, EpisodePart())
         prompt = [folder]
     if isinstance(prompt, Sequence) and prompt and isinstance(prompt[0], str | PathLike):
-        prompt = [read_image(path, WAYS) for path in prompt]
+        prompt = [read_image(path, PROMPT_FORMS) for path in prompt]
     try:
         images = np.asarray(prompt)
     except ValueError as fault:
         raise HMAError("prompt", "its images differ in size", "give images of one size") from fault
-    return (images[None] if images.ndim in (2, 3) else images), None
+    return _of_frames(model, embodiment, images[None] if images.ndim in (2, 3) else images)
 
 
 def starting_window(model: "HMA", embodiment: str, seed: int = 0) -> Prompt:
@@ -145,22 +142,34 @@ def starting_window(model: "HMA", embodiment: str, seed: int = 0) -> Prompt:
     """
     robot = described(model, embodiment)
     if robot is None or not (embodiment in RECORDERS or FAMILY.fullmatch(embodiment)):
-        raise HMAError(f"prompt of {embodiment}", "none comes along: it is no robot of the laboratory", WAYS)
+        raise HMAError(
+            f"prompt of {embodiment}", "none comes along: it is no robot of the laboratory", PROMPT_FORMS
+        )
     with tempfile.TemporaryDirectory() as folder:
-        return _of_recording(model, robot, record(embodiment, folder, 1, seed), Part())
+        return _of_recording(model, robot, record(embodiment, folder, 1, seed), EpisodePart())
 
 
 def _of_mapping(model: "HMA", embodiment: str, prompt: Mapping[str, Any]) -> Prompt:
     given = dict(prompt)
     for key, read in (("shards", _of_shards), ("lerobot", _of_lerobot)):
-        if key in given and not given.keys() - {key, *vars(Part())}:
-            return read(model, embodiment, given.pop(key), Part(**given))
+        if key in given and not given.keys() - {key, *vars(EpisodePart())}:
+            return read(model, embodiment, given.pop(key), EpisodePart(**given))
     if "frames" not in given or given.keys() - {"frames", "chunks", "actions"}:
-        raise HMAError("prompt", f"has the keys {', '.join(map(str, given))}", WAYS)
+        raise HMAError("prompt", f"has the keys {', '.join(map(str, given))}", PROMPT_FORMS)
     frames = np.asarray(given["frames"])
     if "actions" in given:
         return _strided(model, embodiment, frames, given["actions"])
-    return frames, None if given.get("chunks") is None else np.asarray(given["chunks"], np.float32)
+    return _of_frames(model, embodiment, frames, given.get("chunks"))
+
+
+def _of_frames(
+    model: "HMA", embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None = None
+) -> Prompt:
+    if chunks is None:
+        described(model, embodiment)  # raises if the model lacks it
+        width = model.embodiments[embodiment].chunk_dim
+        chunks = np.full((max(0, len(frames) - 1), width), np.nan)
+    return Prompt(frames, np.asarray(chunks, np.float32))
 
 
 def _strided(model: "HMA", embodiment: str, frames: NDArray[Any], actions: ArrayLike) -> Prompt:
@@ -172,13 +181,13 @@ def _strided(model: "HMA", embodiment: str, frames: NDArray[Any], actions: Array
         raise HMAError("prompt", fault, f"give ({len(frames) - 1}, {space.action_dim})")
     steps = (len(frames) - 1) // space.stride
     first = len(frames) - 1 - steps * space.stride
-    return frames[first :: space.stride], values[first:].reshape(steps, space.chunk_dim)
+    return Prompt(frames[first :: space.stride], values[first:].reshape(steps, space.chunk_dim))
 
 
 # -- episodes
 
 
-def _of_shards(model: "HMA", embodiment: str, folder: StrPath, part: Part) -> Prompt:
+def _of_shards(model: "HMA", embodiment: str, folder: StrPath, part: EpisodePart) -> Prompt:
     shards = ShardSet(folder)
     require_tokenizer(model.config, shards.spec, shards.folder)
     described(model, embodiment)
@@ -193,7 +202,7 @@ def _of_shards(model: "HMA", embodiment: str, folder: StrPath, part: Part) -> Pr
     every = shards.manifest.frame_stride
     at = part.rows(model, episode_pieces(shards, chosen), shards.row_stride, every)
     chunks = _chunks(columns["action"], columns.get("action_known"), at, shards.row_stride)
-    return frames[at], chunks
+    return Prompt(frames[at], chunks)
 
 
 def seen_frames(
@@ -215,7 +224,7 @@ def seen_frames(
     return np.concatenate(views, axis=-2), columns
 
 
-def _of_lerobot(model: "HMA", embodiment: str, folder: StrPath, part: Part) -> Prompt:
+def _of_lerobot(model: "HMA", embodiment: str, folder: StrPath, part: EpisodePart) -> Prompt:
     robot = described(model, embodiment)
     if robot is None:
         raise HMAError(embodiment, "has no YAML, which says how its recordings are read", "load a checkpoint")
@@ -228,7 +237,7 @@ def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
     """Return an embodiment that finds its action and its cameras, in their order, in a LeRobotDataset."""
     keys = [key.key for key in open_source("lerobot").inspect(folder, 1).keys if key.kind == "camera"]
     if len(keys) < len(robot.cameras):
-        raise HMAError(folder, f"has {len(keys)} cameras, {robot.id} has {len(robot.cameras)}", WAYS)
+        raise HMAError(folder, f"has {len(keys)} cameras, {robot.id} has {len(robot.cameras)}", PROMPT_FORMS)
     values, at, parts = robot.to_dict(), 0, []
     for part in robot.action.components:
         parts.append({"key": "action", "dims": part.dims, "slice": [at, at + part.dims]})
@@ -242,13 +251,25 @@ def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
     return Embodiment.from_values({**kept, **changed}, f"{folder}, as {robot.id}")
 
 
-def _of_recording(model: "HMA", robot: Embodiment, recording: Path, part: Part) -> Prompt:
+def _of_recording(model: "HMA", robot: Embodiment, recording: Path, part: EpisodePart) -> Prompt:
     """Return frames of an episode of a recording, in the format that the robot's YAML names."""
     source = open_source(robot.source.format)
     ids = source.episode_ids(recording)
     clip = to_clip(source.read(recording, ids[part.number(ids, recording)], robot), robot)
     at = part.rows(model, pieces(pauses(clip.timestamps), len(clip), robot.stride), robot.stride)
-    return _images(model, robot, clip, at), _chunks(clip.actions, clip.action_known, at, robot.stride)
+    spec = TokenizerSpec.from_json(dict(model.config.tokenizer))
+    views = [
+        prepared(
+            clip.episode.streams[name],
+            clip.frame_indices[name][at],
+            robot.camera(name),
+            spec.image_size,
+            spec.resize_filter,
+        )
+        for name in seen_cameras(trained_cameras(card(model, robot.id)), recorded_cameras(robot))
+    ]
+    chunks = _chunks(clip.actions, clip.action_known, at, robot.stride)
+    return Prompt(np.concatenate(views, axis=2), chunks)
 
 
 def _chunks(
@@ -260,19 +281,3 @@ def _chunks(
     if known is not None:
         chunks[~known[spans].all(axis=1)] = np.nan
     return chunks
-
-
-def _images(model: "HMA", robot: Embodiment, clip: Clip, at: NDArray[np.int64]) -> NDArray[np.uint8]:
-    spec = TokenizerSpec.from_json(dict(model.config.tokenizer))
-    cameras = trained_cameras(card(model, robot.id))
-    views = [
-        prepared(
-            clip.episode.streams[name],
-            clip.frame_indices[name][at],
-            robot.camera(name),
-            spec.image_size,
-            spec.resize_filter,
-        )
-        for name in seen_cameras(cameras, recorded_cameras(robot))
-    ]
-    return np.concatenate(views, axis=2)

@@ -27,6 +27,7 @@ from hma_data.shards.windows import episode_pieces
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.worlds.images import (
     Image,
+    Prompt,
     fitted,
     image_shape,
     recorded_cameras,
@@ -41,8 +42,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float32]
 
-PROMPT = 4  # frames; two would show velocities, more also show what stands still
-LONGEST = 64  # frames of a window of a recording
+PROMPT_FRAMES = 4  # frames; two would show velocities, more also show what stands still
+LONGEST_WINDOW = 64  # frames of a window of a recording
 RETURNING = ("joint_velocity", "base_velocity", "joint_delta", "eef_delta")  # spaces whose rest is zero
 
 
@@ -61,14 +62,6 @@ class Dimension:
     low: float
     high: float
     kind: str
-
-
-@dataclass(frozen=True)
-class Prompt:
-    """Known frames (P, H, W, 3) uint8, and the chunks (P - 1, K) float32 between them; NaN is unknown."""
-
-    frames: Image
-    chunks: Floats
 
 
 class Scene(Protocol):
@@ -140,9 +133,9 @@ class LabScene:
     ) -> None:
         self.stride, self.width, self.size = embodiment.stride, embodiment.action_dim, size
         self.simulator = LabSimulator(embodiment.id)
-        frames = [self._fitted(self.simulator.reset(seed=SEED, episode=number))]
+        frames = [self._fitted(self.simulator.reset(seed=SCENE_SEED, episode=number))]
         chunks = []
-        for _ in range(PROMPT - 1):
+        for _ in range(PROMPT_FRAMES - 1):
             chunk, frame = self.advance(None)
             frames.append(frame)
             chunks.append(chunk)
@@ -166,7 +159,7 @@ class LabScene:
         return image if len(image) == self.size else resize(image[None], self.size)[0]
 
 
-SEED = 1_000_000  # of scenes; recordings for training have small seeds
+SCENE_SEED = 1_000_000  # of scenes; recordings for training have small seeds
 
 
 # -- recordings
@@ -198,11 +191,11 @@ class RecordedRobot:
             if row["split"] == split
             for part in episode_pieces(self._shards, row)
         ]
-        lengths = sorted(length for length in parts if length > PROMPT)
+        lengths = sorted(length for length in parts if length > PROMPT_FRAMES)
         if not lengths:
-            fault = f"has no episode longer than {PROMPT} frames without a pause"
+            fault = f"has no episode longer than {PROMPT_FRAMES} frames without a pause"
             raise UsageError(self._shards.folder, fault, "give other shards")
-        length = min(LONGEST, lengths[len(lengths) // 2])
+        length = min(LONGEST_WINDOW, lengths[len(lengths) // 2])
         return WindowDataset(self._shards, split, length, cameras=self._cameras)
 
     def scene(self, number: int) -> "RecordedScene":
@@ -229,10 +222,10 @@ class RecordedScene:
     """A window of a recording: frames (T, H, W, 3) and chunks (T, K)."""
 
     def __init__(self, dims: tuple[Dimension, ...], frames: Image, chunks: Floats) -> None:
-        self._frames, self._chunks, self._at = frames, chunks, PROMPT
+        self._frames, self._chunks, self._at = frames, chunks, PROMPT_FRAMES
         self._followed = True  # whether all actions were the recorded ones
-        self.prompt = Prompt(frames[:PROMPT], chunks[: PROMPT - 1])
-        held = chunks[PROMPT - 2, -len(dims) :]
+        self.prompt = Prompt(frames[:PROMPT_FRAMES], chunks[: PROMPT_FRAMES - 1])
+        held = chunks[PROMPT_FRAMES - 2, -len(dims) :]
         self.action = np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
 
     def advance(self, chunk: Floats | None) -> tuple[Floats, Image | None] | None:
@@ -271,7 +264,7 @@ class ImagedRobot:
         self._action = np.array(rest, np.float32)
         before = np.full_like(self._action, np.nan)
         if len(images) == 1:
-            images = images.repeat(PROMPT, axis=0)
+            images = images.repeat(PROMPT_FRAMES, axis=0)
             if all(dim.kind != "target" for dim in dims):
                 before = self._action
         self._prompt = Prompt(images, np.tile(before, (len(images) - 1, embodiment.stride)))

@@ -19,7 +19,7 @@ from hma_model.checkpoint.folder import EMBEDDED, Checkpoint, action_stats
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.network.model import HMA
 from hma_model.play.session import Frame
-from hma_model.worlds.scenes import PROMPT, SEED, Drivable, LabRobot
+from hma_model.worlds.scenes import PROMPT_FRAMES, SCENE_SEED, Drivable, LabRobot
 from tests.conftest import BlockTokenizer
 from tests.model.robots import stats
 
@@ -55,7 +55,7 @@ class TrueWorld:
         simulator = self.rows[session]
         for number in range(4):
             first = LabSimulator(simulator.embodiment.id)
-            if len(frames) == PROMPT and np.array_equal(first.reset(SEED, number), frames[0]):
+            if len(frames) == PROMPT_FRAMES and np.array_equal(first.reset(SCENE_SEED, number), frames[0]):
                 for chunk in chunks:
                     self._advance(first, chunk)
                 self.rows[session] = first

@@ -18,7 +18,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_model.play import server
 from hma_model.play.server import Server, run
-from hma_model.play.stepper import Engine
+from hma_model.play.stepper import Stepper
 from hma_model.worlds.scenes import RecordedRobot
 from tests.conftest import BlockTokenizer
 from tests.model.true_world import TrueWorld, lab_robots
@@ -30,16 +30,16 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def engine() -> Iterator[Engine]:
-    made = Engine(TrueWorld(), lab_robots("mover_04", "mover_02", "arm4_04", "rails_03"))
+def stepper() -> Iterator[Stepper]:
+    made = Stepper(TrueWorld(), lab_robots("mover_04", "mover_02", "arm4_04", "rails_03"))
     made.start()
     yield made
     made.stop()
 
 
 @pytest.fixture(scope="module")
-def address(engine: Engine) -> Iterator[str]:
-    with serving(engine) as port:
+def address(stepper: Stepper) -> Iterator[str]:
+    with serving(stepper) as port:
         yield f"http://127.0.0.1:{port}/"
 
 
@@ -64,7 +64,7 @@ class StillWorld(TrueWorld):
 @pytest.fixture
 def recorded(
     toy_arm: Embodiment, toy_recording: Path, block_tokenizer: BlockTokenizer, tmp_path: Path
-) -> Iterator[Engine]:
+) -> Iterator[Stepper]:
     """A robot of recordings whose YAML names no value of the action."""
     values = toy_arm.to_dict()
     (part,) = values["action"]["components"]
@@ -76,14 +76,14 @@ def recorded(
     convert(own, toy_recording, block_tokenizer, tmp_path / "shards")
     shards = ShardSet(tmp_path / "shards")
     robot = RecordedRobot(shards, lambda: block_tokenizer, shards.manifest.stats, "first")
-    made = Engine(StillWorld(), {robot.key: robot})
+    made = Stepper(StillWorld(), {robot.key: robot})
     made.start()
     yield made
     made.stop()
 
 
 @contextmanager
-def serving(engine: Engine, port: int = 0) -> Iterator[int]:
+def serving(stepper: Stepper, port: int = 0) -> Iterator[int]:
     """Serve in a thread, as `hma play` does; give the port."""
     listener = socket.create_server(("127.0.0.1", port))
     ready, servers = threading.Event(), []
@@ -92,7 +92,7 @@ def serving(engine: Engine, port: int = 0) -> Iterator[int]:
         servers.append(server)
         ready.set()
 
-    app = Server(engine, "a model").app
+    app = Server(stepper, "a model").app
     thread = threading.Thread(target=lambda: asyncio.run(run(app, listener, started)), daemon=True)
     thread.start()
     assert ready.wait(20)
@@ -132,8 +132,8 @@ def opened(page: "Page", address: str, robot: str = "mover_04") -> "Page":
     return page
 
 
-def session_of(engine: Engine, page: "Page") -> Any:
-    return engine.sessions[page.evaluate("() => sessionStorage.getItem('session')")]
+def session_of(stepper: Stepper, page: "Page") -> Any:
+    return stepper.sessions[page.evaluate("() => sessionStorage.getItem('session')")]
 
 
 def frames(page: "Page", least: int) -> None:
@@ -149,10 +149,10 @@ def number(text: str | None) -> float:
     return float(re.findall(r"-?[\d.]+", text or "")[0])
 
 
-def test_a_key_drives_starts_the_clock_and_comes_to_rest(page: "Page", engine: Engine) -> None:
+def test_a_key_drives_starts_the_clock_and_comes_to_rest(page: "Page", stepper: Stepper) -> None:
     page.keyboard.down("ArrowRight")
     frames(page, 3)
-    session = session_of(engine, page)
+    session = session_of(stepper, page)
     top = session.robot.dimensions[0].high
     assert session.held.tolist() == pytest.approx([top, 0]) and not session.paused
     assert page.input_value("#dim-0") == pytest.approx(str(top)) or number(page.input_value("#dim-0")) > 0
@@ -163,22 +163,22 @@ def test_a_key_drives_starts_the_clock_and_comes_to_rest(page: "Page", engine: E
     assert 5 < number(page.text_content("#fps")) < 15 and number(page.text_content("#latency")) > 0
 
 
-def test_a_short_press_of_a_key_is_not_lost(page: "Page", engine: Engine) -> None:
+def test_a_short_press_of_a_key_is_not_lost(page: "Page", stepper: Stepper) -> None:
     page.keyboard.press("p")
     frames(page, 2)
-    session = session_of(engine, page)
+    session = session_of(stepper, page)
     page.keyboard.press("ArrowDown")  # up at once, between two frames
     frames(page, session.count + 4)
     driven = [frame.actions[0, 1] for frame in session.frames]
     assert max(driven) > 0 and driven[-1] == 0
 
 
-def test_buttons_and_their_keys_pause_step_reset_and_change_the_scene(page: "Page", engine: Engine) -> None:
+def test_buttons_and_their_keys_pause_step_reset_and_change_the_scene(page: "Page", stepper: Stepper) -> None:
     page.click("#run")
     frames(page, 3)
     page.keyboard.press("p")
     page.wait_for_selector("#run:has-text('Run')")
-    session = session_of(engine, page)
+    session = session_of(stepper, page)
     count = session.count
     page.click("#step")
     frames(page, count + 1)
@@ -194,17 +194,17 @@ def test_buttons_and_their_keys_pause_step_reset_and_change_the_scene(page: "Pag
     assert session.number == 1 and session.start.model != first
 
 
-def test_a_clicked_setting_leaves_the_keys_to_the_robot(page: "Page", engine: Engine) -> None:
+def test_a_clicked_setting_leaves_the_keys_to_the_robot(page: "Page", stepper: Stepper) -> None:
     page.locator("input[value=fast]").check(force=True)
     page.locator("#passes").click(position={"x": 60, "y": 10})
     page.keyboard.down("ArrowRight")
     frames(page, 20)
-    session = session_of(engine, page)
+    session = session_of(stepper, page)
     assert session.fast and session.sampling.passes > 2 and session.held[0] > 0
     page.keyboard.up("ArrowRight")
 
 
-def test_the_mouse_steers_by_dragging_on_the_image(page: "Page", engine: Engine) -> None:
+def test_the_mouse_steers_by_dragging_on_the_image(page: "Page", stepper: Stepper) -> None:
     box = page.locator("#stage").bounding_box()
     assert box
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -212,7 +212,7 @@ def test_the_mouse_steers_by_dragging_on_the_image(page: "Page", engine: Engine)
     page.mouse.down()
     page.mouse.move(x - box["width"], y, steps=3)
     frames(page, 3)
-    session = session_of(engine, page)
+    session = session_of(stepper, page)
     assert session.held[0] == pytest.approx(session.robot.dimensions[0].low) and session.held[1] == 0
     page.mouse.up()
     frames(page, session.count + 3)
@@ -220,7 +220,7 @@ def test_the_mouse_steers_by_dragging_on_the_image(page: "Page", engine: Engine)
 
 
 def test_touch_sets_the_target_of_a_robot_that_follows_one(
-    browser: "Browser", address: str, engine: Engine
+    browser: "Browser", address: str, stepper: Stepper
 ) -> None:
     context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
     page = opened(context.new_page(), address, "mover_02")
@@ -230,7 +230,7 @@ def test_touch_sets_the_target_of_a_robot_that_follows_one(
     assert page.evaluate("() => document.documentElement.scrollWidth") <= 390
     page.touchscreen.tap(box["x"] + box["width"] * 0.75, box["y"] + box["height"] * 0.25)
     frames(page, 2)
-    held = session_of(engine, page).held
+    held = session_of(stepper, page).held
     assert held.tolist() == pytest.approx([96, 32], abs=1)  # px of the image of 128
     context.close()
 
@@ -241,12 +241,12 @@ navigator.getGamepads = () => [window.pad];
 """
 
 
-def test_a_gamepad_drives_and_its_button_switches(browser: "Browser", address: str, engine: Engine) -> None:
+def test_a_gamepad_drives_and_its_button_switches(browser: "Browser", address: str, stepper: Stepper) -> None:
     context = browser.new_context()
     page = context.new_page()
     page.add_init_script(GAMEPAD)
     opened(page, address, "arm4_04").wait_for_selector("#dim-4")
-    session = session_of(engine, page)
+    session = session_of(stepper, page)
     before = session.held.copy()
     page.evaluate("() => { pad.axes[0] = 0.5; pad.buttons[0].pressed = true; }")
     frames(page, 4)
@@ -256,7 +256,7 @@ def test_a_gamepad_drives_and_its_button_switches(browser: "Browser", address: s
     context.close()
 
 
-def test_every_control_is_reached_and_used_by_the_keyboard_alone(page: "Page", engine: Engine) -> None:
+def test_every_control_is_reached_and_used_by_the_keyboard_alone(page: "Page", stepper: Stepper) -> None:
     page.select_option("#robot", "arm4_04")
     page.wait_for_selector("#dim-4")
     reached = set()
@@ -270,7 +270,7 @@ def test_every_control_is_reached_and_used_by_the_keyboard_alone(page: "Page", e
         " && !one.textContent.trim() && !one.getAttribute('aria-label')).map((one) => one.id)"
     )
     assert unnamed == []
-    session = session_of(engine, page)
+    session = session_of(stepper, page)
     before = session.held.copy()
     page.focus("#dim-1")
     page.keyboard.press("ArrowRight")
@@ -287,12 +287,12 @@ def test_every_control_is_reached_and_used_by_the_keyboard_alone(page: "Page", e
     assert session.sampling.passes == 3
 
 
-def test_replay_follows_the_recorder_until_a_person_takes_over(page: "Page", engine: Engine) -> None:
+def test_replay_follows_the_recorder_until_a_person_takes_over(page: "Page", stepper: Stepper) -> None:
     page.select_option("#robot", "arm4_04")
     page.wait_for_selector("#dim-4")
     page.click("#replay")
     frames(page, 3)
-    session = session_of(engine, page)
+    session = session_of(stepper, page)
     assert session.replays and page.get_attribute("#replay", "aria-pressed") == "true"
     page.keyboard.press("ArrowRight")
     page.wait_for_selector("#replay[aria-pressed='false']")
@@ -300,7 +300,7 @@ def test_replay_follows_the_recorder_until_a_person_takes_over(page: "Page", eng
 
 
 def test_two_pages_drive_robots_of_their_own(
-    page: "Page", browser: "Browser", address: str, engine: Engine
+    page: "Page", browser: "Browser", address: str, stepper: Stepper
 ) -> None:
     context = browser.new_context()
     other = opened(context.new_page(), address, "arm4_04")
@@ -309,22 +309,22 @@ def test_two_pages_drive_robots_of_their_own(
         one.keyboard.press("p")
     frames(page, 4)
     frames(other, 4)
-    assert session_of(engine, page) is not session_of(engine, other)
+    assert session_of(stepper, page) is not session_of(stepper, other)
     context.close()
-    count = session_of(engine, page).count
+    count = session_of(stepper, page).count
     frames(page, count + 3)
 
 
-def test_a_reload_goes_on_where_it_was(page: "Page", engine: Engine) -> None:
+def test_a_reload_goes_on_where_it_was(page: "Page", stepper: Stepper) -> None:
     page.keyboard.down("ArrowUp")
     frames(page, 4)
     page.keyboard.up("ArrowUp")
     page.keyboard.press("p")
     page.wait_for_selector("#run:has-text('Run')")
-    session = session_of(engine, page)
+    session = session_of(stepper, page)
     page.reload()
     page.wait_for_selector(f"body[data-frame='{session.count}']")
-    assert session_of(engine, page) is session
+    assert session_of(stepper, page) is session
     page.keyboard.press("p")
     frames(page, session.count + 2)
 
@@ -362,7 +362,7 @@ def test_a_file_that_is_prepared_says_how_far_it_is_and_the_page_goes_on(
 
 
 def test_a_recording_has_readable_names_and_its_end_offers_no_pause(
-    browser: "Browser", recorded: Engine
+    browser: "Browser", recorded: Stepper
 ) -> None:
     with serving(recorded) as port:
         context = browser.new_context(viewport={"width": 1280, "height": 800})
@@ -379,9 +379,9 @@ def test_a_recording_has_readable_names_and_its_end_offers_no_pause(
         context.close()
 
 
-def test_a_closed_session_offers_to_start_again(page: "Page", engine: Engine) -> None:
-    name = session_of(engine, page).name
-    engine.call(lambda: engine.close(name, "Closed, because nothing was done for 5 minutes.")).result(10)
+def test_a_closed_session_offers_to_start_again(page: "Page", stepper: Stepper) -> None:
+    name = session_of(stepper, page).name
+    stepper.call(lambda: stepper.close(name, "Closed, because nothing was done for 5 minutes.")).result(10)
     page.wait_for_selector("#again:visible")
     assert "nothing was done" in (page.text_content("#veil-text") or "")
     page.click("#again")
@@ -401,7 +401,7 @@ def test_the_image_says_how_to_begin_and_that_it_stands_still(page: "Page") -> N
     assert re.fullmatch(r"\d\.\d s, \d+ frames", page.text_content("#driven") or "")
 
 
-def test_two_fingers_drive_two_sliders(browser: "Browser", address: str, engine: Engine) -> None:
+def test_two_fingers_drive_two_sliders(browser: "Browser", address: str, stepper: Stepper) -> None:
     context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
     page = opened(context.new_page(), address, "rails_03")
     page.wait_for_selector("#start:has-text('Drag here to drive')")
@@ -418,7 +418,7 @@ def test_two_fingers_drive_two_sliders(browser: "Browser", address: str, engine:
     fingers("touchStart", left, right)
     fingers("touchMove", left | {"y": left["y"] + 120}, right | {"y": right["y"] - 120})
     frames(page, 2)
-    session = session_of(engine, page)
+    session = session_of(stepper, page)
     first, second = session.robot.dimensions
     assert session.held.tolist() == pytest.approx([first.high, second.low])  # down, and up
     fingers("touchEnd")
@@ -427,25 +427,25 @@ def test_two_fingers_drive_two_sliders(browser: "Browser", address: str, engine:
     context.close()
 
 
-def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", engine: Engine) -> None:
-    session = session_of(engine, page)
-    engine.call(lambda: engine._world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
+def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", stepper: Stepper) -> None:
+    session = session_of(stepper, page)
+    stepper.call(lambda: stepper._world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
     page.locator("input[value=fast]").check(force=True)
     page.click("#run")
     page.wait_for_selector("#parted:has-text('parted at 0.1 s')")
     assert "Sync restarts the model" in (page.text_content("#note") or "")
     assert page.get_attribute("#sync", "class") == "call"
-    engine.call(lambda: engine._world.blind.clear()).result(10)  # type: ignore[attr-defined]
+    stepper.call(lambda: stepper._world.blind.clear()).result(10)  # type: ignore[attr-defined]
     page.keyboard.press("y")
     page.wait_for_selector("#parted:has-text('parted')", state="hidden")
     page.wait_for_selector("#sync:not(.call)")
 
 
 def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(
-    page: "Page", engine: Engine
+    page: "Page", stepper: Stepper
 ) -> None:
-    session = session_of(engine, page)
-    engine.call(lambda: engine._world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
+    session = session_of(stepper, page)
+    stepper.call(lambda: stepper._world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
     page.locator("input[value=fast]").check(force=True)
     page.click("#run")
     page.wait_for_selector("#parted:has-text('parted at 0.1 s')")
@@ -477,17 +477,17 @@ def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(
 
 
 def test_a_page_whose_server_stopped_says_so_and_goes_on_when_it_is_back(
-    browser: "Browser", engine: Engine
+    browser: "Browser", stepper: Stepper
 ) -> None:
     page = browser.new_context().new_page()
-    with serving(engine) as port:
+    with serving(stepper) as port:
         opened(page, f"http://127.0.0.1:{port}/")
         page.keyboard.press("ArrowRight")
         frames(page, 2)
         page.keyboard.press("p")
     page.wait_for_selector("#veil:has-text('hma play was stopped')")
-    session = session_of(engine, page)
-    with serving(engine, port):
+    session = session_of(stepper, page)
+    with serving(stepper, port):
         page.wait_for_selector("#veil", state="hidden")
         page.keyboard.press("p")
         frames(page, session.count + 2)
@@ -514,14 +514,14 @@ def test_the_images_and_the_run_button_fit_on_the_screen_side_by_side(
 
 
 def test_the_question_mark_explains_the_page_and_the_keys_rest_meanwhile(
-    page: "Page", engine: Engine
+    page: "Page", stepper: Stepper
 ) -> None:
     page.keyboard.press("?")
     page.wait_for_selector("#about:has-text('A neural network predicts every image')")
     page.keyboard.press("ArrowRight")
     page.keyboard.press("p")
     page.wait_for_timeout(100)
-    session = session_of(engine, page)
+    session = session_of(stepper, page)
     assert session.paused and session.held.tolist() == [0, 0]
     page.keyboard.press("Escape")
     page.wait_for_selector("#about", state="hidden")

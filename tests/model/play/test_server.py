@@ -13,29 +13,29 @@ from starlette.websockets import WebSocketDisconnect
 
 from hma_data.episodes.images import decode_image
 from hma_model.play import server
-from hma_model.play.messages import MOST_BYTES
-from hma_model.play.server import AHEAD, BURST, SCENE, Server
-from hma_model.play.stepper import Engine
+from hma_model.play.messages import MAX_MESSAGE_BYTES
+from hma_model.play.server import FRAMES_AHEAD, MESSAGE_BURST, SCENE_COST, Server
+from hma_model.play.stepper import Stepper
 from tests.model.true_world import TrueWorld, lab_robots
 
 HOST, DRIVE = "http://127.0.0.1:8000", "ws://127.0.0.1:8000/drive"
 
 
 @pytest.fixture
-def engine() -> Iterator[Engine]:
-    made = Engine(TrueWorld(), lab_robots("mover_04", "arm2_12"), most=3)
+def stepper() -> Iterator[Stepper]:
+    made = Stepper(TrueWorld(), lab_robots("mover_04", "arm2_12"), most=3)
     made.start()
     yield made
     made.stop()
 
 
 @pytest.fixture
-def client(engine: Engine) -> Iterator[TestClient]:
-    with TestClient(Server(engine, "a model").app, HOST) as made:
+def client(stepper: Stepper) -> Iterator[TestClient]:
+    with TestClient(Server(stepper, "a model").app, HOST) as made:
         yield made
 
 
-class Page:
+class PageViewer:
     """A page, as far as its websocket goes."""
 
     def __init__(self, socket: WebSocketTestSession) -> None:
@@ -90,7 +90,7 @@ def test_the_page_allows_no_script_but_its_own(client: TestClient) -> None:
 
 def test_a_page_opens_drives_and_sees_both_images(client: TestClient) -> None:
     with client.websocket_connect(DRIVE) as socket:
-        page = Page(socket)
+        page = PageViewer(socket)
         assert {robot["key"] for robot in page.message("hello")["robots"]} == {"mover_04", "arm2_12"}
         opened = page.open()
         assert [d["name"] for d in opened["robot"]["dimensions"]] == ["vx", "vy"] and opened["paused"]
@@ -107,7 +107,7 @@ def test_a_page_opens_drives_and_sees_both_images(client: TestClient) -> None:
 
 def test_a_action_far_outside_the_range_seen_in_training_is_told_once(client: TestClient) -> None:
     with client.websocket_connect(DRIVE) as socket:
-        page = Page(socket)
+        page = PageViewer(socket)
         ends = page.open()["robot"]["dimensions"][0]
         page.send("drive", action=[2 * ends["high"], 0], input=1)
         assert f"vx {ends['low']:g} to {ends['high']:g}" in page.message("error")["text"]
@@ -123,11 +123,11 @@ def test_a_action_far_outside_the_range_seen_in_training_is_told_once(client: Te
 
 def test_a_reload_goes_on_where_it_was(client: TestClient) -> None:
     with client.websocket_connect(DRIVE) as socket:
-        page = Page(socket)
+        page = PageViewer(socket)
         name = page.open()["session"]
         page.works()
     with client.websocket_connect(DRIVE) as socket:
-        page = Page(socket)
+        page = PageViewer(socket)
         page.send("resume", session=name)
         opened = page.message("opened")
         assert opened["frame"] == 1 and opened["scores"] == [[1, 60.0, 60.0]]
@@ -138,18 +138,18 @@ def test_a_reload_goes_on_where_it_was(client: TestClient) -> None:
 
 
 def test_a_page_that_reads_nothing_skips_frames_and_gets_the_latest(
-    client: TestClient, engine: Engine
+    client: TestClient, stepper: Stepper
 ) -> None:
     with client.websocket_connect(DRIVE) as socket:
-        page = Page(socket)
-        session, seen = engine.sessions[page.open()["session"]], []
+        page = PageViewer(socket)
+        session, seen = stepper.sessions[page.open()["session"]], []
         for count in range(1, 9):
             page.send("step")
             while session.count < count:
-                engine.call(lambda: None).result(10)
-            if count <= AHEAD:
+                stepper.call(lambda: None).result(10)
+            if count <= FRAMES_AHEAD:
                 seen.append(page.frame()[0])
-        engine.call(lambda: None).result(10)  # between two steps: the last one has ended
+        stepper.call(lambda: None).result(10)  # between two steps: the last one has ended
         assert [header["frame"] for header in seen] == [1, 2]
         page.see(seen[-1])
         assert page.frame()[0]["frame"] == 8
@@ -164,7 +164,7 @@ WRONG = {
     "infinite": '{"do": "drive", "action": [1e999, 0], "input": 1}',
     "text": '{"do": "drive", "action": ["1", "2"], "input": 1}',
     "deep": "[" * 5000,
-    "huge": '{"do": "resume", "session": "' + "x" * MOST_BYTES + '"}',
+    "huge": '{"do": "resume", "session": "' + "x" * MAX_MESSAGE_BYTES + '"}',
     "passes": '{"do": "sample", "passes": 1000000, "temperature": 0, "order": "random"}',
     "scene": '{"do": "scene", "number": -1}',
 }
@@ -173,54 +173,54 @@ WRONG = {
 @pytest.mark.parametrize("text", WRONG.values(), ids=WRONG)
 def test_a_malformed_message_closes_its_connection_alone(client: TestClient, text: str) -> None:
     with client.websocket_connect(DRIVE) as good, client.websocket_connect(DRIVE) as bad:
-        Page(good).open()
-        Page(bad).open()
+        PageViewer(good).open()
+        PageViewer(bad).open()
         bad.send_text(text)
         with pytest.raises(WebSocketDisconnect) as closed:
-            Page(bad).message("never")
+            PageViewer(bad).message("never")
         assert closed.value.code == 1008 and closed.value.reason
-        Page(good).works()
+        PageViewer(good).works()
 
 
 def test_a_flood_and_bytes_close_their_connections_alone(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server, "RATE", 0.0)  # time restores no credit
+    monkeypatch.setattr(server, "MESSAGES_PER_S", 0.0)  # time restores no credit
     with client.websocket_connect(DRIVE) as good:
-        Page(good).open()
+        PageViewer(good).open()
         with client.websocket_connect(DRIVE) as bad:
-            for _ in range(int(BURST) + 1):
-                Page(bad).send("seen", serial=0)
+            for _ in range(int(MESSAGE_BURST) + 1):
+                PageViewer(bad).send("seen", serial=0)
             with pytest.raises(WebSocketDisconnect, match="1008"):
-                Page(bad).message("never")
+                PageViewer(bad).message("never")
         with client.websocket_connect(DRIVE) as bad:
             bad.send_bytes(b"\0" * 10)
             with pytest.raises(WebSocketDisconnect, match="1008"):
-                Page(bad).message("never")
-        Page(good).works()
+                PageViewer(bad).message("never")
+        PageViewer(good).works()
 
 
 @pytest.mark.parametrize("do", ["open", "scene", "sync"])
 def test_a_page_cannot_begin_scenes_so_often_that_the_others_wait(
-    client: TestClient, engine: Engine, monkeypatch: pytest.MonkeyPatch, do: str
+    client: TestClient, stepper: Stepper, monkeypatch: pytest.MonkeyPatch, do: str
 ) -> None:
-    monkeypatch.setattr(server, "RATE", 0.0)  # time restores no credit
+    monkeypatch.setattr(server, "MESSAGES_PER_S", 0.0)  # time restores no credit
     values = {"open": {"robot": "mover_04"}, "scene": {"number": 1}, "sync": {}}[do]
-    world = engine._world
+    world = stepper._world
     assert isinstance(world, TrueWorld)
     with client.websocket_connect(DRIVE) as bad:
-        Page(bad).open()
+        PageViewer(bad).open()
         with pytest.raises(WebSocketDisconnect, match="1008"):
             for _ in range(50):
-                Page(bad).send(do, **values)
-            Page(bad).message("never")
-        engine.call(lambda: None).result(10)
-        assert 5 <= len(world.begun) <= BURST / SCENE
+                PageViewer(bad).send(do, **values)
+            PageViewer(bad).message("never")
+        stepper.call(lambda: None).result(10)
+        assert 5 <= len(world.begun) <= MESSAGE_BURST / SCENE_COST
 
 
 def test_wrong_values_are_told_and_the_session_goes_on(client: TestClient) -> None:
     with client.websocket_connect(DRIVE) as socket:
-        page = Page(socket)
+        page = PageViewer(socket)
         page.send("open", robot="nobody")
         assert "there is no 'nobody'" in page.message("error")["text"]
         page.open()
@@ -246,11 +246,11 @@ def test_foreign_hosts_and_origins_are_refused(client: TestClient, headers: dict
 def test_its_own_origin_is_let_in(client: TestClient) -> None:
     own = {"Host": "127.0.0.1:8000", "Origin": HOST}
     with client.websocket_connect(DRIVE, headers=own) as socket:
-        Page(socket).message("hello")
+        PageViewer(socket).message("hello")
 
 
-def test_a_token_is_needed_where_one_is_set(engine: Engine) -> None:
-    app = Server(engine, "a model", "0.0.0.0", "a&b é").app
+def test_a_token_is_needed_where_one_is_set(stepper: Stepper) -> None:
+    app = Server(stepper, "a model", "0.0.0.0", "a&b é").app
     page = "/?token=a%26b%20%C3%A9"
     with TestClient(app, "http://192.168.1.7:8000") as client:
         assert [client.get(path).status_code for path in ("/", "/?token=wr%F6ng", page)] == [
@@ -265,7 +265,7 @@ def test_what_was_driven_is_saved(client: TestClient) -> None:
     import av
 
     with client.websocket_connect(DRIVE) as socket:
-        page = Page(socket)
+        page = PageViewer(socket)
         name = page.open()["session"]
         assert client.get(f"/save?kind=mp4&session={name}").status_code == 409
         for _ in range(3):

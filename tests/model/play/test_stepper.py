@@ -1,4 +1,4 @@
-"""The engine of `hma play`: clocks, batches, the truth beside the model, and sessions that end."""
+"""The stepper of `hma play`: clocks, batches, the truth beside the model, and sessions that end."""
 
 from typing import Any
 
@@ -7,32 +7,32 @@ import pytest
 
 from hma_data.errors import UsageError
 from hma_data.lab.simulator import LabSimulator
-from hma_model.play.session import Sampling, Session
-from hma_model.play.stepper import Engine
-from hma_model.worlds.scenes import PROMPT, SEED
+from hma_model.play.session import FrameSampling, Session
+from hma_model.play.stepper import Stepper
+from hma_model.worlds.scenes import PROMPT_FRAMES, SCENE_SEED
 from tests.model.true_world import TrueWorld, Watcher, lab_robots
 
 ROBOTS = ("mover_04", "arm3_04", "pendulum")
 
 
 class Bench:
-    """An engine that is stepped by hand."""
+    """An stepper that is stepped by hand."""
 
     def __init__(self, **settings: Any) -> None:
         self.world = TrueWorld()
-        self.engine = Engine(self.world, lab_robots(*ROBOTS), **settings)
+        self.stepper = Stepper(self.world, lab_robots(*ROBOTS), **settings)
 
     def open(self, robot: str = "mover_04", scene: int = 0) -> tuple[Session, Watcher]:
-        session, viewer = self.engine.open(robot, scene), Watcher()
-        self.engine.attach(session.name, viewer)
+        session, viewer = self.stepper.open(robot, scene), Watcher()
+        self.stepper.attach(session.name, viewer)
         session.paused = False
         return session, viewer
 
     def step(self, count: int = 1) -> None:
         for _ in range(count):
-            for session in self.engine.sessions.values():
+            for session in self.stepper.sessions.values():
                 session.due = 0.0
-            self.engine.step()
+            self.stepper.step()
 
 
 def test_sessions_that_are_due_share_a_pass_and_hold_their_own_actions() -> None:
@@ -60,11 +60,11 @@ def test_a_session_steps_at_the_rate_of_its_robot_or_as_fast_as_it_can() -> None
     assert due == pytest.approx([100.1, 100.2, 105.0])
     assert not session.ready(104.9) and session.ready(105.0)
     session.fast, session.due = True, 0.0
-    bench.engine.step()
-    bench.engine.step()
+    bench.stepper.step()
+    bench.stepper.step()
     assert len(viewer.frames) == 5
     viewer.behind = 2  # its page has not shown the last two
-    bench.engine.step()
+    bench.stepper.step()
     assert len(viewer.frames) == 5
 
 
@@ -77,7 +77,7 @@ def test_a_paused_session_makes_single_frames_and_one_without_viewer_none() -> N
     bench.step(3)
     assert [frame.number for frame in viewer.frames] == [1]
     session.paused = False
-    bench.engine.detach(session.name, viewer)
+    bench.stepper.detach(session.name, viewer)
     bench.step(3)
     assert session.count == 1
 
@@ -100,9 +100,9 @@ def test_replay_gives_the_actions_of_the_recorded_episode() -> None:
     session.replays = True
     bench.step(5)
     simulator = LabSimulator("arm3_04")
-    simulator.reset(SEED, 2)
+    simulator.reset(SCENE_SEED, 2)
     actions = []
-    for _ in range((PROMPT - 1 + 5) * session.robot.embodiment.stride):
+    for _ in range((PROMPT_FRAMES - 1 + 5) * session.robot.embodiment.stride):
         actions.append(simulator.recorded())
         simulator.advance(actions[-1])
     driven = np.concatenate([frame.actions for frame in viewer.frames])
@@ -149,12 +149,12 @@ def test_sync_restarts_the_model_from_the_true_frames_and_their_actions() -> Non
 def test_sessions_of_another_sampling_have_a_pass_of_their_own() -> None:
     bench = Bench(orders=("random",))
     one, other, third = (bench.open()[0] for _ in range(3))
-    bench.engine.change(other, Sampling(4, 0.5, "random"))
+    bench.stepper.change(other, FrameSampling(4, 0.5, "random"))
     bench.step()
     assert bench.world.sampling == [(2, 0.0, "random"), (4, 0.5, "random")]
     assert [set(step) for step in bench.world.steps] == [{one.row, third.row}, {other.row}]
     with pytest.raises(UsageError, match="no 'confidence'"):
-        bench.engine.change(one, Sampling(2, 0.0, "confidence"))
+        bench.stepper.change(one, FrameSampling(2, 0.0, "confidence"))
 
 
 def test_a_new_scene_begins_anew_and_the_same_scene_is_the_same() -> None:
@@ -174,9 +174,9 @@ def test_an_idle_session_is_paused_and_keeps_its_frames_but_is_closed_if_nobody_
     bench.step()
     for session in (idle, left):
         session.touched -= 61
-    bench.engine.detach(left.name, away)
+    bench.stepper.detach(left.name, away)
     bench.step(3)
-    assert list(bench.engine.sessions) == [idle.name, busy.name]
+    assert list(bench.stepper.sessions) == [idle.name, busy.name]
     assert list(bench.world.rows) == [idle.row, busy.row]
     assert idle.paused and len(idle.frames) == 1 and len(busy.frames) == 4
     assert [told["kind"] for told in viewer.told] == ["status", "error"]
@@ -188,17 +188,17 @@ def test_an_idle_session_gives_its_place_to_a_new_page() -> None:
     idle, viewer = bench.open()
     idle.touched -= 61
     bench.open()
-    assert idle.name not in bench.engine.sessions and "another page" in viewer.told[-1]["text"]
+    assert idle.name not in bench.stepper.sessions and "another page" in viewer.told[-1]["text"]
 
 
 def test_a_full_engine_refuses_and_gives_the_places_of_those_who_left() -> None:
     bench = Bench(most=2)
     (first, viewer), _ = bench.open(), bench.open()
     with pytest.raises(UsageError, match="all 2 places are taken"):
-        bench.engine.open("mover_04", 0)
-    bench.engine.detach(first.name, viewer)
+        bench.stepper.open("mover_04", 0)
+    bench.stepper.detach(first.name, viewer)
     bench.open()
-    assert first.name not in bench.engine.sessions
+    assert first.name not in bench.stepper.sessions
 
 
 def test_a_session_that_fails_is_closed_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,7 +206,7 @@ def test_a_session_that_fails_is_closed_and_the_others_go_on(monkeypatch: pytest
     (wrong, viewer), (right, other) = bench.open(), bench.open()
     monkeypatch.setattr(wrong, "scene", None)
     bench.step(2)
-    assert list(bench.engine.sessions) == [right.name]
+    assert list(bench.stepper.sessions) == [right.name]
     assert "simulator failed" in viewer.told[-1]["text"] and len(other.frames) == 2
 
 
@@ -214,18 +214,18 @@ def test_a_second_page_takes_over_and_tells_the_first() -> None:
     bench = Bench()
     session, first = bench.open()
     second = Watcher()
-    bench.engine.attach(session.name, second)
+    bench.stepper.attach(session.name, second)
     bench.step()
     assert "another page" in first.told[-1]["text"] and len(second.frames) == 1 and not first.frames
 
 
 def test_the_thread_runs_calls_and_hands_back_their_errors() -> None:
     bench = Bench()
-    bench.engine.start()
+    bench.stepper.start()
     try:
-        session = bench.engine.call(lambda: bench.engine.open("mover_04", 0)).result(10)
-        assert session.name in bench.engine.sessions
+        session = bench.stepper.call(lambda: bench.stepper.open("mover_04", 0)).result(10)
+        assert session.name in bench.stepper.sessions
         with pytest.raises(UsageError, match="no 'nobody'"):
-            bench.engine.call(lambda: bench.engine.open("nobody", 0)).result(10)
+            bench.stepper.call(lambda: bench.stepper.open("nobody", 0)).result(10)
     finally:
-        bench.engine.stop()
+        bench.stepper.stop()

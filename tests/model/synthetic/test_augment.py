@@ -25,7 +25,7 @@ from hma_model.simulate import World, load_world
 from hma_model.synthetic import augment as augment_module
 from hma_model.synthetic import recorder
 from hma_model.synthetic.augment import Augmentation, augment
-from hma_model.synthetic.recorder import Made, write_shards
+from hma_model.synthetic.recorder import SyntheticEpisode, write_shards
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
 from tests.model.shards import state_pauses
@@ -334,7 +334,9 @@ def test_episodes_of_several_cameras_hold_each_in_its_place(
 def test_the_camera_that_is_shown_is_the_one_that_is_named(tmp_path: Path) -> None:
     arm, tokenizer = three.arm(), BlockTokenizer()
     images = np.zeros((4, 64, 64, 3), np.uint8)
-    made = Made("one", tokenizer.encode(images), np.zeros((3, arm.chunk_dim), np.float32), {}, "a")
+    made = SyntheticEpisode(
+        "one", tokenizer.encode(images), np.zeros((3, arm.chunk_dim), np.float32), {}, "a"
+    )
     given: Any = {"made_by": {"synthetic": True}, "cameras": ["wrist"]}
     (tmp_path / "out").mkdir()
     manifest = write_shards(tmp_path / "out", [made], tokenizer.spec, arm, **given)

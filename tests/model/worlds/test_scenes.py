@@ -24,8 +24,8 @@ from hma_data.sources.base import open_source
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.play.pads import Pad, describe, hint, labels, pads
 from hma_model.play.save import film, lerobot_episode
-from hma_model.play.session import Frame, Sampling, Session, jpeg
-from hma_model.worlds.scenes import PROMPT, LabRobot, RecordedRobot, apart, drivable
+from hma_model.play.session import Frame, FrameSampling, Session, jpeg
+from hma_model.worlds.scenes import PROMPT_FRAMES, LabRobot, RecordedRobot, apart, drivable
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
 from tests.model.robots import save
@@ -49,7 +49,7 @@ KINDS: dict[str, tuple[list[str], list[Pad]]] = {  # robot -> kinds of its value
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_each_value_of_a_action_rests_or_stays_as_its_robot_means_it(name: str) -> None:
+def test_each_value_of_an_action_rests_or_stays_as_its_robot_means_it(name: str) -> None:
     (robot,) = lab_robots(name).values()
     kinds, dragged = KINDS[name]
     assert [dim.kind for dim in robot.dimensions] == kinds
@@ -123,8 +123,8 @@ def test_all_robots_of_the_embedded_model_can_be_driven() -> None:
 def test_a_scene_begins_with_a_prompt_and_a_action_that_leaves_the_robot_there(name: str) -> None:
     (robot,) = lab_robots(name).values()
     scene = robot.scene(3)
-    assert scene.prompt.frames.shape == (PROMPT, 128, 128, 3)
-    assert scene.prompt.chunks.shape == (PROMPT - 1, robot.embodiment.chunk_dim)
+    assert scene.prompt.frames.shape == (PROMPT_FRAMES, 128, 128, 3)
+    assert scene.prompt.chunks.shape == (PROMPT_FRAMES - 1, robot.embodiment.chunk_dim)
     chunk = np.tile(scene.action, robot.embodiment.stride)
     for _ in range(25):  # a target is reached
         still = scene.advance(chunk)
@@ -145,8 +145,8 @@ def test_what_truly_happens_is_shown_in_the_size_of_the_models_images(size: int)
     robot = LabRobot(plain.embodiment, Checkpoint.open(EMBEDDED).stats("mover_04"), size)
     scene = robot.scene(0)
     found = scene.advance(None)
-    assert scene.prompt.frames.shape == (PROMPT, size, size, 3) and found[1].shape == (size, size, 3)
-    session = Session("s", robot, 0, Scaled(), Sampling(2, 0.0, "random"), 0.0)
+    assert scene.prompt.frames.shape == (PROMPT_FRAMES, size, size, 3) and found[1].shape == (size, size, 3)
+    session = Session("s", robot, 0, Scaled(), FrameSampling(2, 0.0, "random"), 0.0)
     assert session.start.psnr is not None
 
 
@@ -155,7 +155,7 @@ def test_a_session_that_cannot_begin_leaves_its_place(monkeypatch: pytest.Monkey
     world = TrueWorld()
     monkeypatch.setattr(world, "image", lambda row: np.zeros((3, 3, 3), np.uint8))
     with pytest.raises(ValueError, match="broadcast"):
-        Session("s", robot, 0, world, Sampling(2, 0.0, "random"), 0.0)
+        Session("s", robot, 0, world, FrameSampling(2, 0.0, "random"), 0.0)
     assert not world.rows
 
 
@@ -182,7 +182,7 @@ def test_a_recordings_truth_is_known_for_its_own_actions(
         assert shown == (chunk.reshape(2, 3)[-1, 1] + 1) % 16
         frames.append(image)
         count += 1
-    assert count == len(frames) - PROMPT > 0
+    assert count == len(frames) - PROMPT_FRAMES > 0
     assert other.advance(np.zeros(6, np.float32)) is not None
     followed = other.advance(None)
     assert followed is not None and followed[1] is None  # it was left
@@ -192,12 +192,12 @@ def test_no_scene_of_a_recording_crosses_a_pause(shards: ShardSet, block_tokeniz
     rows = shards.episodes.to_pylist()
     state_pauses(shards.folder, *[{row["length"] // 3: 50, row["length"] // 3 + 1: 50} for row in rows])
     robot = RecordedRobot(ShardSet(shards.folder), lambda: block_tokenizer, shards.manifest.stats, "first")
-    scene, frames = robot.scene(0), PROMPT
+    scene, frames = robot.scene(0), PROMPT_FRAMES
     while (step := scene.advance(None)) is not None:
         assert step[1] is not None
         frames += 1
     longest = max(row["length"] - row["length"] // 3 - 2 for row in rows)
-    assert PROMPT < frames <= longest // shards.row_stride
+    assert PROMPT_FRAMES < frames <= longest // shards.row_stride
     state_pauses(shards.folder, *[dict.fromkeys(range(row["length"]), 50) for row in rows])
     robot = RecordedRobot(ShardSet(shards.folder), lambda: block_tokenizer, shards.manifest.stats, "first")
     with pytest.raises(UsageError, match="has no episode longer than 4 frames without a pause"):
@@ -229,7 +229,7 @@ def test_a_robot_without_simulator_begins_from_its_sample_or_from_images(tmp_pat
     (robot,) = drivable(opened, (), pytest.fail).values()
     scene = robot.scene(0)
     assert (robot.embodiment.id, robot.source) == ("arm_a", "images")
-    assert np.array_equal(scene.prompt.frames, images[:1].repeat(PROMPT, axis=0))
+    assert np.array_equal(scene.prompt.frames, images[:1].repeat(PROMPT_FRAMES, axis=0))
     chunk = np.ones(robot.embodiment.chunk_dim, np.float32)
     assert scene.advance(chunk) == (chunk, None) and scene.advance(None) is None
     large = images[:2].repeat(2, axis=1).repeat(2, axis=2)
@@ -270,7 +270,10 @@ def test_a_saved_dataset_names_the_cameras_that_the_model_shows(
 def test_a_saved_dataset_reads_as_what_was_driven(name: str, tmp_path: Path) -> None:
     (robot,) = lab_robots(name).values()
     world = TrueWorld()
-    session, rng = Session("s", robot, 0, world, Sampling(2, 0.0, "random"), 0.0), np.random.default_rng(0)
+    session, rng = (
+        Session("s", robot, 0, world, FrameSampling(2, 0.0, "random"), 0.0),
+        np.random.default_rng(0),
+    )
     low, high = (np.array([getattr(dim, end) for dim in robot.dimensions]) for end in ("low", "high"))
     for now in range(5):
         session.held = rng.uniform(low, high).astype(np.float32)
