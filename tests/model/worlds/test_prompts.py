@@ -72,7 +72,8 @@ def test_images_come_as_arrays_files_and_from_environments(model: HMA, tmp_path:
     for prompts, count in ((one, 1), (several, 2)):
         for prompt in prompts:
             frames, chunks = read_prompt(model, MOVER, prompt)
-            assert np.array_equal(frames, images[:count]) and chunks is None
+            assert np.array_equal(frames, images[:count])
+            assert len(chunks) == count - 1 and np.isnan(chunks).all()
 
 
 def test_frames_at_the_control_rate_become_chunks_that_end_at_the_last_frame(model: HMA) -> None:
