@@ -85,7 +85,7 @@ class _Viewer:
         async with connect(url, max_size=None, compression=None) as socket:
             await self._send(socket, "open", robot=self.settings["robot"], scene=self.number)
             about = await self._opened(socket)
-            await self._send(socket, "clock", fast=self.settings["fast"])
+            await self._send(socket, "fast", on=self.settings["fast"])
             await self._send(socket, "run", on=True)
             begin = time.monotonic() + WARMUP_S
             end, count, sent = begin + self.settings["seconds"], 0, time.monotonic()
@@ -102,7 +102,7 @@ class _Viewer:
                 if count and begin <= sent and now < end:
                     self.waits.append(now - sent)
                 count, sent = count + 1, time.monotonic()
-                await self._send(socket, "drive", command=_command(about, count), input=count)
+                await self._send(socket, "drive", action=_command(about, count), input=count)
 
     async def _opened(self, socket: "ClientConnection") -> dict[str, Any]:
         """Return the dimensions of the robot, once its session is open."""

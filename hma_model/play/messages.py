@@ -54,17 +54,17 @@ class SeenMessage(_Message):
     serial: int = Field(ge=0)
 
 
-class RunMessage(_Message):
-    """Run or pause."""
-
-    do: Literal["run"]
-    on: bool
-
-
 class StepMessage(_Message):
-    """Make a single frame."""
+    """Make a single frame, or restart the model from the true last frames."""
 
-    do: Literal["step"]
+    do: Literal["step", "sync"]
+
+
+class SwitchMessage(_Message):
+    """Run or pause, as fast as possible or at the robot's rate, by the recorded actions or the page's."""
+
+    do: Literal["run", "fast", "replay"]
+    on: bool
 
 
 class SceneMessage(_Message):
@@ -72,26 +72,6 @@ class SceneMessage(_Message):
 
     do: Literal["scene"]
     number: Number
-
-
-class SyncMessage(_Message):
-    """Restart the model from the true last frames."""
-
-    do: Literal["sync"]
-
-
-class ClockMessage(_Message):
-    """Run as fast as possible, or at the robot's rate."""
-
-    do: Literal["clock"]
-    fast: bool
-
-
-class ReplayMessage(_Message):
-    """Follow the recorded actions, or those of the page."""
-
-    do: Literal["replay"]
-    on: bool
 
 
 class SampleMessage(_Message):
@@ -104,18 +84,9 @@ class SampleMessage(_Message):
 
 
 Message = (
-    OpenMessage
-    | ResumeMessage
-    | DriveMessage
-    | SeenMessage
-    | RunMessage
-    | StepMessage
-    | SceneMessage
-    | SyncMessage
-    | ClockMessage
-    | ReplayMessage
-    | SampleMessage
-)
+    OpenMessage | ResumeMessage | DriveMessage | SeenMessage
+    | StepMessage | SwitchMessage | SceneMessage | SampleMessage
+)  # fmt: skip
 _MESSAGES: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discriminator="do")])
 
 

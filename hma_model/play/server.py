@@ -285,7 +285,7 @@ class Connection:
 
     def _charge(self, message: messages.Message) -> None:
         """Take a message off the credit, which time restores; raise UsageError if none is left."""
-        begins = isinstance(message, messages.OpenMessage | messages.SceneMessage | messages.SyncMessage)
+        begins = message.do in ("open", "scene", "sync")
         now = time.monotonic()
         restored = self._credit + MESSAGES_PER_S * (now - self._filled)
         self._credit = min(MESSAGE_BURST, restored) - (SCENE_COST if begins else 1)
@@ -350,20 +350,20 @@ class Connection:
                 case messages.DriveMessage():
                     self._hold(session, message)
                     return
-                case messages.RunMessage():
-                    session.paused, session.due, session.steps = not message.on, session.touched, 0
-                case messages.StepMessage():
-                    session.paused, session.steps, session.due = True, 1, session.touched
                 case messages.SceneMessage():
                     session.begin(message.number)
                     self._show_all(session)
                     return
-                case messages.SyncMessage():
+                case messages.StepMessage(do="step"):
+                    session.paused, session.steps, session.due = True, 1, session.touched
+                case messages.StepMessage(do="sync"):
                     session.sync()
                     self.page.show(session.last(), {})  # in the place of an older one that still waits
-                case messages.ClockMessage():
-                    session.fast, session.due = message.fast, session.touched
-                case messages.ReplayMessage():
+                case messages.SwitchMessage(do="run"):
+                    session.paused, session.due, session.steps = not message.on, session.touched, 0
+                case messages.SwitchMessage(do="fast"):
+                    session.fast, session.due = message.on, session.touched
+                case messages.SwitchMessage(do="replay"):
                     session.replays, session.ended = message.on, False
                 case messages.SampleMessage():
                     way = FrameSampling(message.passes, round(message.temperature, 1), message.order)
@@ -373,23 +373,25 @@ class Connection:
             self.page.tell({"kind": "error", "text": str(fault)})
 
     def _hold(self, session: Session, message: messages.DriveMessage) -> None:
+        """Hold an action; the first one far outside the range that the model knows is told."""
         if len(message.action) != len(session.held):
             fault = f"has {len(message.action)} values, this robot takes {len(session.held)}"
             self.page.tell({"kind": "error", "text": f"action: {fault}"})
             return
         session.held, session.input = np.array(message.action, np.float32), message.input
-        if not session.warned:
-            ends = [(dim.low, dim.high) for dim in session.robot.dimensions]
-            rows = enumerate(zip(ends, message.action, strict=True))
-            beyond = [
-                i for i, ((low, high), value) in rows if abs(2 * value - low - high) > 1.05 * (high - low)
-            ]
-            session.warned = bool(beyond)
-            if beyond:
-                names = labels(session.robot)
-                said = ", ".join(f"{names[i]} {ends[i][0]:g} to {ends[i][1]:g}" for i in beyond)
-                text = f"the model knows only {said}; what it shows beyond is a guess. This is said once"
-                self.page.tell({"kind": "error", "text": f"action: {text}"})
+        if session.warned:
+            return
+        beyond = []
+        for dim, name, value in zip(
+            session.robot.dimensions, labels(session.robot), message.action, strict=True
+        ):
+            middle, half = (dim.high + dim.low) / 2, (dim.high - dim.low) / 2
+            if abs(value - middle) > 1.05 * half:  # sliders and pads may end a little beyond
+                beyond.append(f"{name} {dim.low:g} to {dim.high:g}")
+        if beyond:
+            session.warned = True
+            known = f"the model knows only {', '.join(beyond)}; what it shows beyond is a guess"
+            self.page.tell({"kind": "error", "text": f"action: {known}. This is said once"})
 
 
 async def serve(

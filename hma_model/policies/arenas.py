@@ -186,23 +186,19 @@ class TrueArena:
 
 
 class Beginning(Protocol):
-    """The first frames of episodes in the model, and the actions of the true ones."""
+    """The first frames of episodes in the model, and the actions of the true ones.
 
-    @property
-    def scenes(self) -> Scenes:
-        """Return the N scenes."""
+    Attributes:
+        scenes: N of them.
+        prompts: of each.
+        held: (N, A) the actions that leave the robots as they are.
+        told: (N, A) the actions of each step by the recorder's driver.
+    """
 
-    @property
-    def prompts(self) -> Sequence[Prompt]:
-        """Return the prompt of each."""
-
-    @property
-    def held(self) -> Floats:
-        """Return the actions (N, A) that leave the robots as they are, as of `Arena`."""
-
-    @property
-    def told(self) -> Sequence[Floats]:
-        """Return the actions (N, A) of each step by the recorder's driver."""
+    scenes: Scenes
+    prompts: Sequence[Prompt]
+    held: Floats
+    told: list[Floats]
 
 
 class ModelArena:
@@ -255,7 +251,7 @@ class ModelArena:
         return np.stack([state.pose for state in self.states()]).astype(np.float32)
 
     def recorded(self) -> Floats:
-        """Return what the driver of the simulator actioned in the true episode."""
+        """Return the actions of the simulator's driver in the true episode."""
         return self._told[self._steps]
 
     def step(self, actions: Floats) -> None:

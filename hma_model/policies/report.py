@@ -57,12 +57,6 @@ def _rate(row: dict[str, Any], name: str) -> str:
     return f"{row[f'{name}_success']:.0%} ({low:.0%}–{high:.0%})"
 
 
-def _below(cell: Any) -> Any:
-    """Return a cell with its interval below the value, which leaves room for the last columns."""
-    share, bracket, interval = cell.rpartition(" (") if isinstance(cell, str) else ("", "", "")
-    return f"{share}\n{interval.rstrip(')')}" if bracket else cell
-
-
 def sentences(found: PolicyEvaluation) -> list[str]:
     """Return in words what the table means: the task, the judge, the correlations."""
     share = "not known" if found.followed is None else f"{found.followed:.2f}"
@@ -150,7 +144,11 @@ def html(found: PolicyEvaluation) -> str:
     for sentence in doubt(found):  # before anybody reads the rates
         page.section("Do not rely on the model's rates", sentence[:1].upper() + sentence[1:] + ".")
     page.definitions(legend)
-    page.table(COLUMNS, [[_below(cell) for cell in row] for row in table(found)])
+    # An interval below its value leaves room for the last columns.
+    rows = []
+    for name, *cells in table(found):
+        rows.append([name, *(str(cell).replace(" (", "\n").rstrip(")") for cell in cells)])
+    page.table(COLUMNS, rows)
     for sentence in [one for one in sentences(found) if one not in doubt(found)]:
         page.text(sentence[:1].upper() + sentence[1:] + ".")
     page.section("Success rates", "A policy is a point; bars are 95 % intervals over episodes.")
@@ -160,7 +158,13 @@ def html(found: PolicyEvaluation) -> str:
         if chosen:
             page.section(title)
         for one, number in chosen:
-            page.picture(_strip(one, number), "png", _caption(one, number))
+            strip = png_bytes(grid([list(one.true_images[number]), list(one.model_images[number])]))
+            caption = (
+                f"{one.policy}, episode {number}, frames {', '.join(map(str, one.shown))}: simulator above, "
+                f"scored {one.true.scores[number]:.1f} px, model below, judged "
+                f"{one.model.scores[number]:.1f} px"
+            )
+            page.picture(strip, "png", caption)
     return page.html()
 
 
@@ -186,17 +190,6 @@ def _chosen(found: PolicyEvaluation, kind: tuple[bool, bool]) -> Iterator[tuple[
         for one, numbers in zip(found.policies, there, strict=True):
             if turn < len(numbers):
                 yield one, int(numbers[turn])
-
-
-def _caption(one: Scored, number: int) -> str:
-    return (
-        f"{one.policy}, episode {number}, frames {', '.join(map(str, one.shown))}: simulator above, scored "
-        f"{one.true.scores[number]:.1f} px, model below, judged {one.model.scores[number]:.1f} px"
-    )
-
-
-def _strip(one: Scored, number: int) -> bytes:
-    return png_bytes(grid([list(one.true_images[number]), list(one.model_images[number])]))
 
 
 def _plot(found: PolicyEvaluation) -> bytes:

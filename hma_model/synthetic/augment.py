@@ -123,14 +123,14 @@ class SyntheticBatch:
     groups: NDArray[np.str_]
 
 
-@dataclass(frozen=True)
+@dataclass
 class RealBeginnings:
     """Real beginnings from shards; a `Beginning`."""
 
     scenes: Scenes
     prompts: Sequence[Prompt]
     held: Floats
-    told: Sequence[Floats]
+    told: list[Floats]
     groups: Sequence[str]
 
 

@@ -11,7 +11,6 @@ S pixels a side, V views side by side, A action dims, T images of an episode, N 
 import os
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import gymnasium
@@ -49,117 +48,39 @@ class Judge(Protocol):
         ...
 
 
-@dataclass
-class Episodes:
-    """The common part of the environments of one world.
-
-    Attributes:
-        world: of the sessions.
-        embodiment, prompt, control, horizon, judge, clip, size: as of `WorldModelEnv`.
-    """
-
-    world: World
-    embodiment: str
-    prompt: Any
-    control: str
-    horizon: int | None
-    judge: Judge | None
-    clip: bool
-    size: int | None
-    read: dict[int | None, Prompt] = field(default_factory=dict)
-    warned: bool = False
-
-    def __post_init__(self) -> None:
-        if self.control not in CONTROLS:
-            raise UsageError("control", f"{self.control!r} is unknown", f"give {' or '.join(CONTROLS)}")
-        self.spec = self.world.action_spec(self.embodiment)
-        if self.size is not None and self.world.image_shape[0] != self.world.image_shape[1]:
-            raise UsageError("size", "is for models of one view", "leave it out")
-
-    @property
-    def observation_space(self) -> gymnasium.spaces.Box:
-        """Return the space of the images."""
-        shape = self.world.image_shape if self.size is None else (self.size, self.size, 3)
-        return gymnasium.spaces.Box(0, 255, shape, np.uint8)
-
-    @property
-    def action_space(self) -> gymnasium.spaces.Box:
-        """Return the space of the actions: (A,), or (stride, A)."""
-        low, high = self.spec.low, self.spec.high
-        if self.control == "chunk":
-            low, high = (np.tile(bound, (self.spec.stride, 1)) for bound in (low, high))
-        return gymnasium.spaces.Box(low, high, dtype=np.float32)
-
-    @property
-    def fps(self) -> float:
-        """Return the rate of the steps in Hz; 10 if nobody states it."""
-        rate = self.spec.rate_hz or 10.0
-        return rate if self.control == "frame" else rate / self.spec.stride
-
-    def start(self, rng: np.random.Generator, prompt: Any = None) -> Prompt:
-        """Return the prompt of an episode: the reset's, else the environment's, else a drawn one."""
-        if prompt is not None:
-            return read_prompt(self.world.model, self.embodiment, prompt)
-        seed = int(rng.integers(PROMPTS)) if self.prompt is None else None
-        if seed not in self.read:
-            self.read[seed] = read_prompt(self.world.model, self.embodiment, self.prompt, seed=seed or 0)
-        return self.read[seed]
-
-    def checked(self, action: Any) -> Floats:
-        """Return an action as actions (n, A): checked, clipped if wanted; warn once of a strange range."""
-        if self.control == "frame":
-            values = self.spec.one(action)[None]
-        else:
-            values = np.asarray(action, np.float32)
-            self.spec.read(values)
-            values = values.reshape(self.spec.stride, -1)
-        outside = self.spec.outside(values)
-        if outside and self.clip:
-            return self.spec.clip(values)
-        if outside and not self.warned:
-            self.warned = True
-            said = f"{outside}, so what the model shows is a guess; clip=True clips actions to it"
-            warnings.warn(f"{said}. This is said once", OutsideRangeWarning, stacklevel=4)
-        return values
-
-    def seen(self, image: Image) -> Image:
-        """Return an image as it is observed; a copy, which its receiver may change."""
-        return image.copy() if self.size is None else resize(image[None], self.size)[0]
-
-
 class EpisodeSession:
     """One session as episodes: actions gather to chunks, images become observations and rewards."""
 
-    def __init__(self, episodes: Episodes) -> None:
-        self.episodes, self.world = episodes, episodes.world
+    def __init__(self, env: "_Environment") -> None:
+        self.env, self.world = env, env.world
         self.session: int | None = None
         self.image: Image = np.zeros(self.world.image_shape, np.uint8)
 
     def begin(self, rng: np.random.Generator, prompt: Any = None) -> Image:
         """Start an episode, and return its first observation."""
-        start = self.episodes.start(rng, prompt)
+        start = self.env.start(rng, prompt)
         seed = int(rng.integers(2**31))
         if self.session is None:
-            self.session = self.world.open(self.episodes.embodiment, *start, seed=seed)
+            self.session = self.world.open(self.env.embodiment, *start, seed=seed)
         else:
             self.world.reset(self.session, *start, seed=seed)
         self.image = self.world.image(self.session)
         self.steps, self.frames = 0, 0
         self.waiting: list[Floats] = []
-        self.past: Image = self.image[None]  # grows by doubling; kept for a judge only
+        self.past = [self.image]  # kept for a judge only
         self.chunks: list[Floats] = []
-        return self.episodes.seen(self.image)
+        return self.env.seen(self.image)
 
     def take(self, action: Any) -> dict[int, Floats]:
         """Take an action; return the session's chunk once it is whole."""
         if self.session is None:
             raise HMAError("step", "there is no episode", "call reset() first")
-        self.waiting += list(self.episodes.checked(action))
-        if len(self.waiting) < self.episodes.spec.stride:
+        self.waiting += list(self.env.checked(action))
+        if len(self.waiting) < self.env.action_spec.stride:
             return {}
         chunk = np.stack(self.waiting)
         self.waiting = []
-        if self.episodes.judge is not None:
+        if self.env.judge is not None:
             self.chunks.append(chunk)
         return {self.session: chunk}
 
@@ -171,15 +92,12 @@ class EpisodeSession:
         if self.session in made:
             self.image = made[self.session]
             self.frames += 1
-            if self.episodes.judge is not None:
-                if self.frames == len(self.past):
-                    self.past = np.concatenate([self.past, np.empty_like(self.past)])
-                self.past[self.frames] = self.image
-                seen = self.past[: self.frames + 1]
-                reward, terminated = self.episodes.judge(seen, np.stack(self.chunks))
-        truncated = self.episodes.horizon is not None and self.steps >= self.episodes.horizon
+            if self.env.judge is not None:
+                self.past.append(self.image)
+                reward, terminated = self.env.judge(np.stack(self.past), np.stack(self.chunks))
+        truncated = self.env.horizon is not None and self.steps >= self.env.horizon
         facts = {"frames": self.frames}
-        return self.episodes.seen(self.image), float(reward), bool(terminated), truncated, facts
+        return self.env.seen(self.image), float(reward), bool(terminated), truncated, facts
 
     def close(self) -> None:
         """End the session."""
@@ -216,13 +134,57 @@ class _Environment:
         if embodiment is None:
             there = ", ".join(world.model.embodiments)
             raise UsageError("embodiment", "is not given", f"give embodiment=ID; the model has: {there}")
-        self.world, self.render_mode = world, render_mode
-        self.episodes = Episodes(world, embodiment, prompt, control, horizon, judge, clip, size)
-        self.metadata = {**type(self).metadata, "render_fps": self.episodes.fps}
-        self.action_names = self.episodes.spec.names
-        self.action_space: gymnasium.Space[Any] = self.episodes.action_space
-        self.observation_space: gymnasium.Space[Any] = self.episodes.observation_space
-        self.drive = EpisodeSession(self.episodes)
+        if control not in CONTROLS:
+            raise UsageError("control", f"{control!r} is unknown", f"give {' or '.join(CONTROLS)}")
+        if size is not None and world.image_shape[0] != world.image_shape[1]:
+            raise UsageError("size", "is for models of one view", "leave it out")
+        self.world, self.embodiment, self.prompt, self.control = world, embodiment, prompt, control
+        self.horizon, self.judge, self.render_mode = horizon, judge, render_mode
+        self.clip, self.size = clip, size
+        self.action_spec = spec = world.action_spec(embodiment)
+        self.action_names = spec.names
+        rate = spec.rate_hz or 10.0
+        low, high = spec.low, spec.high
+        if control == "chunk":
+            rate /= spec.stride
+            low, high = (np.tile(bound, (spec.stride, 1)) for bound in (low, high))
+        self.metadata = {**type(self).metadata, "render_fps": rate}
+        shape = world.image_shape if size is None else (size, size, 3)
+        self.action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(low, high, dtype=np.float32)
+        self.observation_space: gymnasium.Space[Any] = gymnasium.spaces.Box(0, 255, shape, np.uint8)
+        self._read: dict[int | None, Prompt] = {}
+        self._warned = False  # that actions are outside the range of training
+        self.drive = EpisodeSession(self)
+
+    def start(self, rng: np.random.Generator, prompt: Any = None) -> Prompt:
+        """Return the prompt of an episode: the reset's, else the environment's, else a drawn one."""
+        if prompt is not None:
+            return read_prompt(self.world.model, self.embodiment, prompt)
+        seed = int(rng.integers(PROMPTS)) if self.prompt is None else None
+        if seed not in self._read:
+            self._read[seed] = read_prompt(self.world.model, self.embodiment, self.prompt, seed=seed or 0)
+        return self._read[seed]
+
+    def checked(self, action: Any) -> Floats:
+        """Return an action as actions (n, A): checked, clipped if wanted; warn once of a strange range."""
+        if self.control == "frame":
+            values = self.action_spec.one(action)[None]
+        else:
+            values = np.asarray(action, np.float32)
+            self.action_spec.read(values)
+            values = values.reshape(self.action_spec.stride, -1)
+        outside = self.action_spec.outside(values)
+        if outside and self.clip:
+            return self.action_spec.clip(values)
+        if outside and not self._warned:
+            self._warned = True
+            said = f"{outside}, so what the model shows is a guess; clip=True clips actions to it"
+            warnings.warn(f"{said}. This is said once", OutsideRangeWarning, stacklevel=4)
+        return values
+
+    def seen(self, image: Image) -> Image:
+        """Return an image as it is observed; a copy, which its receiver may change."""
+        return image.copy() if self.size is None else resize(image[None], self.size)[0]
 
 
 def _known(options: dict[str, Any] | None, *keys: str) -> dict[str, Any]:
@@ -303,7 +265,7 @@ class WorldModelVectorEnv(_Environment, VectorEnv[Image, Floats, NDArray[Any]]):
         self.single_action_space, self.single_observation_space = self.action_space, self.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.drives = [self.drive, *(EpisodeSession(self.episodes) for _ in range(num_envs - 1))]
+        self.drives = [self.drive, *(EpisodeSession(self) for _ in range(num_envs - 1))]
         self.random = [seeding.np_random()[0] for _ in range(num_envs)]
         self.observations = np.zeros(self.observation_space.shape or (), np.uint8)
         self.ended: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)

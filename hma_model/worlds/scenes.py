@@ -65,15 +65,15 @@ class Dimension:
 
 
 class Scene(Protocol):
-    """The scene of a robot, and what truly happens there."""
+    """The scene of a robot, and what truly happens there.
 
-    @property
-    def prompt(self) -> Prompt:
-        """Return the beginning."""
+    Attributes:
+        prompt: the beginning.
+        action: (A,) the action that leaves the robot as it is after the prompt.
+    """
 
-    @property
-    def action(self) -> Floats:
-        """Return the action (A,) that leaves the robot as it is after the prompt."""
+    prompt: Prompt
+    action: Floats
 
     def advance(self, chunk: Floats | None) -> tuple[Floats, Image | None] | None:
         """Take the next chunk.
@@ -93,16 +93,14 @@ class Drivable(Protocol):
         key: tells it from others; letters, digits, `_`, `-`, `.` and `:`.
         dimensions: A of them.
         cameras: the names of those that its images show, side by side.
+        source: "simulator", "recordings" or "images".
     """
 
     key: str
     embodiment: Embodiment
     dimensions: tuple[Dimension, ...]
     cameras: list[str]
-
-    @property
-    def source(self) -> str:
-        """Return "simulator", "recordings" or "images"."""
+    source: str
 
     def scene(self, number: int) -> Scene:
         """Return the scene of that number; there is one for every number from 0 on."""
@@ -241,7 +239,7 @@ class RecordedScene:
 # -- images
 
 
-class ImagedRobot:
+class ImageRobot:
     """A robot that begins from images (P, H, W, 3); from a single one it begins at rest.
 
     The actions before several images are unknown, and so is the resting action of a robot with targets.
@@ -269,13 +267,13 @@ class ImagedRobot:
                 before = self._action
         self._prompt = Prompt(images, np.tile(before, (len(images) - 1, embodiment.stride)))
 
-    def scene(self, number: int) -> "ImagedScene":
+    def scene(self, number: int) -> "ImageScene":
         """Return the one scene that there is."""
-        return ImagedScene(self._prompt, self._action)
+        return ImageScene(self._prompt, self._action)
 
 
-@dataclass(frozen=True)
-class ImagedScene:
+@dataclass
+class ImageScene:
     """Images, after which nobody knows what truly happens."""
 
     prompt: Prompt
@@ -332,7 +330,7 @@ def drivable(
             begun = [sample]
         if begun:
             shown = fitted(np.stack(begun), checkpoint.config, embodiment)
-            imaged = ImagedRobot(embodiment, stats, shown, cameras)
+            imaged = ImageRobot(embodiment, stats, shown, cameras)
             found[imaged.key] = imaged
     if not found:
         remedy = "give shards of it, hma play CHECKPOINT SHARDS, or an image of it, --prompt PICTURE"

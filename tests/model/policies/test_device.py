@@ -18,46 +18,27 @@ class Asked(Exception):
 
 
 @pytest.mark.parametrize(
-    ("module", "words"),
+    ("module", "words", "options"),
     [
-        (scores, ["policy-eval", "rails_03", "random", "still"]),
-        (augment, ["augment", "rails_03", "made"]),
-        (labels, ["label-actions", "film", "--checkpoint", "run", "-e", "rails_03", "--out", "made"]),
+        (scores, ["policy-eval", "rails_03", "random", "still"], ["--precision", "bf16", "--compile"]),
+        (augment, ["augment", "rails_03", "made"], ["--precision", "bf16", "--compile"]),
+        (labels, ["label-actions", "film", "--checkpoint", "run", "-e", "rails_03", "--out", "made"], []),
     ],
 )
-def test_the_device_reaches_the_world(
-    module: Any, words: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_device_and_precision_reach_the_world(
+    module: Any, words: list[str], options: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def load(checkpoint: str, **given: Any) -> World:
-        raise Asked(given["device"])
+        raise Asked(given["device"], given.get("precision"), given.get("compile"))
 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "film").mkdir()
     (tmp_path / "film" / "a.mp4").touch()  # film is looked for before the world is loaded
     monkeypatch.setattr("hma_model.training.runtime.choose_device", lambda name: f"chosen {name}")
     monkeypatch.setattr(module, "load_world", load)
-    with pytest.raises(Asked, match="chosen cuda:1"):
-        main(["--debug", *words, "--device", "cuda:1"])
-
-
-@pytest.mark.parametrize(
-    ("module", "words"),
-    [
-        (scores, ["policy-eval", "rails_03", "random", "still"]),
-        (augment, ["augment", "rails_03", "made"]),
-    ],
-)
-def test_the_precision_reaches_the_world(
-    module: Any, words: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def load(checkpoint: str, **given: Any) -> World:
-        raise Asked(given["precision"], given["compile"])
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(module, "load_world", load)
     with pytest.raises(Asked) as said:
-        main(["--debug", *words, "--precision", "bf16", "--compile", "--device", "cpu"])
-    assert said.value.args == ("bf16", True)
+        main(["--debug", *words, *options, "--device", "cuda:1"])
+    assert said.value.args == ("chosen cuda:1", *(("bf16", True) if options else (None, None)))
 
 
 def test_a_device_that_is_not_here_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from hma_model.synthetic import augment as augment_module
 from hma_model.synthetic import recorder
 from hma_model.synthetic.augment import Augmentation, augment
 from hma_model.synthetic.recorder import SyntheticEpisode, write_shards
+from hma_model.worlds.images import Prompt
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
 from tests.model.shards import state_pauses
@@ -257,7 +258,7 @@ def test_windows_with_unknown_actions_are_left_out(
         frames, chunks = read(model, name, prompt)
         chunks = chunks.copy()
         chunks[2, 0] = np.nan if all(unknown) or prompt["start"] % 2 else chunks[2, 0]
-        return frames, chunks
+        return Prompt(frames, chunks)
 
     monkeypatch.setattr(augment_module, "read_prompt", gaps)
     with pytest.raises(UsageError, match="hardly a window of 6 frames whose actions are all known"):
