@@ -51,7 +51,7 @@ class Table:
 
 
 def fill(package: str, template: str, **values: Any) -> str:
-    """Return a template out of a package's folder `templates` with its values, which are escaped."""
+    """Return a template out of a package's folder `templates` with its values, which HTML escapes."""
     return _environment(package).get_template(template).render(values)
 
 
@@ -61,7 +61,7 @@ def _environment(package: str) -> "Environment":
 
     return Environment(
         loader=PackageLoader(package),
-        autoescape=True,
+        autoescape=lambda name: name is not None and name.endswith(".html"),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

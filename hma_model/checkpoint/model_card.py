@@ -5,12 +5,13 @@ authors, so every value becomes one plain line before it enters the page.
 """
 
 import re
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from hma_data.storage.paths import REPOSITORY
 from hma_data.storage.yaml_io import write_yaml
-from hma_data.tables import Table
+from hma_data.tables import Table, fill
 from hma_data.tokenizers.catalog import other_weights
 from hma_model.config import token_words
 
@@ -45,52 +46,44 @@ def render(
         repo: the name of the checkpoint for a reader; None for the folder that the card lies in.
         samples: files that are there of `ID/sample.gif` (a film) and `ID/sample.png`; the film is shown.
     """
-    pictures = [
-        f"### {name}\n\n![A rollout of {name} beside the truth](embodiments/{found[0]})"
-        for name in sorted(cards)
-        if (found := [part for part in (f"{name}/sample.gif", f"{name}/sample.png") if part in samples])
-    ]
+    model, tokenizer = config["model"], config["tokenizer"]
+    example = min(cards, default="ID")
     front: dict[str, Any] = {"library_name": "hma-toolkit", "pipeline_tag": "robotics"}
     front |= licence(card.get("license") for card in cards.values()) | _origins(cards)
     front["tags"] = [*_TAGS, *(f"embodiment:{name}" for name in sorted(cards))]
-    parts = [
-        f"---\n{write_yaml(front)}---",
-        f"# {line((repo or 'HMA world model').rsplit('/', 1)[-1])}",
-        _about(config),
-        "## Embodiments\n\n" + _table(cards) + _words(config, cards),
-        *pictures,
-        "## How to use\n\n" + _usage(repo or ".", config, cards),
-        f"Format version {line(config.get('format_version'))}. Each `card.json` names its trunk by SHA-256: "
-        "parts that do not belong together are refused on loading.",
-    ]
-    return ("\n\n".join(parts) + "\n").encode()
-
-
-def _about(config: Mapping[str, Any]) -> str:
-    model, tokenizer = config["model"], config["tokenizer"]
-    grid = "×".join(str(side) for side in model.get("grid", ()))
-    views = f" of {line(model['views'])} cameras" if model.get("views", 1) != 1 else ""
-    other = other_weights(tokenizer)
-    weights = f", with weights of its own (SHA-256 `{line(other)}`), which are needed too" if other else ""
-    return (
-        "An action-conditioned video model of robots (Heterogeneous Masked Autoregression): one trunk, "
-        "and a stem and head for each embodiment, which are published and pulled one at a time.\n\n"
-        f"- network: {line(model.get('kind'))}, {line(model.get('layers'))} layers, "
-        f"width {line(model.get('width'))}, {line(model.get('heads'))} heads, "
-        f"window of {line(model.get('frames'))} frames{views}\n"
-        f"- tokenizer: {line(tokenizer.get('name'))}, {grid} tokens of a "
-        f"{line(tokenizer.get('image_size'))}-pixel picture{weights}\n"
-        f"- trunk SHA-256: `{line(config.get('trunk_sha256'))}`"
+    pictures = []
+    for name in sorted(cards):
+        found = [part for part in (f"{name}/sample.gif", f"{name}/sample.png") if part in samples]
+        pictures += [(name, picture) for picture in found[:1]]
+    text = fill(
+        "hma_model",
+        "model_card.md",
+        front=write_yaml(front),
+        title=line((repo or "HMA world model").rsplit("/", 1)[-1]),
+        model=_lines(model),
+        views=model.get("views", 1),
+        tokenizer=_lines(tokenizer),
+        grid="×".join(str(side) for side in model.get("grid", ())),
+        weights=line(other_weights(tokenizer)),
+        trunk=line(config.get("trunk_sha256")),
+        table=_table(cards),
+        loss_unit=_loss_unit(config, cards),
+        pictures=pictures,
+        name=repo or ".",
+        example=example,
+        side=line(tokenizer.get("image_size")),
+        chunk=line(cards.get(example, {}).get("chunk_dim")) or "K",
+        dtype="int64" if model.get("kind") == "discrete" else "float32",
+        height=line(next(iter(tokenizer.get("grid", (0,))))),
+        format_version=line(config.get("format_version")),
     )
+    return (text + "\n").encode()
 
 
 def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
-    if not cards:
-        return "None yet."
-    rows = []
-    for name in sorted(cards):
-        card = cards[name]
-        rows.append([
+    """Return the table of embodiments; empty without any."""
+    rows = [
+        [
             f"`{name}`",
             line(card.get("robot") or card.get("description")),
             f"{line(card.get('action_dim'))} ({line(card.get('action_space'))})",
@@ -99,21 +92,19 @@ def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
             _pairs(card.get("data")),
             _pairs(card.get("metrics")),
             line(card.get("license")) or "not stated",
-        ])  # fmt: skip
-    return Table(_HEADINGS, rows).markdown()
+        ]
+        for name, card in sorted(cards.items())
+    ]
+    return Table(_HEADINGS, rows).markdown() if rows else ""
 
 
-def _words(config: Mapping[str, Any], cards: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return what the metrics mean, where an embodiment states a loss beside its baseline."""
+def _loss_unit(config: Mapping[str, Any], cards: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return what the losses are of, where an embodiment states one beside its baseline."""
     stated = _parts(cards, "metrics")
     if config["model"].get("kind") != "discrete" or not any("baseline_loss" in metrics for metrics in stated):
         return ""
     merge = config["model"].get("merge", 1)
-    unit = token_words(merge if isinstance(merge, int) else 1)
-    return (
-        f"\n\nVal loss: nats a {unit}, in held-out episodes. Baseline loss: that of knowing only how often "
-        "each token occurs, which a model must beat. Accuracy: the share predicted right."
-    )
+    return token_words(merge if isinstance(merge, int) else 1)
 
 
 def _origins(cards: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -130,49 +121,6 @@ def _origins(cards: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 def _parts(cards: Mapping[str, Mapping[str, Any]], key: str) -> list[Mapping[str, Any]]:
     return [part for card in cards.values() if isinstance(part := card.get(key), Mapping)]
-
-
-_CODE = """
-import numpy as np
-import torch
-from hma_data import get_tokenizer
-from hma_model import HMA
-
-tokenizer = get_tokenizer("{tokenizer}"{weights})
-model = HMA.from_pretrained("{name}", embodiments=["{example}"]).eval()
-
-pictures = np.zeros((2, {side}, {side}, 3), np.uint8)  # two frames of your camera, RGB
-actions = torch.zeros(1, 2 + 6, {chunk})  # the commands from each frame up to the next, {chunk} values
-stored = tokenizer.encode(pictures){views}
-prompt = torch.from_numpy(stored.astype(np.{dtype}))[None]
-frames = model.generate(prompt, actions, "{example}", frames=6)
-film = tokenizer.decode(frames[0]{first}.numpy().astype(stored.dtype))  # (6, {side}, {side}, 3) uint8
-"""
-
-
-def _usage(name: str, config: Mapping[str, Any], cards: Mapping[str, Any]) -> str:
-    example, model, tokenizer = min(cards, default="ID"), config["model"], config["tokenizer"]
-    views, (height, *_) = model.get("views", 1), tokenizer.get("grid", (0, 0))
-    discrete = model.get("kind") == "discrete"
-    code = _CODE.strip().format(
-        name=name, example=example, tokenizer=line(tokenizer.get("name")),
-        weights=', weights="WEIGHTS"' if other_weights(tokenizer) else "",
-        side=line(tokenizer.get("image_size")), chunk=line(cards.get(example, {}).get("chunk_dim")) or "K",
-        dtype="int64" if discrete else "float32",
-        views="" if views == 1 else f".repeat({line(views)}, axis=-2)  # one picture a camera, stacked",
-        first="" if views == 1 else f"[..., :{line(height)}, :]",
-    )  # fmt: skip
-    where = "In this folder, with" if name == "." else "With"
-    where += " HMA Toolkit (the Python package `hma-toolkit`) installed:\n\n"
-    return (
-        f"{where}```python\n{code}\n```\n\n"
-        "```sh\n"
-        f"hma hub pull {name} --embodiment {example} --out model\n"
-        "hma generate model SHARDS --out rollout.mp4\n"
-        "```\n\n"
-        "`actions[:, k]` is the chunk of commands from frame k up to frame k + 1, in the units of the "
-        "embodiment's `embodiment.yaml`; the model normalises by itself."
-    )
 
 
 def _pairs(values: Any) -> str:
@@ -201,6 +149,11 @@ def licence(stated: Iterable[Any]) -> dict[str, str]:
         return {"license": names[0].lower()}
     shown = re.sub(r"[^a-z0-9.+-]+", "-", names[0].lower()).strip("-")[:60] if len(told) == 1 else "several"
     return {"license": "other", "license_name": shown or "stated-below"}
+
+
+def _lines(values: Mapping[str, Any]) -> Mapping[str, str]:
+    """Return the values as `line` has them; a key that is missing is an empty text."""
+    return defaultdict(str, {key: line(value) for key, value in values.items()})
 
 
 def line(value: Any) -> str:

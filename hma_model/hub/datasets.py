@@ -13,7 +13,7 @@ from hma_data.shards.manifest import BESIDE, EPISODES, FINDER, MANIFEST, SHARD_N
 from hma_data.storage.files import file_sha256, write_atomic
 from hma_data.storage.paths import REPOSITORY, StrPath, as_address, as_path
 from hma_data.storage.yaml_io import write_yaml
-from hma_data.tables import Table
+from hma_data.tables import Table, fill
 from hma_data.tokenizers.catalog import other_weights
 from hma_model.checkpoint.model_card import licence, line, number
 from hma_model.hub.stores import Store, open_store
@@ -157,52 +157,45 @@ def _is(path: Path, sha256: str) -> bool:
 
 def _page(manifest: Manifest, repo: str | None) -> bytes:
     """Return README.md of a set; `repo` is None if the set lies in a folder."""
-    robot = manifest.embodiment
-    parts = [
-        f"---\n{write_yaml(_front(manifest))}---",
-        f"# {line(robot.id)}",
-        line(robot.description) or "Recordings of one robot, tokenized.",
-        _facts(manifest),
-        "## Splits\n\n" + _table(manifest),
-        "## How to use\n\n" + _usage(manifest, repo),
-        "Made with hma-toolkit: one row is one frame; `manifest.json` lists every file with its SHA-256.",
-    ]
-    return ("\n\n".join(parts) + "\n").encode()
-
-
-_CODE = """
-{first}import numpy as np
-from datasets import load_dataset
-from hma_data import get_tokenizer
-
-frames = load_dataset({place}, "frames", split="{split}")
-stored = np.array(frames[:8]["{column}"], np.{dtype}).reshape(-1, {shape})
-pictures = get_tokenizer("{tokenizer}"{weights}).decode(stored)  # (8, {side}, {side}, 3) uint8
-"""
-
-
-def _usage(manifest: Manifest, repo: str | None) -> str:
-    name, spec = repo or ".", manifest.tokenizer
-    split = next((s for s in _SPLITS if any(shard.split == s for shard in manifest.shards)), "train")
-    code = _CODE.strip().format(
-        first="" if repo else "from pathlib import Path\n\n",
+    robot, spec = manifest.embodiment, manifest.tokenizer
+    rate = "unknown" if robot.frequency_hz == "unknown" else number(robot.effective_hz)
+    text = fill(
+        "hma_model",
+        "shard_set.md",
+        front=write_yaml(_front(manifest)),
+        title=line(robot.id),
+        description=line(robot.description) or "Recordings of one robot, tokenized.",
+        facts={
+            "robot": line(robot.robot),
+            "actions": f"{robot.action_dim} dims, {line(robot.action.space)}",
+            "frames per second of the model": rate,
+            "tokenizer": f"{line(spec.name)}, {'×'.join(map(str, spec.grid))} of "
+            f"{spec.image_size} pixels, {line(spec.kind)}",
+            "cameras": line(manifest.cameras_line) if len(robot.cameras) > 1 else "",
+            "licence": line(robot.license) or "not stated",
+            "quarantined episodes": str(manifest.quarantined),
+        },
+        table=_table(manifest),
+        name=repo or ".",
         place=f'"{repo}"' if repo else "str(Path.cwd())",
-        split=_SPLITS[split], dtype=line(spec.dtype), shape=", ".join(map(str, spec.cells)),
+        split=_SPLITS[(_present(manifest) or ["train"])[0]],
         column="tokens" if spec.kind == "discrete" else "latents",
-        tokenizer=line(spec.name), side=spec.image_size,
-        weights=', weights="WEIGHTS"' if other_weights(spec.to_json()) else "",
-    )  # fmt: skip
-    where = "" if repo else "In this folder:\n\n"
-    return (
-        f"{where}```sh\nhma hub pull-data {name} --out shards\nhma shards preview shards --out seen\n```\n\n"
-        f"```python\n{code}\n```"
+        spec=spec,
+        tokenizer=line(spec.name),
+        dtype=line(spec.dtype),
+        weights=other_weights(spec.to_json()),
     )
+    return (text + "\n").encode()
+
+
+def _present(manifest: Manifest) -> list[str]:
+    """Return the splits that have shards."""
+    return [split for split in _SPLITS if any(shard.split == split for shard in manifest.shards)]
 
 
 def _front(manifest: Manifest) -> dict[str, Any]:
     rows = sum(shard.rows for shard in manifest.shards)
-    present = [split for split in _SPLITS if any(shard.split == split for shard in manifest.shards)]
-    frames = [{"split": _SPLITS[split], "path": f"{split}/*.parquet"} for split in present]
+    frames = [{"split": _SPLITS[split], "path": f"{split}/*.parquet"} for split in _present(manifest)]
     configs: list[dict[str, Any]] = [{"config_name": "frames", "data_files": frames, "default": True}]
     episodes = {"split": "train", "path": EPISODES}  # of both splits; datasets reserves the name "all"
     configs.append({"config_name": "episodes", "data_files": [episodes]})
@@ -216,26 +209,10 @@ def _front(manifest: Manifest) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _facts(manifest: Manifest) -> str:
-    robot, tokenizer = manifest.embodiment, manifest.tokenizer
-    rate = "unknown" if robot.frequency_hz == "unknown" else number(robot.effective_hz)
-    facts = {
-        "robot": line(robot.robot),
-        "actions": f"{robot.action_dim} dims, {line(robot.action.space)}",
-        "frames per second of the model": rate,
-        "tokenizer": f"{line(tokenizer.name)}, {'×'.join(map(str, tokenizer.grid))} of "
-        f"{tokenizer.image_size} pixels, {line(tokenizer.kind)}",
-        "cameras": line(manifest.cameras_line) if len(robot.cameras) > 1 else "",
-        "licence": line(robot.license) or "not stated",
-        "quarantined episodes": str(manifest.quarantined),
-    }
-    return "\n".join(f"- {key}: {value}" for key, value in facts.items() if value)
-
-
 def _table(manifest: Manifest) -> str:
     rows = []
     for split, counts in manifest.splits.items():
         size = sum(shard.bytes for shard in manifest.shards if shard.split == split) / 1e6
-        counted = [counts[key] for key in ("episodes", "frames", "shards")]
+        counted = [f"{counts[key]:,}" for key in ("episodes", "frames", "shards")]
         rows.append([line(split), *counted, f"{size:,.1f}"])
     return Table(["split", "episodes", "frames", "shards", "MB"], rows).markdown()
