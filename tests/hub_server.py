@@ -238,14 +238,8 @@ class _Handler(BaseHTTPRequestHandler):
             return self._tree(commit, path)
         if verb == "paths-info":
             return self._paths(commit)
-        siblings: list[dict[str, Any]] = []
-        for path, content in commit.files.items():
-            siblings.append({"rfilename": path, "size": len(content), "blobId": oid(content)})
-            if self.server.habits.by_lfs(path, len(content)):
-                lfs = {"sha256": sha256(content), "size": len(content), "pointerSize": 134}
-                siblings[-1]["lfs"] = lfs
-        facts = {"id": name, "sha": commit.id, "private": repository.private}
-        facts |= {"siblings": siblings} if self.server.habits.siblings else {}
+        siblings = [{"rfilename": path} for path in commit.files]
+        facts = {"id": name, "sha": commit.id, "private": repository.private, "siblings": siblings}
         return self._answer(200, {**facts, "tags": [], "downloads": 0, "likes": 0})
 
     # -- reading
@@ -265,9 +259,6 @@ class _Handler(BaseHTTPRequestHandler):
         entries = [
             self.server.habits.entry(path, content) for path, content in files if path.startswith(begin)
         ]
-        if form := self.server.habits.folders:
-            folders = {path.rpartition("/")[0] for path, _ in files if "/" in path}
-            entries += [{"type": form, "path": "", "size": 0, "oid": ""} for _ in folders]
         start = int(self.query.get("cursor", ["0"])[0])
         headers = {}
         if start + self.server.habits.page < len(entries):
@@ -283,8 +274,7 @@ class _Handler(BaseHTTPRequestHandler):
         if content is None or not (content or self.server.habits.empty):
             return self._answer(404, {"error": "no such entry"}, {**headers, "X-Error-Code": "EntryNotFound"})
         if not self.server.habits.by_lfs(path, len(content)):
-            weak = "W/" if self.server.habits.weak else ""
-            return self._send_file(content, {**headers, "ETag": f'{weak}"{oid(content)}"'})
+            return self._send_file(content, {**headers, "ETag": f'"{oid(content)}"'})
         name = sha256(content)
         self.server.objects.setdefault(name, content)
         if not self.server.habits.redirects:

@@ -25,11 +25,8 @@ class Habits:
         redirects: send files of LFS by another host; otherwise they come directly.
         conflict: status where somebody else has committed.
         tells_oids: say before an upload what is there already.
-        weak: mark ETags as weak.
         ranges: send parts of files.
-        siblings: list the files in a repository's facts.
         codes: say by X-Error-Code what is missing.
-        folders: type of an entry without a path that it lists for each folder; "" for none.
         empty: send empty files; otherwise they are answered by 404.
     """
 
@@ -38,11 +35,8 @@ class Habits:
     redirects: bool = True
     conflict: int = 412
     tells_oids: bool = True
-    weak: bool = False
     ranges: bool = True
-    siblings: bool = True
     codes: bool = True
-    folders: str = ""
     empty: bool = True
 
     def by_lfs(self, path: str, size: int) -> bool:

@@ -151,7 +151,7 @@ class Repository:
         return {
             item.path: Entry(item.size or 0, item.lfs.sha256 if item.lfs else None, str(item.blob_id))
             for item in entries
-            if isinstance(item, RepoFile) and item.path
+            if isinstance(item, RepoFile)
         }
 
     def _of_cache(self) -> dict[str, Entry]:

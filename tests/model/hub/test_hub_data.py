@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from hma_data.conversion import publish
 from hma_data.errors import HubError, ShardError
@@ -13,7 +12,6 @@ from hma_data.shards.reader import ShardSet
 from hma_model.hub.datasets import pull_data, push_data
 from tests.conftest import contents
 from tests.hub_server import Hub
-from tests.hub_state import EVERY
 from tests.model.shards import make_shards
 
 pytest_plugins = ["tests.hub_fixtures"]
@@ -90,28 +88,6 @@ def test_a_push_that_was_cut_goes_on_with_what_is_missing(server, shards, monkey
     assert "manifest.json" in dataset(server).files
 
 
-@pytest.mark.parametrize("step", EVERY)
-def test_a_push_cut_at_any_request_is_ended_by_the_same_command(server, shards, monkeypatch, step):
-    monkeypatch.setattr(publish, "FILES", 1)
-    for at in range(0, 200, step):
-        server.repositories.clear()
-        server.objects.clear()
-        server.gone_after = len(server.log) + at
-        try:
-            push_data(shards, REPO)
-            break
-        except HubError as fault:
-            assert fault.remedy
-        finally:
-            server.gone_after = None
-        push_data(shards, REPO)
-        said = [commit.message for commit in dataset(server).commits[1:]]
-        assert len(said) == len(set(said)) <= 2 and said[-1] == "Add arm"
-        whole = contents(shards)
-        assert {name: dataset(server).files[name] for name in whole} == whole
-    assert 10 < at < 200 - step
-
-
 def test_an_unfinished_push_is_no_shard_set(server, shards, tmp_path, monkeypatch):
     monkeypatch.setattr(publish, "FILES", 1)
     server.create(REPO, "datasets")
@@ -134,21 +110,6 @@ def test_an_interrupted_pull_goes_on_file_by_file(server, shards, tmp_path):
     pull_data(REPO, tmp_path / "out")
     assert [name for name in server.sent() if "shard-" in name] == ["train/shard-00000.parquet"]
     assert contents(tmp_path / "out") == contents(shards)
-
-
-def test_the_viewer_is_told_which_files_are_which_split(server, shards):
-    push_data(shards, REPO)
-    page = dataset(server).files["README.md"].decode()
-    front = yaml.safe_load(page.split("---\n")[1])
-    frames, episodes = front["configs"]
-    assert frames["data_files"] == [
-        {"split": "train", "path": "train/*.parquet"},
-        {"split": "validation", "path": "val/*.parquet"},
-    ]
-    assert episodes["data_files"] == [{"split": "train", "path": "episodes.parquet"}]
-    assert front["size_categories"] == ["n<1K"] and front["license"] == "apache-2.0"
-    assert {"robotics", "embodiment:arm", "tokenizer:raw"} <= set(front["tags"])
-    assert f'load_dataset("{REPO}", "frames", split="train")' in page
 
 
 def test_a_set_made_anew_replaces_the_old_one_whole(server, shards, tmp_path):
@@ -193,13 +154,6 @@ def test_a_set_with_another_file_than_its_manifest_names_is_not_published(server
     assert server.log == []
 
 
-def test_pushes_of_one_set_at_once_both_end_well(server, shards):
-    server.create(REPO, "datasets")
-    server.before_commit = [lambda: push_data(shards, REPO)]
-    push_data(shards, REPO)
-    assert [commit.message for commit in dataset(server).commits] == ["initial commit", "Add arm"]
-
-
 def test_a_push_finds_that_another_robots_set_came_meanwhile(server, shards, tmp_path):
     hand = make_shards(tmp_path / "hand", "hand")
     server.create(REPO, "datasets")
@@ -207,20 +161,6 @@ def test_a_push_finds_that_another_robots_set_came_meanwhile(server, shards, tmp
     with pytest.raises(HubError, match="holds the shard set of hand"):
         push_data(shards, REPO)
     assert b"hand" in dataset(server).files["manifest.json"]
-
-
-def test_a_commit_whose_answer_was_lost_is_not_made_twice(server, shards):
-    server.create(REPO, "datasets")
-    plain = dataset(server).commit
-
-    def commit(files, message="by hand"):
-        plain(files, message)
-        dataset(server).commit = plain
-        raise ConnectionResetError
-
-    dataset(server).commit = commit
-    push_data(shards, REPO)
-    assert [commit.message for commit in dataset(server).commits] == ["initial commit", "Add arm"]
 
 
 @pytest.mark.parametrize("name", ["episodes.parquet", "embodiment.yaml", "quarantine.jsonl"])

@@ -42,8 +42,8 @@ def kinds(server: Hub) -> list[str]:
 @pytest.mark.parametrize(
     "habits",
     [
-        {"lfs": "all", "page": 2, "weak": True}, {"lfs": "none", "tells_oids": False},
-        {"redirects": False, "conflict": 409, "ranges": False}, {"siblings": False},
+        {"lfs": "all", "page": 2}, {"lfs": "none", "tells_oids": False},
+        {"redirects": False, "conflict": 409, "ranges": False},
     ],
     ids=str,
 )  # fmt: skip
@@ -98,14 +98,6 @@ def test_a_repository_that_is_missing_without_a_code_is_made(server, source):
     assert kinds(server) == ["Add arm, hand"]
     with pytest.raises(HubError, match=r"answered 404.*check the name"):
         hub.pull("team/none")
-
-
-@pytest.mark.parametrize("kind", ["directory", "file"])
-def test_entries_without_a_path_are_no_files(server, source, kind):
-    server.habits.folders = kind
-    hub.push(source, REPO, ["arm"])
-    hub.push(source, REPO, ["hand"])
-    assert sorted(checkpoint.load(hub.pull(REPO)).embodiments) == ["arm", "hand"]
 
 
 def test_a_robot_pushed_again_unchanged_makes_no_commit_though_no_oid_is_told(published, source):
