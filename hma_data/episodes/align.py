@@ -22,7 +22,7 @@ from hma_data.errors import AlignmentError, EpisodeError
 from hma_data.registry.components import Component, Sync
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment
 
-Moved = tuple[NDArray[np.int64], Floats]
+Matches = tuple[NDArray[np.int64], Floats]
 Timed = tuple[str, Floats, str, float]  # name, times, method and tolerance in seconds of a stream
 RATE_TOLERANCE = 0.1  # share of the stated rate by which the measured one may differ
 OFF_RATE = "off_rate_frames"  # the flag of an episode whose grid has another rate
@@ -39,7 +39,7 @@ def rounding(*times: Floats) -> float:
     return ROUNDING_S + 4 * float(np.spacing(largest))
 
 
-def nearest(source_times: Floats, target_times: Floats) -> Moved:
+def nearest(source_times: Floats, target_times: Floats) -> Matches:
     """Return the index (T,) of the sample nearest to each target time, and skew_ms (T,).
 
     Of two samples equally near, the earlier one is taken; of samples with equal stamps, the first.
@@ -49,13 +49,15 @@ def nearest(source_times: Floats, target_times: Floats) -> Moved:
     )
     before = after - 1
     after = np.minimum(after, len(source_times) - 1)
+    # A tie takes the earlier sample, and rounding must not decide a tie.
     farther = np.abs(source_times[before] - target_times) - np.abs(source_times[after] - target_times)
     chosen = np.where(farther > rounding(source_times, target_times), after, before)
+    # Samples with equal stamps: the first of them.
     index: NDArray[np.int64] = np.searchsorted(source_times, source_times[chosen], side="left")
     return index, np.abs(source_times[index] - target_times) * 1e3
 
 
-def hold(source_times: Floats, target_times: Floats, tolerance_s: float = 0.0) -> Moved:
+def hold(source_times: Floats, target_times: Floats, tolerance_s: float = 0.0) -> Matches:
     """Return the index (T,) of the sample in force at each target time, and its distance in ms (T,).
 
     The sample in force is the last one stamped at or before the target time, or at most `tolerance_s` after
@@ -65,6 +67,7 @@ def hold(source_times: Floats, target_times: Floats, tolerance_s: float = 0.0) -
     found = np.searchsorted(source_times, target_times + tolerance_s + close, side="right") - 1
     index = np.maximum(found, 0)
     age = target_times - source_times[index]
+    # Within the tolerance the sample is later than the frame: its distance counts, not its sign.
     age = np.where((found < 0) | (age > -close), age, -age)
     return index, np.where(found < 0, age, np.maximum(age, 0)) * 1e3
 
@@ -77,7 +80,7 @@ def interpolate(
     return np.stack(columns, axis=1).astype(np.float32), nearest(source_times, target_times)[1]
 
 
-def matched(method: str, source_times: Floats, target_times: Floats, tolerance_s: float = 0.0) -> Moved:
+def matched(method: str, source_times: Floats, target_times: Floats, tolerance_s: float = 0.0) -> Matches:
     """Return the index (T,) of the sample that a method gives each target time, and skew_ms (T,).
 
     The tolerance is for `hold` alone. For `interpolate`, the result is that of `nearest`.
@@ -183,7 +186,7 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
         timed.append((name, signal.timestamps, method, tolerance_s))
     for name, times, *_ in timed:
         _check_times(episode.id, name, times)
-    frames = np.unique(episode.streams[primary].timestamps)
+    frames = np.unique(episode.streams[primary].timestamps)  # equal stamps give one frame of the grid
     repeated = len(episode.streams[primary].timestamps) - len(frames)
     if repeated > len(frames):
         total = repeated + len(frames)
@@ -195,11 +198,12 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     indices: dict[str, NDArray[np.int64]] = {}
     for name, stream in episode.streams.items():
         indices[name], skew[name] = matched(sync.images, stream.timestamps, grid)
+    # A frame exactly at the limit stays in, whatever its stamp's last digit.
     limit = sync.max_skew_ms and sync.max_skew_ms + 1e3 * rounding(grid, frames)
     moved, marks = [], []
     for (name, signal, components, method), tolerance_s in zip(signals, tolerances, strict=True):
         values, known, off = _moved(signal, components, method, grid, tolerance_s)
-        skew[name] = np.maximum(skew.get(name, off), off)
+        skew[name] = np.maximum(skew.get(name, off), off)  # components of one key share a name
         if limit and sync.beyond == "mask":
             near = off <= limit
             known = near if known is None else known & near
@@ -237,6 +241,7 @@ def _moved(
             )
     if signal.known is None:
         return values, None, skew
+    # An interpolated value is known if both of its neighbours are, or the one sample that it hits.
     before, age_ms = hold(signal.timestamps, grid)
     exact = age_ms <= 1e3 * rounding(signal.timestamps, grid)
     after = np.minimum(before + ~exact, len(signal.values) - 1)

@@ -18,9 +18,9 @@ from hma_data.registry.components import Camera, Quality
 Images = NDArray[np.uint8]
 Filter = Literal["area", "linear"]
 MAX_PIXELS = 64_000_000  # a picture that claims more is a decompression bomb or an error
-FINE, COARSE = (16, 16), (8, 8)  # blocks
-BLANK = 8  # levels from the darkest to the brightest coarse block: 3 % of full scale
-STILL = 4  # levels by which a fine block changes
+FINE_BLOCKS, COARSE_BLOCKS = (16, 16), (8, 8)  # blocks
+BLANK_LEVELS = 8  # levels from the darkest to the brightest coarse block: 3 % of full scale
+STILL_LEVELS = 4  # levels by which a fine block changes
 BT601, OTHER_MATRICES = 5, (1, 7, 9)  # FFmpeg's AVCOL_SPC: BT.709, SMPTE 240M and BT.2020 differ from BT.601
 LIMITED, FULL = 1, 2  # FFmpeg's AVCOL_RANGE: luma of 16 to 235, or of 0 to 255
 
@@ -240,7 +240,8 @@ class PictureCheck:
 
     def __init__(self) -> None:
         self.pictures = self.repeated = 0
-        self._low, self._high = np.full((*FINE, 3), 255, np.uint8), np.zeros((*FINE, 3), np.uint8)
+        self._low = np.full((*FINE_BLOCKS, 3), 255, np.uint8)
+        self._high = np.zeros((*FINE_BLOCKS, 3), np.uint8)
         self._darkest, self._brightest = np.full(3, 255, np.uint8), np.zeros(3, np.uint8)
         self._last: Images | None = None
 
@@ -255,8 +256,8 @@ class PictureCheck:
 
     def _note(self, frame: Images) -> None:
         cv2 = opencv()
-        fine = cv2.resize(frame, FINE, interpolation=cv2.INTER_AREA)
-        coarse = cv2.resize(fine, COARSE, interpolation=cv2.INTER_AREA)
+        fine = cv2.resize(frame, FINE_BLOCKS, interpolation=cv2.INTER_AREA)
+        coarse = cv2.resize(fine, COARSE_BLOCKS, interpolation=cv2.INTER_AREA)
         self._low, self._high = np.minimum(self._low, fine), np.maximum(self._high, fine)
         self._darkest = np.minimum(self._darkest, coarse.min(axis=(0, 1)))
         self._brightest = np.maximum(self._brightest, coarse.max(axis=(0, 1)))
@@ -264,7 +265,7 @@ class PictureCheck:
     @property
     def blank(self) -> bool:
         """Check whether all pictures show one colour, the same throughout; one picture does not count."""
-        return self.contrast <= BLANK and self.pictures > 1
+        return self.contrast <= BLANK_LEVELS and self.pictures > 1
 
     @property
     def contrast(self) -> int:
@@ -274,7 +275,7 @@ class PictureCheck:
     @property
     def still(self) -> bool:
         """Check whether all pictures show the same; one picture does not count."""
-        return int((self._high - self._low).max()) <= STILL and self.pictures > 1
+        return int((self._high - self._low).max()) <= STILL_LEVELS and self.pictures > 1
 
 
 def picture_flags(seen: PictureCheck, rule: Quality, episode_id: str, camera: str) -> dict[str, int]:

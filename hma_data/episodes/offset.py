@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 from hma_data.episodes.align import hold
 from hma_data.episodes.episode import Floats
 
-STEADY, NEAR = 0.9, 0.25  # least share of commands within this part of an interval from their usual place
-LATEST = 0.6  # part of the interval after which a command belongs to the next picture
-UNCLEAR = 0.4  # from this part on, it may as well belong to the next picture
-FEWEST = 5  # commands between pictures
-AFTER = 0.01  # share of commands after their picture, from which `hold` needs a tolerance
-PAUSE = 1.5  # a longer interval, in median intervals, is a pause of the camera
+STEADY_SHARE = 0.9  # least share of actions near their usual place between frames
+NEAR_PART = 0.25  # part of an interval within which an action is near it
+LATEST_PART = 0.6  # part of the interval after which an action belongs to the next frame
+UNCLEAR_PART = 0.4  # from this part on, it may as well belong to the next frame
+MIN_COMMANDS = 5  # actions between frames
+AFTER_SHARE = 0.01  # share of actions after their frame, from which `hold` needs a tolerance
+PAUSE_INTERVALS = 1.5  # a longer interval, in median intervals, is a pause of the camera
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class Offset:
         median, spread = self.after_ms
         side = "before" if median < 0 else "after"
         come = f"commands come {_ms((abs(median), spread))} {side} each picture"
-        if self.tolerance_ms and median > UNCLEAR * self.period_ms:
+        if self.tolerance_ms and median > UNCLEAR_PART * self.period_ms:
             come += ", about midway to the next (remove tolerance_ms if they belong to the next)"
         return come
 
@@ -97,7 +98,7 @@ def measure(runs: Sequence[tuple[Floats, Floats]], camera: str = "") -> Offset |
     """
     ages, delays, parts, intervals = [], [], [], []
     for commands, pictures in runs:
-        commands, pictures = np.unique(commands), np.unique(pictures)
+        commands, pictures = np.unique(commands), np.unique(pictures)  # messages may arrive twice
         if not len(commands) or len(pictures) < 2:
             continue
         index, age_ms = hold(commands, pictures)
@@ -106,11 +107,12 @@ def measure(runs: Sequence[tuple[Floats, Floats]], camera: str = "") -> Offset |
         followed = follows < len(commands)
         delays.append((commands[follows[followed]] - pictures[followed]) * 1e3)
         last, since_ms = hold(pictures, commands)
+        # The last frame has no next one: nothing after it lies between two frames.
         steps = np.append(np.diff(pictures), np.inf)[last] * 1e3
-        between = (since_ms >= 0) & (steps < PAUSE * 1e3 * float(np.median(np.diff(pictures))))
+        between = (since_ms >= 0) & (steps < PAUSE_INTERVALS * 1e3 * float(np.median(np.diff(pictures))))
         parts.append(since_ms[between] / steps[between])
         intervals.append(np.diff(pictures) * 1e3)
-    if sum(map(len, parts)) < FEWEST or not sum(map(len, ages)) or not sum(map(len, delays)):
+    if sum(map(len, parts)) < MIN_COMMANDS or not sum(map(len, ages)) or not sum(map(len, delays)):
         return None
     period = float(np.median(np.concatenate(intervals)))
     after = _after(np.concatenate(parts))
@@ -118,7 +120,7 @@ def measure(runs: Sequence[tuple[Floats, Floats]], camera: str = "") -> Offset |
         camera, _middle(np.concatenate(ages)), _middle(np.concatenate(delays)),
         None if after is None else _middle(after * period), period,
     )  # fmt: skip
-    if after is None or np.mean(after > 0) <= AFTER:
+    if after is None or np.mean(after > 0) <= AFTER_SHARE:
         return found
     tolerance = float(np.median(after) + 0.5) * period  # as far from this command as from the next
     return replace(found, tolerance_ms=round(tolerance) if tolerance >= 10 else round(tolerance, 1))
@@ -131,12 +133,13 @@ def _after(parts: NDArray[np.float64]) -> NDArray[np.float64] | None:
         parts: (C,) where each command lies between two pictures, 0 to 1. The interval is a circle: 0.99 and
             0.01 are near to each other.
     """
+    # The mean direction on the circle: a plain mean of 0.99 and 0.01 would be 0.5.
     middle = float(np.angle(np.mean(np.exp(2j * np.pi * parts))) / (2 * np.pi)) % 1
     away = (parts - middle + 0.5) % 1 - 0.5
-    near = np.abs(away) <= NEAR
-    if np.mean(near) < STEADY:
+    near = np.abs(away) <= NEAR_PART
+    if np.mean(near) < STEADY_SHARE:
         return None
-    after = np.asarray((middle if middle <= LATEST else middle - 1) + away[near], np.float64)
+    after = np.asarray((middle if middle <= LATEST_PART else middle - 1) + away[near], np.float64)
     after[np.abs(after) < 1e-9] = 0.0  # what the circle's sines and cosines add
     return after
 

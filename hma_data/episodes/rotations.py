@@ -63,6 +63,7 @@ def _quaternions(source_times: Floats, values: Floats, target_times: Floats) -> 
 
     Their lengths are interpolated too; they are 1 where the samples have length 1.
     """
+    # q and -q are one rotation: flip signs until each sample is on the side of the one before it.
     turns = np.where((values[1:] * values[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     steady = values * np.cumprod(np.concatenate([[1.0], turns]))[:, None]
     lengths = np.linalg.norm(values, axis=1)
@@ -74,6 +75,7 @@ def _quaternions(source_times: Floats, values: Floats, target_times: Floats) -> 
     )
     units = _directions(steady)
     arc = np.arccos(np.clip((units[before] * units[after]).sum(axis=1), -1, 1))
+    # On a very short arc the sine vanishes; the straight line is as good there.
     bent = (arc > 1e-4) & (lengths[before] > 0) & (lengths[after] > 0)
     sine = np.where(bent, np.sin(arc), 1)
     one = np.where(bent, np.sin((1 - share) * arc) / sine, 1 - share)
@@ -89,6 +91,7 @@ def _angles(source_times: Floats, values: Floats, target_times: Floats, period: 
     """
     steady: Floats = np.unwrap(values, period=period, axis=0).astype(np.float64)
     at = _index_of_nearest(source_times, target_times)
+    # Unwrapping has added whole turns; those of the nearest sample are taken off again.
     found = _linear(source_times, steady, target_times) - (steady - values)[at]
     lowest, highest = values.min(axis=0), values.max(axis=0)
     slack = 1e-3 * period
@@ -112,7 +115,7 @@ def _axis_angle(source_times: Floats, values: Floats, target_times: Floats, peri
     half = np.sinc(angle / (2 * np.pi)) / 2  # sin(angle/2) / angle, 1/2 at 0
     quaternions = np.concatenate([values * scale * half, np.cos(angle / 2)], axis=1)
     mixed = _quaternions(source_times, quaternions, target_times)
-    mixed = np.where(mixed[:, 3:] < 0, -mixed, mixed)
+    mixed = np.where(mixed[:, 3:] < 0, -mixed, mixed)  # so that the angle is at most half a turn
     sine = np.linalg.norm(mixed[:, :3], axis=1, keepdims=True)
     angle = 2 * np.arctan2(sine, mixed[:, 3:])
     beside = values[_index_of_nearest(source_times, target_times)]

@@ -59,6 +59,7 @@ class Entry:
                 return hashlib.file_digest(file, "sha256").hexdigest() == self.sha256
             if not _COMMIT.fullmatch(self.blob_id):
                 return True
+            # git's name of a file: the SHA-1 of this header and the content
             begun = hashlib.sha1(b"blob %d\0" % self.size, usedforsecurity=False)
             return hashlib.file_digest(file, lambda: begun).hexdigest() == self.blob_id
 
@@ -221,6 +222,7 @@ class Repository:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
             return path
+        # The cache may hold a damaged copy: what does not match is downloaded once more.
         for anew in (False, True):
             found = hf_hub_download(
                 **self._place,

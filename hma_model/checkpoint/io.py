@@ -171,6 +171,7 @@ def write_readme(checkpoint: StrPath | Checkpoint) -> None:
 def remove(folder: StrPath) -> None:
     """Delete a checkpoint; an interrupted deletion leaves no partial checkpoint under its name."""
     folder = as_path(folder)
+    # Renamed first: what a killed deletion leaves has no checkpoint's name.
     doomed = folder.with_name(f".{folder.name}.partial-removed")
     shutil.rmtree(doomed, ignore_errors=True)
     folder.rename(doomed)
@@ -200,7 +201,7 @@ def _take_over(base: Checkpoint, new: Path, besides: set[str]) -> str:
         (new / name).parent.mkdir(parents=True, exist_ok=True)
         try:
             (new / name).hardlink_to(inside(base.folder, name))
-        except OSError:  # another file system, or one without links
+        except OSError:  # another file system, or one without hard links
             shutil.copyfile(inside(base.folder, name), new / name)
     return base.trunk_sha256
 
@@ -226,7 +227,7 @@ def _write_embodiment(model: "HMA", home: Path, trunk: str, given: dict[str, Any
         "effective_hz": None if unstated else robot.effective_hz,
         "license": robot.license,
     }
-    files = {part: file_sha256(home / part) for part in PARTS[:-1]}
+    files = {part: file_sha256(home / part) for part in PARTS[:-1]}  # all but the card itself
     card = {**facts, "data": {}, "metrics": {}, **given, **links, "files": files}
     (home / CARD).write_bytes(to_json(card))
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 State = dict[str, "Tensor"]
 STATISTICS = "normalizer."  # the beginning of their names in a stem
-MOST = 1_000_000  # upper limit of every count in a configuration
+LARGEST_COUNT = 1_000_000  # upper limit of every count in a configuration
 _COUNTS = ("layers", "width", "heads", "frames", "channels", "patch", "action_tokens", "history_frames",
            "diffusion_depth", "diffusion_width", "diffusion_train_steps", "diffusion_sample_steps",
            "grid", "views", "factored")  # fmt: skip
@@ -103,6 +103,7 @@ def embodiment(checkpoint: Checkpoint, name: str, space: "ActionSpace") -> tuple
     states = []
     for part in ("stem", "head"):
         path = checkpoint.path(name, f"{part}.safetensors")
+        # A layer has a weight for each value of a chunk, so a file with fewer bytes cannot hold it.
         if space.chunk_dim > path.stat().st_size:
             fault = f"is too small for chunks of {space.chunk_dim:,} values, which embodiment.yaml asks for"
             raise CheckpointError(path, fault, "pull the embodiment again")
@@ -128,7 +129,7 @@ def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: 
     for key in _COUNTS:
         value = getattr(config, key)
         for count in value if isinstance(value, tuple) else (value,):
-            if not isinstance(count, int) or count > MOST:
+            if not isinstance(count, int) or count > LARGEST_COUNT:
                 raise CheckpointError(where, f"model.{key} is {value!r}: no size of a network", _REMEDY)
     values = sum(tensor.numel() for tensor in state.values())
     width, hidden = config.width, config.mlp_ratio * config.width

@@ -18,8 +18,8 @@ from hma_data.tokenizers.catalog import other_weights
 from hma_model.checkpoint.model_card import licence, line, number
 from hma_model.hub.stores import Store, open_store
 
-_OURS = {*SMALL, MANIFEST, *BESIDE}
-_AGAIN = "pull again; if it stays so, have it pushed again"
+_OWN_FILES = {*SMALL, MANIFEST, *BESIDE}
+_PULL_AGAIN = "pull again; if it stays so, have it pushed again"
 _DATASETS = "hf://datasets/"
 _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"),
           (10**7, "1M<n<10M"), (10**8, "10M<n<100M"), (10**9, "100M<n<1B"), (10**10, "1B<n<10B"))  # fmt: skip
@@ -42,7 +42,7 @@ def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str
         HubError: the target holds another shard set, or cannot be reached or written.
     """
     folder = as_path(folder)
-    manifest = _whole(folder)
+    manifest = _whole_manifest(folder)
     store = _open(as_address(target), write=True, private=private)
     page = _page(manifest, store.repo)
     _refuse_others(store, manifest)
@@ -73,12 +73,12 @@ def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> 
     lacking = [path for path in shards if path not in files]
     if lacking:
         raise HubError(store.name, f"lacks {len(lacking)} shards, {lacking[0]} first", "have it pushed again")
-    wanted = [path for path in shards if not _is(out / path, shards[path])]
+    wanted = [path for path in shards if not _has_sha256(out / path, shards[path])]
     store.download([*wanted, *(name for name in SMALL if name in files)], out)
     for name in (*wanted, *(name for name in SMALL if name in manifest.files)):
-        if not _is(out / name, shards.get(name) or manifest.files[name]):
+        if not _has_sha256(out / name, shards.get(name) or manifest.files[name]):
             kind = "shard" if name in shards else "file"
-            raise ShardError(out / name, f"is not the {kind} that {MANIFEST} names", _AGAIN)
+            raise ShardError(out / name, f"is not the {kind} that {MANIFEST} names", _PULL_AGAIN)
     write_atomic(out / MANIFEST, content)
     return out
 
@@ -86,17 +86,17 @@ def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> 
 # -- checks
 
 
-def _whole(folder: Path) -> Manifest:
+def _whole_manifest(folder: Path) -> Manifest:
     """Return the manifest of a set, after checking all its files against it."""
     manifest = Manifest.load(folder)
     if problem := seal_problem((folder / MANIFEST).read_bytes()):
         raise ShardError(folder / MANIFEST, problem, f"hma shards restat {folder} writes it anew")
     for shard in manifest.shards:
         path = folder / shard.path
-        if not _is(path, shard.sha256):
+        if not _has_sha256(path, shard.sha256):
             raise ShardError(path, "is not the shard its manifest names", f"run hma shards verify {folder}")
     for name, sha256 in manifest.files.items():
-        if name not in SMALL or not _is(folder / name, sha256):
+        if name not in SMALL or not _has_sha256(folder / name, sha256):
             remedy = f"hma shards restat {folder} writes it anew"
             raise ShardError(folder / name, "is not the file its manifest names", remedy)
     return manifest
@@ -133,7 +133,7 @@ def _published(store: Store, remedy: str = "have it pushed again") -> tuple[Mani
 def _refuse_others(store: Store, manifest: Manifest) -> dict[str, int]:
     """Return the published files; raise HubError if they are of another robot, tokenizer or kind."""
     files = store.files()
-    strange = [name for name in files if not (name in _OURS or SHARD_NAME.fullmatch(name))]
+    strange = [name for name in files if not (name in _OWN_FILES or SHARD_NAME.fullmatch(name))]
     strange = [name for name in strange if not name.endswith(f"/{FINDER}")]
     if strange:
         raise HubError(store.name, f"holds something else: {strange[0]}", "push to a place of its own")
@@ -148,7 +148,7 @@ def _refuse_others(store: Store, manifest: Manifest) -> dict[str, int]:
     return files
 
 
-def _is(path: Path, sha256: str) -> bool:
+def _has_sha256(path: Path, sha256: str) -> bool:
     return path.is_file() and file_sha256(path) == sha256
 
 

@@ -103,7 +103,7 @@ def _ours(
         except HMAError as fault:
             card, problems = {}, [fault.fault]
         facts["embodiments"].append(_row(name, card, size, problems))
-    origins = {_of(row["data"], "released_checkpoint") for row in facts["embodiments"]} - {None}
+    origins = {_value_of(row["data"], "released_checkpoint") for row in facts["embodiments"]} - {None}
     facts["origin"] = f"imported from {min(map(str, origins))}" if origins else None
     return facts
 
@@ -142,7 +142,7 @@ def _row(name: str, card: Mapping[str, Any], size: int | None, problems: list[st
         "chunk_dim": card.get("chunk_dim"),
         "hz": card.get("effective_hz"),
         "stride": card.get("stride"),
-        **{key: _of(metrics, key) for key in FIGURES},
+        **{key: _value_of(metrics, key) for key in FIGURES},
         "data": card.get("data"),
         "licence": card.get("license"),
         "bytes": size,
@@ -154,7 +154,7 @@ def _tokenizer_problems(tokenizer: Any) -> list[str]:
     """Return the problems that prevent decoding the model's predictions here."""
     from hma_data.tokenizers.catalog import find_entry, other_weights
 
-    name = _of(tokenizer, "name")
+    name = _value_of(tokenizer, "name")
     try:
         entry = find_entry(str(name))
     except PluginError as fault:
@@ -167,5 +167,5 @@ def _tokenizer_problems(tokenizer: Any) -> list[str]:
     return [f"tokenizer {name} needs {', '.join(missing)}: {entry.extra}"] if missing else []
 
 
-def _of(values: Any, key: str) -> Any:
+def _value_of(values: Any, key: str) -> Any:
     return values.get(key) if isinstance(values, dict) else None

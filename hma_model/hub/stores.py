@@ -129,6 +129,7 @@ class FolderStore:
             finally:
                 for part in staged.values():
                     part.unlink(missing_ok=True)
+            # The page lists all embodiments, also those that somebody pushed meanwhile.
             if page is not None and (now := changes().get(README)):
                 write_atomic(self._root / README, now if isinstance(now, bytes) else now.read_bytes())
             self._sweep({*files, README})
@@ -150,6 +151,7 @@ class FolderStore:
         final = self._root / name
         if name == CONFIG and isinstance(final, RemotePath):
             whole = final.scheme in WHOLE_PUTS
+            # The first config.json decides whose trunk the hub has; a store has no locks.
             if not (create_bytes(part.read_bytes(), final) if whole else not final.exists()):
                 raise HubError(self.name, "another push has just begun here", "push again")
         part.replace(final)

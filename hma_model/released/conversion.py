@@ -36,7 +36,7 @@ from hma_model.released.state import State, domains_of, state_from_released, sta
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 _PREFIXES = ("module.", "_orig_mod.")  # which wrappers add to the names of weights
-_SHOWN = 3  # maximum number of names in an error
+_MAX_NAMED = 3  # maximum number of names in an error
 
 
 def import_released(
@@ -212,8 +212,8 @@ def _space(path: Path, state: State, domain: str) -> ActionSpace:
 
 
 def _some(names: list[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
+    more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
+    return ", ".join(names[:_MAX_NAMED]) + more
 
 
 # -- describing

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.align import nearest
 from hma_data.episodes.episode import Floats
-from hma_data.episodes.images import BLANK, Images, PictureCheck
+from hma_data.episodes.images import BLANK_LEVELS, Images, PictureCheck
 
 Severity = Literal["error", "warn", "info"]
 SEVERITIES: tuple[Severity, ...] = ("info", "warn", "error")
@@ -311,7 +311,7 @@ class Look:
         self.same += sum(np.array_equal(frames[i], frames[i + 1]) for i in pairs)
         if self._check:
             self._check.add(frames)
-            if self._check.contrast > BLANK:
+            if self._check.contrast > BLANK_LEVELS:
                 self.blank, self._check = self.blank - 1, None
         step = max(1, int(np.sqrt(size[0] * size[1] / PIXELS)))
         if self.lossless:
