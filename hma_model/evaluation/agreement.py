@@ -1,4 +1,4 @@
-"""Measure how well two judgements agree: correlations and accuracies, with intervals.
+"""Measure how well two judgements agree: correlations, accuracies, precision and recall, with intervals.
 
 Correlations have bootstrap intervals. Shares have those of Clopper and Pearson (1934), which stay honest for
 few episodes and for shares of 0 and 1: a bootstrap would call these certain.
@@ -9,6 +9,7 @@ M policies, N episodes, R resamples. All intervals hold 95 %.
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -178,3 +179,40 @@ def share_interval(successes: int, count: int) -> tuple[float, float]:
     low = stats.beta.ppf(TAIL, successes, failures + 1) if successes else 0.0
     high = stats.beta.ppf(1 - TAIL, successes + 1, failures) if failures else 1.0
     return float(low), float(high)
+
+
+def precision_recall(true: Bools, judged: Bools) -> tuple[Estimate, Estimate]:
+    """Return the share of judged successes (N,) that are true, and that of true ones that are judged so."""
+    hits, said, there = int((true & judged).sum()), int(judged.sum()), int(true.sum())
+    found = []
+    for count, missing in ((said, "nothing is judged a success"), (there, "nothing truly succeeds")):
+        if count:
+            found.append(Estimate(hits / count, *share_interval(hits, count)))
+        else:
+            found.append(Estimate(None, reason=missing))
+    return found[0], found[1]
+
+
+def episode_correlation(one: Floats, other: Floats) -> Estimate:
+    """Return how the scores (N,) of single episodes correlate, with Fisher's interval."""
+    if one.size < MIN_EPISODES:
+        return Estimate(None, reason=f"{one.size} of at least {MIN_EPISODES} episodes")
+    if np.ptp(one) < 1e-12 or np.ptp(other) < 1e-12:
+        return Estimate(None, reason="all episodes score alike")
+    found = stats.pearsonr(one, other)
+    ends = found.confidence_interval(1 - 2 * TAIL)
+    return Estimate(float(found.statistic), float(ends.low), float(ends.high))
+
+
+def alike_pairs(success: Bools) -> list[tuple[int, int]]:
+    """Return the pairs of policies (M, N) whose success over the same episodes is no surprise for equals.
+
+    Only episodes with different outcomes tell two policies apart: the exact test of McNemar (1947).
+    """
+    pairs = []
+    for one, other in combinations(range(len(success)), 2):
+        better = int((success[one] & ~success[other]).sum())
+        worse = int((success[other] & ~success[one]).sum())
+        if better + worse == 0 or stats.binomtest(better, better + worse).pvalue >= 2 * TAIL:
+            pairs.append((one, other))
+    return pairs

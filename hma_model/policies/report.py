@@ -15,10 +15,10 @@ from hma_data.storage.files import atomic_path
 from hma_model.evaluation.agreement import Estimate
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
-from hma_model.policies.scores import WORK, Correlation, PolicyEvaluation, Scored
+from hma_model.policies.scores import WORK, PolicyEvaluation, Scored
 
 COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same actions, sim.")
-GOOD_ACCURACY = 0.75  # balanced accuracy; an interval that holds chance and this says nothing
+LISTED_PAIRS = 6  # pairs of policies that a sentence names
 SHOWN_EPISODES = 2  # episodes of each kind on the page
 OUTCOME_TITLES = {  # (success in the simulator, in the model) -> title
     (True, True): "Both say success",
@@ -58,44 +58,52 @@ def _rate(row: dict[str, Any], name: str) -> str:
 
 
 def sentences(found: PolicyEvaluation) -> list[str]:
-    """Return in words what the table means: the task, the judge, the correlations."""
-    share = "not known" if found.followed is None else f"{found.followed:.2f}"
+    """Return in words what the table means: the task, the judge, and what follows for the policies."""
     scores = "the way it moved" if found.judge.task.name == "moved" else "minus the distance, 0 is best"
+    guessed = f"{found.generated.successes / found.generated.count:.0%}"
     said = [
         f"success: {found.judge.task.text}; shares with 95 % intervals over episodes; scores in px: {scores}",
         "alike: episodes with the same outcome in both; same actions, sim.: the simulator, under the "
         "actions that the policy gave in the model",
         f"judge on held-out true episodes: {found.judge.held_out}",
-        f"judge on generated frames, against the simulator under the same actions: {found.generated}; "
-        f"correlation of the scores {share}",
+        f"judge on generated frames, against the simulator under the same actions: {found.generated}",
+        f"precision: the simulator confirms {_share(found.precision)} of the successes seen in the model "
+        f"({guessed} if guessed); recall: {_share(found.recall)} of its own are seen",
+        f"scores of single episodes in the model and, under the same actions, in the simulator: "
+        f"correlation {found.followed}",
     ]
-    correlated = {"success rates": found.success, "mean scores": found.score}
-    missing = {one.pearson.reason for one in correlated.values()}
-    if len(missing) == 1 and (reason := missing.pop()):
-        said.append(f"correlations over policies are not computed: {reason}")
+    if found.refusal:
+        said.append(refused(found))
     else:
-        said += [_correlation(what, one) for what, one in correlated.items()]
-    return [*said, *doubt(found)]
+        correlated = {"success rates": found.success, "mean scores": found.score}
+        for what, one in correlated.items():
+            if one.pearson.reason:  # of the ranks it is the same
+                said.append(f"{what} over policies: no correlation, {one.pearson.reason}")
+            else:
+                said.append(f"{what} over policies: Pearson {one.pearson}, ranks {one.spearman}")
+    return said + [_alike(found, where) for where in ("true", "model") if found.alike(where)]
 
 
-def doubt(found: PolicyEvaluation) -> list[str]:
-    """Return the sentence that says why the model's success rates mean nothing, if they do."""
-    judged = found.generated
-    if judged.too_few:
-        why = f"there are too few {judged.too_few} to tell whether the judge is better than chance"
-    elif judged.better_than_chance:
-        return []
-    elif judged.high is not None and judged.high >= GOOD_ACCURACY:
-        why = "the judge may be no better than chance; more episodes would tell"
-    else:
-        why = "the judge is no better than chance"
-    return [f"on generated frames {why}: the model's success rates mean nothing"]
+def refused(found: PolicyEvaluation) -> str:
+    """Return the sentence that says why there is no verdict."""
+    return f"no verdict: on generated frames {found.refusal}: the model's success rates mean nothing"
 
 
-def _correlation(what: str, found: Correlation) -> str:
-    if found.pearson.reason:  # of the ranks it is the same
-        return f"{what} over policies: no correlation, {found.pearson.reason}"
-    return f"{what} over policies: Pearson {found.pearson}, ranks {found.spearman}"
+def _share(found: Estimate) -> str:
+    if found.low is None or found.value is None:
+        return f"none ({found.reason})"
+    return f"{found.value:.0%} ({found.low:.0%} to {found.high:.0%})"
+
+
+def _alike(found: PolicyEvaluation, where: str) -> str:
+    place = {"true": "the simulator", "model": "the model"}[where]
+    pairs, count = found.alike(where), len(found.policies)
+    if len(pairs) == count * (count - 1) // 2:
+        return f"by success in {place}, no two policies can be told apart"
+    names = [" and ".join(pair) for pair in pairs[:LISTED_PAIRS]]
+    if len(pairs) > LISTED_PAIRS:
+        names.append(f"{len(pairs) - LISTED_PAIRS} other pairs")
+    return f"by success in {place}, these cannot be told apart: {'; '.join(names)}"
 
 
 def show(found: PolicyEvaluation) -> None:
@@ -127,21 +135,24 @@ def html(found: PolicyEvaluation) -> str:
         "frames a policy, from the same frames in the simulator and in the world model"
     )
     page = Page("Policies inside the world model", lead)
-    page.figures(
-        [
-            (
-                _value(found.success.pearson.value),
-                f"correlation of success rates{_ends(found.success.pearson)}",
-            ),
-            (
-                _value(found.success.spearman.value),
-                f"correlation of their ranks{_ends(found.success.spearman)}",
-            ),
-            (_value(found.judge.held_out.balanced), "judge's balanced accuracy on true episodes"),
-            (_value(found.generated.balanced), "and on generated ones; 0.5 is chance"),
+    figures = [
+        (
+            _value(found.precision),
+            f"of the model's successes hold in the simulator{_ends(found.precision)}",
+        ),
+        (_value(found.recall), f"of the simulator's successes are seen{_ends(found.recall)}"),
+        (_value(found.followed), f"correlation of the scores of single episodes{_ends(found.followed)}"),
+    ]
+    if not found.refusal:
+        pearson, ranks = found.success.pearson, found.success.spearman
+        figures = [
+            (_value(pearson), f"correlation of success rates{_ends(pearson)}"),
+            (_value(ranks), f"correlation of their ranks{_ends(ranks)}"),
+            *figures,
         ]
-    )
-    for sentence in doubt(found):  # before anybody reads the rates
+    page.figures(figures)
+    if found.refusal:  # before anybody reads the rates
+        sentence = refused(found)
         page.section("Do not rely on the model's rates", sentence[:1].upper() + sentence[1:] + ".")
     page.definitions(legend)
     # An interval below its value leaves room for the last columns.
@@ -149,8 +160,9 @@ def html(found: PolicyEvaluation) -> str:
     for name, *cells in table(found):
         rows.append([name, *(str(cell).replace(" (", "\n").rstrip(")") for cell in cells)])
     page.table(COLUMNS, rows)
-    for sentence in [one for one in sentences(found) if one not in doubt(found)]:
-        page.text(sentence[:1].upper() + sentence[1:] + ".")
+    for sentence in sentences(found):
+        if sentence != refused(found):
+            page.text(sentence[:1].upper() + sentence[1:] + ".")
     page.section("Success rates", "A policy is a point; bars are 95 % intervals over episodes.")
     page.picture(_plot(found), "svg+xml", "Success in the simulator and in the model")
     for kind, title in OUTCOME_TITLES.items():
@@ -168,15 +180,15 @@ def html(found: PolicyEvaluation) -> str:
     return page.html()
 
 
-def _value(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
+def _value(found: Estimate) -> str:
+    return "–" if found.value is None else f"{found.value:.2f}"
 
 
 def _ends(found: Estimate) -> str:
     if found.value is None:
         return ""
     if found.low is None:
-        return "; too few policies for an interval"
+        return "; too few for an interval"
     return f"; 95 %: {found.low:.2f} to {found.high:.2f}"
 
 

@@ -31,13 +31,14 @@ from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.agreement import (
-    MIN_EPISODES,
     Accuracy,
     Bools,
     Estimate,
     accuracy,
+    alike_pairs,
     correlations,
-    pearson,
+    episode_correlation,
+    precision_recall,
     share_interval,
 )
 from hma_model.generation.commands import OutsideRangeWarning
@@ -60,6 +61,7 @@ EPISODES, FRAMES = 32, 40
 WORK = ".policies"  # folder of finished policies in an output
 OUTCOMES = ("true", "model", "replayed")
 SHOWN_FRAMES = 8  # images that are kept of an episode
+GOOD_ACCURACY = 0.75  # balanced; an interval that holds chance and this says nothing
 
 
 @dataclass(frozen=True)
@@ -107,8 +109,10 @@ class PolicyEvaluation:
         sampling: how the world drew its frames.
         success, score: correlation over policies of the success rates, and of the mean scores.
         generated: accuracy of the judge on generated frames, against the simulator under the same actions.
+        precision: share of the successes that it sees on generated frames which the simulator confirms.
+        recall: share of the simulator's successes under these actions that it sees.
         followed: how the scores of single episodes, as judged on generated frames, correlate with the true
-            ones under the same actions; None if they do not vary or are few.
+            ones under the same actions.
     """
 
     embodiment: str
@@ -121,7 +125,33 @@ class PolicyEvaluation:
     success: Correlation
     score: Correlation
     generated: Accuracy
-    followed: float | None
+    precision: Estimate
+    recall: Estimate
+    followed: Estimate
+
+    @property
+    def refusal(self) -> str:
+        """Return why nothing follows from what policies do in the model; "" if something does.
+
+        What a judge says of single generated episodes must be better than chance, by outcome and by score:
+        policies can differ in the model and in the simulator for other reasons than what they did.
+        """
+        judged = self.generated
+        if judged.too_few:
+            return f"there are too few {judged.too_few} to tell whether the judge is better than chance"
+        if not judged.better_than_chance:
+            if judged.high is not None and judged.high >= GOOD_ACCURACY:
+                return "the judge may be no better than chance; more episodes would tell"
+            return "the judge is no better than chance"
+        if self.followed.low is not None and self.followed.low <= 0:
+            return "the scores of single episodes agree with the simulator's no better than by chance"
+        return ""
+
+    def alike(self, where: str) -> list[tuple[str, str]]:
+        """Return the pairs of policies that cannot be told apart by their outcomes, "true" or "model"."""
+        names = [one.policy for one in self.policies]
+        success = np.stack([getattr(one, where).success for one in self.policies])
+        return [(names[one], names[other]) for one, other in alike_pairs(success)]
 
     def rows(self) -> list[dict[str, Any]]:
         """Return the figures of each policy."""
@@ -147,7 +177,10 @@ class PolicyEvaluation:
             "success": self.judge.task.text,
             "limit": self.judge.limit,
             "held_out": asdict(self.judge.held_out),
-            "generated": asdict(self.generated) | {"score_correlation": self.followed},
+            "generated": asdict(self.generated),
+            "precision": asdict(self.precision),
+            "recall": asdict(self.recall),
+            "score_correlation": asdict(self.followed),
             "generated_better_than_chance": self.generated.better_than_chance,
         }
         episodes = {
@@ -166,7 +199,9 @@ class PolicyEvaluation:
             "frames": self.frames,
             "episodes": len(self.policies[0].true.scores),
             "judge": judge,
+            "refused": self.refusal,
             "policies": self.rows(),
+            "alike": {"simulator": self.alike("true"), "model": self.alike("model")},
             "correlation": {"success": asdict(self.success), "score": asdict(self.score)},
             "outcomes": episodes,
         }
@@ -259,6 +294,7 @@ def evaluate_policies(
             score = partial(score_policy, name, policy, world, scenes, judge, frames, told)
             scored.append(_kept_or_new(name, kept, key, score))
         success, scores = _matrices(scored, "success"), _matrices(scored, "scores")
+        judged, replayed = success[1].ravel() > 0, success[2].ravel() > 0
         return PolicyEvaluation(
             embodiment,
             str(checkpoint),
@@ -269,8 +305,9 @@ def evaluate_policies(
             tuple(scored),
             Correlation(**correlations(success[0], success[1], seed)),
             Correlation(**correlations(scores[0], scores[1], seed)),
-            accuracy(success[2].ravel() > 0, success[1].ravel() > 0),
-            _correlation(scores[1].ravel(), scores[2].ravel()),
+            accuracy(replayed, judged),
+            *precision_recall(replayed, judged),
+            episode_correlation(scores[1].ravel(), scores[2].ravel()),
         )
 
 
@@ -291,13 +328,6 @@ def _keys(
 
 def _kept_or_new(name: str, kept: KeptParts | None, key: str, score: Callable[[], Scored]) -> Scored:
     return score() if kept is None else _scored(name, kept.part(key, lambda: _arrays(score())))
-
-
-def _correlation(one: Scores, other: Scores) -> float | None:
-    if len(one) < MIN_EPISODES:
-        return None
-    found = float(pearson(one, other))
-    return None if np.isnan(found) else found
 
 
 def score_policy(

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hma_model.evaluation.agreement import accuracy, correlations, pearson, share_interval, spearman
+from hma_model.evaluation.agreement import (
+    accuracy,
+    alike_pairs,
+    correlations,
+    episode_correlation,
+    pearson,
+    precision_recall,
+    share_interval,
+    spearman,
+)
 
 
 def test_correlations_run_over_the_last_axis_and_share_ranks_between_ties() -> None:
@@ -95,3 +104,40 @@ def test_successes_or_failures_too_few_for_any_judge_are_said() -> None:
         assert found.too_few == word and f"too few {word} to tell" in str(found)
     plenty = np.arange(48) < 6
     assert not accuracy(plenty, plenty).too_few and "too few" not in str(accuracy(plenty, ~plenty))
+
+
+def test_precision_and_recall_have_intervals() -> None:
+    true, judged = np.zeros(96, bool), np.zeros(96, bool)
+    true[:30], judged[10:51] = True, True
+    precision, recall = precision_recall(true, judged)
+    assert (precision.value, recall.value) == (pytest.approx(20 / 41), pytest.approx(20 / 30))
+    assert precision.low == pytest.approx(0.329, abs=1e-3) and precision.high == pytest.approx(
+        0.649, abs=1e-3
+    )
+    nothing, none = precision_recall(true & False, judged & False)
+    assert nothing.value is None and none.value is None and "nothing truly succeeds" in none.reason
+
+
+def test_scores_of_episodes_correlate_with_an_interval() -> None:
+    rng = np.random.default_rng(0)
+    one = rng.random(96)
+    found, chance = (
+        episode_correlation(one, one + 0.2 * rng.random(96)),
+        episode_correlation(one, rng.random(96)),
+    )
+    assert found.low is not None and found.low > 0.8 and chance.low is not None and chance.low < 0
+    assert episode_correlation(one, np.ones(96)).reason and episode_correlation(one[:7], one[:7]).reason
+
+
+def test_policies_one_episode_apart_have_no_narrow_correlation() -> None:
+    """A resample without that episode has constant means: it may not be dropped."""
+    success = np.zeros((6, 24))
+    success[:3, 0] = 1
+    for found in correlations(success, success).values():
+        assert found.value == pytest.approx(1) and found.low == -1 and found.high == 1
+
+
+def test_only_episodes_with_different_outcomes_tell_policies_apart() -> None:
+    success = np.zeros((3, 24), bool)
+    success[1, :5] = success[2, :6] = True
+    assert alike_pairs(success) == [(0, 1), (1, 2)]  # five of five is a surprise of 1 in 16, six of 1 in 32

@@ -25,10 +25,10 @@ from hma_model.policies.base import begin, checked
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.judge import StateJudge, task_of
 from hma_model.policies.report import html, sentences, write_report
-from hma_model.policies.scores import PolicyEvaluation, Scored, evaluate_policies, score_policy
-from hma_model.policies.scripted import Called
+from hma_model.policies.scores import Outcomes, PolicyEvaluation, Scored, evaluate_policies, score_policy
+from hma_model.policies.scripted import Called, Still
 from hma_model.simulate import World
-from tests.model.true_world import TrueWorld
+from tests.model.true_world import TrueWorld, tiny_model
 
 ROBOT = "rails_03"
 POLICIES = ["scripted", "scripted:noise=0.5", "random", "still"]
@@ -88,10 +88,11 @@ def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJu
     assert (found.policies[2].model.scores == found.policies[2].true.scores).all()
     assert np.array_equal(found.policies[2].true_images, found.policies[2].model_images)
     assert found.policies[3].true.scores.max() == 0 and found.policies[0].true.scores.max() > 2
-    assert found.generated.balanced == 1 and found.followed == pytest.approx(1)
-    (reason,) = [one for one in sentences(found) if "correlation" in one and "policies" in one]
+    assert found.generated.balanced == 1 and found.followed.value == pytest.approx(1)
+    assert found.precision.value == found.recall.value == 1 and found.refusal == ""
+    (reason,) = [one for one in sentences(found) if "success rates over policies" in one]
     assert found.success.pearson.value is None
-    assert reason == "correlations over policies are not computed: 4 of at least 8 episodes"
+    assert reason.endswith("no correlation, 4 of at least 8 episodes")
 
 
 def test_policies_of_gym_pusht_are_told_where_the_disc_is(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,7 +156,7 @@ def test_shares_have_exact_intervals_and_too_few_successes_are_said(world: World
     (row,) = found.rows()
     assert row["true_success"] == 0 and row["true_success_interval"] == pytest.approx((0, 0.369), abs=1e-3)
     doubt = "there are too few successes to tell whether the judge is better"
-    assert doubt in sentences(found)[-1]
+    assert any(doubt in sentence for sentence in sentences(found))
     page = html(found)
     assert page.count(doubt) == 1 and page.index(doubt) < page.index("<table")
     for high, said in (
@@ -163,7 +164,70 @@ def test_shares_have_exact_intervals_and_too_few_successes_are_said(world: World
         (0.9, "may be no better than chance; more"),
     ):
         generated = Accuracy(0.5, 0.4, high, share=0.5, count=32, successes=4)
-        assert said in sentences(replace(found, generated=generated))[-1]
+        assert said in replace(found, generated=generated).refusal
+
+
+def scored_as(name: str, model: np.ndarray, replayed: np.ndarray, limit: float = 5.0) -> Scored:
+    """Return a policy with these scores (N,), whose true outcomes are those under the same actions."""
+    images = np.zeros((len(model), 1, 8, 8, 3), np.uint8)
+    read, true = (Outcomes(values, values >= limit) for values in (model, replayed))
+    return Scored(name, true, read, true, (0,), images, images)
+
+
+def evaluation(judge: StateJudge, policies: list[Scored]) -> PolicyEvaluation:
+    """Return what `evaluate_policies` makes of these results."""
+    made = {one.policy: one for one in policies}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scores, "score_policy", lambda name, *given: made[name])
+        patch.setattr(scores, "begin", lambda *given: None)
+        patch.setattr(scores, "checked", lambda *given: None)
+        world: Any = FlawlessWorld(World(tiny_model(ROBOT), get_tokenizer("fsq-8")))
+        given: Any = {"world": world, "judge": judge, "episodes": 24, "frames": 4}
+        return evaluate_policies(ROBOT, [(name, Still()) for name in made], **given)
+
+
+def test_no_verdict_where_single_episodes_do_not_agree(judge: StateJudge) -> None:
+    rng = np.random.default_rng(0)
+    rates = (0.1, 0.3, 0.5, 0.7, 0.9)
+    agreeing, unrelated = [], []
+    for number, rate in enumerate(rates):
+        true = np.where(rng.random(24) < rate, 8.0, 2.0) + rng.random(24)
+        agreeing.append(scored_as(f"p{number}", true + rng.normal(0, 0.5, 24), true))
+        unrelated.append(scored_as(f"p{number}", rng.permutation(24) % 9 + 0.0, true))
+    found = evaluation(judge, agreeing)
+    assert found.refusal == "" and found.precision.value == found.recall.value == 1
+    assert any(sentence.startswith("success rates over policies: Pearson") for sentence in sentences(found))
+    wrong = evaluation(judge, unrelated)
+    assert wrong.refusal and wrong.to_json()["refused"] == wrong.refusal
+    said = sentences(wrong)
+    assert any("no verdict" in sentence for sentence in said) and not any("Pearson" in one for one in said)
+    page = html(wrong)
+    assert page.index("no verdict" if "no verdict" in page else "No verdict") < page.index("<table")
+    assert "correlation of success rates" not in page and "correlation of success rates" in html(found)
+
+
+def test_outcomes_alone_are_no_verdict_where_scores_say_nothing(judge: StateJudge) -> None:
+    true = np.where(np.arange(24) < 12, 8.0, 2.0)
+    read = np.where(true >= 5, 5.1, 4.9)
+    read[0] = read[20] = -900.0  # one success and one failure are lost: outcomes hold, scores do not
+    found = evaluation(judge, [scored_as(f"p{number}", read, true) for number in range(3)])
+    assert found.generated.better_than_chance and found.precision.value == 1
+    assert "no better than by chance" in found.refusal and "Pearson" not in " ".join(sentences(found))
+
+
+def test_policies_that_cannot_be_told_apart_are_named(judge: StateJudge) -> None:
+    outcomes = np.zeros((4, 24))
+    outcomes[1, :1] = outcomes[2, :2] = 9.0
+    outcomes[3, :20] = 9.0
+    names = ("none", "one", "two", "most")
+    found = evaluation(judge, [scored_as(name, row, row) for name, row in zip(names, outcomes, strict=True)])
+    apart = [("none", "one"), ("none", "two"), ("one", "two")]
+    assert found.alike("true") == found.alike("model") == apart
+    assert found.to_json()["alike"] == {"simulator": apart, "model": apart}
+    (said,) = [one for one in sentences(found) if "in the model, these cannot be told apart" in one]
+    assert said.endswith("none and one; none and two; one and two")
+    alike = evaluation(judge, [scored_as(name, outcomes[0], outcomes[0]) for name in names])
+    assert "by success in the model, no two policies can be told apart" in sentences(alike)
 
 
 @pytest.mark.slow
@@ -230,7 +294,7 @@ def test_a_policy_that_leaves_the_range_of_training_is_named_once(world: World, 
             ROBOT, [("wild", Called(Wild)), "still"], world=flawless, judge=judge, episodes=2, frames=4
         )
     (said,) = [str(one.message) for one in warned]
-    assert found.followed is None  # of four episodes it would say nothing
+    assert found.followed.value is None  # of four episodes it would say nothing
     assert said.startswith("policy wild: rails_03: an action is outside") and "(action_0 -50 to 50)" in said
 
 
