@@ -52,6 +52,7 @@ from hma_data.shards.schema import RowLayout, flag_totals, to_numpy
 from hma_data.sources.base import EpisodeRef, open_source
 from hma_data.sources.common.choice import chosen_ids, ids_for_robot
 from hma_data.sources.detect import of_another_format, require_utf8
+from hma_data.sources.lerobot.writer import origin_of
 from hma_data.storage.files import remove_parts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_text
@@ -89,6 +90,8 @@ def plan_conversion(
         kept = pa.array(chosen_ids(ids, settings.only, settings.exclude), pa.string())
         chosen = refs.take(to_numpy(pc.is_in(refs.column("id"), kept)))
     plan = make_plan(chosen, embodiment, tokenizer, settings, uri)
+    if form == "lerobot":
+        plan = plan.with_origin(origin_of(place(uri)))
     return replace(plan, left_out=len(refs) - len(chosen)), uri
 
 

@@ -13,8 +13,8 @@ import heapq
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import PurePath
 from typing import Any, Literal
@@ -132,6 +132,13 @@ class Plan:
         """Return the plan of these units; its facts get their hash."""
         plain = json.loads(json.dumps(facts))  # as a footer gives them back
         return cls(tuple(units), {**plain, "hash": plan_hash(plain)})
+
+    def with_origin(self, made_by: Mapping[str, Any]) -> "Plan":
+        """Return the plan with what made its episodes, if that is no robot's recorder."""
+        if not made_by:
+            return self
+        facts = {key: value for key, value in self.facts.items() if key != "hash"}
+        return replace(Plan.of(self.units, facts | {"made_by": dict(made_by)}), left_out=self.left_out)
 
     @property
     def episodes(self) -> int:

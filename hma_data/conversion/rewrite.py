@@ -102,10 +102,7 @@ class _Job:
         plan = make_plan(
             Records.of_table(EpisodeRef, refs), self.embodiment, first.spec, self.settings, self.source
         )
-        if not self.made_by:
-            return plan
-        facts = {key: value for key, value in plan.facts.items() if key != "hash"}
-        return Plan.of(plan.units, facts | {"made_by": dict(self.made_by)})
+        return plan.with_origin(self.made_by)
 
     def run(self, out: StrPath, workers: int, on_progress: OnProgress) -> Manifest:
         """Write the set; keep shards that are already there."""

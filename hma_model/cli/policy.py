@@ -120,15 +120,15 @@ def augment(
     from hma_data.registry.embodiment import Embodiment
     from hma_data.shards.manifest import MANIFEST
     from hma_data.shards.reader import ShardSet
+    from hma_data.sources.lerobot.writer import ORIGIN
     from hma_model.synthetic.augment import Augmentation
     from hma_model.synthetic.augment import augment as run
-    from hma_model.synthetic.recorder import FACTS
 
     there, name = device_name(device), source.resolve().name if source else ""
     settings = Augmentation(
         embodiment, name, episodes, frames, commands, keep, judge, seed, unmask_steps, temperature, precision
     )
-    finished = (out / MANIFEST).is_file() and (lerobot is None or (lerobot / FACTS).is_file())
+    finished = (out / MANIFEST).is_file() and (lerobot is None or (lerobot / ORIGIN).is_file())
     whole = episodes * frames
     with interruptible(lambda: kept("batches", out)), progress("episodes", whole) as update:
         made = run(

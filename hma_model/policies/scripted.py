@@ -25,13 +25,12 @@ class Still:
 
 
 class Random:
-    """A uniform action in the range of training, another one for each chunk."""
+    """A uniform action in the range seen in training, another one for each chunk."""
 
     def begin(self, arena: Arena) -> None:
         self._rng = arena.scenes.rng(1)
-        self._low, self._high = (
-            np.array([getattr(dim, end) for dim in arena.scenes.dimensions]) for end in ("low", "high")
-        )
+        # A person drives a rate both ways; a rate that was only ever positive in training stays so here.
+        self._low, self._high = arena.scenes.robot.seen
 
     def act(self, arena: Arena) -> Floats:
         if arena.fresh:

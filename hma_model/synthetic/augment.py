@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import truth
+from hma_data.lab.scripted import steerable
 from hma_data.lab.simulator import simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
@@ -146,8 +147,7 @@ class ReplayPolicy:
 
     def begin(self, arena: Arena) -> None:
         self._rng = arena.scenes.rng(4)
-        dims = arena.scenes.dimensions
-        self._low, self._high = np.array([dim.low for dim in dims]), np.array([dim.high for dim in dims])
+        self._low, self._high = arena.scenes.robot.seen
 
     def act(self, arena: Arena) -> Floats:
         if arena.fresh:
@@ -265,22 +265,24 @@ class _Maker:
         else:
             self.cameras = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
 
-    def _policy(self, actions: str) -> Policy:
-        kind, _, number = actions.partition("=")
-        std = self.world.model.embodiments[self.robot.id].std
+    def _policy(self, commands: str) -> Policy:
+        kind, _, number = commands.partition("=")
         if not self.settings.recorded:
-            policy = read_policy(actions, self.scenes, self.world)
+            if self.shards is not None and commands.startswith("scripted") and not steerable(self.robot.id):
+                fault = f"{commands!r} needs a driver that goes by images, and {self.robot.id} has none"
+                raise UsageError("--commands", fault, "give replay, perturb=0.3, random or a policy of yours")
+            policy = read_policy(commands, self.scenes, self.world)
             if isinstance(policy, Judged) and not self.settings.judge:
-                fault = f"{actions!r} plans for what a judge calls success"
+                fault = f"{commands!r} plans for what a judge calls success"
                 raise UsageError("--commands", fault, "add --judge moved, or another task")
             return policy
-        share = 0.0 if actions == "replay" else np.nan
+        share = 0.0 if commands == "replay" else np.nan
         if kind == "perturb":
             with suppress(ValueError):
                 share = float(number)
         if not 0 <= share < np.inf:
-            raise UsageError("--commands", f"{actions!r} is unknown", "give replay, or perturb=0.3")
-        return ReplayPolicy(share, std)
+            raise UsageError("--commands", f"{commands!r} is unknown", "give replay, or perturb=0.3")
+        return ReplayPolicy(share, self.world.model.embodiments[self.robot.id].std)
 
     def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:
         """Return the pieces of episodes that are long enough: rows, where they begin, and the room to start.

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
 
 Floats = NDArray[np.float32]
+Array = NDArray[np.float64]
 
 PROMPT_FRAMES = 4  # frames; two would show velocities, more also show what stands still
 LONGEST_WINDOW = 64  # frames of a window of a recording
@@ -117,6 +118,7 @@ class LabRobot:
     def __init__(self, embodiment: Embodiment, stats: Mapping[str, Any], size: int = SIZE) -> None:
         self.key, self.embodiment, self.size = embodiment.id, embodiment, size
         self.dimensions = dimensions(embodiment, stats)
+        self.seen = seen_range(stats)
         self.cameras = [embodiment.primary_camera.name]
 
     def scene(self, number: int) -> "LabScene":
@@ -366,12 +368,16 @@ def trained_on(checkpoint: Checkpoint) -> list[ShardSet]:
     return [one for one in checkpoint.shards() if not simulated(one.embodiment.id)]
 
 
-def dimensions(embodiment: Embodiment, stats: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    """Return the values of a robot's action, with the range of the actions seen in training."""
+def seen_range(stats: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Return the least and the greatest action (A,) seen in training; about them where nobody knows."""
     action = stats["action"]
     mean, std = np.array(action["mean"]), np.array(action["std"])
-    low = np.array(action.get("min", mean - 2 * std))
-    high = np.array(action.get("max", mean + 2 * std))
+    return np.array(action.get("min", mean - 2 * std)), np.array(action.get("max", mean + 2 * std))
+
+
+def dimensions(embodiment: Embodiment, stats: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    """Return the values of a robot's action, with the range of the actions seen in training."""
+    low, high = seen_range(stats)
     parts = [part for part in embodiment.action.components for _ in range(part.dims)]
     values = zip(embodiment.action.names(), parts, low.tolist(), high.tolist(), strict=True)
     return tuple(_dimension(embodiment.action.space, *value) for value in values)

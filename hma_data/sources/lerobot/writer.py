@@ -16,9 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import MissingDependencyError, install_command
+from hma_data.errors import MissingDependencyError, SourceError, install_command
 from hma_data.registry.embodiment import Embodiment
 from hma_data.registry.export import lerobot_features
+from hma_data.storage.files import read_json
+
+ORIGIN = "synthetic.json"  # beside a dataset whose episodes no robot recorded: what made them
+
+
+def origin_of(folder: Path) -> dict[str, Any]:
+    """Return what made the episodes of a dataset: `made_by` of the plan of shards; empty for a recording."""
+    path = folder / ORIGIN
+    return read_json(path, SourceError) if path.is_file() else {}
 
 
 @dataclass(frozen=True)

@@ -330,6 +330,12 @@ def test_episodes_of_several_cameras_hold_each_in_its_place(
     episode = source.read(place, source.episode_ids(place)[0], robot)
     for name, red in (("side", 9), ("top", 1)):
         assert abs(float(episode.streams[name].frames([0])[..., 0].mean()) - 17 * red) < 6
+    back = convert(robot, place, tokenizer, tmp_path / "back", settings=Settings(frames="strided"))
+    assert back.manifest.plan["made_by"] == made.manifest.plan["made_by"]
+    assert back.manifest.plan["made_by"]["synthetic"] is True and verify(tmp_path / "back") == []
+    own = replace(taken, frames="strided")
+    convert(three.arm(), recording, tokenizer, tmp_path / "strided", settings=own)
+    assert "made_by" not in ShardSet(tmp_path / "strided").manifest.plan
 
 
 def test_the_camera_that_is_shown_is_the_one_that_is_named(tmp_path: Path) -> None:
@@ -448,6 +454,40 @@ def test_the_same_call_keeps_a_finished_dataset_and_finishes_one_that_was_cut_of
     (dataset / "synthetic.json").unlink()
     with pytest.raises(OutputError, match="rails: holds something else — remove it or choose another"):
         augment(tmp_path / "out", asked(episodes=2), **given)
+
+
+@pytest.fixture
+def one_sided(block_tokenizer: BlockTokenizer, tmp_path: Path) -> tuple[World, ShardSet]:
+    """A world and shards of a robot without simulator, one of whose rates was never negative in training."""
+    arm = Embodiment.from_values(three.arm().to_dict() | {"id": "a_strangers_arm"}, "a stranger's arm")
+    convert(arm, three.write_hdf5(tmp_path / "three.hdf5"), block_tokenizer, tmp_path / "real")
+    shards = ShardSet(tmp_path / "real")
+    world = World(trained_on("first", shards, tmp_path / "model", frames=4).model, block_tokenizer)
+    seen = np.array([[0, -0.5], [1, 0.5]], np.float32)
+    world._specs[arm.id] = replace(world.action_spec(arm.id), seen=seen)
+    return world, shards
+
+
+@pytest.mark.parametrize("commands", ["random", "perturb=3"])
+def test_actions_stay_in_the_range_seen_in_training(
+    commands: str, one_sided: tuple[World, ShardSet], tmp_path: Path
+) -> None:
+    world, shards = one_sided
+    settings = Augmentation("a_strangers_arm", "real", episodes=4, frames=2, keep=1.0, commands=commands)
+    augment(tmp_path / "out", settings, world=world, shards=shards.folder)
+    made = ShardSet(tmp_path / "out")
+    reader = EpisodeReader(made, made.columns())
+    rows = [reader.episode(row, made.manifest.cameras[0])["action"] for row in made.episodes.to_pylist()]
+    own = np.concatenate([row[-1:] for row in rows]).reshape(-1, 2)
+    assert (own >= [0, -0.5]).all() and (own <= [1, 0.5]).all() and np.ptp(own[:, 0]) > 0.2
+
+
+def test_no_recording_is_called_scripted(one_sided: tuple[World, ShardSet], tmp_path: Path) -> None:
+    world, shards = one_sided
+    for commands in ("scripted", "scripted:noise=0.5"):
+        settings = Augmentation("a_strangers_arm", "real", commands=commands, frames=2)
+        with pytest.raises(UsageError, match=f"'{commands}' needs a driver .* a_strangers_arm has none"):
+            augment(tmp_path / "out", settings, world=world, shards=shards.folder)
 
 
 def test_a_robot_without_simulator_needs_shards(tmp_path: Path) -> None:
