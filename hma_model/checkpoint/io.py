@@ -168,6 +168,18 @@ def write_readme(checkpoint: StrPath | Checkpoint) -> None:
     write_atomic(checkpoint.folder / README, text)
 
 
+def record_evaluation(checkpoint: Checkpoint, embodiment: str, facts: Mapping[str, Any]) -> None:
+    """Write what `hma evaluate` found into an embodiment's card, and the model card anew.
+
+    Args:
+        facts: `verdict`, a sentence about the embodiment, and the figures behind it.
+    """
+    card = checkpoint.card(embodiment)
+    if card.get("evaluation") != facts:
+        write_atomic(checkpoint.path(embodiment, CARD), to_json(card | {"evaluation": dict(facts)}))
+        write_readme(checkpoint)
+
+
 def remove(folder: StrPath) -> None:
     """Delete a checkpoint; an interrupted deletion leaves no partial checkpoint under its name."""
     folder = as_path(folder)

@@ -60,6 +60,11 @@ def render(
         "model_card.md",
         front=write_yaml(front),
         title=line((repo or "HMA world model").rsplit("/", 1)[-1]),
+        verdicts=[
+            (name, line(evaluation.get("verdict"), 400))
+            for name, card in sorted(cards.items())
+            if isinstance(evaluation := card.get("evaluation"), Mapping) and evaluation.get("verdict")
+        ],
         model=_lines(model),
         views=model.get("views", 1),
         tokenizer=_lines(tokenizer),
@@ -156,10 +161,10 @@ def _lines(values: Mapping[str, Any]) -> Mapping[str, str]:
     return defaultdict(str, {key: line(value) for key, value in values.items()})
 
 
-def line(value: Any) -> str:
+def line(value: Any, longest: int = 200) -> str:
     """Return a value as one line that cannot leave its cell, become markup or change the text direction."""
     text = "".join(c if c.isprintable() else " " for c in str("" if value is None else value))
-    text = " ".join(text.split())[:200]
+    text = " ".join(text.split())[:longest]
     if re.fullmatch(r"[\w.-]*", text, re.ASCII):
         return text
     text = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

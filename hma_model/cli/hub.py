@@ -48,6 +48,10 @@ def push(
         _add_films(opened, sample, embodiment)
     address = hub.push(opened, target, embodiment, private, _print_files)
     print(f"published to {address}")
+    for name, card in opened.cards(embodiment).items():
+        judged = card.get("evaluation")
+        if judged and not judged["follows"]:
+            print(f"{name} {judged['verdict']}: the model card opens with this")
     robots = "".join(f" -e {shlex.quote(name)}" for name in embodiment or ())
     print(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {_folder_for(target)}")
 

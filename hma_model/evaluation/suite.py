@@ -14,6 +14,7 @@ import hashlib
 import io
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -32,13 +33,15 @@ from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import finite, to_json, write_atomic
 from hma_data.storage.kept import kept_arrays
-from hma_data.storage.paths import StrPath, as_path, as_text
-from hma_model.checkpoint.folder import require_tokenizer
+from hma_data.storage.paths import StrPath, as_path, as_text, is_repository
+from hma_model.checkpoint.folder import EMBEDDED, require_tokenizer
+from hma_model.checkpoint.io import record_evaluation
 from hma_model.evaluation.evaluate import Settings, measure
 from hma_model.evaluation.losses import no_window
 from hma_model.evaluation.perceptual import Networks
 from hma_model.evaluation.recorded_state import measure_recorded_state
 from hma_model.evaluation.simulated import measure_state
+from hma_model.evaluation.verdict import verdict
 from hma_model.generation.decode import cameras_for, default_prompt
 
 if TYPE_CHECKING:
@@ -118,6 +121,7 @@ def evaluate_all(
                 part = _measured(label, model, shards, settings, networks, counter)
                 if folder:
                     _keep(folder, mark, part)
+            _record(label, model, part, settings)
             parts.append(part)
             done += _frames(model, shards, settings)
             update(done, about)
@@ -234,6 +238,20 @@ def _measured(
     if model.config.kind == "discrete":
         predicted = {kind: values.astype(np.uint32) for kind, values in predicted.items()}
     return Part(label, str(shards.folder), finite(found), rows, predicted)
+
+
+def _record(label: str, model: "HMA", part: Part, settings: Settings) -> None:
+    """Write the verdict on held-out episodes into the card of a checkpoint of this machine."""
+    source = model.source
+    fetched = is_repository(label) or "://" in label
+    if source is None or source.folder == EMBEDDED or fetched or settings.split != "val":
+        return
+    said = verdict(part.found)
+    figures = ("episodes", "windows", "psnr_action_gain_last", "psnr_action_gain_last_95")
+    facts = {"verdict": said, "follows": said.startswith("follows ")}
+    facts |= {name: part.found.get(name) for name in figures}
+    with suppress(OSError):  # a folder that may only be read
+        record_evaluation(source, part.found["embodiment"], facts)
 
 
 # -- the folder

@@ -143,6 +143,7 @@ def _row(name: str, card: Mapping[str, Any], size: int | None, problems: list[st
         "hz": card.get("effective_hz"),
         "stride": card.get("stride"),
         **{key: _value_of(metrics, key) for key in FIGURES},
+        "verdict": _value_of(card.get("evaluation"), "verdict"),
         "data": card.get("data"),
         "licence": card.get("license"),
         "bytes": size,

@@ -6,6 +6,7 @@ folder.
 """
 
 import hashlib
+import re
 import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 Content = Path | bytes
+_FRONT_MATTER = re.compile(r"\A---\n.*?^---$", re.DOTALL | re.MULTILINE)
 MAX_NAMED = 50  # ids that an error lists
 _ADD_ONE = (
     f"Add one: hma finetune --from {EMBEDDED_NAME} --data SHARDS --out RUN, "
@@ -96,6 +98,8 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
         HubError: an embodiment has no YAML, neither in the model's source nor in the registry.
     """
     source = model.source
+    # The trunk's file is taken over where it is unchanged: its hash tells which stems fit it.
+    base = source if source and _has_trunk(model, source) else None
     yaml, stats, cards = {}, {}, {}
     for name, space in model.embodiments.items():
         if source and name in source.embodiments:
@@ -103,6 +107,8 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
             stats[name] = source.stats(name)
             card = source.card(name)
             cards[name] = {key: card.get(key, {}) for key in ("data", "metrics", "training")}
+            if base and "evaluation" in card and _has_embodiment(model, source, name):
+                cards[name]["evaluation"] = card["evaluation"]  # it judged these weights
             continue
         try:
             yaml[name] = find(name).to_yaml()
@@ -113,8 +119,6 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
         action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
         stats[name] = {"action": action}
     with tempfile.TemporaryDirectory() as folder:
-        # The trunk's file is taken over where it is unchanged: its hash tells which stems fit it.
-        base = source if source and _has_trunk(model, source) else None
         saved = checkpoints.save(
             model, Path(folder) / "model", embodiment_yaml=yaml, stats=stats, cards=cards, base=base
         )
@@ -125,9 +129,18 @@ def _has_trunk(model: "HMA", stored: Checkpoint) -> bool:
     """Check whether a model still has a checkpoint's trunk, which may be stored in float16."""
     if model.config != stored.config:
         return False
-    own, theirs = model.trunk_state(), weights.trunk(stored)
-    return own.keys() == theirs.keys() and all(
-        bool((own[name].cpu() == theirs[name].to(own[name].dtype)).all()) for name in own
+    return _is_same(model.trunk_state(), weights.trunk(stored))
+
+
+def _has_embodiment(model: "HMA", stored: Checkpoint, name: str) -> bool:
+    """Check whether a model still has the stem and head of an embodiment of a checkpoint."""
+    stem, head = weights.embodiment(stored, name, model.embodiments[name])
+    return _is_same(model.stem_state(name), stem) and _is_same(model.head_state(name), head)
+
+
+def _is_same(own: weights.State, stored: weights.State) -> bool:
+    return own.keys() == stored.keys() and all(
+        bool((own[name].cpu() == stored[name].to(own[name].dtype)).all()) for name in own
     )
 
 
@@ -153,6 +166,7 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
     elif MANIFEST in files:
         raise HubError(store.name, "holds a shard set", "push to a place of its own")
     else:
+        _require_free(store, files)
         changes[CONFIG] = inside(source.folder, CONFIG)
     if TRUNK not in files:
         changes[TRUNK] = inside(source.folder, TRUNK)
@@ -181,6 +195,21 @@ def _missing_sizes(files: dict[str, Content | None], store: Store) -> dict[str, 
         for name, content in files.items()
         if content is not None and not store.has(name, content)
     }
+
+
+def _require_free(store: Store, files: Iterable[str]) -> None:
+    """Raise if a place without a checkpoint holds files of somebody, such as a README.md.
+
+    Files that a push begins with are allowed, and those of git. A new repository of the hub has a README.md
+    with nothing but its front matter.
+    """
+    own = (TRUNK, ".git", ".gitattributes", "embodiments")
+    foreign = [name for name in files if name.split("/")[0] not in own]
+    if foreign == [README] and store.repo and not _FRONT_MATTER.sub("", store.read(README).decode()).strip():
+        return
+    if foreign:
+        named = README if README in foreign else foreign[0]
+        raise HubError(store.name, f"holds something else: {named}", "push to a place of its own")
 
 
 def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> None:

@@ -327,7 +327,10 @@ def _info(path: Path) -> Info:
     except ValidationError as fault:
         first = fault.errors()[0]
         key = ".".join(map(str, first["loc"]))
-        said = f"{key} is {first['input']!r}: {first['msg']}" if key else first["msg"]
+        value = repr(first["input"])  # of a missing key it would be the whole file
+        said = f"{key} is {value[:60]}: {first['msg']}" if key else first["msg"]
+        if first["type"] == "missing":
+            said = f"lacks {key}"
         remedy = "the dataset is damaged or not complete"
         raise SourceError(path, *unreadable(path, said, remedy)) from fault
     if info.codebase_version not in VERSIONS:

@@ -14,6 +14,7 @@ import torch
 from hma_data.lab import record
 from hma_data.lab.truth import episode
 from hma_data.registry.embodiment import find
+from hma_model.checkpoint.folder import Checkpoint
 from hma_model.cli import main
 from hma_model.evaluation import showcase, suite
 from hma_model.evaluation.report import difference, write_results
@@ -77,6 +78,15 @@ def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_onc
     assert [line[1] for line in lines] == ["arm", "hand", "mean over sets"] * 2 and len(lines[0]) == len(
         names
     )
+
+
+def test_a_verdict_reaches_the_cards_of_a_checkpoint(made: Path) -> None:
+    (arm, _) = run(made)
+    found = Checkpoint.open(made / "one").card("arm")["evaluation"]
+    assert found["verdict"] == verdict(arm.found) and found["episodes"] == 2
+    assert found["follows"] is found["verdict"].startswith("follows")
+    page = (made / "one" / "README.md").read_text()
+    assert page.index("> **arm** ") < page.index("## Embodiments")
 
 
 def test_what_holds_for_every_part_is_said_of_all_and_the_rest_of_its_own(made: Path) -> None:

@@ -6,14 +6,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from huggingface_hub import DatasetCard, ModelCard
 
 from hma_data.errors import HubError
 from hma_data.tokenizers.base import get_tokenizer
+from hma_model.checkpoint.folder import Checkpoint
+from hma_model.checkpoint.io import record_evaluation
 from hma_model.checkpoint.model_card import licence, render
+from hma_model.cli import main
 from hma_model.config import HMAConfig
 from hma_model.hub import publish as hub
 from hma_model.hub.datasets import push_data
+from hma_model.hub.listing import list_embodiments
+from hma_model.network.model import HMA
 from tests.hub_server import Hub
 from tests.hub_state import TOKEN
 from tests.model.robots import edit_card, make_model, save
@@ -60,6 +66,33 @@ def test_the_cards_code_runs_as_pasted(
     monkeypatch.chdir(tmp_path / "hub")  # the card says: in this folder
     exec(found[1], made)
     assert made["film"].shape == (6, spec.image_size, spec.image_size, 3) and made["film"].dtype == np.uint8
+
+
+NOT_YET = "does not follow its actions yet (+0.1 dB on the last frame)"
+
+
+def test_a_card_opens_with_the_verdict_of_the_evaluation(folder: Path, tmp_path: Path, capsys) -> None:
+    record_evaluation(Checkpoint.open(folder), "arm", {"verdict": NOT_YET, "follows": False})
+    assert main(["hub", "push", str(folder), str(tmp_path / "hub")]) == 0
+    assert f"arm {NOT_YET}: the model card opens with this" in capsys.readouterr().out
+    for page in (folder / "README.md", tmp_path / "hub" / "README.md"):
+        text = ModelCard.load(page).text.strip().splitlines()
+        assert text[0].startswith("# ") and text[2].startswith("> **arm** does not follow its actions yet")
+    (row, other) = list_embodiments(tmp_path / "hub")
+    assert (row["verdict"], other["verdict"]) == (NOT_YET, None)
+
+
+@pytest.mark.parametrize("trained", [False, True])
+def test_a_loaded_models_verdict_is_published_unless_its_weights_have_changed(
+    folder: Path, tmp_path: Path, trained: bool
+) -> None:
+    record_evaluation(Checkpoint.open(folder), "arm", {"verdict": NOT_YET, "follows": False})
+    model = HMA.from_pretrained(str(folder))
+    if trained:
+        with torch.no_grad():
+            next(model.stem("arm").parameters()).add_(1)
+    model.push_to_hub(tmp_path / "hub")
+    assert ("evaluation" in Checkpoint.open(tmp_path / "hub").card("arm")) is not trained
 
 
 def test_a_card_says_what_its_losses_are_of() -> None:

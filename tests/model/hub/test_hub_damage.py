@@ -13,6 +13,7 @@ from hma_model.checkpoint.folder import read_metadata
 from hma_model.hub import publish as hub
 from hma_model.hub.datasets import pull_data, push_data
 from hma_model.hub.listing import list_embodiments
+from tests.hub_state import REPO
 from tests.model.robots import save
 from tests.model.shards import make_shards
 
@@ -122,6 +123,27 @@ def test_a_place_that_cannot_be_written_is_called_so(folder, tmp_path, place):
             act()
         assert found.value.remedy
     assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/notes.txt"])
+def test_a_folder_of_somebody_elses_files_stays_as_it_is(folder, tmp_path, name):
+    mine = tmp_path / "project" / name
+    mine.parent.mkdir(parents=True)
+    mine.write_text("# My project")
+    with pytest.raises(
+        HubError, match=rf"project: holds something else: {name} — push to a place of its own"
+    ):
+        hub.push(folder, tmp_path / "project")
+    assert mine.read_text() == "# My project"
+    assert [path for path in (tmp_path / "project").rglob("*") if path.is_file()] == [mine]
+
+
+def test_a_new_repository_with_a_readme_of_front_matter_alone_is_pushed_to(server, source):
+    server.create(REPO).commit({"README.md": b"---\nlicense: mit\n---\n"})
+    hub.push(source, REPO)
+    server.create("team/other").commit({"README.md": b"---\nlicense: mit\n---\n\n# My words"})
+    with pytest.raises(HubError, match=r"holds something else: README\.md"):
+        hub.push(source, "team/other")
 
 
 def test_a_checkpoint_does_not_go_to_a_shard_sets_place(folder, tmp_path):

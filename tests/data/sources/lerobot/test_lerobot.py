@@ -323,7 +323,7 @@ def test_actions_that_are_none_are_refused(copy: Callable[[str], Path], column: 
         ({"fps": 0}, "fps is 0: Input should be greater than 0"),
         ({"fps": "fast"}, "fps is 'fast'"),
         ({"features": {}}, "features is {}"),
-        ({"features": {"action": {"dtype": "float32"}}}, r"features\.action\.shape is"),
+        ({"features": {"action": {"dtype": "float32"}}}, r"lacks features\.action\.shape"),
     ],
 )
 def test_metadata_out_of_bounds_is_one_clear_line(
@@ -341,6 +341,7 @@ def test_metadata_out_of_bounds_is_one_clear_line(
     [
         ("info.json", "{", r"info\.json: Invalid JSON"),
         ("info.json", "[1]", "Input should be an object"),
+        ("info.json", '{"codebase_version": "v2.1", "robot_type": "so100"}', r"info\.json: lacks fps —"),
         ("info.json", "[" * 100_000, "Invalid JSON"),
         (
             "episodes.jsonl",
