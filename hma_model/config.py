@@ -78,6 +78,7 @@ OBJECTIVES: Mapping[str, Objective] = {
 CONDITIONINGS = ("modulation", "concat", "add", "cross_attention")
 _CHOICES = {
     "kind": ("discrete", "continuous"),
+    "trunk": ("transformer",),
     "training_pass": ("window", "pairs"),
     "masked_input": ("learned", "previous"),
     "digit_order": ("together", "chain"),
@@ -116,6 +117,7 @@ class HMAConfig:
     """
 
     kind: str = "discrete"  # discrete: VQ tokens, cross-entropy; continuous: latents, diffusion head
+    trunk: str = "transformer"  # see `hma_model.network.trunks`
     layers: int = 32
     width: int = 256
     heads: int = 8

@@ -20,7 +20,7 @@ from hma_model.evaluation.losses import validation_losses, windows
 from hma_model.generation.rollout import Rollout
 from hma_model.network.masking import VideoMask, corrupt_tokens
 from hma_model.network.model import HMA
-from hma_model.network.trunk import attend
+from hma_model.network.trunks.transformer import attend
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe

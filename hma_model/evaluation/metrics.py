@@ -19,7 +19,7 @@ from torch.nn.functional import cross_entropy
 
 from hma_data.errors import UsageError
 from hma_model.evaluation.intervals import NATURAL, Episodes, ends_of, interval
-from hma_model.network.conditioning import Groups, align, condition
+from hma_model.network.conditioning import Groups, align
 from hma_model.network.copying import known_digits
 from hma_model.network.objectives import Layout
 from hma_model.network.stem import to_digits
@@ -202,8 +202,8 @@ def _at_once(model: "HMA", batch: "Batch") -> Tensor:
     layout = Layout.pairs(model, count, past=count)
     given = align(config, batch.actions, batch.action_mask, count).frames(layout.frames)
     masked = torch.full_like(frames[:, 1:], config.mask_id)
-    x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)), layout.previous)
-    features = model.trunk(x, condition(model, given, groups, layout.times.positions), layout.times)
+    x = model.embed(groups.sort(torch.cat([frames, masked], dim=1)), previous=layout.previous)
+    features = model.trunk(x, model.condition(given, groups, layout.times.positions), layout.times)
     true = to_digits(groups.sort(frames[:, 1:]), config.digits)
     before = known_digits(groups.sort(frames[:, :-1]), config)
     scores = model.token_readout(model.video_features(features)[:, count:], true, before)

@@ -10,16 +10,11 @@ from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.network.conditioning import ActionConditioning
-from hma_model.network.model import HMA
-
-
-def widest(model: HMA, names: Sequence[str]) -> int:
-    """Return the largest K of these embodiments."""
-    return max(model.stem(name).input.in_features for name in set(names))
+from hma_model.network.network import Network
 
 
 def prompt_chunks(
-    model: HMA, names: Sequence[str], actions: Tensor | None, known: Tensor | None, frames: int
+    model: Network, names: Sequence[str], actions: Tensor | None, known: Tensor | None, frames: int
 ) -> ActionConditioning:
     """Return the chunk at each of P known frames.
 
@@ -34,7 +29,7 @@ def prompt_chunks(
     Raises:
         HMAError: the shapes are others.
     """
-    batch, width, device = len(names), widest(model, names), model.device
+    batch, width, device = len(names), model.widest_chunk(names), model.device
     chunks = torch.zeros(batch, frames, width, device=device)
     given = ActionConditioning(chunks, torch.zeros(batch, frames, dtype=torch.bool, device=device))
     if actions is None or frames == 1:
@@ -52,9 +47,9 @@ def prompt_chunks(
     return given
 
 
-def step_chunk(model: HMA, names: Sequence[str], chunk: Tensor) -> Tensor:
+def step_chunk(model: Network, names: Sequence[str], chunk: Tensor) -> Tensor:
     """Return the chunk (n, K) of a step on the model's device; raise HMAError if its shape is another."""
-    width = widest(model, names)
+    width = model.widest_chunk(names)
     if chunk.dim() != 2 or chunk.shape[0] != len(names) or chunk.shape[1] < width:
         raise HMAError("step", f"a chunk has the shape {tuple(chunk.shape)}", f"give ({len(names)}, {width})")
     return chunk[:, :width].to(model.device).float()

@@ -19,7 +19,7 @@ from hma_data.registry.embodiment import Embodiment, find
 from hma_model.checkpoint.folder import Checkpoint
 
 if TYPE_CHECKING:
-    from hma_model.network.model import HMA
+    from hma_model.network.network import Network
 
 Floats = NDArray[np.float32]
 
@@ -46,7 +46,7 @@ class Commands:
     seen: Floats | None
 
     @classmethod
-    def of(cls, model: "HMA", embodiment: str) -> "Commands":
+    def of(cls, model: "Network", embodiment: str) -> "Commands":
         """Return the commands of an embodiment of a model.
 
         Raises:
@@ -129,7 +129,7 @@ class OutsideRangeWarning(UserWarning):
 
 
 def warn_outside(
-    model: "HMA", actions: Tensor, embodiments: str | Sequence[str], known: Tensor | None = None
+    model: "Network", actions: Tensor, embodiments: str | Sequence[str], known: Tensor | None = None
 ) -> None:
     """Warn of known actions outside the range seen in training; once of each embodiment of a model.
 
@@ -156,14 +156,14 @@ def warn_outside(
                 warnings.warn(f"{said}. This is said once", OutsideRangeWarning, stacklevel=4)
 
 
-def _known(model: "HMA", embodiment: str) -> Commands | None:
+def _known(model: "Network", embodiment: str) -> Commands | None:
     """Return the commands of an embodiment; None if the checkpoint that tells them is no longer there."""
     with suppress(CheckpointError):
         return Commands.of(model, embodiment)
     return None
 
 
-def described(model: "HMA", embodiment: str) -> Embodiment | None:
+def described(model: "Network", embodiment: str) -> Embodiment | None:
     """Return the YAML of an embodiment of a model: its checkpoint's, else the registry's; None without one.
 
     Raises:
@@ -182,18 +182,18 @@ def described(model: "HMA", embodiment: str) -> Embodiment | None:
         return None
 
 
-def card(model: "HMA", embodiment: str) -> dict[str, Any]:
+def card(model: "Network", embodiment: str) -> dict[str, Any]:
     """Return the card of an embodiment of a model; empty if the model is not from a checkpoint."""
     kept = _checkpoint(model, embodiment)
     return {} if kept is None else kept.card(embodiment)
 
 
-def _checkpoint(model: "HMA", embodiment: str) -> Checkpoint | None:
+def _checkpoint(model: "Network", embodiment: str) -> Checkpoint | None:
     kept = model.source
     return kept if kept and embodiment in kept.embodiments else None
 
 
-def _seen(model: "HMA", embodiment: str) -> Floats | None:
+def _seen(model: "Network", embodiment: str) -> Floats | None:
     kept = _checkpoint(model, embodiment)
     action = {} if kept is None else kept.stats(embodiment)["action"]
     if "min" not in action or "max" not in action:

@@ -17,7 +17,7 @@ from hma_data.tokenizers.network import NetworkTokenizer
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
-    from hma_model.network.model import HMA
+    from hma_model.network.network import Network
 
 
 def default_prompt(length: int) -> int:
@@ -38,7 +38,7 @@ def decode(tokenizer: "Tokenizer", stored: Tensor) -> NDArray[np.uint8]:
     return pictures.reshape(*stored.shape[:2], *pictures.shape[1:])
 
 
-def cameras_for(model: "HMA", shards: ShardSet, cameras: Cameras | None = None) -> Cameras:
+def cameras_for(model: "Network", shards: ShardSet, cameras: Cameras | None = None) -> Cameras:
     """Return the cameras that a model sees: those given, or those that it was trained on.
 
     Raises:

@@ -12,8 +12,7 @@ from hma_data.tokenizers.network import one_thread
 from hma_model.generation.packed import has_bfloat16, has_int8, packed, packs
 from hma_model.generation.unmask import TokenFrame
 from hma_model.network.head import TokenReadout
-from hma_model.network.model import HMA
-from hma_model.network.trunk import Trunk
+from hma_model.network.network import Network
 
 PRECISIONS = {"float32": torch.float32, "bf16": torch.bfloat16, "int8": torch.qint8}
 MOST_GRAPHS = 64  # of a model's passes: each number of rows and of tokens to unmask has one
@@ -36,12 +35,12 @@ class Engine:
         whole: the compiled trunk, readout and choice of tokens, `unmasked_by`; None without.
     """
 
-    def __init__(self, model: HMA, precision: str, compile: bool) -> None:
+    def __init__(self, model: Network, precision: str, compile: bool) -> None:
         self.config, self.device, self.precision = model.config, model.device, precision
         dtype, device = products_in(precision, model.device, compile), model.device
-        whole = model.trunk.position.dtype == torch.float32 and not torch.is_autocast_enabled(device.type)
+        whole = model.dtype == torch.float32 and not torch.is_autocast_enabled(device.type)
         pack = whole and not compile and packs(device)
-        self.trunk: Trunk = packed(model.trunk, dtype) if pack else model.trunk
+        self.trunk: nn.Module = packed(model.trunk, dtype) if pack else model.trunk
         # Scores of tokens stay float32; the diffusion head, most of a frame of latents, may be bfloat16.
         half = dtype == torch.bfloat16 and model.config.kind == "continuous"
         self.readout: nn.Module = (

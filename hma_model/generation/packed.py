@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from hma_model.network.linear import has_kernels
-from hma_model.network.trunk import MLP
+from hma_model.network.trunks.transformer import MLP
 
 _OPS: Any = torch.ops.mkldnn
 

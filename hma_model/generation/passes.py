@@ -14,9 +14,9 @@ from torch import Tensor
 from hma_model.generation.engine import Engine
 from hma_model.generation.state import Pass, RowState
 from hma_model.generation.unmask import PatchFrame, TokenFrame
-from hma_model.network.conditioning import Groups, condition
-from hma_model.network.model import HMA
-from hma_model.network.trunk import Conditioning, LayerCache, TimePositions, window_times
+from hma_model.network.conditioning import Groups
+from hma_model.network.network import Network
+from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions, window_times
 
 
 class Passes:
@@ -32,7 +32,7 @@ class Passes:
         noise_level: that the model is told of frames that it made itself; 0 tells nothing.
     """
 
-    def __init__(self, model: HMA, engine: Engine, state: RowState, caching: bool) -> None:
+    def __init__(self, model: Network, engine: Engine, state: RowState, caching: bool) -> None:
         self.model, self.config, self.engine, self.state = model, model.config, engine, state
         self.caching, self.noise_level = caching, 0.0
         self.passive: bool | None = None
@@ -63,21 +63,22 @@ class Passes:
 
     def inputs(
         self, frame: TokenFrame | PatchFrame, part: Pass, first: bool
-    ) -> tuple[Tensor, Conditioning, TimePositions, list[LayerCache] | None]:
+    ) -> tuple[Tensor, Conditioning, TimePositions, Carried | None]:
         """Return the inputs of the trunk for a pass."""
         whole = first or not self.caching
         fresh = part.past if whole or self.config.masked_input == "previous" else part.past[:, :0]
         values = torch.cat([fresh, part.lay_out(frame.values).unsqueeze(1)], dim=1)
         masked = torch.zeros(values.shape[:3], dtype=torch.bool, device=values.device)
         masked[:, -1] = part.lay_out(frame.masked)
-        x = self._embed(values, masked)
+        levels = None
         if whole and part.levels is not None:
-            x = self._tell(x, torch.nn.functional.pad(part.levels, (0, 1)))  # nothing of the new frame
+            levels = torch.nn.functional.pad(part.levels, (0, 1))  # of the new frame nothing is told
+        x = self._embed(values, masked, levels)
         if not self.caching:
             return x, part.conditioning, part.times, None
         conditioning = part.conditioning if first else part.conditioning.last()
         times = part.times if first else part.times.last()
-        return x if whole else x[:, -1:].contiguous(), conditioning, times, self._cache()
+        return x if whole else x[:, -1:].contiguous(), conditioning, times, self._carried()
 
     def catch_up(self, rows: list[int]) -> None:
         """Add all pending frames but the newest to the cache."""
@@ -125,59 +126,55 @@ class Passes:
     def _past_features(self, rows: list[int], count: int, late: int) -> Tensor:
         """Add `count` known frames, `late` before the next one, to the cache; return their features."""
         begin = [self.state.times[row] - count - late for row in rows]
-        return self._known_features(rows, self.state.cached_times(rows, begin, count), self._cache())
+        return self._known_features(rows, self.state.cached_times(rows, begin, count), self._carried())
 
-    def _known_features(
-        self, rows: list[int], times: TimePositions, cache: list[LayerCache] | None
-    ) -> Tensor:
+    def _known_features(self, rows: list[int], times: TimePositions, carried: Carried | None) -> Tensor:
         """Return the features (n, T, N, D) of known frames at times that all rows share, or (n, T) ones."""
         positions = times.positions if times.positions.dim() > 1 else times.positions.unsqueeze(0)
         past = self.state.past(rows, positions)
         masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
-        x = self._tell(self._embed(past, masked), self._levels(rows, positions))
-        return self.engine.trunk(x, self._condition(rows, positions), times, cache)
+        x = self._embed(past, masked, self._levels(rows, positions))
+        return self.engine.trunk(x, self._condition(rows, positions), times, carried)
 
     def _compute(self, frame: TokenFrame | PatchFrame, part: Pass, first: bool) -> tuple[Tensor, Tensor]:
         """Compute a pass: all its frames if it is the first or there is no cache, else the new one."""
-        x, conditioning, times, layers = self.inputs(frame, part, first)
+        x, conditioning, times, carried = self.inputs(frame, part, first)
         trunk = self.engine.compiled or self.engine.trunk
-        features, at = trunk(x, conditioning, times, layers)[:, -1], times.positions[..., -1:].view(-1, 1)
+        features = trunk(x, conditioning, times, carried)[:, -1]
+        at = times.positions[..., -1:].view(-1, 1)
         if part.lanes is None:
             return features, at
         return features[part.lanes], at if len(at) == 1 else at[part.lanes]
 
-    def _embed(self, values: Tensor, masked: Tensor) -> Tensor:
+    def _embed(self, values: Tensor, masked: Tensor, levels: Tensor | None) -> Tensor:
         """Embed frames (n, T, S) of which some tokens are masked, (n, T, S) bool, as (n, T, S, D)."""
-        if self.config.kind == "discrete":
-            return self.model.embed_tokens(values)  # a masked token says so by itself
-        return self.model.embed_patches(values, masked.unsqueeze(-1))
+        return self.model.embed(values, masked.unsqueeze(-1), corruption=levels)
 
     def _levels(self, rows: list[int], positions: Tensor) -> Tensor | None:
         """Return the noise (n, T) that the model is told of the frames at times (1 or n, T)."""
         level = self.noise_level
         return self.state.made(rows, positions) * level if level else None
 
-    def _tell(self, x: Tensor, levels: Tensor | None) -> Tensor:
-        return x if levels is None or self.model.trunk.noise is None else x + self.model.trunk.noise(levels)
-
-    def _cache(self) -> list[LayerCache]:
+    def _carried(self) -> Carried:
+        """Return what the trunk carries of the rows' past frames."""
         appended = self.config.absent_tokens if self.passive else self.config.appended_tokens
-        like = self.model.trunk.position.detach()
-        if torch.is_autocast_enabled(like.device.type):
-            like = like.to(torch.get_autocast_dtype(like.device.type))
-        before = self.state.layers
+        device, dtype = self.model.device.type, self.model.dtype
+        if torch.is_autocast_enabled(device):
+            dtype = torch.get_autocast_dtype(device)
+        before = self.state.carried
+        # Outside inference mode, because a row may be restored later, and inference tensors refuse that.
         with torch.inference_mode(False), torch.no_grad():
-            layers = self.state.cache(self.config.tokens_per_frame + appended, like)
-        if self.engine.compiled is not None and layers is not before:
-            for layer in layers:  # static addresses: the compiled code writes them in place
-                for kept in (layer.time, layer.action):
-                    if kept is not None:
-                        torch._dynamo.mark_static_address(kept)
-        return layers
+            carried = self.state.carry(self.config.tokens_per_frame + appended, dtype)
+        if self.engine.compiled is not None and carried is not before:
+            # CUDA graphs replay with the addresses of their recording. Memory that is not marked would be
+            # copied into the graph's own before each pass, and what a pass writes would be lost.
+            for memory in carried.tensors():
+                torch._dynamo.mark_static_address(memory)
+        return carried
 
     def _condition(self, rows: list[int], positions: Tensor) -> Conditioning:
         """Return the conditioning of rows at times (1 or n, T); it is the same in every pass."""
         groups = Groups.of([self.state.embodiments[row] for row in rows], len(rows))
         skips = self.passive and self.config.absent_action != "embedding"
         given = None if skips else self.state.given(rows, positions)
-        return condition(self.model, given, groups, positions, unsort=True)
+        return self.model.condition(given, groups, positions, unsort=True)

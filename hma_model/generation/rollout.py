@@ -38,7 +38,7 @@ from hma_model.generation.unmask import (
 )
 from hma_model.network.conditioning import Groups
 from hma_model.network.copying import known_digits
-from hma_model.network.model import HMA
+from hma_model.network.network import Network
 from hma_model.network.stem import split_tokens, unpatchify
 
 
@@ -72,7 +72,7 @@ class Rollout:
 
     def __init__(
         self,
-        model: HMA,
+        model: Network,
         embodiment: str | Sequence[str],
         batch: int = 1,
         *,
@@ -371,7 +371,7 @@ class Rollout:
 
 
 def generate(
-    model: HMA,
+    model: Network,
     prompt: Tensor,
     actions: Tensor | None,
     embodiment: str | Sequence[str],

@@ -16,12 +16,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from hma_model.generation.chunks import widest
 from hma_model.network.conditioning import ActionConditioning
 from hma_model.network.head import device_of
-from hma_model.network.model import HMA
+from hma_model.network.network import Network
 from hma_model.network.rotary import rotary_angles
-from hma_model.network.trunk import Conditioning, LayerCache, TimePositions
+from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ class Snapshot:
         embodiments, times, pending, prompts: as of `RowState`.
         generators: the states of the generators.
         frames, chunks, known: the rows of the buffers.
-        layers: the rows of the cache; empty if there is none yet.
+        carried: the rows of what the trunk carries; None if there is nothing yet.
         passive: whether the rollout has no actions; None if it has made no step.
     """
 
@@ -44,16 +43,12 @@ class Snapshot:
     frames: Tensor
     chunks: Tensor
     known: Tensor
-    layers: tuple[LayerCache, ...] = ()
+    carried: Carried | None = None
     passive: bool | None = None
 
     def take(self, rows: Sequence[int]) -> "Snapshot":
         """Return a copy of some of the rows, in this order; a row may be taken several times."""
         index = torch.tensor(rows, device=self.frames.device)
-        layers = [
-            LayerCache(part.time[:, :, index], None if part.action is None else part.action[:, :, index])
-            for part in self.layers
-        ]
         return replace(
             self,
             embodiments=tuple(self.embodiments[row] for row in rows),
@@ -64,7 +59,7 @@ class Snapshot:
             frames=self.frames[index],
             chunks=self.chunks[index],
             known=self.known[index],
-            layers=tuple(layers),
+            carried=None if self.carried is None else self.carried.take(index),
         )
 
 
@@ -115,11 +110,11 @@ class RowState:
         generators: of each row's random numbers; None until a row without a seed draws.
         frames: (B, R, S) ids of the trunk's tokens, or scaled patches (B, R, S, C).
         chunks, known: (B, R, K) float32 raw and (B, R) bool, the chunk in force at each frame.
-        layers: the cache; empty until the first pass.
+        carried: what the trunk carries of past frames; None until the first pass.
     """
 
     def __init__(
-        self, model: HMA, embodiments: Sequence[str], generator: torch.Generator | None, caching: bool
+        self, model: Network, embodiments: Sequence[str], generator: torch.Generator | None, caching: bool
     ) -> None:
         self.model, self.config, self.shared, self.caching = model, model.config, generator, caching
         self.embodiments = list(embodiments)
@@ -129,9 +124,9 @@ class RowState:
         slots = config.frames + (config.time_position == "rotary")
         blank = self.blank(batch).unsqueeze(1)
         self.frames = torch.zeros_like(blank).repeat(1, slots, *[1] * (blank.dim() - 2))
-        self.chunks = torch.zeros(batch, slots, widest(model, self.embodiments), device=model.device)
+        self.chunks = torch.zeros(batch, slots, model.widest_chunk(self.embodiments), device=model.device)
         self.known = torch.zeros(batch, slots, dtype=torch.bool, device=model.device)
-        self.layers: list[LayerCache] = []
+        self.carried: Carried | None = None
 
     @property
     def slots(self) -> int:
@@ -271,20 +266,12 @@ class RowState:
 
     # -- the cache ----------------------------------------------------------------------------------------
 
-    def cache(self, tokens: int, like: Tensor) -> list[LayerCache]:
-        """Return the cache for frames of N tokens; it stays in place unless N, dtype or device change."""
-        config, batch = self.config, len(self.times)
-        shape = (2, self.slots, batch, tokens, config.heads, config.head_dim)
-        if self.layers:
-            kept = self.layers[0].time
-            if (kept.shape, kept.dtype, kept.device) == (shape, like.dtype, like.device):
-                return self.layers
-        crossed = "cross_attention" in config.conditioning
-        self.layers = [
-            LayerCache(like.new_zeros(shape), like.new_zeros(shape[:3] + shape[4:]) if crossed else None)
-            for _ in range(config.layers)
-        ]
-        return self.layers
+    def carry(self, tokens: int, dtype: torch.dtype) -> Carried:
+        """Return what the trunk carries for frames of N tokens; unless N or the type change, the same one."""
+        device = self.model.device
+        if self.carried is None or not self.carried.fits(self.slots, tokens, dtype, device):
+            self.carried = self.model.trunk.carry(len(self.times), self.slots, tokens, dtype, device)
+        return self.carried
 
     def cached_times(self, rows: Sequence[int], begin: Sequence[int], frames: int) -> TimePositions:
         """Return the times of a pass over T frames of each row, from the times `begin` on."""
@@ -306,7 +293,7 @@ class RowState:
         """Return a copy of the state of rows."""
         states = tuple(None if one is None else one.get_state() for one in self.generators)
         lists = tuple(self.embodiments), tuple(self.times), tuple(self.pending), tuple(self.prompts), states
-        return Snapshot(*lists, self.frames, self.chunks, self.known, tuple(self.layers)).take(rows)
+        return Snapshot(*lists, self.frames, self.chunks, self.known, self.carried).take(rows)
 
     def restore(self, rows: Sequence[int], kept: Snapshot) -> None:
         """Put rows into the state of a snapshot."""
@@ -315,12 +302,8 @@ class RowState:
         self._widen(width)
         self.frames[index, :length], self.known[index, :length] = kept.frames, kept.known
         self.chunks[index, :length, :width] = kept.chunks
-        if kept.layers:
-            like = kept.layers[0].time
-            for own, other in zip(self.cache(like.shape[3], like), kept.layers):
-                own.time[:, :, index] = other.time
-                if own.action is not None and other.action is not None:
-                    own.action[:, :, index] = other.action
+        if kept.carried is not None:
+            self.carry(kept.carried.tokens, kept.carried.tensors()[0].dtype).put(index, kept.carried)
         for i, row in enumerate(rows):
             self.embodiments[row] = kept.embodiments[i]
             self.times[row], self.pending[row] = kept.times[i], kept.pending[i]

@@ -7,10 +7,10 @@ B batch, T frames, D width, K = stride * action dim, L layers.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -18,10 +18,10 @@ from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.config import HMAConfig
-from hma_model.network.trunk import Conditioning, rows_at
+from hma_model.network.stem import Stem
+from hma_model.network.trunks.contract import Conditioning, Trunk, rows_at
 
-if TYPE_CHECKING:
-    from hma_model.network.model import HMA
+type FindStem = Callable[[str], Stem]  # by the id of an embodiment
 
 
 @dataclass(frozen=True)
@@ -104,40 +104,47 @@ def align(config: HMAConfig, actions: Tensor, known: Tensor | None, frames: int)
     return ActionConditioning(shifted, F.pad(known[:, : frames - 1], (1, 0)))
 
 
-def unknown(model: "HMA", groups: Groups, frames: int) -> ActionConditioning:
+def unknown(find_stem: FindStem, groups: Groups, frames: int) -> ActionConditioning:
     """Return chunks (B, T, K) of zeros, as wide as the widest embodiment's, none of them known."""
-    widest = max(model.stem(name).input.in_features for name, _ in groups.parts)
-    known = torch.zeros((groups.batch, frames), dtype=torch.bool, device=model.device)
-    return ActionConditioning(torch.zeros(groups.batch, frames, widest, device=model.device), known)
+    inputs = [find_stem(name).input for name, _ in groups.parts]
+    width, device = max(linear.in_features for linear in inputs), inputs[0].weight.device
+    known = torch.zeros((groups.batch, frames), dtype=torch.bool, device=device)
+    return ActionConditioning(torch.zeros(groups.batch, frames, width, device=device), known)
 
 
 def condition(
-    model: "HMA", given: ActionConditioning | None, groups: Groups, positions: Tensor, unsort: bool = False
+    trunk: Trunk,
+    find_stem: FindStem,
+    given: ActionConditioning | None,
+    groups: Groups,
+    positions: Tensor,
+    unsort: bool = False,
 ) -> Conditioning:
     """Return the trunk's conditioning for the samples, in the order of `groups`.
 
     Args:
-        model: the model, whose stems and modulation are used once per embodiment.
+        trunk: that of the model.
+        find_stem: returns the stem of an embodiment; each is called once.
         given: in the batch's order; None for no actions at all.
         groups: the batch's embodiments.
         positions: (T,) int64, the times of the frames; (B, T) in the batch's order if the samples' differ.
         unsort: return it in the batch's own order.
     """
-    config, frames = model.config, positions.shape[-1]
-    absent = rows_at(model.trunk.absent, positions).expand(groups.batch, frames, -1)
+    config, frames = trunk.config, positions.shape[-1]
+    absent = rows_at(trunk.absent, positions).expand(groups.batch, frames, -1)
     if given is None:
         if config.absent_action == "skip":
             return Conditioning()
         if config.absent_action == "tokens":
             return Conditioning(tokens=absent if unsort else groups.sort(absent))
-        given = unknown(model, groups, frames)
+        given = unknown(find_stem, groups, frames)
     if positions.dim() > 1:
         absent = groups.sort(absent)
     chunks, known = groups.sort(given.chunks), groups.sort(given.known).unsqueeze(-1)
     shown = torch.ones_like(known) if config.absent_action == "tokens" else known
     embeddings, modulations, outs = [], [], []
     for name, span in groups.spans():
-        stem = model.stem(name)
+        stem = find_stem(name)
         width = stem.input.in_features
         if chunks.shape[-1] < width:
             fault = f"a chunk has {chunks.shape[-1]} values, but {name} needs {width}"
@@ -152,8 +159,8 @@ def condition(
             outs.append((embedding.shape[0], *stem.modulation.out))
     embedding = _cat(embeddings, 0)
     tokens = torch.where(known, embedding, absent) if config.appended_tokens else None
-    if model.trunk.modulation is not None:
-        modulations = [model.trunk.modulation(embedding)]
+    if trunk.modulation is not None:
+        modulations = [trunk.modulation(embedding)]
     modulation = _cat(modulations, 1) if modulations else None
     if not unsort or groups.inverse is None:
         return Conditioning(embedding, modulation, outs or None, tokens)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from hma_model.config import ActionSpace, HMAConfig, Readout
 from hma_model.network.copying import CopyGain, Copying, PatchCopy
 from hma_model.network.linear import Linear
-from hma_model.network.trunk import rows_at
+from hma_model.network.trunks.contract import rows_at
 
 _LEVEL_VALUES = 256  # sinusoids that describe a noise level
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.config import OBJECTIVES, HMAConfig, Objective, Readout
-from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
+from hma_model.network.conditioning import ActionConditioning, Groups, align
 from hma_model.network.copying import frames_before
 from hma_model.network.head import randn, uniform
 from hma_model.network.masking import (
@@ -24,12 +24,12 @@ from hma_model.network.masking import (
     draw_video_mask,
     drop_chunks,
 )
+from hma_model.network.network import Network
 from hma_model.network.stem import patches_before, to_digits
-from hma_model.network.trunk import TimePositions, paired_times
+from hma_model.network.trunks.contract import TimePositions, paired_times
 
 if TYPE_CHECKING:
     from hma_data.loading.rows import Batch
-    from hma_model.network.model import HMA
 
 
 @dataclass
@@ -73,7 +73,7 @@ class Layout:
     times: TimePositions
 
     @classmethod
-    def of(cls, model: "HMA", count: int, objective: Objective) -> Self:
+    def of(cls, model: Network, count: int, objective: Objective) -> Self:
         """Return the frames of a pass over windows of `count` frames."""
         if model.config.training_pass == "window" or not objective.predicts_video or count < 2:
             order = list(range(count))
@@ -82,7 +82,7 @@ class Layout:
         return cls.pairs(model, count, past=count if objective.readout else count - 1)
 
     @classmethod
-    def pairs(cls, model: "HMA", count: int, past: int) -> Self:
+    def pairs(cls, model: Network, count: int, past: int) -> Self:
         """Return the first `past` frames of `count`, then a copy of each frame from the second on."""
         previous = [*range(-1, past - 1), *range(count - 1)]
         times = paired_times(model.config, past, count, model.device)
@@ -99,7 +99,9 @@ class Layout:
         return slice(self.past if self.paired else 0, None)
 
 
-def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torch.Generator | None) -> Output:
+def compute(
+    model: Network, batch: "Batch", objective: str | None, generator: torch.Generator | None
+) -> Output:
     """Compute the losses of one batch; `HMA.forward` explains the arguments."""
     config = model.config
     name = objective or draw_objective(config, generator)
@@ -115,7 +117,7 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
     video = _hide_tokens(config, batch, chosen, layout, generator)
     dropped = _hide_chunks(batch, chosen.readout, generator)
     given = _shown_chunks(model, batch, chosen, dropped, layout, generator)
-    conditioning = condition(model, given, groups, layout.times.positions)
+    conditioning = model.condition(given, groups, layout.times.positions)
     x, shown = _embed(model, batch, frames, video, layout, groups, generator)
     features = model.trunk(x, conditioning, layout.times)
 
@@ -142,7 +144,7 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
 
 
 def _readout_inputs(
-    model: "HMA", features: Tensor, shown: Tensor, video: VideoMask, layout: Layout, groups: Groups
+    model: Network, features: Tensor, shown: Tensor, video: VideoMask, layout: Layout, groups: Groups
 ) -> tuple[Tensor, Tensor | None]:
     """Return what the readout takes of frames that predict video: features or conditions, and digits before.
 
@@ -160,7 +162,7 @@ def _readout_inputs(
 
 
 def _video_logits(
-    model: "HMA",
+    model: Network,
     features: Tensor,
     own: Tensor,
     before: Tensor | None,
@@ -223,7 +225,7 @@ def _hide_chunks(batch: "Batch", readout: Readout | None, generator: torch.Gener
 
 
 def _shown_chunks(
-    model: "HMA",
+    model: Network,
     batch: "Batch",
     objective: Objective,
     dropped: Tensor,
@@ -239,7 +241,7 @@ def _shown_chunks(
 
 
 def _embed(
-    model: "HMA",
+    model: Network,
     batch: "Batch",
     true: Tensor,
     video: VideoMask,
@@ -258,21 +260,20 @@ def _embed(
         frames = torch.cat([frames[:, : layout.past], true[:, 1:]], dim=1)
     if model.config.kind == "discrete":
         shown = groups.sort(corrupt_tokens(model.config, frames, video, generator))
-        x = model.embed_tokens(shown, layout.previous)
+        hidden = None
     else:
         masked = video.masked.to(frames.device).unsqueeze(-1)
         if spread := model.config.latent_noise:
             rate = spread * video.corruption.to(frames.device)[..., None, None]
             frames = frames + rate * randn(frames.shape, generator, frames.device)
         shown = groups.sort(frames)
-        x = model.embed_patches(shown, groups.sort(masked), layout.previous)
-    if model.trunk.noise is not None:
-        x = x + model.trunk.noise(groups.sort(video.corruption.to(x.device)))
-    return x, shown
+        hidden = groups.sort(masked)
+    corruption = groups.sort(video.corruption.to(frames.device))
+    return model.embed(shown, hidden, layout.previous, corruption), shown
 
 
 def _video_loss(
-    model: "HMA",
+    model: Network,
     features: Tensor,
     frames: Tensor,
     before: Tensor | None,
@@ -298,7 +299,7 @@ def _video_loss(
 
 
 def _action_loss(
-    model: "HMA",
+    model: Network,
     features: Tensor,
     batch: "Batch",
     dropped: Tensor,

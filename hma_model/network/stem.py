@@ -95,15 +95,16 @@ class TokenEmbedding(nn.Module):
         self.carries = config.masked_input == "previous"
         self.mask = nn.Parameter(torch.randn(config.width) * (0.5 if self.carries else 0.02))
 
-    def forward(self, tokens: Tensor, previous: Sequence[int]) -> Tensor:
+    def forward(self, tokens: Tensor, masked: Tensor | None, previous: Sequence[int]) -> Tensor:
         """Embed ids (B, T, S) as (B, T, S, D).
 
         Args:
             tokens: the configuration's `mask_id` means masked.
+            masked: not used: an id says by itself that it is masked.
             previous: (T,) for each frame the index of the frame before it, or -1 if it is not there.
         """
-        masked = (tokens == self.mask_id).unsqueeze(-1)
-        digits = to_digits(tokens.masked_fill(masked.squeeze(-1), 0), self.factored)
+        hidden = (tokens == self.mask_id).unsqueeze(-1)
+        digits = to_digits(tokens.masked_fill(hidden.squeeze(-1), 0), self.factored)
         if len(self.factored) > 2:  # one sum over all digits
             starts = _places(tuple(self.factored), tokens.device)[2]
             rows = (digits + starts).flatten(0, -2)
@@ -113,12 +114,13 @@ class TokenEmbedding(nn.Module):
             embedding = F.embedding(digits[..., 0], self.digits[0])
             for index in range(1, len(self.factored)):
                 embedding = embedding + F.embedding(digits[..., index], self.digits[index])
-        if not self.carries:
-            return torch.where(masked, self.mask, embedding)
-        return torch.where(masked, self.mask + carried(embedding.masked_fill(masked, 0), previous), embedding)
+        mask: Tensor = self.mask
+        if self.carries:
+            mask = mask + values_before(embedding.masked_fill(hidden, 0), previous)
+        return torch.where(hidden, mask, embedding)
 
 
-def carried(values: Tensor, previous: Sequence[int]) -> Tensor:
+def values_before(values: Tensor, previous: Sequence[int]) -> Tensor:
     """Return for each frame of (B, T, S, D) the values of the frame before it; zeros where there is none."""
     index = torch.tensor(previous, device=values.device)
     before = values.index_select(1, index.clamp(min=0))
@@ -131,7 +133,7 @@ def patches_before(patches: Tensor, masked: Tensor, previous: Sequence[int], pat
     `patches` (B, T, S, c*p*p) and `masked` (B, T, S, p*p or 1) are those of `LatentEmbedding`.
     """
     pixels = patches.unflatten(-1, (-1, patch**2)).masked_fill(masked.unsqueeze(-2), 0)
-    return carried(pixels.flatten(-2), previous)
+    return values_before(pixels.flatten(-2), previous)
 
 
 class LatentEmbedding(nn.Module):

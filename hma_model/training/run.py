@@ -80,11 +80,11 @@ class Run:
             self.stats = {name: self.start.stats(shards) for name, shards in self.sets.items()}
         torch.manual_seed(seed_for(recipe.seed, "init"))
         self.model = self._fresh_model()
-        held_out = (
+        splits = (
             (name, s, WindowDataset(s, "val", recipe.frames, cameras=recipe.cameras))
             for name, s in self.sets.items()
         )
-        self.held_out = {name: shards for name, shards, dataset in held_out if len(dataset)}
+        self.held_out = {name: shards for name, shards, dataset in splits if len(dataset)}
         self.step, self.skipped, self.seconds = 0, 0, 0.0  # finished steps, and the time they took
         self.cpu_seconds = 0.0  # of the steps, the mean over the ranks
         self.spike_detector = guards.GradientSpikeDetector(recipe.spike)

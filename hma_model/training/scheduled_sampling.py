@@ -18,7 +18,7 @@ from hma_data.loading.dataset import Batch
 from hma_model.network.conditioning import Groups
 from hma_model.network.head import uniform
 from hma_model.network.stem import from_digits, split_tokens, unpatchify
-from hma_model.network.trunk import Conditioning, TimePositions
+from hma_model.network.trunks.contract import Conditioning, TimePositions
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -68,8 +68,8 @@ def forwarded(
     training = model.training
     model.eval()
     groups, times = Groups.of(names, len(rows)), model.time_positions(frames)
-    actions, known = batch.actions[chosen], batch.action_mask[chosen]
-    conditioning = model.condition(actions if model.config.sees_actions else None, known, groups, times)
+    actions = batch.actions[chosen] if model.config.sees_actions else None
+    conditioning = model.condition_window(actions, batch.action_mask[chosen], groups, times)
     for offset in range(depth):
         at = first[chosen] + offset
         context[rows, at] = _predicted(model, context, at, (conditioning, groups, times), generator)

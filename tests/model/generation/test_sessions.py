@@ -159,10 +159,10 @@ def test_the_cache_stays_in_place_over_prompts_and_resets() -> None:
     model = small_model()
     rollout = Rollout(model, "arm", 3)
     play(model, rollout)
-    before = [part.time.data_ptr() for part in rollout.state.layers]
+    before = [memory.data_ptr() for memory in rollout.state.carried.tensors()]
     rollout.prompt(torch.zeros(3, 2, 4, 4, dtype=torch.long), None)
     rollout.step(torch.zeros(3, WIDEST))
-    assert [part.time.data_ptr() for part in rollout.state.layers] == before
+    assert [memory.data_ptr() for memory in rollout.state.carried.tensors()] == before
 
 
 @pytest.mark.parametrize(

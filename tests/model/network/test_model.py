@@ -215,7 +215,7 @@ def test_the_scores_of_one_frame_of_each_window_are_those_of_all_at_these_frames
     batch = small_batch(model.config, ["arm", "hand.v1", "arm"])
     frame = torch.tensor([4, 1, 0])
     groups, times = Groups.of(batch.embodiment, 3), model.time_positions(5)
-    conditioning = model.condition(batch.actions, None, groups, times)
+    conditioning = model.condition_window(batch.actions, None, groups, times)
     for true in (None, batch.tokens):
         whole = model.video_logits(batch.tokens, batch.actions, batch.embodiment, None, true)
         one = model.logits_under(conditioning, batch.tokens, groups, times, true, frame=frame)

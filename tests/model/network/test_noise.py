@@ -13,9 +13,9 @@ NAMES = ["arm", "hand.v1", "arm", "arm"]
 def _embedded_level(model, batch, monkeypatch, objective="forward"):
     """Return the corruption (B, T) that a pass tells the model, and the ids (B, T, S) that it embeds."""
     told, tokens = [], []
-    noise, embed = NoiseEmbedding.forward, model.embed_tokens
+    noise, embed = NoiseEmbedding.forward, model.embed
     monkeypatch.setattr(NoiseEmbedding, "forward", lambda self, x: told.append(x) or noise(self, x))
-    monkeypatch.setattr(model, "embed_tokens", lambda *given: tokens.append(given[0]) or embed(*given))
+    monkeypatch.setattr(model, "embed", lambda *given: tokens.append(given[0]) or embed(*given))
     model(batch, objective, seeded())
     return told[0], tokens[0]
 

@@ -12,7 +12,7 @@ from hma_model.network.masking import draw_pairs_mask
 from hma_model.network.model import HMA
 from hma_model.network.objectives import Layout
 from hma_model.network.stem import merge_tokens, split_tokens, to_digits
-from hma_model.network.trunk import sinusoids
+from hma_model.network.trunks.transformer import sinusoids
 from tests.model.network_parts import seeded, small_batch, small_config, small_model
 
 WHOLE = {
@@ -88,8 +88,8 @@ def test_half_of_the_copies_are_wholly_masked_and_the_past_never():
 
 def test_noise_in_the_past_of_latents_has_the_spread_of_its_corruption(monkeypatch):
     model, seen = small_model(kind="continuous", training_pass="pairs", latent_noise=2.0), []
-    original = model.embed_patches
-    monkeypatch.setattr(model, "embed_patches", lambda *given: seen.append(given[0]) or original(*given))
+    original = model.embed
+    monkeypatch.setattr(model, "embed", lambda *given: seen.append(given[0]) or original(*given))
     batch = _batch(model)
     model(batch, "forward", seeded())
     rate = draw_pairs_mask(model.config, 3, 5, 4, seeded()).corruption[:, :4]
@@ -149,7 +149,7 @@ def test_the_embedding_and_the_loss_are_sums_over_the_digits(factored):
     tokens = torch.randint(0, config.vocab_size, (2, 3, 16), generator=seeded())
     digits = to_digits(tokens, factored)
     rows = [weight[digits[..., i]].double() for i, weight in enumerate(embed.digits)]
-    assert torch.allclose(model.embed_tokens(tokens).double(), sum(rows), atol=1e-5)
+    assert torch.allclose(model.embed(tokens).double(), sum(rows), atol=1e-5)
 
     features = torch.randn(7, config.width, generator=seeded())
     goal = torch.stack([torch.randint(0, v, (7,), generator=seeded(v)) for v in factored], dim=1)

@@ -6,11 +6,12 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from hma_data.errors import HMAError
 from hma_model.config import ActionSpace
-from hma_model.network import trunk
 from hma_model.network.model import HMA
 from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv
 from hma_model.network.stem import Normalizer
-from hma_model.network.trunk import MLP, TemporalAttention, TimePositions
+from hma_model.network.trunks import transformer
+from hma_model.network.trunks.contract import TimePositions
+from hma_model.network.trunks.transformer import MLP, TemporalAttention
 from tests.model.network_parts import ARM, HAND, small_batch, small_config, small_model
 
 LAYOUTS = [
@@ -248,6 +249,6 @@ def test_many_sequences_are_attended_part_by_part(
 ) -> None:
     q, k, v = torch.randn(3, 7, 2, 5, 4)
     allowed = None if mask is None else torch.ones(mask, dtype=torch.bool).tril(1)
-    whole = trunk.attend(q, k, v, allowed, 0.5, causal=mask is None)
-    monkeypatch.setattr(trunk, "MOST_SEQUENCES", 3)
-    assert torch.equal(trunk.attend(q, k, v, allowed, 0.5, causal=mask is None), whole)
+    whole = transformer.attend(q, k, v, allowed, 0.5, causal=mask is None)
+    monkeypatch.setattr(transformer, "SEQUENCE_LIMIT", 3)
+    assert torch.equal(transformer.attend(q, k, v, allowed, 0.5, causal=mask is None), whole)

@@ -1,15 +1,15 @@
 """Define the space-time transformer that all embodiments share (paper section 3).
 
 A block applies bidirectional attention among the tokens of a frame, modulation by the action, causal
-attention over time at each place of the frame, and an MLP. No information flows backwards in time, so keys
-and values of past frames can be cached (`cache`).
+attention over time at each place of the frame, and an MLP. No information flows backwards in time, so a
+rollout carries the keys and values of past frames (`KeyValues`).
 
 B batch, T frames, S tokens of a frame, N = S + action tokens, D width, L layers, R cache slots.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -18,78 +18,11 @@ from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
 from hma_model.network.linear import Linear, after_gelu, after_norm, recomputed
-from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv, turns_of
+from hma_model.network.rotary import rotate, rotate_qkv, turns_of
 from hma_model.network.stem import LatentEmbedding, Modulation, NoiseEmbedding, TokenEmbedding
+from hma_model.network.trunks.contract import Conditioning, TimePositions, rows_at
 
-MOST_SEQUENCES = 2**15  # of one call of attention: kernels of a GPU refuse 65,536 and more
-
-
-@dataclass
-class Conditioning:
-    """The conditioning of the trunk by actions.
-
-    Attributes:
-        embedding: (B, T, D), the embedding of the chunk at each frame; None without conditioning.
-        tokens: (B, T, D), the action tokens after the tokens of each frame; None for no tokens.
-        modulation: (L, B, T, 2D) shift and gain.
-        out: for each group of samples, in batch order: its size and the embodiment's projections after the
-            modulated norm, (L, D, D) and (L, D). None if the trunk has them.
-        order: indices (B,) that sort the samples into the groups of `out`, and that undo it; None if they are
-            sorted.
-    """
-
-    embedding: Tensor | None = None
-    modulation: Tensor | None = None
-    out: list[tuple[int, Tensor, Tensor]] | None = None
-    tokens: Tensor | None = None
-    order: tuple[Tensor, Tensor] | None = None
-
-    def last(self) -> "Conditioning":
-        """Return the conditioning of the last frame alone, in memory of its own as a compiler wants it."""
-        embedding, tokens = (
-            None if x is None else x[:, -1:].contiguous() for x in (self.embedding, self.tokens)
-        )
-        modulation = None if self.modulation is None else self.modulation[:, :, -1:].contiguous()
-        return Conditioning(embedding, modulation, self.out, tokens, self.order)
-
-
-@dataclass
-class TimePositions:
-    """The times of the frames of a pass, and which frames each may see.
-
-    Samples whose times differ have a first axis B in every attribute; where they agree, it is 1 or absent.
-
-    Attributes:
-        positions: (T,) int64, the times of the frames.
-        allowed: (T, keys) bool, which key frames each frame may see.
-        rotary: cos and sin (T, head_dim / 2) of the rotary angles.
-        causal: `allowed` is the plain lower triangle.
-        slots: (B, T) int64, slot · rows of the cache + row, the places of the frames' keys and values; None
-            without a cache.
-        rows: the samples' rows of the cache; None for all.
-        shared: what `once` keeps.
-    """
-
-    positions: Tensor
-    allowed: Tensor
-    rotary: tuple[Tensor, Tensor]
-    causal: bool = False
-    slots: Tensor | None = None
-    rows: slice | Tensor | None = None
-    shared: dict[str, Tensor] = field(default_factory=dict, repr=False)
-
-    def once(self, name: str, make: Callable[[], Tensor]) -> Tensor:
-        """Return what `make` returns; the layers of a pass share it."""
-        if name not in self.shared:
-            self.shared[name] = make()
-        return self.shared[name]
-
-    def last(self) -> "TimePositions":
-        """Return the times of the last frame alone."""
-        cos, sin = (angle[..., -1:, :].contiguous() for angle in self.rotary)
-        slots = None if self.slots is None else self.slots[:, -1:].contiguous()
-        allowed, positions = self.allowed[..., -1:, :].contiguous(), self.positions[..., -1:].contiguous()
-        return TimePositions(positions, allowed, (cos, sin), slots=slots, rows=self.rows)
+SEQUENCE_LIMIT = 2**15  # of one call of attention: kernels of a GPU refuse 65,536 and more
 
 
 @dataclass
@@ -104,39 +37,50 @@ class LayerCache:
     time: Tensor
     action: Tensor | None = None
 
+    def take(self, rows: Tensor) -> "LayerCache":
+        """Return a copy of some rows."""
+        action = None if self.action is None else self.action[:, :, rows]
+        return LayerCache(self.time[:, :, rows], action)
+
+
+@dataclass(frozen=True)
+class KeyValues:
+    """The keys and values of past frames, which a rollout carries (`hma_model.network.trunks.contract`)."""
+
+    layers: list[LayerCache]
+
+    @property
+    def tokens(self) -> int:
+        """Return N of the frames."""
+        return self.layers[0].time.shape[3]
+
+    def fits(self, slots: int, tokens: int, dtype: torch.dtype, device: torch.device) -> bool:
+        """Check whether this is for so many slots a row and tokens a frame."""
+        kept = self.layers[0].time
+        return (kept.shape[1], kept.shape[3], kept.dtype, kept.device) == (slots, tokens, dtype, device)
+
+    def take(self, rows: Tensor) -> "KeyValues":
+        """Return a copy of some rows."""
+        return KeyValues([layer.take(rows) for layer in self.layers])
+
+    def put(self, rows: Tensor, other: "KeyValues") -> None:
+        """Replace rows by all rows of another one."""
+        for own, theirs in zip(self.tensors(), other.tensors(), strict=True):
+            own[:, :, rows] = theirs
+
+    def tensors(self) -> list[Tensor]:
+        """Return the memory of all layers, which a pass writes in place."""
+        pairs = ((layer.time, layer.action) for layer in self.layers)
+        return [kept for pair in pairs for kept in pair if kept is not None]
+
 
 def remember(cache: Tensor, new: tuple[Tensor, Tensor], times: TimePositions) -> Tensor:
     """Write keys and values (B, T, ...) into a cache (2, R, rows, ...); return that of the pass's rows."""
     assert times.slots is not None
+    # `slots` numbers (slot, row) pairs: one index_copy_ writes frames of rows at different times.
     for values, kept in zip(new, cache):
         kept.flatten(0, 1).index_copy_(0, times.slots.flatten(), values.flatten(0, 1))
     return cache if times.rows is None else cache[:, :, times.rows]
-
-
-def rows_at(table: Tensor, positions: Tensor) -> Tensor:
-    """Return the rows of a table at absolute times, or its only row if it does not depend on time."""
-    return table if table.shape[0] == 1 else table[positions]
-
-
-def window_times(config: HMAConfig, frames: int, device: torch.device | str) -> TimePositions:
-    """Return the times of consecutive frames; each sees itself and the `config.frames` - 1 before it."""
-    positions = torch.arange(frames, device=device)
-    age = positions.unsqueeze(1) - positions
-    allowed = (age >= 0) & (age < config.frames)
-    return TimePositions(positions, allowed, rotary_angles(config, positions), causal=frames <= config.frames)
-
-
-def paired_times(config: HMAConfig, past: int, frames: int, device: torch.device | str) -> TimePositions:
-    """Return the times of the first `past` frames, then of a copy of each frame from the second on.
-
-    A frame sees itself and the frames before it; a copy sees itself and the frames before it, no other copy.
-    """
-    positions = torch.cat([torch.arange(past), torch.arange(1, frames)]).to(device)
-    age = positions.unsqueeze(1) - positions
-    true = torch.arange(len(positions), device=device) < past
-    allowed = (age > 0) & (age < config.frames) & true
-    allowed.fill_diagonal_(True)
-    return TimePositions(positions, allowed, rotary_angles(config, positions))
 
 
 def sinusoids(grid: tuple[int, int], width: int) -> Tensor:
@@ -161,12 +105,12 @@ def attend(
     `mask` (T, R) or (1 or M, 1, T, R) is True where attention is allowed. Attention over time has a sequence
     for each place of each window: M may be large.
     """
-    if len(q) <= MOST_SEQUENCES:
+    if len(q) <= SEQUENCE_LIMIT:
         return F.scaled_dot_product_attention(q, k, v, mask, is_causal=causal, scale=scale)
-    masks: Sequence[Tensor | None] = [mask] * -(-len(q) // MOST_SEQUENCES)
+    masks: Sequence[Tensor | None] = [mask] * -(-len(q) // SEQUENCE_LIMIT)
     if mask is not None and mask.dim() > 2 and len(mask) > 1:
-        masks = mask.split(MOST_SEQUENCES)
-    parts = zip(*(x.split(MOST_SEQUENCES) for x in (q, k, v)), masks, strict=True)
+        masks = mask.split(SEQUENCE_LIMIT)
+    parts = zip(*(x.split(SEQUENCE_LIMIT) for x in (q, k, v)), masks, strict=True)
     return torch.cat([attend(q, k, v, mask, scale, causal) for q, k, v, mask in parts])
 
 
@@ -371,12 +315,8 @@ class Block(nn.Module):
         return joined if conditioning.order is None else joined[conditioning.order[1]]
 
 
-class Trunk(nn.Module):
-    """The trunk: embedding, positions and blocks.
-
-    Attributes:
-        checkpointing: recompute each block in the backward pass instead of keeping its activations.
-    """
+class Transformer(nn.Module):
+    """The space-time transformer: embedding, positions and blocks; it satisfies `contract.Trunk`."""
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
@@ -407,14 +347,31 @@ class Trunk(nn.Module):
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
 
-    def forward(
-        self,
-        x: Tensor,
-        conditioning: Conditioning,
-        times: TimePositions,
-        caches: list[LayerCache] | None = None,
+    def embed_frames(
+        self, frames: Tensor, masked: Tensor | None, previous: Sequence[int], corruption: Tensor | None
     ) -> Tensor:
-        """Map embedded tokens (B, T, S, D) to features (B, T, N, D); action tokens come last in a frame."""
+        """Embed frames, as `Trunk.embed_frames` says."""
+        x: Tensor = self.embed(frames, masked, previous)
+        return x if corruption is None or self.noise is None else x + self.noise(corruption)
+
+    def carry(
+        self, rows: int, slots: int, tokens: int, dtype: torch.dtype, device: torch.device
+    ) -> KeyValues:
+        """Return a cache for frames of N tokens."""
+        config = self.config
+        crossed = "cross_attention" in config.conditioning
+        of_actions = (2, slots, rows, config.heads, config.head_dim)
+        of_frames = (2, slots, rows, tokens, config.heads, config.head_dim)
+        layers = []
+        for _ in range(config.layers):
+            action = torch.zeros(of_actions, dtype=dtype, device=device) if crossed else None
+            layers.append(LayerCache(torch.zeros(of_frames, dtype=dtype, device=device), action))
+        return KeyValues(layers)
+
+    def forward(
+        self, x: Tensor, conditioning: Conditioning, times: TimePositions, carried: KeyValues | None = None
+    ) -> Tensor:
+        """Map embedded frames to features, as `Trunk.__call__` says."""
         embedding, config = conditioning.embedding, self.config
         if embedding is not None and "add" in config.conditioning and config.add_at == "input":
             x = x + embedding.unsqueeze(2)
@@ -423,7 +380,7 @@ class Trunk(nn.Module):
             x = torch.cat([x, copies.to(x.dtype)], dim=2)
         x = self.embed_norm(x + rows_at(self.position, times.positions)[..., : x.shape[2], :])
         for layer, block in enumerate(self.blocks):
-            cache = None if caches is None else caches[layer]
+            cache = None if carried is None else carried.layers[layer]
             if self.checkpointing and self.training and torch.is_grad_enabled():
                 x = checkpoint(block, x, conditioning, layer, times, cache, use_reentrant=False)
             else:
