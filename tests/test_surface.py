@@ -24,7 +24,8 @@ MODULES = (
     "hma_data", "hma_data.errors", "hma_data.episodes.episode", "hma_data.lab", "hma_data.loader",
     "hma_data.shards.reader", "hma_data.sources.base", "hma_data.sources.common.inspection",
     "hma_data.sources.detect", "hma_data.tokenizers", "hma_data.tokenizers.catalog",
-    "hma_model", "hma_model.network.network", "hma_model.hub.datasets", "hma_model.hub.publish", "hma_model.simulate",
+    "hma_model", "hma_model.network.network", "hma_model.hub.datasets", "hma_model.hub.publish",
+    "hma_model.simulate",
     "hma_model.policies.scores",
 )  # fmt: skip
 

@@ -185,18 +185,6 @@ def test_a_run_may_go_on_with_other_workers(recipe, tmp_path):
     assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
 
 
-def test_a_run_of_an_older_release_goes_on_with_keys_at_their_defaults(recipe, tmp_path):
-    train(recipe(), out=tmp_path / "run", show=False)
-    for path in (tmp_path / "run/checkpoints").glob("*/training/state.json"):
-        state = json.loads(path.read_text())
-        del state["sha256"]
-        for key in ("ema", "spike", "short", "freeze"):
-            del state["recipe"][key]
-        del state["norms"]
-        path.write_text(json.dumps(state))
-    assert train(recipe(), out=tmp_path / "run", show=False).step == 6
-
-
 @pytest.mark.parametrize("ema", [0.0, 0.9])
 def test_force_goes_on_with_other_shards_and_other_robots(recipe, tmp_path, capsys, ema):
     arm, leg = make_shards(tmp_path / "arm", "arm", seed=4), make_shards(tmp_path / "leg", "leg", dims=3)
