@@ -299,8 +299,10 @@ class Hdf5Layout(SourceLayout):
 class LeRobotLayout(SourceLayout):
     """The way in which the rows of a LeRobotDataset find their pictures."""
 
-    pairing: Literal["time", "index"] = Field(
-        "time", description="time: by the stamps; index: row i has picture i, whatever the film's stamps say"
+    pairing: Literal["time", "index"] | None = Field(
+        None,
+        description="by the stamps, if the whole film fits its episodes; time: by the stamps, whatever the "
+        "number of frames; index: row i has frame i, whatever the stamps say",
     )
 
 

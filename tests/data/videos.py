@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 HEIGHT, WIDTH = 64, 96
+TICKS = 20  # of a frame period
 STEP = 4  # shades between neighbours, more than any codec here is off by
 CODECS = {"h264": ("libx264", {"crf": "4"}), "av1": ("libsvtav1", {"crf": "10", "preset": "12"})}
 
@@ -37,19 +38,25 @@ def encode(
     gop: int = 8,
     b_frames: int = 2,
     draw: Callable[[int], np.ndarray] = picture,
+    stamps: Sequence[float] | None = None,
 ) -> Path:
-    """A video of those pictures at `path`."""
+    """A video of those pictures at `path`; `stamps` are times in frame periods, by default 0, 1, 2, …"""
     name, options = CODECS[codec]
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
+    # With B-frames an edit list would hide the delay of the first frame; without them it is what states it.
+    late = {"use_editlist": "0", "avoid_negative_ts": "make_non_negative"}
+    with av.open(str(path), "w", options=late if stamps is not None and b_frames else {}) as container:
         stream = container.add_stream(name, rate=fps, options=options)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         stream.codec_context.gop_size = gop
         if codec == "h264":
             stream.codec_context.max_b_frames = b_frames
-        stream.codec_context.time_base = Fraction(1, fps)
-        for number in numbers:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(draw(number), format="rgb24")))
+        stream.codec_context.time_base = Fraction(1, fps * TICKS)
+        for i, number in enumerate(numbers):
+            frame = av.VideoFrame.from_ndarray(draw(number), format="rgb24")
+            frame.pts = round(TICKS * (i if stamps is None else stamps[i]))
+            frame.time_base = Fraction(1, fps * TICKS)
+            container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     return path
 

@@ -27,6 +27,7 @@ CHECKS = {  # the checks of an inspection, in the order they are printed
     "readable": "episodes that can be read",
     "files": "files and metadata",
     "keys": "the same keys in every episode",
+    "text": "tasks in words",
     "rows": "keys of one length",
     "frames": "frames missing or too many",
     "repeated": "stamps that repeat",

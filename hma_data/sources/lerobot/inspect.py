@@ -5,6 +5,7 @@ whose files are there. Nothing is fetched from the Hub for this.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.sources.common import checks
@@ -12,12 +13,13 @@ from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.survey import MAX_VALUES, Survey, sampled
 from hma_data.sources.common.video_file import VideoFile, frame_table
-from hma_data.sources.lerobot.films import PAIRING, frames_of_rows
+from hma_data.sources.lerobot.films import BY_INDEX, Fit, fit_of, frames_of_rows
 from hma_data.sources.lerobot.metadata import Feature, Metadata, Span, episode_name
-from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, times_of
+from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, tasks_of, times_of
 
 MAX_LENGTHS = 1_000  # most lengths in the inspection
 MAX_EPISODES = 20_000  # most episodes whose files are looked for, spread over all
+TIMES = "timestamp"  # the column
 MAX_VIDEOS = 64  # videos opened at most, over all cameras
 
 
@@ -30,7 +32,6 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
     if not meta.folder.repo:
         looking.look()
     keys = tuple(survey.key(info) for info in _keys(meta))
-    measured = next((key.hz for key in keys if key.key == "timestamp"), None)
     facts = {"version": str(meta.info.codebase_version), "tasks": str(len(meta.tasks))}
     return Inspection(
         format="lerobot",
@@ -39,7 +40,7 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
         keys=keys,
         frames=sum(lengths),
         lengths=tuple(lengths[:MAX_LENGTHS]),
-        hz=measured if looking.drifts else meta.fps,
+        hz=looking.hz if looking.drifts else meta.fps,
         robot=meta.info.robot_type or None,
         facts=facts | ({"pairing": "index"} if looking.drifts else {}),
         looked_at=len(survey.looked),
@@ -66,6 +67,7 @@ class _Looking:
 
     Attributes:
         drifts: whether a video has a frame for each row, but not at the times of the rows.
+        hz: rate of the rows by their times; None where they have none.
     """
 
     def __init__(self, meta: Metadata, survey: Survey, episodes: int) -> None:
@@ -74,6 +76,8 @@ class _Looking:
         indices = list(meta.episodes)
         self._indices = [indices[i] for i in sampled(len(indices), MAX_EPISODES)]
         self.drifts = False
+        self.hz: float | None = None
+        self._videos_seen: set[tuple[str, str]] = set()
 
     def look(self) -> None:
         """Find which files are there; then sample the episodes that have all of their files."""
@@ -118,9 +122,14 @@ class _Looking:
         except HMAError as fault:
             self._survey.fault(name, fault)
             return
+        self._survey.made.add("text")
+        if not tasks_of(meta, index, rows):
+            self._survey.note(Finding("text", "warn", f"{name}: has no task in words", key="task_index"))
         wanted = [key for key, item in meta.features.items() if item.dtype != "video"]
         length = meta.episodes[index]["length"]
         self._survey.lengths(name, length, {key: len(rows) for key in wanted if key in rows.columns}, wanted)
+        if TIMES not in wanted and TIMES in rows.columns:
+            self._numbers(name, TIMES, rows)  # some writers leave it out of the features
         for key in wanted:
             feature = meta.features[key]
             if key not in rows.columns:
@@ -136,8 +145,9 @@ class _Looking:
     def _numbers(self, name: str, key: str, rows: Rows) -> None:
         values = rows.numbers(key)
         self._survey.numbers(name, key, values)
-        if key == "timestamp":
+        if key == TIMES:
             clock = self._survey.times(name, key, values.reshape(len(values), -1)[:, 0].astype(np.float64))
+            self.hz = self.hz or clock.hz
             self._survey.made.add("rate")
             for found in checks.drift(f"{name}: {key}", clock.hz, self._meta.fps):
                 self._survey.note(found)
@@ -149,44 +159,57 @@ class _Looking:
             self._survey.pictures(name, key, stream.frames(run), run, codec)
 
     def _video(self, key: str, index: int, pairs: int) -> None:
-        """Compare the frames of an episode's video with its rows; hand some frames to the survey."""
-        meta, name, span = self._meta, episode_name(index), self._meta.video(index, key)
-        self._survey.made.add("frames")
+        """Compare a video with its episodes, and an episode's frames with its rows."""
+        meta, name = self._meta, episode_name(index)
+        self._survey.made |= {"frames", "skew"}
         try:
+            span = meta.video(index, key)
             file = VideoFile(meta.folder.path(span.path))
-            first, last = span.frames(file.timestamps, meta.fps)
-            rows = meta.episodes[index]["length"]
-            if last - first < rows or (last - first > rows and span.stop is None):
-                said = f"{span.path} has {last - first:,} frames{span} for {rows:,} rows"
-                numbers = {"frames": last - first, "rows": rows}
-                self._survey.note(Finding("frames", "warn", said, key=key, numbers=numbers))
-            else:
-                self._drift(file, span, key, index, last - first == rows)
-            last = min(last, first + rows)  # a shared video may go on with frames of no episode
-            if last > first:
-                indices = first + checks.choose(last - first, pairs, file.table.keys[first:last] - first)
-                for run in checks.runs(indices):
-                    self._survey.pictures(name, key, file.frames(run), run, file.table.codec)
+            found = fit_of(meta, key, file, span)
+            self._whole_video(key, span.path, file, found)
+            if span.index in found.unused:
+                count = found.unused[span.index]
+                said = f"{span.path} has {count:,} frames after the last row of {name} that no row asks for"
+                self._survey.note(Finding("frames", "warn", said, key=key, numbers={"frames": count}))
+            for run in self._sampled_frames(key, index, span, file, pairs):
+                self._survey.pictures(name, key, file.frames(run), run, file.table.codec)
             file.close()
         except HMAError as fault:
             self._survey.fault(name, fault, key)
 
-    def _drift(self, file: VideoFile, span: Span, key: str, index: int, as_many: bool) -> None:
-        """Note a video whose stamps are not the times of the rows; propose the pairing by index."""
+    def _whole_video(self, key: str, path: str, file: VideoFile, found: Fit) -> None:
+        """Note once what is wrong with a video as a whole."""
+        if (key, path) in self._videos_seen:
+            return
+        self._videos_seen.add((key, path))
+        rows = sum(span.rows for span in self._meta.spans(key, path))
+        numbers = {"frames": len(file), "rows": rows}
+        if found.fault:
+            said = f"{path} {found.fault}"
+            self._survey.note(Finding("frames", "warn", said, found.remedy, key, numbers))
+        elif found.shift:
+            said = f"{path} begins {found.shift:+.3f} s from where its metadata say, with one frame a row"
+            self._survey.note(Finding("frames", "info", said, key=key, numbers=numbers))
+
+    def _sampled_frames(
+        self, key: str, index: int, span: Span, file: VideoFile, pairs: int
+    ) -> list[NDArray[np.int64]]:
+        """Return runs of frames of an episode to look at; note stamps that are not the times of the rows."""
         try:
             times = times_of(rows_of(self._meta, index), self._meta.fps)
         except HMAError:
-            return  # `_rows` has noted it
-        self._survey.made.add("skew")
+            return []  # `_rows` has noted it
         try:
-            frames_of_rows(file, span, times, self._meta.fps, by_index=False)
+            indices = frames_of_rows(self._meta, key, file, span, times, None)
         except EpisodeError as fault:
-            self.drifts |= as_many
-            said = f"{episode_name(index)} {key}: {fault.fault}"
-            remedy = (
-                f"both count {len(times):,}: if row i belongs to frame i, set {PAIRING}" if as_many else ""
-            )
-            self._survey.note(Finding("skew", "warn", said, remedy, key))
+            if not fit_of(self._meta, key, file, span).fault:
+                self.drifts |= BY_INDEX in fault.remedy
+                said = f"{episode_name(index)} {key}: {fault.fault}"
+                remedy = fault.remedy if BY_INDEX in fault.remedy else ""
+                self._survey.note(Finding("skew", "warn", said, remedy, key))
+            return checks.runs(checks.choose(len(file), pairs, file.table.keys))
+        chosen = checks.choose(len(indices), pairs, np.searchsorted(indices, file.table.keys[indices]))
+        return checks.runs(indices[chosen])
 
 
 def _is_vector(feature: Feature) -> bool:

@@ -8,17 +8,14 @@ the file of an episode and, within a video, its start and end.
 import json
 import math
 import re
-from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
 from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 
-from hma_data.episodes.episode import Floats
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.storage.kinds import unreadable
 
@@ -99,30 +96,22 @@ class Info(BaseModel):
 
 @dataclass(frozen=True)
 class Span:
-    """The part of a video that holds an episode, in seconds of its clock.
+    """The part of a video that holds an episode, in seconds of the clock that the metadata use.
 
     Attributes:
+        index: of the episode.
         path: of the file.
+        rows: how many the episode has.
         start: time of the episode's first frame.
         stop: as the metadata state it; None for a whole file. Some writers state the end of the last frame,
             others its time, so no frames are counted by it. lerobot does not read it either.
-        limit: start of the next episode in the file; infinity after the last one.
     """
 
+    index: int
     path: str
+    rows: int
     start: float = 0.0
     stop: float | None = None
-    limit: float = math.inf
-
-    def frames(self, clock: Floats, fps: float) -> tuple[int, int]:
-        """Return the indices [first, last) of the frames up to the next episode, of a video's times."""
-        if self.stop is None:
-            return 0, len(clock)
-        first, last = np.searchsorted(clock, [self.start - 0.5 / fps, self.limit - 0.5 / fps])
-        return int(first), int(last)
-
-    def __str__(self) -> str:
-        return "" if self.stop is None else f" from {self.start:.3f} to {self.stop:.3f} s"
 
 
 class Folder:
@@ -222,9 +211,10 @@ class Metadata:
         self.fps, self.features = self.info.fps, self.info.features
         self._is_v3 = is_v3 = self.info.codebase_version == "v3.0"
         self.splits = _splits(self.info.splits)
-        self.tasks = _tasks_v3(folder) if is_v3 else _tasks_v2(folder)
+        self.tasks = _by_number(_tasks_v3(folder) if is_v3 else _tasks_v2(folder))
         self.episodes = _by_index(_episodes_v3(folder) if is_v3 else _lines(folder, "episodes.jsonl"))
-        self._starts: dict[str, dict[str, list[float]]] = {}  # camera -> video -> starts of its episodes
+        self._spans: dict[str, dict[str, tuple[Span, ...]]] = {}  # camera -> video -> its episodes
+        self.fits: dict[tuple[str, str], tuple[Any, Any]] = {}  # camera, video -> its table, and its Fit
         if not self.episodes:
             raise SourceError(folder.uri, "has no episodes", "record some, or check meta/")
 
@@ -235,29 +225,26 @@ class Metadata:
 
     def video(self, index: int, key: str) -> Span:
         """Return the part of a video that holds an episode's frames of one camera."""
-        path = self._video_path(index, key)
+        row, path = self.episodes[index], self._video_path(index, key)
         if not self._is_v3:
-            return Span(path)
-        row = self.episodes[index]
+            return Span(index, path, row["length"])
         start, stop = row.get(f"videos/{key}/from_timestamp"), row.get(f"videos/{key}/to_timestamp")
-        if not (isinstance(start, float) and isinstance(stop, float) and 0 <= start <= stop < math.inf):
+        if not (isinstance(start, float) and isinstance(stop, float) and 0 <= start < math.inf):
             raise EpisodeError(episode_name(index), f"meta/episodes does not say where {key} begins and ends")
-        return Span(path, start, stop, self._next_start(key, path, start))
+        return Span(index, path, row["length"], start, stop)
 
-    def _next_start(self, key: str, path: str, start: float) -> float:
-        """Return where the episode after the one at `start` begins in a video; infinity after the last."""
-        if key not in self._starts:
-            found = self._starts[key] = {}
-            for index, row in self.episodes.items():
-                begin = row.get(f"videos/{key}/from_timestamp")
-                if isinstance(begin, float):
-                    with suppress(EpisodeError):
-                        found.setdefault(self._video_path(index, key), []).append(begin)
-            for starts in found.values():
-                starts.sort()
-        starts = self._starts[key][path]
-        after = bisect_right(starts, start)
-        return starts[after] if after < len(starts) else math.inf
+    def spans(self, key: str, path: str) -> tuple[Span, ...]:
+        """Return the episodes that have their frames of one camera in a video, in the order of the video."""
+        if key not in self._spans:
+            found: dict[str, list[Span]] = {}
+            for index in self.episodes:
+                with suppress(EpisodeError):
+                    span = self.video(index, key)
+                    found.setdefault(span.path, []).append(span)
+            self._spans[key] = {
+                name: tuple(sorted(spans, key=lambda span: span.start)) for name, spans in found.items()
+            }
+        return self._spans[key][path]
 
     def _video_path(self, index: int, key: str) -> str:
         if not self.info.video_path:
@@ -350,15 +337,27 @@ Row = tuple[str, dict[str, Any]]  # where it is written, and what it holds
 
 
 def _lines(folder: Folder, name: str) -> Iterator[Row]:
+    """Yield the objects of a file of JSON lines; some writers store one list, or one object over lines."""
     path = folder.root / "meta" / name
-    for i, line in enumerate(_content(path).splitlines(), 1):
-        if line.strip():
-            where = f"{path} line {i}"
-            try:
-                yield where, json.loads(line)
-            except ValueError as fault:
-                reason = unreadable(path, f"is not JSON: {fault}", "the dataset is damaged")
-                raise SourceError(where, *reason) from fault
+    content = _content(path).decode("utf-8-sig", errors="replace")
+    found: list[tuple[str, Any]] = []
+    with suppress(ValueError):
+        found = [(str(path), json.loads(content))]
+    lines = [] if found else enumerate(content.splitlines(), 1)
+    for i, line in lines:
+        if not line.strip():
+            continue
+        where = f"{path} line {i}"
+        try:
+            found.append((where, json.loads(line)))
+        except ValueError as fault:
+            reason = unreadable(path, f"is not JSON: {fault}", "the dataset is damaged")
+            raise SourceError(where, *reason) from fault
+    for where, value in found:
+        for row in value if isinstance(value, list) else [value]:
+            if not isinstance(row, dict):
+                raise SourceError(where, f"holds {row!r:.60}, not an object", "the dataset is damaged")
+            yield where, row
 
 
 def _splits(found: dict[str, Any]) -> dict[str, range]:
@@ -367,20 +366,33 @@ def _splits(found: dict[str, Any]) -> dict[str, range]:
     return {name: range(int(match[1]), int(match[2])) for name, match in matches.items() if match}
 
 
-def _tasks_v2(folder: Folder) -> dict[int, str]:
-    return {row.get("task_index", -1): str(row.get("task", "")) for _, row in _lines(folder, "tasks.jsonl")}
+def _tasks_v2(folder: Folder) -> Iterator[tuple[Any, Any]]:
+    # Without the file, the episodes' own lists have the words.
+    rows = _lines(folder, "tasks.jsonl") if (folder.root / "meta" / "tasks.jsonl").is_file() else ()
+    yield from ((row.get("task_index"), row.get("task")) for _, row in rows)
 
 
-def _tasks_v3(folder: Folder) -> dict[int, str]:
+def _tasks_v3(folder: Folder) -> Iterator[tuple[Any, Any]]:
     import pyarrow.parquet as pq
 
     path = folder.root / "meta" / "tasks.parquet"
+    if not path.is_file():
+        return
     with parquet_explained(path, SourceError):
         with pq.ParquetFile(path) as file:
             table = file.read(use_threads=False)
         # The text is pandas' index, whose column is named `task` or not at all.
         texts = "task" if "task" in table.column_names else "__index_level_0__"
-        return dict(zip(table["task_index"].to_pylist(), map(str, table[texts].to_pylist()), strict=True))
+        yield from zip(table["task_index"].to_pylist(), table[texts].to_pylist(), strict=True)
+
+
+def _by_number(tasks: Iterator[tuple[Any, Any]]) -> dict[int, str]:
+    """Return the text of each task; none for a number that stands for two texts."""
+    found: dict[int, set[str]] = {}
+    for number, text in tasks:
+        if isinstance(number, int) and isinstance(text, str) and text.strip():
+            found.setdefault(number, set()).add(text)
+    return {number: texts.pop() for number, texts in found.items() if len(texts) == 1}
 
 
 def _episodes_v3(folder: Folder) -> Iterator[Row]:

@@ -31,7 +31,7 @@ class Rows:
     Attributes:
         path: of the file.
         columns: names of all columns of the file.
-        places: (T, 2) row group and row within it.
+        places: (T, 2) row group and row within it, in the order of the episode.
     """
 
     path: Path
@@ -49,13 +49,14 @@ class Rows:
         """
         self.check(key)
         with parquet_explained(self.path, EpisodeError):
-            parts = [
-                _column_of_group(self.path, _changed(self.path), int(group), key).take(
-                    self.places[self.places[:, 0] == group, 1]
-                )
-                for group in np.unique(self.places[:, 0])
-            ]
-            return pa.concat_arrays(parts)
+            parts, order = [], []
+            for group in np.unique(self.places[:, 0]):
+                held = _column_of_group(self.path, _changed(self.path), int(group), key)
+                mine = np.flatnonzero(self.places[:, 0] == group)
+                parts.append(held.take(self.places[mine, 1]))
+                order.append(mine)
+            # A group's rows may lie apart in the episode: bring the groups back into its order.
+            return pa.concat_arrays(parts).take(np.argsort(np.concatenate(order)))
 
     def check(self, key: str) -> None:
         """Raise an EpisodeError where the file has no such column."""
@@ -110,7 +111,27 @@ def rows_of(meta: Metadata, index: int) -> Rows:
         placed = np.concatenate(places)
         if not len(placed):
             raise EpisodeError(path, f"has no rows of episode {index}", "the dataset is not complete")
-        return Rows(path, columns, placed)
+        return _in_order(Rows(path, columns, placed), index)
+
+
+def _in_order(rows: Rows, index: int) -> Rows:
+    """Return the rows by their number in the episode: parallel writers and merges store them in any order.
+
+    Raises:
+        EpisodeError: a row is missing, or there twice.
+    """
+    key = next((name for name in ("frame_index", "index") if name in rows.columns), None)
+    if key is None:
+        return rows
+    numbers = rows.numbers(key).reshape(len(rows), -1)[:, 0]
+    order = np.argsort(numbers, kind="stable")
+    steps = np.diff(numbers[order])
+    if (steps != 1).any():
+        number = numbers[order][int(np.argmax(steps != 1))]
+        fault = f"has row {number} of episode {index} twice" if (steps == 0).any() else ""
+        fault = fault or f"lacks rows of episode {index} after row {number}"
+        raise EpisodeError(rows.path, f"{fault}, by {key}", "write or merge the dataset again")
+    return Rows(rows.path, rows.columns, rows.places[order])
 
 
 def _may_hold(held: Any, index: int) -> bool:
@@ -159,7 +180,25 @@ def times_of(rows: Rows, fps: float) -> Floats:
     times = rows.numbers("timestamp").reshape(len(rows), -1)[:, 0].astype(np.float64)
     if not np.isfinite(times).all():
         raise EpisodeError(rows.path, "has timestamps that are not finite")
+    if (np.diff(times) <= 0).any():
+        row = int(np.argmax(np.diff(times) <= 0))
+        said = f"{times[row]:g} s, then {times[row + 1]:g} s"
+        raise EpisodeError(rows.path, f"its timestamps do not rise after row {row}: {said}")
     return times
+
+
+def tasks_of(meta: Metadata, index: int, rows: Rows) -> list[str]:
+    """Return the tasks in the order of the rows.
+
+    Where a row's number is of no task, as merges leave it, the episode's own list counts.
+    """
+    listed = meta.episodes[index].get("tasks")
+    own = [str(task) for task in listed if task] if isinstance(listed, list) else []
+    if "task_index" not in rows.columns:
+        return own
+    numbers = list(dict.fromkeys(rows.numbers("task_index").reshape(-1).tolist()))
+    found = [meta.tasks[number] for number in numbers if meta.tasks.get(number)]
+    return found if len(found) == len(numbers) or not own else own
 
 
 class StillImages:

@@ -4,8 +4,10 @@ A uri is a folder, `hf://datasets/NAME/DATASET[@REVISION]`, or `NAME/DATASET` on
 the files of the episodes that are read are fetched. Keys are feature names (`action`,
 `observation.images.cam_high`). The rate is `fps` of info.json, and the embodiment's rate must agree with it.
 
-A row has the frame of its time. Where the film's stamps drift away from the rows' times, the embodiment may
-say `source: {layout: {pairing: index}}`: row i then has frame i, and the times and the rate are the rows'.
+A row has the frame of its time, where the whole video fits the rows of its episodes (see `films`). Where the
+film's stamps drift away from the rows' times, the embodiment may say `source: {layout: {pairing: index}}`:
+row i then has frame i, and the times and the rate are the rows'. `pairing: time` believes the stamps whatever
+the number of frames.
 
 T frames of an episode.
 """
@@ -17,18 +19,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Episode, Floats, Signal, Stream
+from hma_data.episodes.episode import Episode, Signal, Stream
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.registry.components import Camera, Vector
+from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
 from hma_data.sources.common.places import file_fingerprint
-from hma_data.sources.lerobot.films import FilmRows, frames_of_rows, open_video
+from hma_data.sources.lerobot.films import FilmRows, fit_of, frames_of_rows, open_video
 from hma_data.sources.lerobot.inspect import inspect
 from hma_data.sources.lerobot.metadata import Folder, Metadata, episode_name
-from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, times_of
+from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, tasks_of, times_of
 from hma_data.storage.paths import StrPath, as_text
 
+NO_TASK = "episodes_without_task"
+UNUSED = "frames_without_row"
 RATE_TOLERANCE = 0.01  # of the rate
 _SAMPLE = 4096  # bytes at each end of a video that its fingerprint covers
 
@@ -93,19 +97,29 @@ class LeRobotSource:
         if len(rows) != length:
             raise EpisodeError(rows.path, f"has {len(rows)} rows of {episode_id}, its metadata says {length}")
         times = times_of(rows, meta.fps)
-        tasks = _tasks(meta, index, rows)
+        tasks = tasks_of(meta, index, rows)
+        pairing = (embodiment.source.layout or {}).get("pairing")
+        streams: dict[str, Stream] = {}
+        flags = {} if tasks or embodiment.source.instruction else {NO_TASK: 1}
+        for camera in embodiment.cameras:
+            if meta.features[camera.key].dtype == "image":
+                streams[camera.name] = StillImages(rows, camera.key, times, meta.folder)
+                continue
+            span = meta.video(index, camera.key)
+            file = open_video(meta.folder.path(span.path), camera.key)
+            found = frames_of_rows(meta, camera.key, file, span, times, pairing)
+            streams[camera.name] = FilmRows(file, times, found)
+            if unused := fit_of(meta, camera.key, file, span).unused.get(index):
+                flags[f"{UNUSED}:{camera.name}"] = unused
         return Episode(
             id=episode_id,
-            streams={
-                camera.name: _stream(meta, index, camera, rows, times, pairs_by_index(embodiment))
-                for camera in embodiment.cameras
-            },
+            streams=streams,
             actions=(Signal(times, _vector(rows, embodiment.action)),),
             states=(Signal(times, _vector(rows, embodiment.state)),) if embodiment.state else (),
             instruction=_instruction(rows, embodiment.source.instruction, tasks),
             success=_success(rows),
             source=str(rows.path),
-            metadata={"tasks": tasks} if len(tasks) > 1 else {},
+            metadata={"flags": flags} | ({"tasks": tasks} if len(tasks) > 1 else {}),
         )
 
     def _open(self, uri: str, again: bool = False) -> Metadata:
@@ -117,13 +131,13 @@ class LeRobotSource:
 open = LeRobotSource
 
 
-def pairs_by_index(embodiment: Embodiment) -> bool:
+def _pairs_by_index(embodiment: Embodiment) -> bool:
     """Check whether the embodiment says that row i has frame i."""
     return (embodiment.source.layout or {}).get("pairing") == "index"
 
 
 def _check_rate(meta: Metadata, embodiment: Embodiment) -> None:
-    if pairs_by_index(embodiment):
+    if _pairs_by_index(embodiment):
         return  # then fps is the film's rate, and the rows have another
     stated = embodiment.frequency_hz
     if isinstance(stated, float) and abs(stated - meta.fps) > RATE_TOLERANCE * meta.fps:
@@ -179,15 +193,6 @@ def _vector(rows: Rows, vector: Vector) -> NDArray[np.float32]:
     return compose(vector, [pieces[part.key] for part in vector.components], str(rows.path))
 
 
-def _tasks(meta: Metadata, index: int, rows: Rows) -> list[str]:
-    """Return the tasks in the order of the rows; the episode's own list where rows state none."""
-    if "task_index" in rows.columns and meta.tasks:
-        numbers = rows.numbers("task_index").reshape(-1).tolist()
-        return [meta.tasks[number] for number in dict.fromkeys(numbers) if number in meta.tasks]
-    said = meta.episodes[index].get("tasks")
-    return [str(task) for task in said] if isinstance(said, list) else []
-
-
 def _instruction(rows: Rows, key: str | None, tasks: list[str]) -> str:
     if key and key != "task":
         return str(rows.column(key)[0].as_py() or "")
@@ -196,11 +201,3 @@ def _instruction(rows: Rows, key: str | None, tasks: list[str]) -> str:
 
 def _success(rows: Rows) -> bool | None:
     return bool(rows.numbers("next.success").reshape(-1)[-1]) if "next.success" in rows.columns else None
-
-
-def _stream(meta: Metadata, index: int, camera: Camera, rows: Rows, times: Floats, by_index: bool) -> Stream:
-    if meta.features[camera.key].dtype == "image":
-        return StillImages(rows, camera.key, times, meta.folder)
-    span = meta.video(index, camera.key)
-    file = open_video(meta.folder.path(span.path), camera.key)
-    return FilmRows(file, times, frames_of_rows(file, span, times, meta.fps, by_index))
