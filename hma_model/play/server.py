@@ -30,6 +30,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from hma_data.errors import HMAError, UsageError
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.play import messages
+from hma_model.play.holding import UNKNOWN, Holding, holdings
 from hma_model.play.pads import describe, labels
 from hma_model.play.save import FILE_KINDS, film, told_by
 from hma_model.play.session import Frame, FrameSampling, Session
@@ -162,6 +163,7 @@ class Server:
         host: the address that it listens on.
         token: what every request must carry, or None.
         first: the key of the robot that a page opens with; None for the best known one.
+        holdings: how long robots stay with the truth, by id.
     """
 
     def __init__(
@@ -171,8 +173,10 @@ class Server:
         host: str = LOOPBACK[0],
         token: str | None = None,
         first: str | None = None,
+        holdings: Mapping[str, Holding] | None = None,
     ) -> None:
         self.stepper, self.model, self.first = stepper, model, first or FIRST_ROBOT
+        self.holdings = holdings or {}
         self.viewers = 0
         self._page = files("hma_model.play").joinpath("page.html").read_text("utf-8")
         self._saving = asyncio.Semaphore(1)
@@ -262,7 +266,14 @@ class Connection:
         self.session: Session | None = None
         self.fault = ""
         self._credit, self._filled = MESSAGE_BURST, time.monotonic()
-        robots = [describe(robot) for robot in self.stepper.robots.values()]
+        held = {
+            key: server.holdings.get(robot.embodiment.id, UNKNOWN)
+            for key, robot in self.stepper.robots.items()
+        }
+        robots = [
+            describe(self.stepper.robots[key]) | {"holds": known.words, "follows": known.follows is not False}
+            for key, known in sorted(held.items(), key=lambda pair: pair[1].rank)
+        ]
         orders = list(self.stepper.orders)
         hello = {"model": server.model, "robots": robots, "orders": orders, "first": server.first}
         self.page.tell({"kind": "hello", **hello})
@@ -431,7 +442,8 @@ async def serve(
     stepper = Stepper(World(model, tokenizer, **settings), robots, orders=("random", *confidence))
     stepper.start()
     try:
-        await run(Server(stepper, name, host, token, first).app, listener, lambda server: ready())
+        server = Server(stepper, name, host, token, first, holdings(checkpoint))
+        await run(server.app, listener, lambda server: ready())
     finally:
         stepper.stop()
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.images import opencv
 from hma_data.errors import UsageError
+from hma_model.play.divergence import DivergenceDetector
 from hma_model.play.pads import describe
 from hma_model.worlds.scenes import Drivable, Floats, Image, LabScene
 
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 
 RESTART_FRAMES = 8  # frames that a restart of the model is given
 KEPT_FRAMES = 3000  # frames to save
-PSNR_DROP = 6.0  # dB: twice the tokenizer's own error
-MIN_BAD_FRAMES = 3  # frames that are bad in a row before model and truth have parted; a second of them
 QUALITY = 92  # of JPEG
 
 
@@ -120,15 +119,25 @@ class Session:
         self.held = self.scene.action.copy()
         self.frames: deque[Frame] = deque(maxlen=KEPT_FRAMES)
         self.count, self.ended, self.steps = 0, False, 0
-        self.parted: int | None = None
-        self._bad = 0  # frames in a row in which the model is no better than a still
 
     def _set_start(self) -> None:
         """Take the prompt's last frame as the tokenizer shows it, which the model cannot surpass."""
-        true, shown = self._true[-1], self._world.image(self.row)
-        self._best, self._still = psnr(shown, true), true
-        none = np.zeros((0, 0), np.float32)
-        self.start = self._last = Frame(0, jpeg(shown), jpeg(true), none, self._state, self._best, 60.0)
+        self.start = self._last = self._restarted(
+            Frame(0, b"", None, np.zeros((0, 0), np.float32), self._state, None)
+        )
+
+    def _restarted(self, frame: Frame) -> Frame:
+        """Return a frame with the images from which the model goes on; divergence is looked for anew."""
+        shown, true = self._world.image(self.row), self._true[-1]
+        rate = self.robot.embodiment.rate_hz / self.robot.embodiment.stride
+        self._divergence = DivergenceDetector(true, shown, round(rate))
+        self._still = true
+        return replace(frame, model=jpeg(shown), true=jpeg(true), psnr=psnr(shown, true), still=60.0)
+
+    @property
+    def parted(self) -> int | None:
+        """Return the frame from which on the model no longer shows what truly happens."""
+        return self._divergence.parted
 
     def sync(self) -> None:
         """Restart the model from the true last frames.
@@ -139,10 +148,7 @@ class Session:
         if not self._true:
             raise UsageError("sync", "the true frames are unknown here", "reset first, or drive a simulator")
         self._world.reset(self.row, *self._history())
-        shown, true = self._world.image(self.row), self._true[-1]
-        self._best, self._still = psnr(shown, true), true
-        self.parted, self._bad = None, 0
-        self._last = replace(self._last, model=jpeg(shown), true=jpeg(true), psnr=self._best, still=60.0)
+        self._last = self._restarted(self._last)
 
     def _history(self) -> tuple[Image, Floats]:
         """Return the true last frames, and the chunks between them."""
@@ -186,7 +192,7 @@ class Session:
         score = still = None
         if self._truth is not None:
             score, still = psnr(image, self._truth), psnr(self._still, self._truth)
-            self._judge(score, still)
+            self._divergence.look(self.count, image, self._truth)
         stride = self.robot.embodiment.stride
         actions = self._chunks[-1].reshape(stride, -1)
         true = None if self._truth is None else jpeg(self._truth)
@@ -208,22 +214,6 @@ class Session:
     def _state(self) -> Floats | None:
         """Return the state (S,) of the simulator, if there is one."""
         return self.scene.simulator.state if isinstance(self.scene, LabScene) else None
-
-    def _judge(self, score: float, still: float) -> None:
-        """Note the moment from which on, for a second, the model's images are no better than a still.
-
-        They must be much worse than the tokenizer's own too: a still is exact while nothing moves.
-        """
-        if self.parted is not None:
-            return
-        self._bad = self._bad + 1 if score <= still and score < self._best - PSNR_DROP else 0
-        if self._bad == self.row_of_bad:
-            self.parted = self.count - self._bad + 1
-
-    @property
-    def row_of_bad(self) -> int:
-        """Return how many bad frames in a row it takes to say that model and truth have parted."""
-        return max(MIN_BAD_FRAMES, round(self.robot.embodiment.rate_hz / self.robot.embodiment.stride))
 
     def _rate(self, now: float) -> float:
         """Return the frames a second of the last 2 s or so."""

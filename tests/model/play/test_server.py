@@ -13,6 +13,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from hma_data.episodes.images import decode_image
 from hma_model.play import server
+from hma_model.play.holding import Holding
 from hma_model.play.messages import MAX_MESSAGE_BYTES
 from hma_model.play.server import FRAMES_AHEAD, MESSAGE_BURST, SCENE_COST, Server
 from hma_model.play.stepper import Stepper
@@ -27,6 +28,15 @@ def stepper() -> Iterator[Stepper]:
     made.start()
     yield made
     made.stop()
+
+
+def test_robots_are_listed_by_how_long_they_hold(stepper: Stepper) -> None:
+    known = {"mover_04": Holding(1.0, False, False), "arm2_12": Holding(8.2, False, True)}
+    server = Server(stepper, "a model", holdings=known)
+    with TestClient(server.app, HOST) as client, client.websocket_connect(DRIVE) as socket:
+        listed = PageViewer(socket).message("hello")["robots"]
+    said = [(one["id"], one["holds"], one["follows"]) for one in listed]
+    assert said == [("arm2_12", "holds 8 s", True), ("mover_04", "does not follow its actions", False)]
 
 
 @pytest.fixture

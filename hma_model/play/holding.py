@@ -1,0 +1,63 @@
+"""Say how long each robot of a checkpoint stays with the truth, so that people choose one that does.
+
+The bundled model's robots were measured by `recipes/bench/holding.py`. Of other checkpoints the verdict of
+`hma evaluate` is known, if its card has one.
+"""
+
+import json
+from dataclasses import dataclass
+from importlib.resources import files
+
+from hma_model.checkpoint.folder import Checkpoint
+
+MEASURED = "holding.json"
+FOLLOWS_S = 2.0  # a robot that is lost within so many seconds does not follow its actions
+
+
+@dataclass(frozen=True)
+class Holding:
+    """How long a robot stays with the truth.
+
+    Attributes:
+        seconds: until model and truth part, the median over scenes; None if nobody measured it.
+        at_least: whether they had not parted when the measurement ended.
+        follows: whether the robot follows its actions; None if nobody knows.
+    """
+
+    seconds: float | None
+    at_least: bool
+    follows: bool | None
+
+    @property
+    def words(self) -> str:
+        """Return what the list of robots says of it; "" if nobody knows."""
+        if self.follows is False:
+            return "does not follow its actions"
+        if self.seconds is None:
+            return ""
+        return f"holds {self.seconds:.0f} s" + " or more" * self.at_least
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Return its place in the list: those that hold longest come first, those that do not follow last."""
+        return self.follows is False, -(self.seconds or 0.0)
+
+
+UNKNOWN = Holding(None, False, None)
+
+
+def holdings(checkpoint: Checkpoint) -> dict[str, Holding]:
+    """Return what is known of each robot of a checkpoint."""
+    measured = json.loads(files("hma_model.play").joinpath(MEASURED).read_text("utf-8"))
+    known = measured["robots"] if measured["trunk_sha256"] == checkpoint.trunk_sha256 else {}
+    found = {}
+    for name in checkpoint.embodiments:
+        if name in known:
+            seconds, at_least = known[name]["seconds"], known[name]["at_least"]
+            found[name] = Holding(seconds, at_least, at_least or seconds > FOLLOWS_S)
+        else:
+            verdict = (checkpoint.card(name).get("evaluation") or {}).get("verdict", "")
+            says = {"follows": True, "does not follow": False}
+            follows = [value for words, value in says.items() if str(verdict).startswith(words)]
+            found[name] = Holding(None, False, follows[0] if follows else None)
+    return found

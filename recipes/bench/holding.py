@@ -1,0 +1,61 @@
+"""Measure how long the robots of a checkpoint stay with the truth, as `hma play` sees it.
+
+    python recipes/bench/holding.py            # writes hma_model/play/holding.json for the bundled model
+
+Each robot with a simulator replays the recorder's actions in the model until model and truth have parted
+(`hma_model.play.divergence`), in several scenes. The median over scenes is the time that it holds.
+"""
+
+import argparse
+import json
+import statistics
+from pathlib import Path
+
+import hma_model.play
+from hma_data.storage.files import write_atomic
+from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.play.holding import MEASURED
+from hma_model.play.session import FrameSampling, Session
+from hma_model.worlds.scenes import drivable
+from hma_model.worlds.world import load_world
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--checkpoint", default=str(EMBEDDED))
+    parser.add_argument("--out", type=Path, default=Path(hma_model.play.__file__).parent / MEASURED)
+    parser.add_argument("--scenes", type=int, default=4)
+    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--device", default="cpu")
+    given = parser.parse_args()
+    checkpoint = Checkpoint.open(given.checkpoint)
+    world = load_world(given.checkpoint, device=given.device)
+    robots = drivable(checkpoint, (), lambda: world.tokenizer)
+    sampling = FrameSampling(world.unmask_steps, world.temperature, world.order)
+    sessions: dict[str, list[Session]] = {}
+    for name, robot in robots.items():
+        if robot.source == "simulator":
+            sessions[name] = [Session(name, robot, n, world, sampling, 0.0) for n in range(given.scenes)]
+    every = [session for some in sessions.values() for session in some]
+    for session in every:
+        session.replays = True
+    for frame in range(given.frames):
+        live = [session for session in every if session.parted is None]
+        chunks = {session.row: session.next_chunk() for session in live}
+        images = world.step({row: chunk for row, chunk in chunks.items() if chunk is not None})
+        for session in live:
+            session.take(images[session.row], 0.0, 0.0)
+        print(f"frame {frame + 1}: {len(live)} sessions", flush=True)
+    found = {}
+    for name, some in sessions.items():
+        hz = robots[name].embodiment.effective_hz
+        frames = statistics.median(session.parted or given.frames for session in some)
+        at_least = frames >= given.frames
+        found[name] = {"seconds": round(frames / hz, 1), "at_least": at_least}
+    settings = {"scenes": given.scenes, "frames": given.frames}
+    content = {"trunk_sha256": checkpoint.trunk_sha256, **settings, "robots": found}
+    write_atomic(given.out, json.dumps(content, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
