@@ -16,7 +16,6 @@ from typer import Option
 from typer.core import TyperGroup
 
 from hma_data import __version__
-from hma_data.bench import BENCHES, RECIPES
 from hma_data.cli import mount
 from hma_data.console import fail, interruptible
 from hma_data.cpu import bound_spinning, take_ordinary_priority
@@ -233,13 +232,4 @@ def _opened(checkpoint: str, data: Path, device: str) -> tuple[Any, Any, Any]:
 app.command("policy-eval", rich_help_panel=MODELS)(policy_eval)
 app.command(rich_help_panel=MODELS)(augment)
 app.command("label-actions", rich_help_panel=MODELS)(label_actions)
-BENCHES |= {
-    "drift": "hma_model.bench.drift:BENCH",
-    "generate": "hma_model.bench.generation:GENERATE",
-    "mup": f"{RECIPES}.mup:BENCH",
-    "play": "hma_model.bench.play:BENCH",
-    "quality": f"{RECIPES}.quality:BENCH",
-    "train": "hma_model.bench.speed:TRAIN",
-    "waiting": f"{RECIPES}.waiting:WAITING",
-}
 app.add_typer(hub_app, name="hub", rich_help_panel=MODELS)

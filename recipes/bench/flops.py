@@ -85,7 +85,7 @@ def _seconds(m: int, k: int, n: int, device: "torch.device", precision: str) -> 
 
 
 def _best(product: Callable[["torch.Tensor"], "torch.Tensor"], x: "torch.Tensor") -> float:
-    from hma_model.bench.speed import finish
+    from recipes.bench.speed import finish
 
     count, best = 1, float("inf")
     for _ in range(REPEATS):

@@ -16,7 +16,7 @@ from statistics import median
 from typing import Any
 
 from hma_data.bench import Bench, in_fresh_process
-from hma_model.bench.speed import check_settings, numbers_of, step_seconds
+from recipes.bench.speed import check_settings, numbers_of, step_seconds
 
 WAITS: dict[str, dict[str, str]] = {
     "PASSIVE": {"OMP_WAIT_POLICY": "PASSIVE"},
@@ -57,7 +57,7 @@ def waiting(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 def measure_both(settings: dict[str, Any]) -> dict[str, float]:
     """Return the speed of generation and training, and the CPU seconds that each took on all cores."""
-    from hma_model.bench.generation import Frames, embedded
+    from recipes.bench.generation import Frames, embedded
 
     way: dict[str, Any] = {"cache": True, "decode": True, "compile": False, "unmask_steps": 2}
     way |= {"ddim_steps": None, "seconds": float("inf"), **settings}

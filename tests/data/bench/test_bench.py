@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from hma_data import bench
-from hma_data.bench import sources
-from hma_data.bench.sources import CASES, actions, scene
 from hma_data.episodes.align import to_clip
 from hma_data.errors import UsageError
 from hma_data.sources.base import open_source
+from recipes.bench import sources
+from recipes.bench.sources import CASES, actions, scene
 
 TOY = bench.Bench(
     "a toy",

@@ -5,10 +5,9 @@ from typing import Any
 
 import pytest
 
-from hma_data.bench import loader
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
-from recipes.bench import peers
+from recipes.bench import loader, peers
 from tests.data.loading.test_pools import SMALL
 
 

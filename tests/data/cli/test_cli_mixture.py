@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from hma_data.bench.loader import make_set
 from hma_data.errors import UsageError
 from hma_model.cli import app
+from recipes.bench.loader import make_set
 from tests.data.loading.test_pools import SMALL
 
 

@@ -13,11 +13,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.bench.loader import make_set
 from hma_data.errors import ShardError, UsageError
 from hma_data.loading.dataset import MixtureDataset, WindowDataset
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
+from recipes.bench.loader import make_set
 from tests.data.loading.test_pools import SMALL
 
 FIRST = "train/shard-00000.parquet"

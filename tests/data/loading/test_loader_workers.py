@@ -12,10 +12,10 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from hma_data.bench.loader import make_set
 from hma_data.loading.dataset import Batch, MixtureDataset, WindowDataset, as_batch
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
+from recipes.bench.loader import make_set
 from tests.data.loading.test_pools import SMALL
 
 FRAMES, SIZE = 6, 8

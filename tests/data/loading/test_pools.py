@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hma_data.bench.loader import BENCH, make_set
 from hma_data.loading.pools import LARGEST_POOL, UnitAssignment, WindowSequence, pool_size, spread
 from hma_data.loading.rows import MIB, Decoder
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import WindowIndex
+from recipes.bench.loader import BENCH, make_set
 from tests.data.shards.test_windows import fake
 
 SMALL = BENCH.defaults | {

@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from hma_data.bench.loader import make_set
 from hma_data.shards.schema import to_numpy
+from recipes.bench.loader import make_set
 from tests.data.loading.test_pools import SMALL
 
 COLUMNS = [

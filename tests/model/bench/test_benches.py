@@ -10,9 +10,8 @@ from typer.testing import CliRunner
 
 from hma_data.errors import UsageError
 from hma_data.tokenizers.network import NetworkTokenizer
-from hma_model.bench import generation, play, speed
 from hma_model.cli import app
-from recipes.bench import flops, waiting
+from recipes.bench import flops, generation, play, speed, waiting
 
 SMALL = {
     "layers": 1, "width": 32, "heads": 4, "window": 3, "device": "cpu", "threads": 1, "diffusion_width": 32

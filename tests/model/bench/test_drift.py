@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hma_data.errors import HMAError, UsageError
-from hma_model.bench import drift
+from recipes.bench import drift
 from tests.model import embedded
 
 BATCH, FRAMES = 3, 50

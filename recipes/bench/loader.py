@@ -16,7 +16,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from hma_data.bench import Bench, in_fresh_process, make_robot, peak_rss_mib, recipe_module, rss_mib
+from hma_data.bench import Bench, in_fresh_process, make_robot, peak_rss_mib, rss_mib
 from hma_data.loading.mixture import Draw
 
 PEERS = ("datasets", "lance", "litdata", "streaming")  # of recipes/bench/peers.py
@@ -28,7 +28,9 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
         sets = [make_set(Path(folder) / str(i), i, settings) for i in range(settings["embodiments"])]
         results = [_timed(_load, case, sets, settings) for case in settings["cases"]]
         for name in settings["peers"]:
-            results.append(_timed(recipe_module("peers").run_peer, name, sets[0], settings))
+            from recipes.bench.peers import run_peer  # its rivals are optional packages
+
+            results.append(_timed(run_peer, name, sets[0], settings))
         return results
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from hma_data.bench import Bench
 from hma_data.errors import HMAError, UsageError
-from hma_model.bench.speed import check_settings, numbers_of
+from recipes.bench.speed import check_settings, numbers_of
 
 if TYPE_CHECKING:
     from websockets.asyncio.client import ClientConnection

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.bench import Bench, make_robot, recipe_module, rss_mib
+from hma_data.bench import Bench, make_robot, rss_mib
 from hma_data.errors import UsageError
 
 
@@ -29,7 +29,8 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
         if wait := settings["wait_ms"]:
             if settings["tokenizer"] != BENCH.defaults["tokenizer"]:
                 raise UsageError("wait_ms", "stands for a tokenizer", "leave tokenizer out")
-            waiting = recipe_module("waiting_tokenizer")
+            from recipes.bench import waiting_tokenizer as waiting
+
             settings = settings | {"tokenizer": waiting.NAME}
             stack.enter_context(waiting.offered(Path(folder) / "path", wait))
         stack.enter_context(_cluster(settings["engine"], settings["nodes"]))

@@ -1,4 +1,7 @@
-"""Run benchmarks: `hma bench NAME [key=value …]`. Input is generated; nothing is downloaded."""
+"""Run benchmarks: `hma bench NAME [key=value …]`. Input is generated; nothing is downloaded.
+
+The benchmarks are modules of `recipes/bench`, which is shipped beside the packages.
+"""
 
 import os
 import platform
@@ -17,13 +20,19 @@ from hma_data.storage.paths import shipped
 if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
 
-RECIPES = "recipes.bench"  # benchmarks that judge our own choices; they are kept out of the packages
-BENCHES: dict[str, str] = {  # name -> module:object; hma_model adds its own
-    "convert": "hma_data.bench.convert:BENCH",
-    "lerobot": "hma_data.bench.sources:LEROBOT",
-    "loader": "hma_data.bench.loader:BENCH",
-    "scale": f"{RECIPES}.scale:BENCH",
-    "sources": "hma_data.bench.sources:BENCH",
+BENCHES: dict[str, str] = {  # name -> module of recipes/bench:object
+    "convert": "convert:BENCH",
+    "drift": "drift:BENCH",
+    "generate": "generation:GENERATE",
+    "lerobot": "sources:LEROBOT",
+    "loader": "loader:BENCH",
+    "mup": "mup:BENCH",
+    "play": "play:BENCH",
+    "quality": "quality:BENCH",
+    "scale": "scale:BENCH",
+    "sources": "sources:BENCH",
+    "train": "speed:TRAIN",
+    "waiting": "waiting:WAITING",
 }
 
 
@@ -56,10 +65,7 @@ def load(name: str) -> Bench:
         known = ", ".join(sorted(BENCHES))
         raise UsageError(f"benchmark {name!r}", "does not exist", f"known: {known}")
     module, _, entry = BENCHES[name].partition(":")
-    in_recipes = module.startswith(f"{RECIPES}.")
-    found = recipe_module(module.rpartition(".")[2]) if in_recipes else import_module(module)
-    bench: Bench = getattr(found, entry)
-    return bench
+    return getattr(recipe_module(module), entry)
 
 
 def recipe_module(name: str) -> Any:
@@ -70,7 +76,7 @@ def recipe_module(name: str) -> Any:
         raise UsageError(f"recipes/bench/{name}.py", "is not part of this installation", remedy)
     if str(folder.parent) not in sys.path:  # spawned processes take sys.path over, and find the module too
         sys.path.append(str(folder.parent))
-    return import_module(f"{RECIPES}.{name}")
+    return import_module(f"recipes.bench.{name}")
 
 
 def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, Any]:

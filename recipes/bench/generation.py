@@ -19,9 +19,9 @@ from collections.abc import Callable
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from hma_data.bench import Bench, in_fresh_process, recipe_module
+from hma_data.bench import Bench, in_fresh_process
 from hma_data.errors import UsageError
-from hma_model.bench.speed import (
+from recipes.bench.speed import (
     COMMON,
     KINDS,
     check_settings,
@@ -98,7 +98,8 @@ def measure_frames(settings: dict[str, Any]) -> dict[str, Any]:
     made = Frames(model, settings)
     seconds = made.seconds()
     frame = min(seconds) / settings["batch"]
-    flops = recipe_module("flops")
+    from recipes.bench import flops
+
     products = flops.products_of(made.step)
     gflop = sum(products.values()) / 1e9 / settings["batch"]
     rate = flops.rate_of(products, model.device, settings["precision"])
