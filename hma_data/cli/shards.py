@@ -78,7 +78,7 @@ def _print_info(facts: dict[str, Any]) -> None:
     )
     print(
         f"episodes of {episodes['shortest']:,} to {episodes['longest']:,} frames, median "
-        f"{episodes['median']:,.0f}; {_with_instruction(episodes['instructions'])}; "
+        f"{episodes['median']:,.0f}; {_instructions(episodes)}; "
         f"{_successes(episodes)}; skew up to {episodes['worst_skew_ms']:.1f} ms"
     )
     for label in ("flags", "quarantine"):
@@ -101,8 +101,11 @@ def _print_info(facts: dict[str, Any]) -> None:
         )
 
 
-def _with_instruction(count: int) -> str:
-    return f"{count:,} with an instruction" if count else "no instructions"
+def _instructions(episodes: dict[str, Any]) -> str:
+    """Return how many episodes have an instruction, and how many different ones there are."""
+    if not episodes["with_instruction"]:
+        return "no instructions"
+    return f"{episodes['with_instruction']:,} with an instruction ({episodes['instructions']:,} different)"
 
 
 def _successes(episodes: dict[str, Any]) -> str:

@@ -97,11 +97,13 @@ def _episodes(shards: ShardSet) -> dict[str, Any]:
     lengths = np.sort(table["length"].to_numpy())
     told = pc.value_counts(table["success"].combine_chunks()).to_pylist()
     success = {item["values"]: item["counts"] for item in told}
+    instructed = table["instruction"].filter(pc.not_equal(table["instruction"], ""))
     return {
         "shortest": int(lengths[0]) if len(lengths) else 0,
         "median": float(np.median(lengths)) if len(lengths) else 0.0,
         "longest": int(lengths[-1]) if len(lengths) else 0,
-        "instructions": len(set(table["instruction"].to_pylist()) - {"", None}),
+        "with_instruction": len(instructed),
+        "instructions": len(instructed.unique()),
         "success": success.get(True, 0),
         "failure": success.get(False, 0),
         "not_told": success.get(None, 0),

@@ -4,6 +4,8 @@ import json
 import shutil
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner, Result
 
@@ -37,6 +39,19 @@ def test_info_in_figures(made: Path) -> None:
     said = run("info", made).stdout
     for word in ("toy_arm", "122 frames", "q99", "windows"):
         assert word in said
+
+
+def test_info_counts_episodes_with_an_instruction_and_different_ones_apart(
+    made: Path, tmp_path: Path
+) -> None:
+    path = Path(shutil.copytree(made, tmp_path / "set")) / "episodes.parquet"
+    table = pq.read_table(path)
+    place = table.column_names.index("instruction")
+    words = pa.array(["push", "push", "", "lift", ""])
+    pq.write_table(table.set_column(place, table.schema.field(place), words), path)
+    episodes = json.loads(run("info", tmp_path / "set", "--json").stdout)["episodes"]
+    assert (episodes["with_instruction"], episodes["instructions"]) == (3, 2)
+    assert "3 with an instruction (2 different)" in run("info", tmp_path / "set").stdout
 
 
 def test_verify_ends_with_1_when_it_finds_something(made: Path, tmp_path: Path) -> None:
