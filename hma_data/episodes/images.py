@@ -77,10 +77,14 @@ class FrameToRGB:
 
     def __call__(self, frame: Any) -> Any:
         """Return the frame as one of PyAV in rgb24."""
-        full = frame.color_range == FULL
-        if not (full or frame.colorspace in OTHER_MATRICES) or _has_usual_colours(frame, full):
+        full, kind = frame.color_range == FULL, frame.format
+        other = frame.colorspace in OTHER_MATRICES
+        # FFmpeg converts RGB, grey and "yuvj" the same with and without what they state.
+        colourless = kind.is_rgb or len(kind.components) < 3
+        usual = colourless or (full and kind.name.startswith("yuvj") and not other)
+        if usual or not (full or other):
             return self._usual.reformat(frame, format="rgb24")
-        matrix = int(frame.colorspace) if frame.colorspace in OTHER_MATRICES else BT601
+        matrix = int(frame.colorspace) if other else BT601
         return self._stated.reformat(
             frame,
             format="rgb24",
@@ -90,14 +94,6 @@ class FrameToRGB:
             src_color_range=FULL if full else LIMITED,
             dst_color_range=FULL,
         )
-
-
-def _has_usual_colours(frame: Any, full: bool) -> bool:
-    """Check whether FFmpeg converts a frame the same with and without what it states: RGB, grey, "yuvj"."""
-    kind = frame.format
-    if kind.is_rgb or len(kind.components) < 3:
-        return True
-    return full and kind.name.startswith("yuvj") and frame.colorspace not in OTHER_MATRICES
 
 
 def prepare(
@@ -186,7 +182,11 @@ def resize(
     top, left = (size - inner_h) // 2, (size - inner_w) // 2
     for frame, square in zip(frames, out):
         inner = square[top : top + inner_h, left : left + inner_w]
-        cv2.resize(_packed(frame), (inner_w, inner_h), dst=inner, interpolation=interpolation)
+        # OpenCV takes gaps between rows, but not between pixels or backwards.
+        rows, *pixel = frame.strides
+        if rows <= 0 or pixel != [3, 1]:
+            frame = np.ascontiguousarray(frame)
+        cv2.resize(frame, (inner_w, inner_h), dst=inner, interpolation=interpolation)
     return out
 
 
@@ -216,12 +216,6 @@ def describe_resize(camera: Camera, height: int, width: int, size: int) -> str:
     return f"{text}, {share} of the {side} cropped; resize: letterbox keeps it"
 
 
-def _packed(frame: Images) -> Images:
-    """Return the picture in a memory layout that OpenCV takes: gaps between rows, but not between pixels."""
-    rows, *pixel = frame.strides
-    return frame if rows > 0 and pixel == [3, 1] else np.ascontiguousarray(frame)
-
-
 # -- cameras that show nothing
 
 
@@ -247,20 +241,18 @@ class PictureCheck:
 
     def add(self, frames: Images) -> None:
         """Add the next pictures (n, S, S, 3)."""
+        cv2 = opencv()
         for frame in frames:
+            self.pictures += 1
             if self._last is not None and np.array_equal(frame, self._last):
                 self.repeated += 1
-            else:
-                self._note(frame)
-            self.pictures, self._last = self.pictures + 1, frame
-
-    def _note(self, frame: Images) -> None:
-        cv2 = opencv()
-        fine = cv2.resize(frame, FINE_BLOCKS, interpolation=cv2.INTER_AREA)
-        coarse = cv2.resize(fine, COARSE_BLOCKS, interpolation=cv2.INTER_AREA)
-        self._low, self._high = np.minimum(self._low, fine), np.maximum(self._high, fine)
-        self._darkest = np.minimum(self._darkest, coarse.min(axis=(0, 1)))
-        self._brightest = np.maximum(self._brightest, coarse.max(axis=(0, 1)))
+                continue
+            self._last = frame
+            fine = cv2.resize(frame, FINE_BLOCKS, interpolation=cv2.INTER_AREA)
+            coarse = cv2.resize(fine, COARSE_BLOCKS, interpolation=cv2.INTER_AREA)
+            self._low, self._high = np.minimum(self._low, fine), np.maximum(self._high, fine)
+            self._darkest = np.minimum(self._darkest, coarse.min(axis=(0, 1)))
+            self._brightest = np.maximum(self._brightest, coarse.max(axis=(0, 1)))
 
     @property
     def blank(self) -> bool:

@@ -4,6 +4,7 @@ N pictures, H×W pixels, A action dims; pictures are uint8 RGB.
 """
 
 import io
+import os
 import re
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
@@ -71,23 +72,11 @@ def fitted(text: str, width: int, scale: float = 0.42) -> str:
 
 
 def fitted_names(names: Sequence[str], width: int, scale: float = 0.42) -> list[str]:
-    """Return names that fit `width` pixels and still differ.
-
-    If one is too long, the words that all of them begin and end with are left out; then see `fitted`.
-    """
-    if len(names) < 2 or all(text_width(name, scale) <= width for name in names):
-        return [fitted(name, width, scale) for name in names]
-    words = [re.findall(r"[^_./ ]*[_./ ]|[^_./ ]+", name) for name in names]
-    room = min(map(len, words)) - 1  # a word of each name stays
-    before = min(_common(words), room)
-    after = min(_common([parts[::-1] for parts in words]), room - before)
-    cut = ["".join(parts[before : len(parts) - after]) for parts in words]
-    return [fitted(name.rstrip("_./ "), width, scale) for name in cut]
-
-
-def _common(words: Sequence[Sequence[str]]) -> int:
-    """Return the number of words with which all names begin."""
-    return next((i for i, column in enumerate(zip(*words, strict=False)) if len(set(column)) > 1), 0)
+    """Return names that fit `width` pixels and still differ: the words that all begin with are left out."""
+    if any(text_width(name, scale) > width for name in names):
+        same = re.match(r".*[_./ ]|", os.path.commonprefix(list(names)))
+        names = [name[same.end() :] if same else name for name in names]
+    return [fitted(name, width, scale) for name in names]
 
 
 def _ascii(text: str) -> str:

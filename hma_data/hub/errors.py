@@ -30,47 +30,61 @@ def explain(where: str, fault: BaseException) -> HubError:
     import httpx
     from huggingface_hub import errors
 
-    plain = {
-        errors.GatedRepoError: ("is gated", f"ask for access on its page, then {LOG_IN}"),
-        errors.RevisionNotFoundError: ("has no such revision", "name a branch, tag or commit of it"),
-        errors.RepositoryNotFoundError: ("no such repository, or no access", f"check the name; {LOG_IN}"),
-        errors.RemoteEntryNotFoundError: ("no such file there", "check the name and the revision"),
-        errors.HFValidationError: ("is not a repository's name", "write ORGANISATION/NAME"),
-        errors.FileMetadataError: ("was not answered by a hub", "check HF_ENDPOINT and your proxy"),
-    }
-    for kind, (text, remedy) in plain.items():
+    name, cause = type(fault).__name__, fault.__cause__ or fault.__context__
+    if isinstance(fault, ValueError) and isinstance(cause, errors.BadRequestError):  # of the card's metadata
+        remedy = 'correct "license" in the card.json of a checkpoint, in the embodiment of a shard set'
+        return HubError(where, f"the hub refuses the card: {shown(str(fault).partition('\n')[2])}", remedy)
+    if isinstance(fault, errors.LocalEntryNotFoundError) and isinstance(cause, errors.HfHubHTTPError):
+        return explain(where, cause)
+    away = errors.OfflineModeIsEnabled | httpx.ConnectError | httpx.TimeoutException
+    plain: tuple[tuple[Any, str, str], ...] = (
+        (errors.GatedRepoError, "is gated", f"ask for access on its page, then {LOG_IN}"),
+        (errors.RevisionNotFoundError, "has no such revision", "name a branch, tag or commit of it"),
+        (errors.RepositoryNotFoundError, "no such repository, or no access", f"check the name; {LOG_IN}"),
+        (errors.RemoteEntryNotFoundError, "no such file there", "check the name and the revision"),
+        (errors.HFValidationError, "is not a repository's name", "write ORGANISATION/NAME"),
+        (
+            errors.LocalEntryNotFoundError,
+            "is out of reach, and not in the cache",
+            "check the name, go online",
+        ),
+        (away, f"is out of reach: {name}", "check the network, try again"),
+    )
+    for kind, text, remedy in plain:
         if isinstance(fault, kind):
             return HubError(where, text, remedy)
-    name, cause = type(fault).__name__, fault.__cause__ or fault.__context__
-    match fault:
-        case errors.HfHubHTTPError():
-            return _answered(where, fault)
-        case ValueError() if isinstance(cause, errors.BadRequestError) and "README.md" in str(fault):
-            remedy = 'correct "license" in the card.json of a checkpoint, in the embodiment of a shard set'
-            said = shown(str(fault).partition("\n")[2])
-            return HubError(where, f"the hub refuses the card: {said}", remedy)
-        case errors.LocalEntryNotFoundError() if not isinstance(cause, errors.HfHubHTTPError):
-            return HubError(
-                where, "is out of reach, and not in the cache", "check the name, go online, run it again"
-            )
-        case errors.LocalEntryNotFoundError() | RuntimeError() | ValueError() if isinstance(
-            cause, httpx.HTTPError | errors.OfflineModeIsEnabled
-        ):
-            return explain(where, cause)  # the client wraps what a download or an upload raised
-        case errors.OfflineModeIsEnabled() | httpx.ConnectError() | httpx.TimeoutException():
-            return HubError(where, f"is out of reach: {name}", "check the network, try again")
-        case httpx.TooManyRedirects() | httpx.DecodingError() | httpx.UnsupportedProtocol():
-            return _strange(where, fault)
-        case httpx.HTTPError():
-            return HubError(where, f"the connection was cut: {name}", AGAIN)
-        case OSError() if fault.errno is not None:
-            return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
-        case OSError():
-            return HubError(where, f"did not come whole: {shown(str(fault))}", AGAIN)
-        case RuntimeError() if not isinstance(fault, RecursionError):  # of the hub's library for transfers
-            remedy = "run it again; HF_HUB_DISABLE_XET=1 may help"
-            return HubError(where, f"the transfer failed: {shown(str(fault))}", remedy)
-    return _strange(where, fault)
+    if isinstance(fault, errors.HfHubHTTPError):
+        return _answered(where, fault)
+    if isinstance(fault, RuntimeError | ValueError) and isinstance(cause, away | httpx.HTTPError):
+        return explain(where, cause)  # the client wraps what a download or an upload raised
+    if isinstance(fault, httpx.TransportError) and not isinstance(fault, httpx.UnsupportedProtocol):
+        return HubError(where, f"the connection was cut: {name}", AGAIN)
+    if isinstance(fault, OSError) and fault.errno is not None:
+        return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
+    if isinstance(fault, OSError):
+        return HubError(where, f"did not come whole: {shown(str(fault))}", AGAIN)
+    if isinstance(fault, RuntimeError) and not isinstance(fault, RecursionError):
+        remedy = "run it again; HF_HUB_DISABLE_XET=1 may help"  # of the hub's library for transfers
+        return HubError(where, f"the transfer failed: {shown(str(fault))}", remedy)
+    return HubError(where, f"did not answer as a hub does: {name}", "check HF_ENDPOINT and your proxy")
+
+
+def _answered(where: str, fault: Any) -> HubError:
+    request, code = fault.response.request, fault.response.status_code
+    if code == 401 and "authorization" not in request.headers:
+        return HubError(where, "no such repository, or it is private", "check the name; " + LOG_IN)
+    forbidden = "write here: use one with write access to this organisation"
+    if request.method in ("GET", "HEAD"):
+        forbidden = "read this: ask its owners for access"
+    remedies = {
+        401: "the token is not valid: " + LOG_IN,
+        403: f"the token may not {forbidden}",
+        404: "check the name",
+        429: "too many requests: wait some minutes and run it again",
+    }
+    remedy = remedies.get(code, "run the same command again later; nothing there was changed")
+    said = shown(getattr(fault, "server_message", None) or "")
+    return HubError(where, f"the hub answered {code}" + (f": {said}" if said else ""), remedy)
 
 
 def status(fault: BaseException) -> int | None:
@@ -99,11 +113,10 @@ def is_missing(fault: HubError) -> bool:
     """Check whether a repository does not exist, as far as its hub tells."""
     from huggingface_hub import errors
 
-    cause = fault.__cause__
-    if isinstance(cause, errors.GatedRepoError | errors.RevisionNotFoundError):
-        return False
     # Some hubs answer 404 without the code that states what is missing.
-    return isinstance(cause, errors.RepositoryNotFoundError) or status(fault) == 404
+    there = errors.GatedRepoError | errors.RevisionNotFoundError
+    missing = isinstance(fault.__cause__, errors.RepositoryNotFoundError) or status(fault) == 404
+    return missing and not isinstance(fault.__cause__, there)
 
 
 def is_away(fault: HubError) -> bool:
@@ -111,7 +124,7 @@ def is_away(fault: HubError) -> bool:
     import httpx
     from huggingface_hub import errors
 
-    away = (errors.OfflineModeIsEnabled, httpx.ConnectError, httpx.TimeoutException)
+    away = errors.OfflineModeIsEnabled | httpx.ConnectError | httpx.TimeoutException
     return isinstance(fault.__cause__, away)
 
 
@@ -127,36 +140,6 @@ def is_of_xet(fault: BaseException) -> bool:
 def _response(fault: BaseException) -> Any:
     found = (getattr(item, "response", None) for item in causes(fault))
     return next((response for response in found if response is not None), None)
-
-
-def _answered(where: str, fault: Any) -> HubError:
-    response = fault.response
-    code = response.status_code if response is not None else None
-    if code == 401 and "authorization" not in response.request.headers:
-        return HubError(where, "no such repository, or it is private", "check the name; " + LOG_IN)
-    reading = response is not None and response.request.method in ("GET", "HEAD")
-    forbidden = (
-        "the token may not read this: ask its owners for access"
-        if reading
-        else "the token may not write here: use one with write access to this organisation"
-    )
-    remedies = {
-        400: "change what the hub names in its answer",
-        401: "the token is not valid: " + LOG_IN,
-        402: "its plan does not cover this: see the account's billing page",
-        403: forbidden,
-        404: "check the name",
-        413: "a file is too large for the hub",
-        429: "too many requests: wait some minutes and run it again",
-        507: "the storage of this account is full",
-    }
-    remedy = remedies.get(code or 0, "run the same command again later; nothing there was changed")
-    said = shown(getattr(fault, "server_message", None) or "")
-    return HubError(where, f"the hub answered {code}" + (f": {said}" if said else ""), remedy)
-
-
-def _strange(where: str, fault: BaseException) -> HubError:
-    return HubError(where, f"did not answer as a hub does: {type(fault).__name__}", "check HF_ENDPOINT")
 
 
 def shown(text: str) -> str:
@@ -175,6 +158,5 @@ def _hidden(text: str) -> str:
 def without_token(fault: BaseException) -> BaseException:
     """Return the error after removing the token from its text and from the texts of its causes."""
     for link in causes(fault):
-        if any(isinstance(part, str) and part != _hidden(part) for part in link.args):
-            link.args = tuple(_hidden(part) if isinstance(part, str) else part for part in link.args)
+        link.args = tuple(_hidden(part) if isinstance(part, str) else part for part in link.args)
     return fault

@@ -13,7 +13,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 
 from hma_data.errors import HubError
 from hma_data.hub.errors import LOG_IN, explained, is_away, is_missing, is_of_xet, status, waiting
-from hma_data.storage.files import MAX_JSON_BYTES, PART
+from hma_data.storage.files import MAX_JSON_BYTES
 
 ATTEMPTS = 8  # attempts to commit; half as many for any other call
 LISTING_S, SILENCE_S = 30.0, 300.0  # seconds; the hub needs minutes for a commit of many files
@@ -200,17 +200,12 @@ class Repository:
         """Download files to a folder, not to the client's cache; each gets its name when it is complete."""
         if self.from_cache:
             raise HubError(self.name, "is out of reach", "go online and pull again")
-        staging = out / f".pull{PART}"
-
-        def bring(name: str) -> None:
-            path = self._fetch(name, staging)
-            (out / name).parent.mkdir(parents=True, exist_ok=True)
-            path.replace(out / name)
-
         try:
-            self._each(bring, [name for name in names if name in self._entries])
+            self._each(lambda name: self._fetch(name, out), [name for name in names if name in self._entries])
         finally:
-            shutil.rmtree(staging, ignore_errors=True)
+            shutil.rmtree(out / ".cache" / "huggingface", ignore_errors=True)  # the client's notes
+            with suppress(OSError):  # it holds something else
+                (out / ".cache").rmdir()
 
     def _fetch(self, name: str, folder: Path | None = None) -> Path:
         """Download a file to a folder or to the client's cache, unless it is there; return its path."""
@@ -218,10 +213,9 @@ class Repository:
 
         entry = self._entries[name]
         if folder is not None and entry.size == 0:  # some hubs do not send empty files
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.touch()
-            return path
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).touch()
+            return folder / name
         # The cache may hold a damaged copy: what does not match is downloaded once more.
         for anew in (False, True):
             found = hf_hub_download(
@@ -233,10 +227,9 @@ class Repository:
                 library_name="hma-toolkit",
                 tqdm_class=None if entry.size >= LARGE else _no_bar(),
             )
-            path = Path(found)
-            if entry.states(path):
-                return path
-        remedy = f"pull again; if it stays so, delete {path}, or do not use this repository"
+            if entry.states(Path(found)):
+                return Path(found)
+        remedy = f"pull again; if it stays so, delete {found}, or do not use this repository"
         raise HubError(f"{self.name}/{name}", "came with other content than the hub stated", remedy)
 
     def _each[T](self, act: Callable[[str], T], names: Iterable[str]) -> list[T]:

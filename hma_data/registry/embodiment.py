@@ -391,9 +391,8 @@ def _unknown_key(path: str, values: dict[str, Any]) -> Problem:
     if parent == "source.layout":
         known, of = LAYOUTS[values["source"]["format"]], f" of format {values['source']['format']}"
     keys, key = _keys(known), path.rpartition(".")[2]
-    places = [place for place, model in _KEYS_AT.items() if key in _keys(model)]
-    other = [name for name in [_OTHER_WORDS.get(key.lower())] if name in keys]
-    near = other or get_close_matches(key, keys, n=1) or [f"{place}.{key}" for place in places]
+    places = [f"{place}.{key}" for place, model in _KEYS_AT.items() if key in _keys(model)]
+    near = get_close_matches(_OTHER_WORDS.get(key.lower(), key), keys, n=1) or places
     hint = f", did you mean {near[0]!r}?" if near else ""
     return Problem(path, f"unknown key{of}{hint}", allowed=", ".join(keys) or "none")
 

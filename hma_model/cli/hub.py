@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from hma_data.cli.options import Folder, Json
-from hma_data.console import human_bytes, human_count, print_json, print_lines, print_table
+from hma_data.console import print_json, print_table
 
 if TYPE_CHECKING:
     from hma_model.checkpoint.folder import Checkpoint
@@ -46,7 +46,7 @@ def push(
     opened = Checkpoint.open(checkpoint)
     if film or sample:
         _add_films(opened, sample, embodiment)
-    address = hub.push(opened, target, embodiment, private, _print_files)
+    address = hub.push(opened, target, embodiment, private)
     print(f"published to {address}")
     for name, card in opened.cards(embodiment).items():
         judged = card.get("evaluation")
@@ -54,23 +54,6 @@ def push(
             print(f"{name} {judged['verdict']}: the model card opens with this")
     robots = "".join(f" -e {shlex.quote(name)}" for name in embodiment or ())
     print(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {_folder_for(target)}")
-
-
-def _print_files(sizes: dict[str, int]) -> None:
-    """Print what will be sent: a line for each file, of robots one for all of their files."""
-    if not sizes:
-        print("nothing to send: all files are there already")
-        return
-    groups: dict[str, list[int]] = {}
-    for name, size in sizes.items():
-        groups.setdefault("/".join(name.split("/")[:2]), []).append(size)
-    lines = [
-        (name, human_bytes(sum(own)) + (f" in {len(own)} files" if len(own) > 1 else ""))
-        for name, own in groups.items()
-    ]
-    print(f"sending {human_count(len(sizes), 'file')}, {human_bytes(sum(sizes.values()))}")
-    print_lines((f"  {name}", text) for name, text in lines)
-    sys.stdout.flush()  # the transfer's own progress follows on standard error
 
 
 def _folder_for(target: str) -> str:

@@ -6,9 +6,9 @@ folder.
 """
 
 import hashlib
-import re
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 Content = Path | bytes
-_FRONT_MATTER = re.compile(r"\A---\n.*?^---$", re.DOTALL | re.MULTILINE)
 MAX_NAMED = 50  # ids that an error lists
 _ADD_ONE = (
     f"Add one: hma finetune --from {EMBEDDED_NAME} --data SHARDS --out RUN, "
@@ -57,7 +56,6 @@ def push(
     target: StrPath,
     embodiments: Iterable[str] | None = None,
     private: bool | None = None,
-    told: Callable[[dict[str, int]], None] | None = None,
 ) -> str:
     """Publish embodiments of a checkpoint, and its trunk if the hub has none yet.
 
@@ -66,7 +64,6 @@ def push(
         target: str or path of a folder, a URI, or a repository; it is made if it does not exist.
         embodiments: ids; None for all.
         private: make a new repository a private one.
-        told: called once before anything is sent, with the files to send and their sizes in bytes.
 
     Returns:
         The address of the published checkpoint: a path, URI or web address.
@@ -80,15 +77,8 @@ def push(
     ids = sorted(source.chosen(embodiments))
     _require_publishable(source, ids)
     store = open_store(target, write=True, private=private)
-    listeners = [told] if told else []
-
-    def changes() -> dict[str, Content | None]:
-        files = _changes(source, ids, store)
-        while listeners:  # a store asks for the changes again when somebody else was faster
-            listeners.pop()(_missing_sizes(files, store))
-        return files
-
-    return store.publish(changes, f"Add {', '.join(ids)}" if ids else "Add the trunk")
+    message = f"Add {', '.join(ids)}" if ids else "Add the trunk"
+    return store.publish(lambda: _changes(source, ids, store), message)
 
 
 def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None = None) -> str:
@@ -99,7 +89,9 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
     """
     source = model.source
     # The trunk's file is taken over where it is unchanged: its hash tells which stems fit it.
-    base = source if source and _has_trunk(model, source) else None
+    base = source if source and source.config == model.config else None
+    if base and not _is_same(model.trunk_state(), weights.trunk(base)):
+        base = None
     yaml, stats, cards = {}, {}, {}
     for name, space in model.embodiments.items():
         if source and name in source.embodiments:
@@ -107,8 +99,10 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
             stats[name] = source.stats(name)
             card = source.card(name)
             cards[name] = {key: card.get(key, {}) for key in ("data", "metrics", "training")}
-            if base and "evaluation" in card and _has_embodiment(model, source, name):
-                cards[name]["evaluation"] = card["evaluation"]  # it judged these weights
+            if base and "evaluation" in card:  # it stays if it judged these weights
+                stem, head = weights.embodiment(base, name, space)
+                if _is_same(model.stem_state(name), stem) and _is_same(model.head_state(name), head):
+                    cards[name]["evaluation"] = card["evaluation"]
             continue
         try:
             yaml[name] = find(name).to_yaml()
@@ -125,20 +119,8 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
         return push(saved, target, list(model.embodiments) if embodiments is None else embodiments)
 
 
-def _has_trunk(model: "HMA", stored: Checkpoint) -> bool:
-    """Check whether a model still has a checkpoint's trunk, which may be stored in float16."""
-    if model.config != stored.config:
-        return False
-    return _is_same(model.trunk_state(), weights.trunk(stored))
-
-
-def _has_embodiment(model: "HMA", stored: Checkpoint, name: str) -> bool:
-    """Check whether a model still has the stem and head of an embodiment of a checkpoint."""
-    stem, head = weights.embodiment(stored, name, model.embodiments[name])
-    return _is_same(model.stem_state(name), stem) and _is_same(model.head_state(name), head)
-
-
 def _is_same(own: weights.State, stored: weights.State) -> bool:
+    """Check whether tensors are those that were stored, perhaps in float16."""
     return own.keys() == stored.keys() and all(
         bool((own[name].cpu() == stored[name].to(own[name].dtype)).all()) for name in own
     )
@@ -163,10 +145,13 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
     changes: dict[str, Content | None] = {}
     if CONFIG in files:
         _require_trunk(source, _config(store, files), store.name)
-    elif MANIFEST in files:
-        raise HubError(store.name, "holds a shard set", "push to a place of its own")
     else:
-        _require_free(store, files)
+        # A push begins with these; git's files are no content. A repository keeps what is overwritten.
+        own = (TRUNK, ".git", ".gitattributes", "embodiments")
+        foreign = [name for name in sorted(files) if name.split("/")[0] not in own]
+        if foreign and (store.repo is None or MANIFEST in foreign):
+            named = "a shard set" if MANIFEST in foreign else f"something else: {foreign[0]}"
+            raise HubError(store.name, f"holds {named}", "push to a place of its own")
         changes[CONFIG] = inside(source.folder, CONFIG)
     if TRUNK not in files:
         changes[TRUNK] = inside(source.folder, TRUNK)
@@ -178,38 +163,18 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
             path = f"embodiments/{name}/{part}"
             if part not in shown and path in files:
                 changes[path] = None
-    others = [name for name in embodiment_ids(files) if name not in ids]
-    store.warm([f"embodiments/{name}/{CARD}" for name in others])
-    cards = {name: _readable_card(store, name) for name in others} | source.cards(ids)
+    others = {name: f"embodiments/{name}/{CARD}" for name in embodiment_ids(files) if name not in ids}
+    store.warm(list(others.values()))
+    cards = source.cards(ids)
+    for name, path in others.items():
+        cards[name] = {}
+        with suppress(HubError):  # a card of somebody else that cannot be read stops no push
+            cards[name] = json_object(store.read(path), f"{store.name}: {path}", HubError)
     there = {path for path in {*files, *changes} if changes.get(path, b"") is not None}
     samples = {path.removeprefix("embodiments/") for path in there if path.endswith(PICTURES)}
     config = checkpoints.config_json(source.config, source.trunk_sha256)
     changes[README] = render(config, cards, repo=store.repo, samples=samples)
     return changes
-
-
-def _missing_sizes(files: dict[str, Content | None], store: Store) -> dict[str, int]:
-    """Return the sizes in bytes of the files that the store has not yet."""
-    return {
-        name: content.stat().st_size if isinstance(content, Path) else len(content)
-        for name, content in files.items()
-        if content is not None and not store.has(name, content)
-    }
-
-
-def _require_free(store: Store, files: Iterable[str]) -> None:
-    """Raise if a place without a checkpoint holds files of somebody, such as a README.md.
-
-    Files that a push begins with are allowed, and those of git. A new repository of the hub has a README.md
-    with nothing but its front matter.
-    """
-    own = (TRUNK, ".git", ".gitattributes", "embodiments")
-    foreign = [name for name in files if name.split("/")[0] not in own]
-    if foreign == [README] and store.repo and not _FRONT_MATTER.sub("", store.read(README).decode()).strip():
-        return
-    if foreign:
-        named = README if README in foreign else foreign[0]
-        raise HubError(store.name, f"holds something else: {named}", "push to a place of its own")
 
 
 def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> None:
@@ -220,15 +185,6 @@ def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> Non
         raise HubError(where, fault, remedy)
     if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
         raise HubError(where, "has the same trunk with another tokenizer", "push to a hub of its own")
-
-
-def _readable_card(store: Store, name: str) -> dict[str, Any]:
-    """Return the card of an embodiment that is not pushed now; an empty card if it cannot be read."""
-    path = f"embodiments/{name}/{CARD}"
-    try:
-        return json_object(store.read(path), f"{store.name}: {path}", HubError)
-    except HubError:
-        return {}
 
 
 # -- pulling

@@ -15,10 +15,6 @@ from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import EMBEDDED, FILM, SAMPLE, Checkpoint, require_tokenizer
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from hma_data.loading.dataset import WindowDataset
-    from hma_data.loading.views import Cameras
     from hma_data.shards.reader import ShardSet
 
 COLUMNS, SIDE = 6, 128  # pictures in a row, and pixels of a side
@@ -72,6 +68,7 @@ def at_hand(checkpoint: Checkpoint, embodiments: Iterable[str] | None = None) ->
 def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
     """Return a PNG of truth and predictions over a window, and a GIF of both with the commands."""
     from hma_data.episodes.sheets import gif_bytes, grid, png_bytes
+    from hma_data.loading.dataset import WindowDataset
     from hma_data.shards.preview import tokenizer_of
     from hma_model.evaluation.rollout_video import rollout_video
     from hma_model.evaluation.rollouts import rollout
@@ -79,7 +76,13 @@ def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
 
     model = checkpoints.load(checkpoint, [shards.embodiment.id])
     require_tokenizer(model.config, shards.spec, shards.folder)
-    split, windows = _windows(shards, model.config.frames, cameras_for(model, shards))
+    cameras, length = cameras_for(model, shards), model.config.frames
+    found = {split: WindowDataset(shards, split, length, cameras=cameras) for split in ("val", "train")}
+    split = next((split for split, windows in found.items() if len(windows)), None)
+    if split is None:
+        fault = f"has no window of {length} frames"
+        raise UsageError(shards.folder, fault, "give shards with longer episodes")
+    windows = found[split]
     middle, tokenizer = len(windows) // 2, tokenizer_of(shards)
     batch = windows.batch([middle])
     true = rollout(model, tokenizer, batch)
@@ -91,26 +94,12 @@ def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
         f"predicted from frame {true.prompt} on": true.predicted[0],
         "with the actions in reverse": other.predicted[0],
     }
-    shown = [[_sized(frame) for frame in frames[picks]] for frames in rows.values()]
+    # Small frames are enlarged, large ones subsampled, to about SIDE pixels.
+    side = true.truth.shape[2]
+    scale, every = max(1, -(-SIDE // side)), max(1, side // SIDE)
+    shown = [
+        [frame.repeat(scale, 0).repeat(scale, 1)[::every, ::every] for frame in frames[picks]]
+        for frames in rows.values()
+    ]
     film = rollout_video(model, tokenizer, shards, split=split, window=middle, prompt=true.prompt)
     return png_bytes(grid(shown, list(rows))), gif_bytes(film.frames, film.fps)
-
-
-def _windows(shards: "ShardSet", frames: int, cameras: "Cameras") -> "tuple[str, WindowDataset]":
-    """Return the windows of the validation split, or of training if that has none."""
-    from hma_data.loading.dataset import WindowDataset
-
-    for split in ("val", "train"):
-        windows = WindowDataset(shards, split, frames, cameras=cameras)
-        if len(windows):
-            return split, windows
-    raise UsageError(shards.folder, f"has no window of {frames} frames", "give shards with longer episodes")
-
-
-def _sized(frame: "NDArray[np.uint8]") -> "NDArray[np.uint8]":
-    """Return a frame near the size of the card: a small one enlarged, a large one subsampled."""
-    side = frame.shape[0]
-    if side < SIDE:
-        scale = -(-SIDE // side)
-        return frame.repeat(scale, 0).repeat(scale, 1)
-    return frame[:: side // SIDE, :: side // SIDE]

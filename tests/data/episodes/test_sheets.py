@@ -26,7 +26,6 @@ def test_shortened_names_fit_and_still_differ(names: list[str]) -> None:
 
 def test_what_fits_stays_and_the_middle_of_a_long_text_goes() -> None:
     assert fitted("gripper", 200) == "gripper"
-    assert fitted_names(["gripper", "dx"], 200) == ["gripper", "dx"]
     short = fitted("pick up the red block and put it into the green bowl", 200)
     assert short.startswith("pick up") and short.endswith("bowl") and ".." in short
 

@@ -13,7 +13,6 @@ from hma_model.checkpoint.folder import read_metadata
 from hma_model.hub import publish as hub
 from hma_model.hub.datasets import pull_data, push_data
 from hma_model.hub.listing import list_embodiments
-from tests.hub_state import REPO
 from tests.model.robots import save
 from tests.model.shards import make_shards
 
@@ -136,14 +135,6 @@ def test_a_folder_of_somebody_elses_files_stays_as_it_is(folder, tmp_path, name)
         hub.push(folder, tmp_path / "project")
     assert mine.read_text() == "# My project"
     assert [path for path in (tmp_path / "project").rglob("*") if path.is_file()] == [mine]
-
-
-def test_a_new_repository_with_a_readme_of_front_matter_alone_is_pushed_to(server, source):
-    server.create(REPO).commit({"README.md": b"---\nlicense: mit\n---\n"})
-    hub.push(source, REPO)
-    server.create("team/other").commit({"README.md": b"---\nlicense: mit\n---\n\n# My words"})
-    with pytest.raises(HubError, match=r"holds something else: README\.md"):
-        hub.push(source, "team/other")
 
 
 def test_a_checkpoint_does_not_go_to_a_shard_sets_place(folder, tmp_path):
