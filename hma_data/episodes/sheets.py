@@ -4,8 +4,6 @@ N pictures, H×W pixels, A action dims; pictures are uint8 RGB.
 """
 
 import io
-import os
-import re
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from itertools import chain
@@ -72,11 +70,22 @@ def fitted(text: str, width: int, scale: float = 0.42) -> str:
 
 
 def fitted_names(names: Sequence[str], width: int, scale: float = 0.42) -> list[str]:
-    """Return names that fit `width` pixels and still differ: the words that all begin with are left out."""
-    if any(text_width(name, scale) > width for name in names):
-        same = re.match(r".*[_./ ]|", os.path.commonprefix(list(names)))
-        names = [name[same.end() :] if same else name for name in names]
+    """Return names that fit `width` pixels and still differ.
+
+    If one is too long, the words that all of them begin and end with are left out; then see `fitted`.
+    """
+    if len(set(names)) > 1 and any(text_width(name, scale) > width for name in names):
+        begin = _shared(names)
+        end = _shared([name[::-1] for name in names])
+        names = [name[begin : max(len(name) - end, begin + 1)] for name in names]
     return [fitted(name, width, scale) for name in names]
+
+
+def _shared(names: Sequence[str]) -> int:
+    """Return the length of the words, with the marks after them, that all names begin with."""
+    first, last = min(names), max(names)  # what these two share, all share
+    same = next((i for i, pair in enumerate(zip(first, last)) if len(set(pair)) > 1), len(first))
+    return max(first.rfind(mark, 0, same) + 1 for mark in "_./ ")
 
 
 def _ascii(text: str) -> str:
