@@ -7,6 +7,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from functools import cache
 from importlib.util import module_from_spec, spec_from_file_location
@@ -153,5 +154,12 @@ def test_a_command_that_is_not_of_hma_is_found(wrong: str) -> None:
 
 
 def test_the_readme_shows_the_two_commands() -> None:
-    page = (ROOT / "README.md").read_text()
-    assert "pip install uv && uv run hma demo" in page and "pip install uv && uv run pytest" in page
+    page, tests = (ROOT / "README.md").read_text(), "pip install uv && uv run --group dev pytest\n"
+    assert "pip install uv && uv run hma demo" in page and tests.strip() in page
+    assert tests in (ROOT / ".ci" / "run").read_text()
+
+
+def test_a_users_first_command_installs_no_group_of_developers() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert project["tool"]["uv"]["default-groups"] == []
+    assert "pytest" in " ".join(project["dependency-groups"]["dev"])
