@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.episode import Clip, Episode, Floats, Known, Signal
 from hma_data.episodes.rotations import between
 from hma_data.errors import AlignmentError, EpisodeError
-from hma_data.registry.components import Component, Sync
+from hma_data.registry.components import Component
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment
 
 Matches = tuple[NDArray[np.int64], Floats]
@@ -211,7 +211,13 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
         marks.append(known)
     if limit:
         refusing = skew if sync.beyond == "refuse" else {name: skew[name] for name in indices}
-        _check_skew(episode.id, refusing, limit, sync, grid)
+        for name, off_ms in refusing.items():
+            worst = int(np.argmax(off_ms))
+            if off_ms[worst] > limit:
+                far = f"{off_ms[worst]:.1f} ms off at {grid[worst] - grid[0]:.3f} s"
+                fault = f"{name} is {far}; sync.max_skew_ms is {sync.max_skew_ms:g}"
+                remedy = "raise max_skew_ms, or leave the episode in quarantine"
+                raise AlignmentError(episode.id, fault, remedy)
 
     count = len(episode.actions)
     actions, action_known = _masked(np.concatenate(moved[:count], axis=1), marks[:count])
@@ -292,15 +298,6 @@ def _check_times(episode_id: str, name: str, times: Floats) -> None:
         i = int(backwards[0])
         fault = f"{name} goes back in time at sample {i + 1}: {times[i]:.6f} then {times[i + 1]:.6f} s"
         raise AlignmentError(episode_id, fault, "try stamp: receive")
-
-
-def _check_skew(episode_id: str, skew: dict[str, Floats], limit_ms: float, sync: Sync, grid: Floats) -> None:
-    for name, values in skew.items():
-        worst = int(np.argmax(values))
-        if values[worst] > limit_ms:
-            off, time = values[worst], grid[worst] - grid[0]
-            fault = f"{name} is {off:.1f} ms off at {time:.3f} s; sync.max_skew_ms is {sync.max_skew_ms:g}"
-            raise AlignmentError(episode_id, fault, "raise max_skew_ms, or leave the episode in quarantine")
 
 
 # -- the rate of a grid

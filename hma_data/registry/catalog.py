@@ -51,8 +51,10 @@ def entries(files: Iterable[StrPath] | None = None) -> list[Entry]:
     else:
         found = []
         for folder in registry_folders():
-            here = _doubles([_entry(path, cache) for path in registry_files([folder])])
-            found += [_misnamed(entry) for entry in here]
+            for entry in _doubles([_entry(path, cache) for path in registry_files([folder])]):
+                named = entry.facts is None or file_id(entry.path) == entry.name
+                said = f"does not find its file {entry.path.name}: file name and id must be the same"
+                found.append(entry if named else _with(entry, said))
     cache.save()
     return found
 
@@ -129,13 +131,6 @@ def _doubles(found: list[Entry]) -> list[Entry]:
     return found
 
 
-def _misnamed(entry: Entry) -> Entry:
-    """Add a problem to a file of a registry folder whose name is not its id."""
-    if entry.facts is None or file_id(entry.path) == entry.name:
-        return entry
-    return _with(entry, f"does not find its file {entry.path.name}: file name and id must be the same")
-
-
 class _Cache:
     """The judgements of YAML files by the hash of their bytes, in one JSON file per version of the code."""
 
@@ -154,8 +149,9 @@ class _Cache:
         key = hashlib.sha256(content).hexdigest()
         if key not in self._kept:
             found = _judge(content, path)
-            if _depends_on_packages(found):
-                return found
+            foreign = any(problem["path"] == "source.format" for problem in found["problems"])
+            if foreign or (found["facts"] and found["facts"]["format"] not in FORMATS):
+                return found  # installing a package changes what is said of a format that is not built in
             self._kept[key], self._new = found, True
         return self._kept[key]
 
@@ -164,10 +160,3 @@ class _Cache:
         if self._new:
             with suppress(HMAError, OSError):
                 write_atomic(self._path, json.dumps(self._kept))
-
-
-def _depends_on_packages(judgement: dict[str, Any]) -> bool:
-    """Check whether the format is not built in: installing a package changes such a judgement."""
-    if judgement["facts"]:
-        return judgement["facts"]["format"] not in FORMATS
-    return any(problem["path"] == "source.format" for problem in judgement["problems"])

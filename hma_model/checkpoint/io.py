@@ -74,11 +74,26 @@ def save(
     from safetensors import SafetensorError
 
     folder = as_path(folder)
-    _check_parts(model, folder, embodiment_yaml, stats)
+    if unnamed := sorted(set(model.embodiments) - set(embodiment_yaml)):
+        raise CheckpointError(folder, f"no embodiment YAML was given for {', '.join(unnamed)}")
+    for name, text in embodiment_yaml.items():
+        check_id(name, folder)
+        found = Embodiment.from_yaml(text, f"{folder}: {name}").id
+        if found != name:
+            raise CheckpointError(folder, f"the YAML given for {name!r} has id {found!r}")
+        action_stats(stats.get(name, {}), f"{folder}: statistics of {name}")
+    foreign = any(folder.iterdir()) if folder.is_dir() else folder.exists()
+    if foreign and not (folder / CONFIG).is_file():
+        raise CheckpointError(folder, "is there already and is no checkpoint", "choose another folder")
     try:
         with new_folder(folder) as new:
             if base:
-                trunk = _take_over(base, new, set(embodiment_yaml))
+                trunk = base.trunk_sha256
+                taken = [CONFIG, TRUNK]
+                for name in set(base.embodiments) - set(embodiment_yaml):
+                    taken += [f"embodiments/{name}/{part}" for part in (*PARTS, *base.pictures(name))]
+                for name in taken:
+                    _link(inside(base.folder, name), new / name)
             else:
                 write_tensors(new / TRUNK, model.trunk_state(), {"format": "pt"}, half)
                 trunk = file_sha256(new / TRUNK)
@@ -203,19 +218,12 @@ def config_json(config: HMAConfig, trunk_sha256: str) -> dict[str, Any]:
     }
 
 
-def _take_over(base: Checkpoint, new: Path, besides: set[str]) -> str:
-    """Link or copy a checkpoint's trunk and embodiments, except `besides`; return the trunk's hash."""
-    names = [CONFIG, TRUNK]
-    for name in base.embodiments:
-        if name not in besides:
-            names += [f"embodiments/{name}/{part}" for part in (*PARTS, *base.pictures(name))]
-    for name in names:
-        (new / name).parent.mkdir(parents=True, exist_ok=True)
-        try:
-            (new / name).hardlink_to(inside(base.folder, name))
-        except OSError:  # another file system, or one without hard links
-            shutil.copyfile(inside(base.folder, name), new / name)
-    return base.trunk_sha256
+def _link(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        target.hardlink_to(source)
+    except OSError:  # another file system, or one without hard links
+        shutil.copyfile(source, target)
 
 
 def _write_embodiment(model: "HMA", home: Path, trunk: str, given: dict[str, Any], half: bool) -> None:
@@ -242,19 +250,3 @@ def _write_embodiment(model: "HMA", home: Path, trunk: str, given: dict[str, Any
     files = {part: file_sha256(home / part) for part in PARTS[:-1]}  # all but the card itself
     card = {**facts, "data": {}, "metrics": {}, **given, **links, "files": files}
     (home / CARD).write_bytes(to_json(card))
-
-
-def _check_parts(
-    model: "HMA", folder: Path, yaml: Mapping[str, str], stats: Mapping[str, dict[str, Any]]
-) -> None:
-    if unnamed := sorted(set(model.embodiments) - set(yaml)):
-        raise CheckpointError(folder, f"no embodiment YAML was given for {', '.join(unnamed)}")
-    for name in yaml:
-        check_id(name, folder)
-        found = Embodiment.from_yaml(yaml[name], f"{folder}: {name}").id
-        if found != name:
-            raise CheckpointError(folder, f"the YAML given for {name!r} has id {found!r}")
-        action_stats(stats.get(name, {}), f"{folder}: statistics of {name}")
-    foreign = any(folder.iterdir()) if folder.is_dir() else folder.exists()
-    if foreign and not (folder / CONFIG).is_file():
-        raise CheckpointError(folder, "is there already and is no checkpoint", "choose another folder")

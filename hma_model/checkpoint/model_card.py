@@ -47,7 +47,9 @@ def render(
         samples: files that are there of `ID/sample.gif` (a film) and `ID/sample.png`; the film is shown.
     """
     model, tokenizer = config["model"], config["tokenizer"]
-    example = min(cards, default="ID")
+    example, merge = min(cards, default="ID"), model.get("merge", 1)
+    beside = any("baseline_loss" in metrics for metrics in _parts(cards, "metrics"))
+    says_baseline = beside and model.get("kind") == "discrete"
     front: dict[str, Any] = {"library_name": "hma-toolkit", "pipeline_tag": "robotics"}
     front |= licence(card.get("license") for card in cards.values()) | _origins(cards)
     front["tags"] = [*_TAGS, *(f"embodiment:{name}" for name in sorted(cards))]
@@ -72,7 +74,7 @@ def render(
         weights=line(other_weights(tokenizer)),
         trunk=line(config.get("trunk_sha256")),
         table=_table(cards),
-        loss_unit=_loss_unit(config, cards),
+        loss_unit=token_words(merge if isinstance(merge, int) else 1) if says_baseline else "",
         pictures=pictures,
         name=repo or ".",
         example=example,
@@ -101,15 +103,6 @@ def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
         for name, card in sorted(cards.items())
     ]
     return Table(_HEADINGS, rows).markdown() if rows else ""
-
-
-def _loss_unit(config: Mapping[str, Any], cards: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return what the losses are of, where an embodiment states one beside its baseline."""
-    stated = _parts(cards, "metrics")
-    if config["model"].get("kind") != "discrete" or not any("baseline_loss" in metrics for metrics in stated):
-        return ""
-    merge = config["model"].get("merge", 1)
-    return token_words(merge if isinstance(merge, int) else 1)
 
 
 def _origins(cards: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -144,7 +144,13 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
     files = store.files()
     changes: dict[str, Content | None] = {}
     if CONFIG in files:
-        _require_trunk(source, _config(store, files), store.name)
+        there, own_place = _config(store, files), "push to a hub of its own"
+        if there.get("trunk_sha256") != source.trunk_sha256:
+            theirs, ours = str(there.get("trunk_sha256"))[:16], source.trunk_sha256[:16]
+            fault = f"has another trunk: {theirs}, this checkpoint's is {ours}"
+            raise HubError(store.name, fault, f"{own_place}, or finetune on the trunk that is there")
+        if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
+            raise HubError(store.name, "has the same trunk with another tokenizer", own_place)
     else:
         # A push begins with these; git's files are no content. A repository keeps what is overwritten.
         own = (TRUNK, ".git", ".gitattributes", "embodiments")
@@ -170,21 +176,11 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
         cards[name] = {}
         with suppress(HubError):  # a card of somebody else that cannot be read stops no push
             cards[name] = json_object(store.read(path), f"{store.name}: {path}", HubError)
-    there = {path for path in {*files, *changes} if changes.get(path, b"") is not None}
-    samples = {path.removeprefix("embodiments/") for path in there if path.endswith(PICTURES)}
+    after = {path for path in {*files, *changes} if changes.get(path, b"") is not None}
+    samples = {path.removeprefix("embodiments/") for path in after if path.endswith(PICTURES)}
     config = checkpoints.config_json(source.config, source.trunk_sha256)
     changes[README] = render(config, cards, repo=store.repo, samples=samples)
     return changes
-
-
-def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> None:
-    if there.get("trunk_sha256") != source.trunk_sha256:
-        theirs, ours = str(there.get("trunk_sha256"))[:16], source.trunk_sha256[:16]
-        fault = f"has another trunk: {theirs}, this checkpoint's is {ours}"
-        remedy = "push to a hub of its own, or finetune on the trunk that is there"
-        raise HubError(where, fault, remedy)
-    if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
-        raise HubError(where, "has the same trunk with another tokenizer", "push to a hub of its own")
 
 
 # -- pulling
@@ -260,7 +256,15 @@ def _pull(
     there = embodiment_ids(files)
     wanted = list(dict.fromkeys(there if embodiments is None else embodiments))
     for name in wanted:
-        _require_whole(store, files, there, name)
+        check_id(name, store.name)
+        if name not in there:
+            away = " in the cache, and is out of reach" if store.from_cache else ""
+            known = f"it has: {', '.join(there[:MAX_NAMED]) or 'none'}"
+            raise HubError(store.name, f"has no embodiment {name!r}{away}", known)
+        lacking = [part for part in PARTS if f"embodiments/{name}/{part}" not in files]
+        if lacking and not store.from_cache:
+            fault = f"lacks {lacking[0]} of embodiment {name!r}"
+            raise HubError(store.name, fault, "name the embodiments you want, or have it pushed again")
     if TRUNK not in files and not store.from_cache:
         raise HubError(store.name, f"has no {TRUNK}", "have it pushed again")
     names = [CONFIG, TRUNK]
@@ -281,19 +285,6 @@ def _pull(
     if out:
         checkpoints.write_readme(pulled)
     return pulled, wanted
-
-
-def _require_whole(store: Store, files: dict[str, int], there: list[str], name: str) -> None:
-    """Raise unless a hub has an embodiment and all of its files."""
-    check_id(name, store.name)
-    if name not in there:
-        away = " in the cache, and is out of reach" if store.from_cache else ""
-        known = f"it has: {', '.join(there[:MAX_NAMED]) or 'none'}"
-        raise HubError(store.name, f"has no embodiment {name!r}{away}", known)
-    lacking = [part for part in PARTS if f"embodiments/{name}/{part}" not in files]
-    if lacking and not store.from_cache:
-        fault = f"lacks {lacking[0]} of embodiment {name!r}"
-        raise HubError(store.name, fault, "name the embodiments you want, or have it pushed again")
 
 
 def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
