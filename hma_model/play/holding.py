@@ -19,7 +19,7 @@ class Holding:
     """How long a robot stays with the truth.
 
     Attributes:
-        seconds: until model and truth part, the median over scenes; None if nobody measured it.
+        seconds: until model and truth part, the lower median over scenes; None if nobody measured it.
         at_least: whether they had not parted when the measurement ended.
         follows: whether the robot follows its actions; None if nobody knows.
     """

@@ -3,7 +3,7 @@
     python recipes/bench/holding.py            # writes hma_model/play/holding.json for the bundled model
 
 Each robot with a simulator replays the recorder's actions in the model until model and truth have parted
-(`hma_model.play.divergence`), in several scenes. The median over scenes is the time that it holds.
+(`hma_model.play.divergence`), in several scenes. The lower median over scenes is the time that it holds.
 """
 
 import argparse
@@ -49,7 +49,7 @@ def main() -> None:
     found = {}
     for name, some in sessions.items():
         hz = robots[name].embodiment.effective_hz
-        frames = statistics.median(session.parted or given.frames for session in some)
+        frames = statistics.median_low(session.parted or given.frames for session in some)
         at_least = frames >= given.frames
         found[name] = {"seconds": round(frames / hz, 1), "at_least": at_least}
     settings = {"scenes": given.scenes, "frames": given.frames}
