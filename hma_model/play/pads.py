@@ -109,21 +109,16 @@ def _arm(mechanism: Arm, found: list[Pad]) -> list[Pad]:
 
 def hint(robot: Drivable) -> str:
     """Return what a drag on the image does, as a sentence without its full stop."""
-    found, dims = pads(robot), robot.dimensions
+    found, shown = pads(robot), labels(robot)
     if not found:
         return "Use the sliders"
-    first = found[0]
-    if first.low is not None:
+    if found[0].low is not None:
         return "Drag on the image to move the target" + "s" * (len(found) > 1)
-    if all(pad.x is None or pad.y is None for pad in found) and len(found) > 1:
-        return f"Drag on the image, along {'each' if len(found) > 2 else 'either'} rail"
-    names, shown = [dim.name for dim in dims], labels(robot)
-    if len(found) == 1 and {"vx", "speed", "bridge"} & set(names):
-        return "Drag on the image to steer"
     if len(found) > 1:
-        said = [" and ".join(shown[i] for i in (pad.x, pad.y) if i is not None) for pad in found]
-        return f"Drag on the image: on its left half {said[0]}, on its right half {said[1]}"
-    ways = (("sideways", first.x), ("up or down", first.y))
+        ordered = sorted(found, key=lambda pad: pad.zone)  # from left to right, else from above
+        said = [" and ".join(shown[i] for i in (pad.x, pad.y) if i is not None) for pad in ordered]
+        return f"Drag on the image, each in its place: {', '.join(said)}"
+    ways = (("sideways", found[0].x), ("up or down", found[0].y))
     return f"Drag on the image: {', '.join(f'{way} {shown[i]}' for way, i in ways if i is not None)}"
 
 

@@ -95,68 +95,8 @@ class Guard:
         return name == socket.gethostname()
 
 
-class PageViewer:
-    """A viewer: what is still to be sent to one websocket.
-
-    `show` and `tell` are called in the stepper's thread. Of frames only the latest waits, so that a page that
-    reads slowly sees fewer.
-    """
-
-    def __init__(self, websocket: WebSocket) -> None:
-        self.websocket = websocket
-        self._loop, self._wake = asyncio.get_running_loop(), asyncio.Event()
-        self._messages: deque[dict[str, Any]] = deque(maxlen=100)
-        self._latest: tuple[Frame, dict[str, Any]] | None = None
-        self._sent = self._shown = 0  # serial numbers
-        self._heard = time.monotonic()
-
-    @property
-    def behind(self) -> int:
-        return self._sent - self._shown + (self._latest is not None)
-
-    @property
-    def stalled(self) -> bool:
-        return self.behind > 0 and time.monotonic() - self._heard > STALLED_S
-
-    def show(self, frame: Frame, facts: dict[str, Any]) -> None:
-        self._latest = (frame, facts)
-        self._notify()
-
-    def tell(self, message: dict[str, Any]) -> None:
-        self._messages.append(message)
-        self._notify()
-
-    def seen(self, serial: int) -> None:
-        """Note that the page has shown a frame."""
-        self._shown = max(self._shown, min(serial, self._sent))
-        self._heard = time.monotonic()
-        self._wake.set()
-
-    def _notify(self) -> None:
-        with contextlib.suppress(RuntimeError):  # the server has stopped
-            self._loop.call_soon_threadsafe(self._wake.set)
-
-    async def send(self) -> None:
-        """Send what waits, until the viewer has gone or reads nothing any more."""
-        while True:
-            await self._wake.wait()
-            self._wake.clear()
-            while self._messages:
-                text = json.dumps(self._messages.popleft())
-                with anyio.fail_after(SEND_S):
-                    await self.websocket.send_text(text)
-            if self._latest and self._sent - self._shown < FRAMES_AHEAD:
-                (frame, facts), self._latest = self._latest, None
-                if not self._sent - self._shown:
-                    self._heard = time.monotonic()  # it had nothing to read before
-                self._sent += 1
-                data = messages.frame_bytes(frame, facts, self._sent)
-                with anyio.fail_after(SEND_S):
-                    await self.websocket.send_bytes(data)
-
-
 class Server:
-    """The application of an stepper.
+    """The application of a stepper.
 
     Args:
         model: a name for the model, shown on the page.
@@ -240,7 +180,7 @@ class Server:
                         await work()
                     tasks.cancel_scope.cancel()  # one has ended, so the other does
 
-                tasks.start_soon(run, connection.page.send)
+                tasks.start_soon(run, connection.send)
                 tasks.start_soon(run, connection.receive)
         finally:
             self.viewers -= 1
@@ -254,18 +194,25 @@ class Server:
 
 
 class Connection:
-    """One websocket, and the session that it drives.
+    """One websocket, and the session that it drives: what the page asks for, and what is sent to it.
+
+    `show` and `tell` are called in the stepper's thread. Of frames only the latest waits, so that a page that
+    reads slowly sees fewer.
 
     Attributes:
         fault: why the page is no longer listened to; "" if it has left.
     """
 
     def __init__(self, server: Server, websocket: WebSocket) -> None:
-        self.server, self.stepper, self.websocket = server, server.stepper, websocket
-        self.page = PageViewer(websocket)
+        self.stepper, self.websocket = server.stepper, websocket
         self.session: Session | None = None
         self.fault = ""
         self._credit, self._filled = MESSAGE_BURST, time.monotonic()
+        self._loop, self._wake = asyncio.get_running_loop(), asyncio.Event()
+        self._messages: deque[dict[str, Any]] = deque(maxlen=100)
+        self._latest: tuple[Frame, dict[str, Any]] | None = None
+        self._sent = self._shown = 0  # serial numbers of frames
+        self._heard = time.monotonic()
         held = {
             key: server.holdings.get(robot.embodiment.id, UNKNOWN)
             for key, robot in self.stepper.robots.items()
@@ -274,9 +221,49 @@ class Connection:
             describe(self.stepper.robots[key]) | {"holds": known.words, "follows": known.follows is not False}
             for key, known in sorted(held.items(), key=lambda pair: pair[1].rank)
         ]
-        orders = list(self.stepper.orders)
-        hello = {"model": server.model, "robots": robots, "orders": orders, "first": server.first}
-        self.page.tell({"kind": "hello", **hello})
+        hello = {"model": server.model, "robots": robots, "first": server.first}
+        self.tell({"kind": "hello", "orders": list(self.stepper.orders), **hello})
+
+    # -- to the page
+
+    @property
+    def behind(self) -> int:
+        return self._sent - self._shown + (self._latest is not None)
+
+    @property
+    def stalled(self) -> bool:
+        return self.behind > 0 and time.monotonic() - self._heard > STALLED_S
+
+    def show(self, frame: Frame, facts: dict[str, Any]) -> None:
+        self._latest = (frame, facts)
+        self._notify()
+
+    def tell(self, message: dict[str, Any]) -> None:
+        self._messages.append(message)
+        self._notify()
+
+    def _notify(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the server has stopped
+            self._loop.call_soon_threadsafe(self._wake.set)
+
+    async def send(self) -> None:
+        """Send what waits, until the viewer has gone or reads nothing any more."""
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            while self._messages:
+                with anyio.fail_after(SEND_S):
+                    await self.websocket.send_text(json.dumps(self._messages.popleft()))
+            # The socket buffers megabytes; the page's word on what it has shown keeps frames from piling up.
+            if self._latest and self._sent - self._shown < FRAMES_AHEAD:
+                (frame, facts), self._latest = self._latest, None
+                if not self._sent - self._shown:
+                    self._heard = time.monotonic()  # it had nothing to read before
+                self._sent += 1
+                with anyio.fail_after(SEND_S):
+                    await self.websocket.send_bytes(messages.frame_bytes(frame, facts, self._sent))
+
+    # -- from the page
 
     async def receive(self) -> None:
         """Take messages until the page leaves, or sends one that is not allowed."""
@@ -307,11 +294,13 @@ class Connection:
     def leave(self) -> None:
         """Let the session stand still."""
         if session := self.session:
-            self.stepper.call(lambda: self.stepper.detach(session.name, self.page))
+            self.stepper.call(lambda: self.stepper.detach(session.name, self))
 
     async def _do(self, message: messages.Message) -> None:
         if isinstance(message, messages.SeenMessage):
-            self.page.seen(message.serial)
+            self._shown = max(self._shown, min(message.serial, self._sent))
+            self._heard = time.monotonic()
+            self._wake.set()
             self.stepper.wake()
         elif isinstance(message, messages.OpenMessage | messages.ResumeMessage):
             await self._enter(message)
@@ -323,12 +312,12 @@ class Connection:
     async def _enter(self, message: messages.OpenMessage | messages.ResumeMessage) -> None:
         def enter() -> Session:
             if isinstance(message, messages.ResumeMessage):
-                session = self.stepper.attach(message.session, self.page)
+                session = self.stepper.attach(message.session, self)
             else:
                 if self.session and self.session.name in self.stepper.sessions:
                     self.stepper.close(self.session.name)
                 session = self.stepper.open(message.robot, message.scene)
-                self.stepper.attach(session.name, self.page)
+                self.stepper.attach(session.name, self)
             self._show_all(session)
             return session
 
@@ -336,24 +325,24 @@ class Connection:
             entered = await asyncio.wrap_future(self.stepper.call(enter))
         except HMAError as fault:
             ended = isinstance(message, messages.ResumeMessage)
-            self.page.tell({"kind": "gone" if ended else "error", "text": str(fault)})
+            self.tell({"kind": "gone" if ended else "error", "text": str(fault)})
             return
         except Exception as fault:  # a bug of ours; the stepper has logged it
             text = f"stopped with {type(fault).__name__}: {fault}; the terminal has more"
-            self.page.tell({"kind": "error", "text": text})
+            self.tell({"kind": "error", "text": text})
             return
         if self.session and self.session.name != entered.name:
             left = self.session.name
-            self.stepper.call(lambda: self.stepper.detach(left, self.page))
+            self.stepper.call(lambda: self.stepper.detach(left, self))
         self.session = entered
 
     def _show_all(self, session: Session) -> None:
-        self.page.tell(session.opened())
-        self.page.show(session.last(), {})
+        self.tell(session.opened())
+        self.show(session.last(), {})
 
     def _change(self, session: Session, message: messages.Message) -> None:
         """Do what a message says, in the stepper's thread."""
-        if session.name not in self.stepper.sessions or session.viewer is not self.page:
+        if session.name not in self.stepper.sessions or session.viewer is not self:
             return
         session.touched = time.monotonic()
         try:
@@ -369,7 +358,7 @@ class Connection:
                     session.paused, session.steps, session.due = True, 1, session.touched
                 case messages.StepMessage(do="sync"):
                     session.sync()
-                    self.page.show(session.last(), {})  # in the place of an older one that still waits
+                    self.show(session.last(), {})  # in the place of an older one that still waits
                 case messages.SwitchMessage(do="run"):
                     session.paused, session.due, session.steps = not message.on, session.touched, 0
                 case messages.SwitchMessage(do="fast"):
@@ -379,15 +368,15 @@ class Connection:
                 case messages.SampleMessage():
                     way = FrameSampling(message.passes, round(message.temperature, 1), message.order)
                     self.stepper.change(session, way)
-            self.page.tell(session.status())
+            self.tell(session.status())
         except HMAError as fault:
-            self.page.tell({"kind": "error", "text": str(fault)})
+            self.tell({"kind": "error", "text": str(fault)})
 
     def _hold(self, session: Session, message: messages.DriveMessage) -> None:
         """Hold an action; the first one far outside the range that the model knows is told."""
         if len(message.action) != len(session.held):
             fault = f"has {len(message.action)} values, this robot takes {len(session.held)}"
-            self.page.tell({"kind": "error", "text": f"action: {fault}"})
+            self.tell({"kind": "error", "text": f"action: {fault}"})
             return
         session.held, session.input = np.array(message.action, np.float32), message.input
         if session.warned:
@@ -402,7 +391,7 @@ class Connection:
         if beyond:
             session.warned = True
             known = f"the model knows only {', '.join(beyond)}; what it shows beyond is a guess"
-            self.page.tell({"kind": "error", "text": f"action: {known}. This is said once"})
+            self.tell({"kind": "error", "text": f"action: {known}. This is said once"})
 
 
 async def serve(

@@ -15,7 +15,7 @@ from hma_data.storage.files import atomic_path
 from hma_model.evaluation.agreement import Estimate
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
-from hma_model.policies.scores import WORK, PolicyEvaluation, Scored
+from hma_model.policies.scores import MODEL, TRUE, WORK, PolicyEvaluation, Scored
 
 COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same actions, sim.")
 LISTED_PAIRS = 6  # pairs of policies that a sentence names
@@ -77,11 +77,11 @@ def sentences(found: PolicyEvaluation) -> list[str]:
     else:
         correlated = {"success rates": found.success, "mean scores": found.score}
         for what, one in correlated.items():
-            if one.pearson.reason:  # of the ranks it is the same
-                said.append(f"{what} over policies: no correlation, {one.pearson.reason}")
+            if one["pearson"].reason:  # of the ranks it is the same
+                said.append(f"{what} over policies: no correlation, {one['pearson'].reason}")
             else:
-                said.append(f"{what} over policies: Pearson {one.pearson}, ranks {one.spearman}")
-    return said + [_alike(found, where) for where in ("true", "model") if found.alike(where)]
+                said.append(f"{what} over policies: Pearson {one['pearson']}, ranks {one['spearman']}")
+    return said + [_alike(found, where) for where in (TRUE, MODEL) if found.alike(where)]
 
 
 def refused(found: PolicyEvaluation) -> str:
@@ -95,8 +95,8 @@ def _share(found: Estimate) -> str:
     return f"{found.value:.0%} ({found.low:.0%} to {found.high:.0%})"
 
 
-def _alike(found: PolicyEvaluation, where: str) -> str:
-    place = {"true": "the simulator", "model": "the model"}[where]
+def _alike(found: PolicyEvaluation, where: int) -> str:
+    place = "the simulator" if where == TRUE else "the model"
     pairs, count = found.alike(where), len(found.policies)
     if len(pairs) == count * (count - 1) // 2:
         return f"by success in {place}, no two policies can be told apart"
@@ -129,7 +129,7 @@ def write_report(found: PolicyEvaluation, folder: Path) -> Path:
 def html(found: PolicyEvaluation) -> str:
     """Return the page."""
     found, legend = renamed(found)
-    count = len(found.policies[0].true.scores)
+    count = len(found.policies[0].scores[TRUE])
     lead = (
         f"{found.embodiment} in {found.checkpoint} ({found.sampling}): {count} episodes of {found.frames} "
         "frames a policy, from the same frames in the simulator and in the world model"
@@ -144,7 +144,7 @@ def html(found: PolicyEvaluation) -> str:
         (_value(found.followed), f"correlation of the scores of single episodes{_ends(found.followed)}"),
     ]
     if not found.refusal:
-        pearson, ranks = found.success.pearson, found.success.spearman
+        pearson, ranks = found.success["pearson"], found.success["spearman"]
         figures = [
             (_value(pearson), f"correlation of success rates{_ends(pearson)}"),
             (_value(ranks), f"correlation of their ranks{_ends(ranks)}"),
@@ -173,8 +173,8 @@ def html(found: PolicyEvaluation) -> str:
             strip = png_bytes(grid([list(one.true_images[number]), list(one.model_images[number])]))
             caption = (
                 f"{one.policy}, episode {number}, frames {', '.join(map(str, one.shown))}: simulator above, "
-                f"scored {one.true.scores[number]:.1f} px, model below, judged "
-                f"{one.model.scores[number]:.1f} px"
+                f"scored {one.scores[TRUE, number]:.1f} px, model below, judged "
+                f"{one.scores[MODEL, number]:.1f} px"
             )
             page.picture(strip, "png", caption)
     return page.html()
@@ -195,7 +195,7 @@ def _ends(found: Estimate) -> str:
 def _chosen(found: PolicyEvaluation, kind: tuple[bool, bool]) -> Iterator[tuple[Scored, int]]:
     """Yield episodes of a kind, of each policy one before any second one."""
     there = [
-        np.flatnonzero((one.true.success == kind[0]) & (one.model.success == kind[1]))
+        np.flatnonzero((one.success[TRUE] == kind[0]) & (one.success[MODEL] == kind[1]))
         for one in found.policies
     ]
     for turn in range(SHOWN_EPISODES):

@@ -1,7 +1,7 @@
 """Score policies in the true simulator and inside the world model, and compare the two.
 
     found = evaluate_policies("rails_03", ["scripted", "scripted:noise=0.5", "random", "still"])
-    found.success.spearman            # of the policies' success rates
+    found.success["spearman"]         # of the policies' success rates
 
 Every policy acts in the same scenes of a laboratory robot: once in its simulator, which knows the outcome,
 and once in the world model from the same frames, where a judge reads the outcome off the images. The
@@ -60,16 +60,9 @@ Progress = Callable[[float, str], None]
 EPISODES, FRAMES = 32, 40
 WORK = ".policies"  # folder of finished policies in an output
 OUTCOMES = ("true", "model", "replayed")
+TRUE, MODEL, REPLAYED = range(3)
 SHOWN_FRAMES = 8  # images that are kept of an episode
 GOOD_ACCURACY = 0.75  # balanced; an interval that holds chance and this says nothing
-
-
-@dataclass(frozen=True)
-class Outcomes:
-    """Scores (N,) of a policy's episodes, and which are a success (N,)."""
-
-    scores: Scores
-    success: Bools
 
 
 @dataclass(frozen=True)
@@ -77,28 +70,18 @@ class Scored:
     """The results of one policy.
 
     Attributes:
-        true: in the simulator.
-        model: in the world model, as judged.
-        replayed: in the simulator, under the actions that the policy gave in the model.
+        scores, success: (3, N) of its episodes: in the simulator, in the world model as judged, and in the
+            simulator under the actions that the policy gave in the model.
         shown: frames of which images are kept.
         true_images, model_images: (N, len(shown), S, S, 3).
     """
 
     policy: str
-    true: Outcomes
-    model: Outcomes
-    replayed: Outcomes
-    shown: tuple[int, ...]
+    scores: Scores
+    success: Bools
+    shown: NDArray[np.int64]
     true_images: Image
     model_images: Image
-
-
-@dataclass(frozen=True)
-class Correlation:
-    """The correlations over policies of a figure in the model with that in the simulator."""
-
-    pearson: Estimate
-    spearman: Estimate
 
 
 @dataclass(frozen=True)
@@ -107,7 +90,7 @@ class PolicyEvaluation:
 
     Attributes:
         sampling: how the world drew its frames.
-        success, score: correlation over policies of the success rates, and of the mean scores.
+        success, score: correlations over policies of the success rates, and of the mean scores, by name.
         generated: accuracy of the judge on generated frames, against the simulator under the same actions.
         precision: share of the successes that it sees on generated frames which the simulator confirms.
         recall: share of the simulator's successes under these actions that it sees.
@@ -122,8 +105,8 @@ class PolicyEvaluation:
     frames: int
     judge: StateJudge
     policies: tuple[Scored, ...]
-    success: Correlation
-    score: Correlation
+    success: dict[str, Estimate]
+    score: dict[str, Estimate]
     generated: Accuracy
     precision: Estimate
     recall: Estimate
@@ -147,63 +130,54 @@ class PolicyEvaluation:
             return "the scores of single episodes agree with the simulator's no better than by chance"
         return ""
 
-    def alike(self, where: str) -> list[tuple[str, str]]:
-        """Return the pairs of policies that cannot be told apart by their outcomes, "true" or "model"."""
-        names = [one.policy for one in self.policies]
-        success = np.stack([getattr(one, where).success for one in self.policies])
-        return [(names[one], names[other]) for one, other in alike_pairs(success)]
+    def alike(self, where: int) -> list[tuple[str, str]]:
+        """Return the pairs of policies that cannot be told apart by their outcomes, TRUE or MODEL."""
+        pairs = alike_pairs(np.stack([one.success[where] for one in self.policies]))
+        return [(self.policies[one].policy, self.policies[other].policy) for one, other in pairs]
 
     def rows(self) -> list[dict[str, Any]]:
         """Return the figures of each policy."""
         rows = []
         for one in self.policies:
             row: dict[str, Any] = {"policy": one.policy}
-            for name in OUTCOMES:
-                outcomes: Outcomes = getattr(one, name)
-                good, count = int(outcomes.success.sum()), len(outcomes.success)
-                row |= {
-                    f"{name}_success": good / count,
-                    f"{name}_success_interval": share_interval(good, count),
-                    f"{name}_score": float(outcomes.scores.mean()),
-                }
-            agree = (one.true.success == one.model.success).mean()
-            rows.append(row | {"episodes_alike": float(agree)})
+            for name, scores, success in zip(OUTCOMES, one.scores, one.success, strict=True):
+                row[f"{name}_success"] = float(success.mean())
+                row[f"{name}_success_interval"] = share_interval(int(success.sum()), len(success))
+                row[f"{name}_score"] = float(scores.mean())
+            row["episodes_alike"] = float((one.success[TRUE] == one.success[MODEL]).mean())
+            rows.append(row)
         return rows
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures, and the outcome of each episode, as plain values."""
-        judge = {
-            "task": self.judge.task.name,
-            "success": self.judge.task.text,
-            "limit": self.judge.limit,
-            "held_out": asdict(self.judge.held_out),
-            "generated": asdict(self.generated),
-            "precision": asdict(self.precision),
-            "recall": asdict(self.recall),
-            "score_correlation": asdict(self.followed),
-            "generated_better_than_chance": self.generated.better_than_chance,
-        }
-        episodes = {
-            one.policy: {
-                name: {"scores": value.scores.round(3).tolist(), "success": value.success.tolist()}
-                for name in OUTCOMES
-                for value in [getattr(one, name)]
+        outcomes: dict[str, dict[str, Any]] = {}
+        for one in self.policies:
+            each = zip(OUTCOMES, one.scores.round(3).tolist(), one.success.tolist(), strict=True)
+            outcomes[one.policy] = {
+                name: {"scores": scores, "success": success} for name, scores, success in each
             }
-            for one in self.policies
-        }
-        return {
-            "embodiment": self.embodiment,
-            "checkpoint": self.checkpoint,
-            "sampling": self.sampling,
-            "seed": self.seed,
-            "frames": self.frames,
-            "episodes": len(self.policies[0].true.scores),
-            "judge": judge,
+        own = ("embodiment", "checkpoint", "sampling", "seed", "frames")
+        return {key: getattr(self, key) for key in own} | {
+            "episodes": self.policies[0].scores.shape[1],
+            "judge": {
+                "task": self.judge.task.name,
+                "success": self.judge.task.text,
+                "limit": self.judge.limit,
+                "held_out": asdict(self.judge.held_out),
+                "generated": asdict(self.generated),
+                "precision": asdict(self.precision),
+                "recall": asdict(self.recall),
+                "score_correlation": asdict(self.followed),
+                "generated_better_than_chance": self.generated.better_than_chance,
+            },
             "refused": self.refusal,
             "policies": self.rows(),
-            "alike": {"simulator": self.alike("true"), "model": self.alike("model")},
-            "correlation": {"success": asdict(self.success), "score": asdict(self.score)},
-            "outcomes": episodes,
+            "alike": {"simulator": self.alike(TRUE), "model": self.alike(MODEL)},
+            "correlation": {
+                what: {name: asdict(one) for name, one in found.items()}
+                for what, found in (("success", self.success), ("score", self.score))
+            },
+            "outcomes": outcomes,
         }
 
 
@@ -218,12 +192,8 @@ def evaluate_policies(
     seed: int = 0,
     out: StrPath | None = None,
     world: World | None = None,
-    unmask_steps: int = 2,
-    temperature: float | None = None,
-    device: str = "cpu",
-    precision: str = "float32",
-    compile: bool = False,
-    on_progress: Progress | None = None,
+    on_progress: Progress = lambda done, words: None,
+    **settings: Any,
 ) -> PolicyEvaluation:
     """Score policies in the simulator of a laboratory robot and inside a world model.
 
@@ -237,10 +207,8 @@ def evaluate_policies(
         seed: of scenes, policies, judge and intervals; on one device, the same seed gives the same figures.
         out: folder that keeps finished policies until `write_report` has written there; None keeps nothing.
         world: a world instead of a checkpoint.
-        unmask_steps, temperature: of the world, as of `World`.
-        device: of the world made from the checkpoint, and of policies that are networks.
-        precision, compile: of that world, as of `World`.
         on_progress: called with the frames done, and what is done.
+        settings: of the world made from the checkpoint, as of `load_world`.
 
     Raises:
         HMAError: a policy fails, the robot has no simulator, or the judge is no better than chance.
@@ -252,12 +220,8 @@ def evaluate_policies(
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise UsageError(f"policy {twice}", "is given twice", "give each once")
     folder = None if out is None else as_path(out)
-    tell = on_progress or (lambda done, words: None)
     with locked(folder) if folder else nullcontext():
-        world = world or load_world(
-            checkpoint, device=device, unmask_steps=unmask_steps, temperature=temperature,
-            precision=precision, compile=compile,
-        )  # fmt: skip
+        world = world or load_world(checkpoint, **settings)
         sampling = f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}"
         if world.precision != "float32":
             sampling += f",precision={world.precision}"
@@ -272,43 +236,45 @@ def evaluate_policies(
                 checked(name, policy, arena)
         if not isinstance(judge, StateJudge):
             task = task_of(embodiment, judge)
+            told = partial(on_progress, 0)
             judge = train_judge(
-                embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed, tell=partial(tell, 0)
-            )
+                embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed, tell=told
+            )  # fmt: skip
         kept = None
         if folder:
             facts = {"embodiment": embodiment, "episodes": episodes, "frames": frames, "seed": seed}
             facts |= {"judge": asdict(judge.task), "sampling": sampling}
             facts |= world_digests(world, embodiment) | device_facts(world.model)
             kept = KeptParts(folder / WORK, facts)
-        tell(0, "episodes")  # the clock of the time left starts here
+        on_progress(0, "episodes")  # the clock of the time left starts here
         scored: list[Scored] = []
-        for name, policy, key in zip(names, made, keys, strict=True):
+        for number, (name, policy, key) in enumerate(zip(names, made, keys, strict=True)):
             if isinstance(policy, Judged):
                 policy.judged(judge)
-            before = len(scored) * frames * episodes
 
-            def told(done: float, where: str, before: int = before, name: str = name) -> None:
-                tell(before + done, f"{name}, {where}")
+            def tell(done: float, where: str, number: int = number, name: str = name) -> None:
+                on_progress(number * frames * episodes + done, f"{name}, {where}")
 
-            score = partial(score_policy, name, policy, world, scenes, judge, frames, told)
-            scored.append(_kept_or_new(name, kept, key, score))
-        success, scores = _matrices(scored, "success"), _matrices(scored, "scores")
-        judged, replayed = success[1].ravel() > 0, success[2].ravel() > 0
-        return PolicyEvaluation(
-            embodiment,
-            str(checkpoint),
-            sampling,
-            seed,
-            frames,
-            judge,
-            tuple(scored),
-            Correlation(**correlations(success[0], success[1], seed)),
-            Correlation(**correlations(scores[0], scores[1], seed)),
-            accuracy(replayed, judged),
-            *precision_recall(replayed, judged),
-            episode_correlation(scores[1].ravel(), scores[2].ravel()),
-        )
+            score = partial(score_policy, policy=policy, world=world, scenes=scenes, judge=judge)
+            score = partial(score, name, frames=frames, tell=tell)
+            scored.append(Scored(name, **(score() if kept is None else kept.part(key, score))))
+    success = np.stack([one.success for one in scored], axis=1)  # (3, M, N)
+    scores = np.stack([one.scores for one in scored], axis=1)
+    judged, replayed = success[MODEL].ravel(), success[REPLAYED].ravel()
+    return PolicyEvaluation(
+        embodiment,
+        str(checkpoint),
+        sampling,
+        seed,
+        frames,
+        judge,
+        tuple(scored),
+        correlations(success[TRUE].astype(float), success[MODEL].astype(float), seed),
+        correlations(scores[TRUE], scores[MODEL], seed),
+        accuracy(replayed, judged),
+        *precision_recall(replayed, judged),
+        episode_correlation(scores[MODEL].ravel(), scores[REPLAYED].ravel()),
+    )
 
 
 def _keys(
@@ -326,10 +292,6 @@ def _keys(
     return [hashlib.sha256(json.dumps([one, shared]).encode()).hexdigest()[:32] for one in own]
 
 
-def _kept_or_new(name: str, kept: KeptParts | None, key: str, score: Callable[[], Scored]) -> Scored:
-    return score() if kept is None else _scored(name, kept.part(key, lambda: _arrays(score())))
-
-
 def score_policy(
     name: str,
     policy: Policy,
@@ -338,10 +300,10 @@ def score_policy(
     judge: StateJudge,
     frames: int,
     tell: Progress = lambda done, where: None,
-) -> Scored:
-    """Return what comes of one policy in the simulator and in the model."""
+) -> dict[str, NDArray[Any]]:
+    """Return what comes of one policy in the simulator and in the model: the arrays of `Scored`."""
     size, limit = world.image_shape[0], judge.task.limit
-    shown = tuple(sorted({round(frame) for frame in np.linspace(0, frames, SHOWN_FRAMES)}))
+    shown = np.unique(np.linspace(0, frames, SHOWN_FRAMES).round().astype(int))
     true = TrueArena(scenes, size)
     true_images, _ = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
     model = ModelArena(world, true, judge.probe)
@@ -352,17 +314,15 @@ def score_policy(
     again = TrueArena(scenes, size, drawn=False)
     for action in actions:
         again.step(action)
-    scores = [judge.true_score(np.stack(arena.parts, axis=1)) for arena in (true, again)]
+    there, replayed = (judge.true_score(np.stack(arena.parts, axis=1)) for arena in (true, again))
     read = judge.score(np.stack(model_images, axis=1))
-    return Scored(
-        name,
-        Outcomes(scores[0], scores[0] >= limit),
-        Outcomes(read, judge.success(read)),
-        Outcomes(scores[1], scores[1] >= limit),
-        shown,
-        np.stack([true_images[frame] for frame in shown], axis=1),
-        np.stack([model_images[frame] for frame in shown], axis=1),
-    )
+    return {
+        "scores": np.stack([there, read, replayed]),
+        "success": np.stack([there >= limit, judge.success(read), replayed >= limit]),
+        "shown": shown,
+        "true_images": np.stack([true_images[frame] for frame in shown], axis=1),
+        "model_images": np.stack([model_images[frame] for frame in shown], axis=1),
+    }
 
 
 def run(
@@ -388,26 +348,3 @@ def run(
             images.append(arena.images)
             tell((len(images) - 1) * len(arena.images))
     return images, actions
-
-
-def _arrays(one: Scored) -> dict[str, NDArray[Any]]:
-    """Return the results of a policy as arrays to keep; `_scored` reads them."""
-    arrays: dict[str, NDArray[Any]] = {"shown": np.array(one.shown)}
-    for name in OUTCOMES:
-        outcomes: Outcomes = getattr(one, name)
-        arrays |= {f"{name}_scores": outcomes.scores, f"{name}_success": outcomes.success}
-    return arrays | {"true_images": one.true_images, "model_images": one.model_images}
-
-
-def _scored(name: str, arrays: dict[str, NDArray[Any]]) -> Scored:
-    outcomes: Any = {key: Outcomes(arrays[f"{key}_scores"], arrays[f"{key}_success"]) for key in OUTCOMES}
-    images: Any = {key: arrays[key] for key in ("true_images", "model_images")}
-    return Scored(name, shown=tuple(arrays["shown"].tolist()), **outcomes, **images)
-
-
-def _matrices(scored: Sequence[Scored], key: str) -> list[Scores]:
-    """Return "success" or "scores" in the simulator, in the model, and as replayed; (M, N) each."""
-    return [
-        np.stack([getattr(getattr(one, where), key) for one in scored]).astype(np.float64)
-        for where in OUTCOMES
-    ]

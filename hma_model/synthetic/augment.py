@@ -48,6 +48,7 @@ from hma_model.synthetic.recorder import (
 )
 from hma_model.worlds.images import Prompt, seen_cameras
 from hma_model.worlds.prompts import default_frames, read_prompt
+from hma_model.worlds.scenes import at_rest
 from hma_model.worlds.world import World, load_world
 
 WORK = ".augment"
@@ -392,8 +393,7 @@ class _Maker:
             told.append(np.nan_to_num(chunks[known - 1 :]).reshape(-1, len(scenes.dimensions)))
             groups.append(str(row["group"] or row["id"]))
         steps = list(np.stack(told, axis=1).astype(np.float32))
-        held = np.where([dim.kind == "rate" for dim in scenes.dimensions], 0, steps[0]).astype(np.float32)
-        return RealBeginnings(scenes, prompts, held, steps, groups)
+        return RealBeginnings(scenes, prompts, at_rest(scenes.dimensions, steps[0]), steps, groups)
 
     def _window(self, shards: ShardSet, number: int) -> tuple[dict[str, Any], Prompt]:
         """Return a row of an episode, and a window of it: frames (P + T, …) and chunks (P + T - 1, K).

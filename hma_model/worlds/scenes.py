@@ -140,8 +140,7 @@ class LabScene:
             frames.append(frame)
             chunks.append(chunk)
         self.prompt = Prompt(np.stack(frames), np.stack(chunks))
-        held = self.prompt.chunks[-1][-self.width :]
-        self.action = np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
+        self.action = at_rest(dims, self.prompt.chunks[-1][-self.width :])
 
     def advance(self, chunk: Floats | None) -> tuple[Floats, Image]:
         taken = []
@@ -160,6 +159,11 @@ class LabScene:
 
 
 SCENE_SEED = 1_000_000  # of scenes; recordings for training have small seeds
+
+
+def at_rest(dims: Sequence[Dimension], held: NDArray[Any]) -> Floats:
+    """Return the action (…, A) after which nothing moves on: no rate, and the targets that are held."""
+    return np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
 
 
 # -- recordings
@@ -207,7 +211,12 @@ class RecordedRobot:
         stored = batch.latents if batch.tokens is None else batch.tokens
         assert stored is not None
         frames = decode(self._tokenizer(), stored)[0]
-        return RecordedScene(self.dimensions, frames, batch.actions[0].numpy().astype(np.float32))
+        chunks = batch.actions[0].numpy().astype(np.float32)
+        prompt = Prompt(frames[:PROMPT_FRAMES], chunks[: PROMPT_FRAMES - 1])
+        held = prompt.chunks[-1, -len(self.dimensions) :]
+        # The chunk after the last frame leads to no frame that is known.
+        rest = frames[PROMPT_FRAMES:], chunks[PROMPT_FRAMES - 1 : -1]
+        return RecordedScene(prompt, at_rest(self.dimensions, held), *rest)
 
 
 def apart(count: int) -> int:
@@ -219,23 +228,21 @@ def apart(count: int) -> int:
 
 
 class RecordedScene:
-    """A window of a recording: frames (T, H, W, 3) and chunks (T, K)."""
+    """A prompt, and the frames (T, H, W, 3) and chunks (T, K) that were recorded after it, if any were."""
 
-    def __init__(self, dims: tuple[Dimension, ...], frames: Image, chunks: Floats) -> None:
-        self._frames, self._chunks, self._at = frames, chunks, PROMPT_FRAMES
+    def __init__(
+        self, prompt: Prompt, action: Floats, frames: Image | tuple[()] = (), chunks: Floats | tuple[()] = ()
+    ) -> None:
+        self.prompt, self.action = prompt, action
+        self._rest = iter(zip(chunks, frames, strict=True))
         self._followed = True  # whether all actions were the recorded ones
-        self.prompt = Prompt(frames[:PROMPT_FRAMES], chunks[: PROMPT_FRAMES - 1])
-        held = chunks[PROMPT_FRAMES - 2, -len(dims) :]
-        self.action = np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
 
     def advance(self, chunk: Floats | None) -> tuple[Floats, Image | None] | None:
         if chunk is not None:
             self._followed = False
             return chunk, None
-        if self._at == len(self._frames):
-            return None
-        self._at += 1
-        return self._chunks[self._at - 2], self._frames[self._at - 1] if self._followed else None
+        found = next(self._rest, None)
+        return found if found is None or self._followed else (found[0], None)
 
 
 # -- images
@@ -269,20 +276,9 @@ class ImageRobot:
                 before = self._action
         self._prompt = Prompt(images, np.tile(before, (len(images) - 1, embodiment.stride)))
 
-    def scene(self, number: int) -> "ImageScene":
-        """Return the one scene that there is."""
-        return ImageScene(self._prompt, self._action)
-
-
-@dataclass
-class ImageScene:
-    """Images, after which nobody knows what truly happens."""
-
-    prompt: Prompt
-    action: Floats
-
-    def advance(self, chunk: Floats | None) -> tuple[Floats, None] | None:
-        return None if chunk is None else (chunk, None)
+    def scene(self, number: int) -> RecordedScene:
+        """Return the one scene that there is; nobody knows what truly happens after the images."""
+        return RecordedScene(self._prompt, self._action)
 
 
 # -- what can be driven

@@ -25,7 +25,15 @@ from hma_model.policies.base import begin, checked
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.judge import StateJudge, task_of
 from hma_model.policies.report import html, sentences, write_report
-from hma_model.policies.scores import Outcomes, PolicyEvaluation, Scored, evaluate_policies, score_policy
+from hma_model.policies.scores import (
+    MODEL,
+    REPLAYED,
+    TRUE,
+    PolicyEvaluation,
+    Scored,
+    evaluate_policies,
+    score_policy,
+)
 from hma_model.policies.scripted import Called, Still
 from hma_model.simulate import World
 from tests.model.true_world import TrueWorld, tiny_model
@@ -82,16 +90,16 @@ def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJu
     flawless: Any = FlawlessWorld(world)
     found = evaluate_policies(ROBOT, POLICIES, world=flawless, judge=judge, episodes=4, frames=10)
     for one in found.policies:
-        np.testing.assert_allclose(one.model.scores, one.replayed.scores, atol=1e-6)
+        np.testing.assert_allclose(one.scores[MODEL], one.scores[REPLAYED], atol=1e-6)
         if one.policy != "scripted":  # it steers by places, whose pose is found to a few digits
-            np.testing.assert_allclose(one.model.scores, one.true.scores, atol=1.0)
-    assert (found.policies[2].model.scores == found.policies[2].true.scores).all()
+            np.testing.assert_allclose(one.scores[MODEL], one.scores[TRUE], atol=1.0)
+    assert (found.policies[2].scores[MODEL] == found.policies[2].scores[TRUE]).all()
     assert np.array_equal(found.policies[2].true_images, found.policies[2].model_images)
-    assert found.policies[3].true.scores.max() == 0 and found.policies[0].true.scores.max() > 2
+    assert found.policies[3].scores[TRUE].max() == 0 and found.policies[0].scores[TRUE].max() > 2
     assert found.generated.balanced == 1 and found.followed.value == pytest.approx(1)
     assert found.precision.value == found.recall.value == 1 and found.refusal == ""
     (reason,) = [one for one in sentences(found) if "success rates over policies" in one]
-    assert found.success.pearson.value is None
+    assert found.success["pearson"].value is None
     assert reason.endswith("no correlation, 4 of at least 8 episodes")
 
 
@@ -132,11 +140,11 @@ def test_an_interrupted_evaluation_continues_after_its_last_finished_policy(
         given: Any = {"world": world, "judge": judge, "episodes": 4, "seed": 3, "out": out}
         return evaluate_policies(ROBOT, ["random", "still"], frames=frames, **given)
 
-    def score(name: str, *given: Any) -> Scored:
+    def score(name: str, **given: Any) -> dict[str, Any]:
         begun.append(name)
         if begun == ["random", "still"]:
             raise KeyboardInterrupt
-        return score_policy(name, *given)
+        return score_policy(name, **given)
 
     whole, begun, out = run(None), list[str](), tmp_path / "out"
     monkeypatch.setattr(scores, "score_policy", score)
@@ -170,15 +178,18 @@ def test_shares_have_exact_intervals_and_too_few_successes_are_said(world: World
 def scored_as(name: str, model: np.ndarray, replayed: np.ndarray, limit: float = 5.0) -> Scored:
     """Return a policy with these scores (N,), whose true outcomes are those under the same actions."""
     images = np.zeros((len(model), 1, 8, 8, 3), np.uint8)
-    read, true = (Outcomes(values, values >= limit) for values in (model, replayed))
-    return Scored(name, true, read, true, (0,), images, images)
+    values = np.stack([replayed, model, replayed])
+    return Scored(name, values, values >= limit, np.zeros(1, int), images, images)
 
 
 def evaluation(judge: StateJudge, policies: list[Scored]) -> PolicyEvaluation:
     """Return what `evaluate_policies` makes of these results."""
     made = {one.policy: one for one in policies}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scores, "score_policy", lambda name, *given: made[name])
+        arrays = {name: dict(vars(one)) for name, one in made.items()}
+        for one in arrays.values():
+            del one["policy"]
+        patch.setattr(scores, "score_policy", lambda name, **given: arrays[name])
         patch.setattr(scores, "begin", lambda *given: None)
         patch.setattr(scores, "checked", lambda *given: None)
         world: Any = FlawlessWorld(World(tiny_model(ROBOT), get_tokenizer("fsq-8")))
@@ -222,7 +233,7 @@ def test_policies_that_cannot_be_told_apart_are_named(judge: StateJudge) -> None
     names = ("none", "one", "two", "most")
     found = evaluation(judge, [scored_as(name, row, row) for name, row in zip(names, outcomes, strict=True)])
     apart = [("none", "one"), ("none", "two"), ("one", "two")]
-    assert found.alike("true") == found.alike("model") == apart
+    assert found.alike(TRUE) == found.alike(MODEL) == apart
     assert found.to_json()["alike"] == {"simulator": apart, "model": apart}
     (said,) = [one for one in sentences(found) if "in the model, these cannot be told apart" in one]
     assert said.endswith("none and one; none and two; one and two")
@@ -236,9 +247,9 @@ def test_a_policy_that_was_edited_is_scored_again(
 ) -> None:
     begun = list[str]()
 
-    def score(name: str, *given: Any) -> Scored:
+    def score(name: str, **given: Any) -> dict[str, Any]:
         begun.append(name)
-        return score_policy(name, *given)
+        return score_policy(name, **given)
 
     def written(value: int) -> list[str]:
         sys.modules.pop("mine", None)
