@@ -8,7 +8,7 @@ import base64
 import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,9 @@ CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "libdav1d"}  # Fo
 ENCODERS = (("264", "h264"), ("265", "h265"), ("hevc", "h265"), ("vp9", "vp9"), ("av1", "av1"))
 BLOCK = 64  # video messages fetched at a time
 NAL_UNIT = re.compile(b"\x00\x00\x01(.)", re.DOTALL)
+START_CODES = (b"\x00\x00\x01", b"\x00\x00\x00\x01")  # of H.264 and H.265 as a byte stream
+# The first two bytes of H.265's parameter sets, of its delimiter and of messages before them.
+H265_HEADS = (b"\x40\x01", b"\x42\x01", b"\x44\x01", b"\x46\x01", b"\x4e\x01")
 AV1_SEQUENCE = 1  # type of the unit that holds a sequence header
 # What FFmpeg logs where a reference image is missing, and the level of that message.
 MISSING = {"h264": ("DEBUG", "Frame num gap"), "h265": ("ERROR", "Could not find ref")}
@@ -58,6 +61,16 @@ def image_kind(message_type: str) -> str | None:
     """Return raw, still or video; None for a type without images."""
     short = re.sub(r"^foxglove(_msgs)?[./](msg[./])?", "foxglove/", message_type).replace("/msg/", "/")
     return KINDS.get(short)
+
+
+def content_kind(message: Any, kind: str | None) -> str | None:
+    """Return the kind of a message's content: a CompressedImage may hold a frame of H.264 or H.265."""
+    if kind != STILL or message is None:
+        return kind
+    try:
+        return VIDEO if payload(message).startswith(START_CODES) else STILL
+    except (KeyError, TypeError, ValueError):  # `picture` raises it again
+        return STILL
 
 
 def codec(message: Any, kind: str) -> str:
@@ -74,14 +87,22 @@ def codec(message: Any, kind: str) -> str:
 
 
 def video_codec(message: Any) -> str:
-    """Return h264, h265, vp9, av1, or another codec that the message states.
+    """Return h264, h265, vp9, av1, or another codec that the message states; its content goes first.
 
     FFMPEGPacket names the encoder (libx264, hevc_nvenc), or the codec first: "h264;yuv420p;bgr8;bgr8".
+    CompressedImage names the encoding of the pixels first: "bgr8; h264 compressed".
     """
-    if "format" in field_names(message):
-        return str(child(message, "format")).lower()
-    stated = str(child(message, "encoding")).lower().partition(";")[0]
-    return next((codec for name, codec in ENCODERS if name in stated), stated)
+    data = payload(message)
+    unit = NAL_UNIT.search(data, 0, 8) if data.startswith(START_CODES) else None
+    if unit and (head := data[unit.end() - 1 : unit.end() + 1]):
+        if head in H265_HEADS:
+            return "h265"
+        if head[0] & 0x1F in (7, 9):  # a parameter set, or the delimiter before it
+            return "h264"
+    name = "format" if "format" in field_names(message) else "encoding"
+    stated = str(child(message, name)).lower()
+    known = next((codec for word, codec in ENCODERS if word in stated), "")
+    return known or stated.partition(";")[0]
 
 
 def encoding(message: Any, kind: str) -> str:
@@ -116,15 +137,43 @@ def picture(message: Any, kind: str, where: str, levels: Levels | None = None) -
                 remedy = "state the values of black and white in the YAML, such as levels: [0, 4095]"
                 raise EpisodeError(where, "images in mono16 have 16 bits of grey", remedy)
             return _grey(wide_grey(message, kind, where), levels)
-        return _raw(message, where) if kind == RAW else decode_image(payload(message), where)
+        if kind == RAW:
+            return _raw(message, where)
+        if pattern := _mosaic(message):
+            return _demosaiced(payload(message), pattern, where)
+        return decode_image(payload(message), where)
     except (KeyError, TypeError, ValueError) as fault:
         raise EpisodeError(where, f"a message is not an image: {fault!r}") from fault
 
 
+def _mosaic(message: Any) -> str:
+    """Return the Bayer encoding that a compressed image states, such as bayer_rggb8; empty without one."""
+    stated = str(child(message, "format")).lower() if "format" in field_names(message) else ""
+    found = re.search(r"bayer_\w+", stated)
+    return found[0] if found else ""
+
+
+def _demosaiced(data: bytes, pattern: str, where: str) -> Images:
+    """Return the colours (H, W, 3) of a compressed image whose format names a Bayer encoding.
+
+    Some publishers make colours before they compress, others compress the mosaic: that has one channel.
+    """
+    if not one_channel(data):
+        return decode_image(data, where)
+    cv2 = opencv()
+    mosaic = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if mosaic is None or mosaic.ndim != 2 or mosaic.dtype != np.uint8 or pattern not in ENCODINGS:
+        fault = f"images in {pattern!r} are not a mosaic of 8 bits"
+        raise EpisodeError(where, fault, "publish them in colour")
+    return cv2.cvtColor(mosaic, getattr(cv2, f"COLOR_{ENCODINGS[pattern][1]}"))
+
+
 def is_grey(message: Any, kind: str) -> bool:
-    """Check whether a raw or still image has one channel."""
+    """Check whether a raw or still image has one channel; a mosaic has three."""
     if kind == RAW:
         return encoding(message, kind) in ("mono8", "8uc1", MONO16)
+    if kind == STILL and _mosaic(message):
+        return False
     return kind == STILL and (encoding(message, kind) == MONO16 or one_channel(payload(message)))
 
 
@@ -210,6 +259,38 @@ def is_keyframe(data: bytes, codec: str) -> bool | None:
     return _av1_begins(data) if codec == "av1" else None
 
 
+def has_b_slices(data: bytes) -> bool:
+    """Check whether a frame of H.264 has slices of type B, which are stored after frames shown later."""
+    for unit in NAL_UNIT.finditer(data):
+        if unit[1][0] & 0x1F != 1:  # a slice of a frame that is no key frame
+            continue
+        bits = "".join(f"{byte:08b}" for byte in data[unit.end() : unit.end() + 8])
+        _, at = _exp_golomb(bits, 0)  # first_mb_in_slice
+        slice_type, _ = _exp_golomb(bits, at)
+        if slice_type % 5 == 1:
+            return True
+    return False
+
+
+def _exp_golomb(bits: str, at: int) -> tuple[int, int]:
+    """Return the number in exponential Golomb code at a bit, and the bit after it."""
+    zeros = bits.find("1", at) - at
+    if zeros < 0:
+        return 0, len(bits)
+    end = at + 2 * zeros + 1
+    return int(bits[at + zeros : end], 2) - 1, end
+
+
+def is_reordered(data: bytes, codec: str) -> bool:
+    """Check by a stream's first key frame whether its frames are stored in another order than shown."""
+    import av
+
+    context = av.CodecContext.create(CODECS[codec], "r")
+    with suppress(av.FFmpegError):  # a damaged frame raises its error when it is read
+        context.decode(av.Packet(data))
+    return bool(context.has_b_frames)
+
+
 def _vp9_begins(data: bytes) -> bool:
     """Check whether the first frame is a key frame: VP9 bitstream specification, uncompressed_header."""
     if not data or data[0] >> 6 != 2:
@@ -246,17 +327,26 @@ class VideoDecoder:
         keyframes: (T,) bool, where decoding can begin; True at 0.
         fetch: yields the stored bytes of the messages from a position to the last.
         where: the episode and topic, for the error.
+        reorders: whether frames are shown in another order than their messages come. Then indices count
+            frames as they are shown: nothing after a key frame is shown before what comes before it.
 
     Raises:
         EpisodeError: the codec is not one of these.
     """
 
     def __init__(
-        self, codec: str, keyframes: NDArray[np.bool_], fetch: Callable[[int], Iterator[bytes]], where: str
+        self,
+        codec: str,
+        keyframes: NDArray[np.bool_],
+        fetch: Callable[[int], Iterator[bytes]],
+        where: str,
+        reorders: bool = False,
     ) -> None:
         if codec not in CODECS:
             raise EpisodeError(where, f"video in {codec!r} cannot be read", f"these can: {', '.join(CODECS)}")
         self._codec, self._keyframes, self._fetch, self._where = codec, keyframes, fetch, where
+        self._reorders = reorders
+        self._group, self._shown = 0, 0  # the key frame of the frames last shown; how many were shown since
         self._context: Any = None
         self._to_rgb = FrameToRGB()
         self._next = 0  # the message that the decoder takes next
@@ -302,9 +392,12 @@ class VideoDecoder:
         self._context = av.CodecContext.create(CODECS[self._codec], "r")
         self._context.thread_count = 1
         self._context.options = {"max_pixels": str(MAX_PIXELS)}
+        if self._reorders:  # without it, FFmpeg guesses how many frames it must hold back, and guesses low
+            self._context.options |= {"strict": "strict"}
         self._ready, self._spoilt, self._lost, self._incomplete = {}, False, False, set()
         self._next = int(np.flatnonzero(self._keyframes[: index + 1])[-1])
         self._taken = self._next - 1
+        self._group, self._shown = self._next, 0
 
     def _decode(self, data: bytes | None, wanted: int) -> None:
         """Give the decoder its next message; with None, let it finish."""
@@ -334,7 +427,26 @@ class VideoDecoder:
             self._spoilt = is_spoilt(frame, self._spoilt)
             if frame.pts is not None:
                 usable = not self._spoilt and frame.pts not in self._incomplete
-                self._ready[frame.pts] = frame if usable else None
+                self._ready[self._place(frame.pts)] = frame if usable else None
+        if data is None and self._reorders:
+            self._require_whole(len(self._keyframes))
+
+    def _place(self, message: int) -> int:
+        """Return the index of the frame shown next, which came with that message."""
+        if not self._reorders:
+            return message
+        group = int(np.flatnonzero(self._keyframes[: message + 1])[-1])
+        if group != self._group:
+            self._require_whole(group)
+            self._group, self._shown = group, 0
+        self._shown += 1
+        return group + self._shown - 1
+
+    def _require_whole(self, end: int) -> None:
+        """Raise EpisodeError if a frame is missing before that message: the others could not be counted."""
+        if self._group + self._shown != end:
+            fault = f"frames {self._group} to {end - 1} of the video lack one, and are stored out of order"
+            raise EpisodeError(self._where, fault, "encode it without B-frames (bf=0)")
 
 
 _LOGGING = threading.Lock()  # PyAV's log settings hold for the whole process
@@ -414,17 +526,24 @@ class VideoStream:
     """A camera of video; see episode.Stream.
 
     Args:
-        timestamps: (T,) of the images shown, which are the last T messages.
-        keyframes: (M,) of all messages; the messages before those shown serve only for decoding.
+        timestamps: (T,) of the frames shown.
+        keyframes: (M,) of all messages; those before and after the frames shown serve only for decoding.
+        lead: the first frame shown.
+        reorders: see VideoDecoder.
     """
 
     def __init__(
-        self, timestamps: Floats, messages: Messages, keyframes: NDArray[np.bool_], codec: str
+        self,
+        timestamps: Floats,
+        messages: Messages,
+        keyframes: NDArray[np.bool_],
+        codec: str,
+        lead: int = 0,
+        reorders: bool = False,
     ) -> None:
         self.timestamps = timestamps
-        self._messages, self._count = messages, len(keyframes)
-        self._lead = len(keyframes) - len(timestamps)
-        self._decoder = VideoDecoder(codec, keyframes, self._from, messages.where)
+        self._messages, self._count, self._lead = messages, len(keyframes), lead
+        self._decoder = VideoDecoder(codec, keyframes, self._from, messages.where, reorders)
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """See episode.Stream."""

@@ -247,7 +247,7 @@ class _BagInspection:
         self.clocks: dict[str, _Clock] = {}
         for name, topic in self._topics.items():
             if len(topic.track):
-                order = topic.track.order()
+                order = topic.track.by_receipt()
                 times = [topic.track.seconds(clock)[order] for clock in ("header", "receive")]
                 self.clocks[name] = _Clock(*times)
 
@@ -278,7 +278,7 @@ class _BagInspection:
             self._survey.note(Finding("readable", "warn", topic.fault, key=name))
         stated = track.channels[0]
         kind = image_kind(stated.type)
-        times = track.seconds("header")[track.order()]
+        times = track.seconds("header")[track.by_receipt()]
         measured = measure(times) if name in LOGS else self._times(track, times, bool(kind))
         found: list[KeyInfo] = []
         if not topic.fault:
@@ -325,7 +325,7 @@ class _BagInspection:
                 self._survey.pictures(self._name, name, frames, run, stored)
             grey, stated = is_grey(topic.sample, kind), encoding(topic.sample, kind)
             if grey and stated == MONO16:
-                messages = Messages(self.bag, track.channels, track.places()[track.order()], name)
+                messages = Messages(self.bag, track.channels, track.places()[track.by_receipt()], name)
                 high = float(max(wide_grey(one, kind, name).max() for one in messages.read(indices)))
         except EpisodeError as fault:
             self._survey.note(Finding("readable", "warn", f"{name}: {fault.fault}", key=name))

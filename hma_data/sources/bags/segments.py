@@ -12,7 +12,7 @@ arrives, or when a field of it becomes a value.
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass, field
 from itertools import pairwise
@@ -27,8 +27,8 @@ from hma_data.errors import EpisodeError
 from hma_data.registry.components import Marker, Segments
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace
-from hma_data.sources.bags.container import Channel, Record, RecordFilter
-from hma_data.sources.bags.images import VIDEO, image_kind
+from hma_data.sources.bags.container import Record, RecordFilter
+from hma_data.sources.bags.images import RAW, STILL, VIDEO, content_kind, image_kind
 from hma_data.sources.bags.messages import decode, head_stamp
 from hma_data.sources.bags.topic_track import TopicTrack, missing_topic, parse_key
 from hma_data.storage.files import cache_folder, write_atomic
@@ -139,10 +139,23 @@ def _cached[V](cache: dict[Any, V], key: Any, make: Callable[[], V], limit: int)
     return value
 
 
-def heads(channels: Sequence[Channel]) -> frozenset[str]:
-    """Return the topics of frames whose messages hold their time in their first bytes."""
-    still = {c.topic for c in channels if image_kind(c.type) not in (None, VIDEO)}
-    return frozenset(topic for topic in still if all(head_stamp(c) for c in channels if c.topic == topic))
+def heads(bag: Bag, topics: Collection[str]) -> frozenset[str]:
+    """Return those of the topics that hold still images whose time is in the first bytes of a message.
+
+    Only the content of a message tells a still image from a frame of a video.
+    """
+    channels = [channel for channel in bag.counts() if channel.topic in topics]
+    found = {c.topic for c in channels if image_kind(c.type) in (RAW, STILL)}
+    found = {topic for topic in found if all(head_stamp(c) for c in channels if c.topic == topic)}
+    return frozenset(topic for topic in found if not _begins_as_video(bag, topic))
+
+
+def _begins_as_video(bag: Bag, topic: str) -> bool:
+    first = next(bag.records(RecordFilter(frozenset({topic}))), None)
+    if first is None or image_kind(first[1].channel.type) == RAW:
+        return False
+    message = decode(first[1].channel, first[1].data, str(bag.path))
+    return content_kind(message, STILL) == VIDEO
 
 
 def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
@@ -156,18 +169,22 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
     camera = embodiment.primary_camera
     if camera.key not in topics:
         raise missing_topic(camera.key, topics, where)
-    videos = {c.topic for c in channels if image_kind(c.type) == VIDEO} & {c.key for c in embodiment.cameras}
+    cameras = {camera.key for camera in embodiment.cameras}
+    headed = heads(bag, cameras)
+    images = {channel.topic for channel in channels if image_kind(channel.type)}
+    videos = {key for key in cameras & images if key not in headed}  # still images may be among them
     tracks = {key: TopicTrack(key) for key in {camera.key} | videos}
     start = MarkerTrack(segments.start, topics, where) if segments.start else None
     stop = MarkerTrack(segments.stop, topics, where) if segments.stop else None
-    _scan(bag, tracks, [marker for marker in (start, stop) if marker], heads(channels))
+    _scan(bag, tracks, [marker for marker in (start, stop) if marker], headed)
+    videos = {key for key in videos if tracks[key].kind == VIDEO}
 
     track = tracks[camera.key]
     if not len(track):
         raise EpisodeError(where, f"{camera.key} has no messages")
     stated = camera.stamp or embodiment.sync.stamp
     clock = "header" if stated == "header" and track.stamped else "receive"
-    order = track.order()
+    order = track.by_receipt()
     received, times = track.received()[order], track.seconds(clock)[order]
     runs = _runs(_events(start, stop, received, times, clock), len(times), begun=start is None)
     parts = [piece for begin, end in runs for piece in _at_gaps(times, begin, end, segments.gap_s)]
@@ -296,7 +313,7 @@ class MarkerTrack:
 
     def moments(self) -> Rows:
         """Return the indices of the messages that count, in order of receipt."""
-        order = self.track.order()
+        order = self.track.by_receipt()
         if self.marker.equals is None:
             return order
         fitting = np.array(self._fitting, bool)[order]

@@ -19,6 +19,7 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Camera, Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace, find_bags
+from hma_data.sources.bags.clocks import MAX_LATE_S, apart
 from hma_data.sources.bags.container import Channel, Record, RecordFilter, damaged
 from hma_data.sources.bags.images import image_kind
 from hma_data.sources.bags.inspect import report
@@ -164,6 +165,7 @@ class _EpisodeReading:
         notes = self._bag.notes()
         primary = self._stream(embodiment.primary_camera)
         shown = primary.timestamps
+        self._require_one_clock(shown)
         streams: dict[str, Stream] = {}
         for camera in embodiment.cameras:
             same = camera is embodiment.primary_camera
@@ -200,7 +202,7 @@ class _EpisodeReading:
         instruction = parse_key(key, self._counts, self._where) if key else None
         read = {topic for topic, track in self._tracks.items() if track.columns}
         read |= {instruction.topic} if instruction else set()
-        short = (heads(list(self._bag.counts())) & self._tracks.keys()) - read
+        short = heads(self._bag, self._tracks.keys() - read)
         for place, record in self._records(frozenset(self._tracks) | read, short):
             topic = record.channel.topic
             if topic in short:
@@ -234,7 +236,10 @@ class _EpisodeReading:
             keyframes = table.keyframes[topic]
             at = int(np.searchsorted(keyframes, first_ns, side="right")) - 1
             begin = int(keyframes[at]) if at >= 0 else 0
-            wanted = RecordFilter(frozenset({topic}), begin, last_ns, again=True)
+            # The last frames of video with B-frames need messages up to the next key frame.
+            later = keyframes[keyframes > last_ns]
+            end = int(later[0]) if len(later) else last_ns
+            wanted = RecordFilter(frozenset({topic}), begin, end, again=True)
             parts.append(self._bag.records(wanted))
         return chain.from_iterable(parts)
 
@@ -254,7 +259,7 @@ class _EpisodeReading:
         track, clock = self._tracks[camera.key], camera.stamp or self._embodiment.sync.stamp
         if self._segment is None or self._table is None:
             return camera_stream(self._bag, track, clock, levels=camera.levels)
-        order = track.order()
+        order = track.by_receipt()
         received = track.received()[order]
         if shown is not None:
             around = self._around(received, track.seconds(clock)[order], shown)
@@ -265,13 +270,39 @@ class _EpisodeReading:
 
     def _signal(self, column: Column, shown: Floats) -> Signal:
         track, rows = self._tracks[column.field.topic], column.rows()
-        order = track.order(rows)
         clock = column.component.stamp or self._embodiment.sync.stamp
-        times = track.seconds(clock)[rows[order]]
+        chosen: Rows = np.arange(len(rows))
         if self._segment:
-            begin, stop = self._around(track.received()[rows[order]], times, shown)
-            order, times = order[begin:stop], times[begin:stop]
-        return Signal(times, component_values(column.component, column.values()[order], self._where))
+            chosen = track.by_receipt(rows)
+            times = track.seconds(clock)[rows[chosen]]
+            begin, stop = self._around(track.received()[rows[chosen]], times, shown)
+            chosen = np.sort(chosen[begin:stop])
+        chosen = chosen[track.order(clock, f"{self._where}, {track.topic}", rows[chosen])]
+        values = component_values(column.component, column.values()[chosen], self._where)
+        return Signal(track.seconds(clock)[rows[chosen]], values)
+
+    def _require_one_clock(self, shown: Floats) -> None:
+        """Raise EpisodeError if the primary camera and another topic are timed by clocks that differ.
+
+        A `stamp` at the camera or at a component says that its author knows better.
+        """
+        primary, stated = self._embodiment.primary_camera, self._embodiment.sync.stamp
+        state = self._embodiment.state.components if self._embodiment.state else ()
+        others = [(camera.key, camera.stamp) for camera in self._embodiment.cameras]
+        for component in (*self._embodiment.action.components, *state):
+            others.append((parse_key(component.key, self._counts, self._where).topic, component.stamp))
+        topics = dict.fromkeys(topic for topic, stamp in others if not (stamp or primary.stamp))
+        tracks = [self._tracks[primary.key], *(self._tracks[topic] for topic in topics)]
+        if any(track.sorted_rows("receive", np.arange(len(track))) is None for track in tracks):
+            return  # the recorder's clock was set back, so it cannot compare the others
+        period_s = float(np.median(np.diff(shown))) if len(shown) > 1 else 0.0
+        for track in tracks[1:]:
+            if fault := apart(tracks[0].clock(stated), track.clock(stated), period_s):
+                remedy = (
+                    "sync: {stamp: receive} pairs them by the times of receipt; "
+                    f"stamp: header at camera {primary.name} keeps the stamps, if they are right"
+                )
+                raise EpisodeError(self._where, fault, remedy)
 
     def _around(self, received: Rows, times: Floats, shown: Floats) -> tuple[int, int]:
         """Return the range of samples, in order of receipt, that the frames shown need.
@@ -282,15 +313,16 @@ class _EpisodeReading:
         """
         assert self._segment
         inside = np.searchsorted(received, [self._segment.first_ns, self._segment.last_ns + 1])
-        breaks = np.flatnonzero(np.diff(times) < 0) + 1
+        breaks = np.flatnonzero(np.diff(times) < -MAX_LATE_S) + 1
         earlier, later = breaks[breaks <= inside[0]], breaks[breaks >= max(inside[1], 1)]
         low = int(earlier[-1]) if len(earlier) else 0
         high = int(later[0]) if len(later) else len(times)
-        if np.any(np.diff(times[low:high]) < 0):
-            return low, high  # `align` reports where the times go back
-        begin = low + max(0, int(np.searchsorted(times[low:high], shown[0], side="right")) - 1)
+        if np.any(np.diff(times[low:high]) < -MAX_LATE_S):
+            return low, high  # ordering them by the clock reports where it goes back
+        rising = np.maximum.accumulate(times[low:high])  # a message may have been overtaken by the next
+        begin = low + max(0, int(np.searchsorted(rising, shown[0], side="right")) - 1)
         last = shown[-1] + (self._embodiment.sync.tolerance_ms or 0) / 1e3
-        stop = low + int(np.searchsorted(times[low:high], last, side="left")) + 1
+        stop = low + int(np.searchsorted(rising, last, side="left")) + 1
         return begin, min(max(stop, begin + 1), high)
 
     def _about(self) -> dict[str, dict[str, int]]:

@@ -24,14 +24,18 @@ from hma_data.episodes.episode import Floats, Stream
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import Component
 from hma_data.sources.bags.bag import Bag, BagPlace
+from hma_data.sources.bags.clocks import Clock, set_back, sorted_by
 from hma_data.sources.bags.container import Channel, Data
 from hma_data.sources.bags.images import (
     VIDEO,
     Messages,
     StillStream,
     VideoStream,
+    content_kind,
+    has_b_slices,
     image_kind,
     is_keyframe,
+    is_reordered,
     payload,
     video_codec,
 )
@@ -225,14 +229,18 @@ class TopicTrack:
     Attributes:
         columns: the components that read this topic; each takes its values as messages are added.
         channels: the channels of the messages, usually one.
+        kind: raw, still or video, by the content of the messages; None without images.
         codec: of video; empty for anything else.
+        b_slices: whether some frames of H.264 are stored after frames that are shown later.
     """
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
         self.columns: list[Column] = []
         self.channels: list[Channel] = []
+        self.kind: str | None = None
         self.codec = ""
+        self.b_slices = False
         self._log_ns, self._stamp_ns, self._places = array("q"), array("q"), array("q")
         self._keyframes: list[bool | None] = []
 
@@ -252,13 +260,16 @@ class TopicTrack:
             raise EpisodeError(
                 self.topic, f"a message is not a {channel.type}: it has {len(data)} bytes"
             ) from fault
+        self.kind = image_kind(channel.type)
         self._take(channel, log_ns, place, own_ns)
 
     def add(self, channel: Channel, log_ns: int, place: BagPlace, message: Any) -> None:
         """Add the next message; a message that cannot be decoded is None, and keeps its time of receipt."""
         for column in self.columns:
             column.add(message, len(self))
-        if message is not None and image_kind(channel.type) == VIDEO:
+        if not len(self) or channel not in self.channels:
+            self.kind = content_kind(message, image_kind(channel.type))
+        if message is not None and self.kind == VIDEO:
             self._keyframes.append(self._is_keyframe(message))
         self._take(channel, log_ns, place, stamp_ns(message))
 
@@ -272,14 +283,62 @@ class TopicTrack:
     def _is_keyframe(self, message: Any) -> bool | None:
         try:
             self.codec = self.codec or video_codec(message)
-            return is_keyframe(payload(message), self.codec)
+            data = payload(message)
+            self.b_slices = self.b_slices or (self.codec == "h264" and has_b_slices(data))
+            return is_keyframe(data, self.codec)
         except (KeyError, TypeError, ValueError) as fault:
             raise EpisodeError(self.topic, f"a message is not a frame of a video: {fault!r}") from fault
 
-    def order(self, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+    def by_receipt(self, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """Return the order of receipt: of all messages, or of those rows (then an index into `rows`)."""
         received = self.received()
         return np.argsort(received if rows is None else received[rows], kind="stable")
+
+    def order(self, clock: str, where: str, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """Return the order by one of the clocks: of all messages, or of those rows (an index into `rows`).
+
+        Args:
+            rows: rising.
+
+        Raises:
+            EpisodeError: the clock was set back.
+        """
+        rows = np.arange(len(self)) if rows is None else rows
+        order = self.sorted_rows(clock, rows)
+        if order is not None:
+            return order
+        by_header = clock == "header" and self.stamped
+        at, seconds = set_back((self.stamps() if by_header else self.received())[rows])
+        other = "receive" if by_header else "header"
+        usable = (by_header or self.stamped) and self.sorted_rows(other, rows) is not None
+        remedy = "cut the file there, and keep the parts in folders of their own"
+        if by_header:
+            fault = f"header stamps go back by {seconds:.3g} s at message {at}: their clock was set back"
+            fault += ", or a simulation began anew"
+            if usable:
+                remedy = (
+                    "source.segments: {gap_s: 1} makes the parts episodes of their own; "
+                    "sync: {stamp: receive} joins them by the times of receipt"
+                )
+        else:
+            fault = f"times of receipt go back by {seconds:.3g} s at message {at}: "
+            fault += "the recorder's clock was set back"
+            remedy = "sync: {stamp: header} takes the header stamps, which are in order" if usable else remedy
+        raise EpisodeError(where, fault, remedy)
+
+    def sorted_rows(self, clock: str, rows: NDArray[np.int64]) -> NDArray[np.int64] | None:
+        """Return the order of rows by a clock; None where it was set back."""
+        times = self.stamps() if clock == "header" and self.stamped else self.received()
+        return sorted_by(times[rows], self.places()[rows, 0])
+
+    def clock(self, clock: str) -> Clock:
+        """Measure the clock by which the messages are timed."""
+        stamps = self.stamps() if clock == "header" and self.stamped else None
+        return Clock.of(self.topic, stamps, self.received())
+
+    def stamps(self) -> NDArray[np.int64]:
+        """Return (T,) nanoseconds of the header stamps, in the file's order."""
+        return np.frombuffer(self._stamp_ns, np.int64)
 
     def received(self) -> NDArray[np.int64]:
         """Return (T,) nanoseconds of receipt, in the file's order."""
@@ -299,8 +358,7 @@ class TopicTrack:
 
     def seconds(self, clock: str) -> Floats:
         """Return (T,) seconds in the file's order: `header` where messages are stamped, else `receive`."""
-        stamps = self._stamp_ns if clock == "header" and self.stamped else self._log_ns
-        nanoseconds = np.frombuffer(stamps, np.int64)
+        nanoseconds = self.stamps() if clock == "header" and self.stamped else self.received()
         # Whole seconds are divided first, because 61 bits do not fit a float.
         return nanoseconds // 10**9 + (nanoseconds % 10**9) / 1e9
 
@@ -329,47 +387,57 @@ def camera_stream(
 
     Args:
         clock: header or receive.
-        shown: [from, to) of the frames, in order of receipt; all by default. Video may need earlier
+        shown: [from, to) of the frames, in order of receipt; all by default. Video may need other
             messages too, to be decoded.
         levels: of the camera, for frames in mono16.
 
     Raises:
-        EpisodeError: the topic holds no images, or video that never begins.
+        EpisodeError: the topic holds no images, or video that never begins; or the clock was set back.
     """
     where = f"{bag.path}, {track.topic}"
-    kinds = {image_kind(channel.type) for channel in track.channels}
-    kind = kinds.pop()
-    if kind is None or kinds:
+    if track.kind is None or len({image_kind(channel.type) for channel in track.channels}) > 1:
         types = ", ".join(sorted({channel.type or channel.encoding for channel in track.channels}))
         raise EpisodeError(where, f"holds {types}, not images", "name a topic of images as the camera's key")
-    order = track.order()
-    begin, stop = shown or (0, len(order))
-    if kind != VIDEO:
-        order = order[begin:stop]
-        messages = Messages(bag, track.channels, track.places()[order], where)
-        return StillStream(track.seconds(clock)[order], messages, kind, levels)
-    first, keyframes = _decodable(track, order, begin, where)
-    begin = max(begin, first)
-    order, keyframes = order[first:stop], keyframes[first:stop]
-    if begin >= stop:
-        raise EpisodeError(where, f"the {track.codec} video has no key frame before frame {stop}")
-    messages = Messages(bag, track.channels, track.places()[order], where)
-    times = track.seconds(clock)[order[begin - first :]]
-    return VideoStream(times, messages, keyframes, track.codec)
+    rows = track.by_receipt()
+    begin, stop = shown or (0, len(rows))
+    if track.kind != VIDEO:
+        rows = np.sort(rows[begin:stop])
+        rows = rows[track.order(clock, where, rows)]
+        messages = Messages(bag, track.channels, track.places()[rows], where)
+        return StillStream(track.seconds(clock)[rows], messages, track.kind, levels)
+    return _video_stream(bag, track, clock, (begin, stop), where)
 
 
-def _decodable(
-    track: TopicTrack, order: NDArray[np.int64], begin: int, where: str
-) -> tuple[int, NDArray[np.bool_]]:
-    """Return where decoding must begin for the message `begin`, and the key frames in order of receipt.
-
-    Messages before the first key frame cannot be decoded.
-    """
+def _video_stream(bag: Bag, track: TopicTrack, clock: str, shown: tuple[int, int], where: str) -> VideoStream:
+    begin, stop = shown
+    rows = track.by_receipt()
     keyframes = track.keyframes()
     if keyframes is None:  # only the first message is certain to be one
-        return 0, np.arange(len(order)) == 0
-    keyframes = keyframes[order]
-    if not keyframes.any():
+        keyframes = np.arange(len(track)) == rows[0]
+    key_places = np.flatnonzero(keyframes[rows])
+    if not len(key_places):
         raise EpisodeError(where, f"the {track.codec} video has no key frame")
-    earlier = np.flatnonzero(keyframes[: begin + 1])
-    return int(earlier[-1] if len(earlier) else np.argmax(keyframes)), keyframes
+    # Messages before the first key frame cannot be decoded.
+    earlier = key_places[key_places <= begin]
+    first = int(earlier[-1] if len(earlier) else key_places[0])
+    begin = max(begin, first)
+    if begin >= stop:
+        raise EpisodeError(where, f"the {track.codec} video has no key frame before frame {stop}")
+    reorders = track.b_slices
+    if track.codec == "h265":
+        head = Messages(bag, track.channels, track.places()[rows[first : first + 1]], where)
+        reorders = is_reordered(payload(next(head.read([0]))), track.codec)
+    if reorders:  # the last frames may build on messages up to the next key frame
+        later = key_places[key_places >= stop]
+        rows = np.sort(rows[first : int(later[0]) if len(later) else len(rows)])
+        times = track.seconds(clock)[rows]
+        times = times[track.order(clock, where, rows)]
+    else:
+        rows = np.sort(rows[first:stop])
+        rows = rows[track.order(clock, where, rows)]
+        times = track.seconds(clock)[rows]
+    messages = Messages(bag, track.channels, track.places()[rows], where)
+    decoder_rows = keyframes[rows]
+    return VideoStream(
+        times[begin - first : stop - first], messages, decoder_rows, track.codec, begin - first, reorders
+    )
