@@ -292,12 +292,19 @@ class _EpisodeReading:
         for component in (*self._embodiment.action.components, *state):
             others.append((parse_key(component.key, self._counts, self._where).topic, component.stamp))
         topics = dict.fromkeys(topic for topic, stamp in others if not (stamp or primary.stamp))
-        tracks = [self._tracks[primary.key], *(self._tracks[topic] for topic in topics)]
-        if any(track.sorted_rows("receive", np.arange(len(track))) is None for track in tracks):
-            return  # the recorder's clock was set back, so it cannot compare the others
+        clocks = []
+        for topic in (primary.key, *topics):
+            track, rows = self._tracks[topic], np.arange(len(self._tracks[topic]))
+            if self._segment:  # clocks may begin anew between the episodes of a bag
+                received = track.received()
+                rows = rows[(received >= self._segment.first_ns) & (received <= self._segment.last_ns)]
+            if track.sorted_rows("receive", rows) is None:
+                return  # the recorder's clock was set back, so it cannot compare the others
+            if len(rows):
+                clocks.append(track.clock(stated, rows))
         period_s = float(np.median(np.diff(shown))) if len(shown) > 1 else 0.0
-        for track in tracks[1:]:
-            if fault := apart(tracks[0].clock(stated), track.clock(stated), period_s):
+        for clock in clocks[1:]:
+            if fault := apart(clocks[0], clock, period_s):
                 remedy = (
                     "sync: {stamp: receive} pairs them by the times of receipt; "
                     f"stamp: header at camera {primary.name} keeps the stamps, if they are right"

@@ -331,10 +331,10 @@ class TopicTrack:
         times = self.stamps() if clock == "header" and self.stamped else self.received()
         return sorted_by(times[rows], self.places()[rows, 0])
 
-    def clock(self, clock: str) -> Clock:
-        """Measure the clock by which the messages are timed."""
-        stamps = self.stamps() if clock == "header" and self.stamped else None
-        return Clock.of(self.topic, stamps, self.received())
+    def clock(self, clock: str, rows: NDArray[np.int64]) -> Clock:
+        """Measure the clock by which some of the messages are timed."""
+        stamps = self.stamps()[rows] if clock == "header" and self.stamped else None
+        return Clock.of(self.topic, stamps, self.received()[rows])
 
     def stamps(self) -> NDArray[np.int64]:
         """Return (T,) nanoseconds of the header stamps, in the file's order."""
@@ -417,16 +417,19 @@ def _video_stream(bag: Bag, track: TopicTrack, clock: str, shown: tuple[int, int
     key_places = np.flatnonzero(keyframes[rows])
     if not len(key_places):
         raise EpisodeError(where, f"the {track.codec} video has no key frame")
+    reorders = track.b_slices
+    if track.codec == "h265":
+        head = Messages(bag, track.channels, track.places()[rows[key_places[:1]]], where)
+        reorders = is_reordered(payload(next(head.read([0]))), track.codec)
+        if reorders:  # frames shown before a key frame may be stored after it, and need what precedes it
+            key_places = key_places[:1]
+            keyframes = np.arange(len(track)) == rows[key_places[0]]
     # Messages before the first key frame cannot be decoded.
     earlier = key_places[key_places <= begin]
     first = int(earlier[-1] if len(earlier) else key_places[0])
     begin = max(begin, first)
     if begin >= stop:
         raise EpisodeError(where, f"the {track.codec} video has no key frame before frame {stop}")
-    reorders = track.b_slices
-    if track.codec == "h265":
-        head = Messages(bag, track.channels, track.places()[rows[first : first + 1]], where)
-        reorders = is_reordered(payload(next(head.read([0]))), track.codec)
     if reorders:  # the last frames may build on messages up to the next key frame
         later = key_places[key_places >= stop]
         rows = np.sort(rows[first : int(later[0]) if len(later) else len(rows)])

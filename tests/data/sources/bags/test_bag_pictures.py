@@ -132,7 +132,14 @@ def test_compressed_depth_is_refused_and_jpeg_is_decoded() -> None:
             picture({"format": "jpeg", "data": data}, "still", "")
 
 
-def write_video(path: Path, codec: str, name: str, options: dict[str, str], drop: int = 0) -> np.ndarray:
+def write_video(
+    path: Path,
+    codec: str,
+    name: str,
+    options: dict[str, str],
+    drop: int = 0,
+    kind: str = "foxglove.CompressedVideo",
+) -> np.ndarray:
     """An MCAP of CompressedVideo, one frame a message; the pictures that went in."""
     import base64
 
@@ -157,7 +164,7 @@ def write_video(path: Path, codec: str, name: str, options: dict[str, str], drop
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=4096)
         writer.start()
-        schema = writer.register_schema("foxglove.CompressedVideo", "jsonschema", b"{}")
+        schema = writer.register_schema(kind, "jsonschema", b"{}")
         channel = writer.register_channel("/video", "json", schema)
         number = writer.register_channel("/n", "json", 0)
         for i, packet in list(enumerate(packets))[drop:]:
@@ -166,8 +173,8 @@ def write_video(path: Path, codec: str, name: str, options: dict[str, str], drop
                 "format": name,
                 "data": base64.b64encode(bytes(packet)).decode(),
             }
-            writer.add_message(channel, i + 1, json.dumps(text).encode(), i)
-            writer.add_message(number, i + 1, b'{"value": 1}', i)
+            writer.add_message(channel, (1 + i) * 10**9, json.dumps(text).encode(), i)
+            writer.add_message(number, (1 + i) * 10**9, b'{"value": 1}', i)
         writer.finish()
     return pictures
 
@@ -201,9 +208,42 @@ def test_video_begins_at_its_first_key_frame(tmp_path: Path) -> None:
 
 
 def test_unknown_video_is_refused(tmp_path: Path) -> None:
-    write_video(tmp_path / "v.mcap", "libx264", "mjpeg2000", LOW_DELAY)
+    write_video(tmp_path / "v.mcap", "libvpx-vp9", "mjpeg2000", {"deadline": "realtime"})
     with pytest.raises(EpisodeError, match=r"'mjpeg2000' cannot be read.*h264"):
         read(tmp_path / "v.mcap", arm(VIDEO_YAML))
+
+
+@pytest.mark.parametrize("name", ["jpeg2000", "bgr8; h264 compressed"])
+def test_h264_is_found_by_its_content_whatever_the_format_says(tmp_path: Path, name: str) -> None:
+    pictures = write_video(
+        tmp_path / "v.mcap", "libx264", name, LOW_DELAY, kind="sensor_msgs/CompressedImage"
+    )
+    stream = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"]
+    for indices in (range(30), [25, 3]):
+        assert np.abs(stream.frames(indices).astype(int) - pictures[list(indices)]).mean() < 4
+
+
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+def test_frames_stored_out_of_order_come_in_the_order_they_are_shown(tmp_path: Path, codec: str) -> None:
+    name = {"libx264": "h264", "libx265": "h265"}[codec]
+    options = {"g": "10", "bf": "2", "crf": "10", "x265-params": "log-level=none:keyint=10:bframes=2"}
+    pictures = write_video(tmp_path / "v.mcap", codec, name, options)
+    stream = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"]
+    for indices in (range(30), [12], [25, 3], [29, 0]):
+        assert np.abs(stream.frames(indices).astype(int) - pictures[list(indices)]).mean() < 4, indices
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr"])
+def test_a_compressed_mosaic_becomes_colours(pattern: str) -> None:
+    rgb = smooth()
+    mosaic = np.zeros(rgb.shape[:2], np.uint8)
+    for i, colour in enumerate(pattern.upper()):
+        mosaic[i // 2 :: 2, i % 2 :: 2] = rgb[i // 2 :: 2, i % 2 :: 2, "RGB".index(colour)]
+    data = cv2.imencode(".png", mosaic)[1].tobytes()
+    found = picture(
+        {"format": f"bayer_{pattern}8; png compressed bayer_{pattern}8", "data": data}, "still", ""
+    )
+    assert np.abs(found[2:-2, 2:-2].astype(int) - rgb[2:-2, 2:-2]).max() <= 6
 
 
 @pytest.mark.parametrize("padding", [0, 4])
