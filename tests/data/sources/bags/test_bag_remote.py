@@ -18,10 +18,9 @@ from hma_data.sources.bags.bag import find_bags
 from hma_data.sources.common.places import existing_path
 from hma_data.sources.detect import detect
 from hma_data.storage import blocks, remote
-from tests.conftest import BlockTokenizer
+from tests.conftest import BlockTokenizer, contents
 from tests.data.bag_files import SOURCE
 from tests.data.bag_parts import KINDS, PLAIN, ZSTD, make_run, mcap, parted, ros1, ros1_without_index
-from tests.data.storage.test_store_s3 import local, out, proxy, server  # noqa: F401
 
 GAP = parted("{gap_s: 1}")
 WHOLE_FILE_KINDS = ("ros1-without-index", "mcap-without-chunks", "mcap-without-indexes")
@@ -203,19 +202,19 @@ def contents(folder: Path) -> list:
 @pytest.mark.parametrize(
     "make", [large_run, lambda d: ros1(d, make_run(60, (20, 40), side=64), chunk=20_000)]
 )
-def test_s3_gives_the_shards_of_the_local_bag(make, small, out, proxy, tmp_path) -> None:  # noqa: F811
+def test_s3_gives_the_shards_of_the_local_bag(make, small, s3_out, proxy, tmp_path) -> None:
     path = make(tmp_path)
-    (out / path.name).files.put_file(str(path), (out / path.name).key)
+    (s3_out / path.name).files.put_file(str(path), (s3_out / path.name).key)
     settings = Settings(val_fraction=0.4, shard_frames=20)
     convert(GAP, str(path), BlockTokenizer(), tmp_path / "here", settings=settings)
     proxy.log.clear()
-    convert(GAP, str(out / path.name), BlockTokenizer(), tmp_path / "there", settings=settings)
+    convert(GAP, str(s3_out / path.name), BlockTokenizer(), tmp_path / "there", settings=settings)
     assert contents(tmp_path / "there") == contents(tmp_path / "here")
     gets = [asked for method, path, asked in proxy.log if method == "GET" and asked]
     assert all(asked != f"bytes=0-{path.stat().st_size - 1}" for asked in gets)
     proxy.trouble = lambda method, path, number: "cut" if number % 17 == 0 else None
-    convert(GAP, str(out / path.name), BlockTokenizer(), tmp_path / "again", settings=settings)
-    assert local(tmp_path / "again") == local(tmp_path / "there")
+    convert(GAP, str(s3_out / path.name), BlockTokenizer(), tmp_path / "again", settings=settings)
+    assert contents(tmp_path / "again") == contents(tmp_path / "there")
 
 
 def test_a_bag_without_an_index_is_one_line(small, tmp_path, caplog) -> None:
