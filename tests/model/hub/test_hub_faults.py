@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,7 +12,6 @@ import pytest
 from huggingface_hub import constants
 
 from hma_data.errors import HubError
-from hma_data.hub.repository import Entry
 from hma_data.storage.files import part_of
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.io import PARTS
@@ -21,7 +19,6 @@ from hma_model.hub import publish as hub
 from hma_model.hub.listing import list_embodiments
 from tests.hub_server import Hub
 from tests.hub_state import EVERY, REPO, sha256
-from tests.model.robots import make_model, save
 
 pytest_plugins = ["tests.hub_fixtures"]
 TOKEN = "secret-without-a-prefix"
@@ -207,71 +204,6 @@ def test_pulls_at_once_fetch_every_byte_once(published, source):
     assert len(folders) == 1 and published.sent() == sizes(source, ARM)
 
 
-def test_pulls_at_once_of_a_damaged_cache_all_end_well(published, monkeypatch):
-    """Each has found the damage before the first mends it; the last then finds a good file, and keeps it."""
-    path = hub.pull(REPO, ["arm"]) / STEM
-    damaged, found, plain = damage(path), threading.Barrier(2), Entry.states
-
-    def states(entry: Entry, content: Path | bytes) -> bool:
-        right = plain(entry, content)
-        if not right:
-            found.wait(60)
-        return right
-
-    monkeypatch.setattr(Entry, "states", states)
-    published.log.clear()
-    with ThreadPoolExecutor(2) as pool:
-        pulls = [pool.submit(hub.pull, REPO, ["arm"]) for _ in range(2)]
-        assert {pull.result(60) for pull in pulls} == {path.parents[2]}
-    assert not damaged() and set(published.sent()) == {STEM}
-
-
-def test_a_file_that_another_pull_has_mended_stays_while_it_comes_again(published, monkeypatch):
-    path = hub.pull(REPO, ["arm"]) / STEM
-    damaged, plain, others = damage(path), Entry.states, [True]
-
-    def states(entry: Entry, content: Path | bytes) -> bool:
-        right = plain(entry, content)
-        if not right and others:  # between the check and what follows from it
-            others.pop()
-            hub.pull(REPO, ["arm"])
-            assert not damaged()
-            published.fail("GET /cdn/.*stem", stall=60.0, late=True)
-        return right
-
-    monkeypatch.setattr(Entry, "states", states)
-    published.log.clear()
-    with ThreadPoolExecutor(1) as pool:
-        pull = pool.submit(hub.pull, REPO, ["arm"])
-        published.await_count("GET /cdn/.*stem", 2)
-        assert not damaged()
-        published.stalled.set()
-        assert pull.result(60) and not damaged()
-
-
-@pytest.mark.parametrize("at", ["before", "after"])
-def test_a_file_that_another_pull_renames_into_place_meanwhile_is_used(published, monkeypatch, at):
-    path, plain = hub.pull(REPO, ["arm"]) / STEM, Entry.states
-
-    def rename() -> None:
-        new = path.resolve().with_name("another.incomplete")
-        new.write_bytes(path.read_bytes())
-        new.replace(path.resolve())
-
-    def states(entry: Entry, content: Path | bytes) -> bool:
-        if at == "before" and content == path:
-            rename()
-        right = plain(entry, content)
-        if at == "after" and content == path:
-            rename()
-        return right
-
-    monkeypatch.setattr(Entry, "states", states)
-    published.log.clear()
-    assert list(checkpoint.load(hub.pull(REPO, ["arm"])).embodiments) == ["arm"]
-    assert published.sent() == {}
-
-
 @pytest.mark.parametrize("damaged", [False, True])
 def test_processes_that_pull_at_once_all_end_well(published, source, tmp_path, damaged):
     still = damage(hub.pull(REPO, ["arm"]) / STEM) if damaged else None
@@ -364,19 +296,6 @@ def test_what_a_killed_pull_left_is_deleted_by_the_next(folder, tmp_path, dead):
     left = dead(tmp_path / "out/trunk.safetensors")
     hub.pull(folder, ["arm"], tmp_path / "out")
     assert not left.exists()
-
-
-def test_pushes_of_one_embodiment_at_once_leave_the_whole_of_one(folder, source, tmp_path):
-    others = []
-    for seed in range(3):
-        model = checkpoint.load(source, [])
-        model.add_embodiment(make_model({"arm": 2}, seed).embodiments["arm"])
-        save(tmp_path / f"other{seed}", {"arm": 2}, model=model)
-        others.append(tmp_path / f"other{seed}")
-    with ThreadPoolExecutor(3) as pool:
-        pushed = [pool.submit(hub.push, other, folder) for other in others]
-        assert [future.result(60) for future in pushed] == [str(folder)] * 3
-    assert list(checkpoint.load(folder).embodiments) == ["arm"]
 
 
 def test_an_update_keeps_what_else_is_in_an_embodiments_folder(folder, source):

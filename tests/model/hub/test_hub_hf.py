@@ -221,12 +221,6 @@ def test_what_was_pulled_is_there_offline(published, monkeypatch):
     assert published.log == []
 
 
-def test_what_was_pulled_is_there_when_the_hub_is_gone(published, monkeypatch):
-    hub.pull(REPO, ["arm"])
-    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
-    assert list(HMA.from_pretrained(REPO, embodiments=["arm"]).embodiments) == ["arm"]
-
-
 def test_what_was_never_pulled_is_not_there_offline(published, monkeypatch):
     hub.pull(REPO, ["arm"])
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
