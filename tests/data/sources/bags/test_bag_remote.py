@@ -18,7 +18,7 @@ from hma_data.sources.bags.bag import find_bags
 from hma_data.sources.common.places import existing_path
 from hma_data.sources.detect import detect
 from hma_data.storage import blocks, remote
-from tests.conftest import BlockTokenizer, contents
+from tests.conftest import BlockTokenizer
 from tests.data.bag_files import SOURCE
 from tests.data.bag_parts import KINDS, PLAIN, ZSTD, make_run, mcap, parted, ros1, ros1_without_index
 
