@@ -1,7 +1,6 @@
 """Save what was driven: as a film, or as a LeRobotDataset of one episode that converts like any recording."""
 
 import io
-import json
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +14,7 @@ import numpy as np
 from hma_data.episodes.images import decode_image
 from hma_data.episodes.sheets import gif_bytes, write_mp4, write_text
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.lerobot.writer import ORIGIN, LeRobotEpisode, write_lerobot
+from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 from hma_model.play.session import Frame, Session
 from hma_model.worlds.scenes import Drivable, Image
 
@@ -60,10 +59,10 @@ def film(
         home = Path(folder) / robot.embodiment.id
         episode, embodiment = lerobot_episode(robot, frames)
         total = len(episode.action)
-        write_lerobot(home, embodiment, [episode], lambda done, words: on_progress(words, done, total))
         made_by = {"by": "hma play", "synthetic": True}
-        (home / ORIGIN).write_text(json.dumps(made_by), encoding="utf-8")
-        (home / "embodiment.yaml").write_text(embodiment.to_yaml(), encoding="utf-8")
+        write_lerobot(
+            home, embodiment, [episode], lambda done, words: on_progress(words, done, total), made_by
+        )
         on_progress("packing the files", total, total)
         return _zipped(home)
 

@@ -37,21 +37,17 @@ def policy_facts(words: str, embodiment: str) -> dict[str, str]:
     """
     kind, _, rest = words.partition(":")
     if kind == "hma" and rest:
-        return _checkpoint_facts(split_options(kind, rest, OPTIONS)[0], embodiment)
+        with suppress(HMAError):
+            kept = Checkpoint.open(split_options(kind, rest, OPTIONS)[0])
+            parts = {part: file_sha256(kept.path(embodiment, part)) for part in (STEM, HEAD, YAML, STATS)}
+            return {"trunk": kept.trunk_sha256} | parts
+        return {}  # of the hub or a store
     if kind == "lerobot" and rest:
         folder = Path(rest)
         files = sorted(path for path in folder.rglob("*") if path.is_file())
         return {str(path.relative_to(folder)): file_sha256(path) for path in files}
     source = getattr(sys.modules.get(kind), "__file__", None) if rest else None
     return {"module": file_sha256(Path(source))} if source else {}
-
-
-def _checkpoint_facts(checkpoint: str, embodiment: str) -> dict[str, str]:
-    with suppress(HMAError):
-        kept = Checkpoint.open(checkpoint)
-        parts = {part: file_sha256(kept.path(embodiment, part)) for part in (STEM, HEAD, YAML, STATS)}
-        return {"trunk": kept.trunk_sha256} | parts
-    return {}  # of the hub or a store
 
 
 def world_facts(world: "World") -> dict[str, Any]:

@@ -106,7 +106,12 @@ class Cost:
             costs = goal_distance(images[:, :, -1], np.asarray(info_dict["goal"][:, 0]))
         else:
             assert self.first is not None
-            costs = self._judged(self.judge, self.first[scenes], images)
+            # How far the judge finds imagined episodes from a success; negative beyond.
+            count, tried = images.shape[:2]
+            first = self.first[scenes][:, None, None]
+            begun = np.broadcast_to(first, (count, tried, 1, *first.shape[3:]))
+            episodes = np.concatenate([begun, images], axis=2).reshape(count * tried, -1, *first.shape[3:])
+            costs = -self.judge.score(episodes).reshape(count, tried)
         return torch.from_numpy(costs).to(action_candidates)
 
     criterion = get_cost
@@ -118,13 +123,6 @@ class Cost:
         made = [self.world.open(self.embodiment, *prompt, seed=row) for row, prompt in enumerate(prompts)]
         self.sessions = made
         self.first = np.stack([self.world.image(session) for session in made])
-
-    def _judged(self, judge: "StateJudge", first: Image, images: Image) -> NDArray[np.float64]:
-        """Return how far the judge finds imagined episodes (N, C, H, …) from a success; negative beyond."""
-        count, tried = images.shape[:2]
-        begun = np.broadcast_to(first[:, None, None], (count, tried, 1, *first.shape[1:]))
-        episodes = np.concatenate([begun, images], axis=2).reshape(count * tried, -1, *first.shape[1:])
-        return -judge.score(episodes).reshape(count, tried)
 
 
 def goal_distance(images: Image, goals: Image) -> NDArray[np.float64]:
@@ -180,7 +178,15 @@ class Planning:
     def begin(self, arena: Arena) -> None:
         self._follower.begin(arena)
         self.cost.sessions, self.cost.first = self._follower.sessions, arena.images
-        self._solver = self._made(len(arena.images))
+        made, configured = solver_of(self._kind)
+        count, one = len(arena.images), self.cost.space
+        horizon, samples, steps, receding = self._sizes
+        self._solver = made(
+            self.cost, batch_size=max(1, MAX_ROWS // samples), num_samples=samples, n_steps=steps,
+            seed=self._seed, topk=max(2, samples // ELITES),
+        )  # fmt: skip
+        box = gymnasium.spaces.Box(np.tile(one.low, (count, 1)), np.tile(one.high, (count, 1)))
+        self._solver.configure(action_space=box, n_envs=count, config=configured(horizon, receding))
         self._ahead: list[Floats] = []
         self._rest: torch.Tensor | None = None
 
@@ -195,19 +201,6 @@ class Planning:
             actions = self.cost.actions(planned[:, :receding].numpy())  # (N, receding, stride, A)
             self._ahead = list(actions.reshape(len(actions), -1, actions.shape[-1]).swapaxes(0, 1))
         return self._follower.take(self._ahead.pop(0))
-
-    def _made(self, count: int) -> Any:
-        horizon, samples, steps, receding = self._sizes
-        made, configured = solver_of(self._kind)
-        given: dict[str, Any] = {"topk": max(2, samples // ELITES)}
-        solver = made(
-            self.cost, batch_size=max(1, MAX_ROWS // samples), num_samples=samples, n_steps=steps,
-            seed=self._seed, **given,
-        )  # fmt: skip
-        one = self.cost.space
-        box = gymnasium.spaces.Box(np.tile(one.low, (count, 1)), np.tile(one.high, (count, 1)))
-        solver.configure(action_space=box, n_envs=count, config=configured(horizon, receding))
-        return solver
 
 
 def solver_of(kind: str) -> tuple[Any, Any]:

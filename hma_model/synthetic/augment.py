@@ -167,9 +167,8 @@ def augment(
     shards: StrPath | None = None,
     lerobot: StrPath | None = None,
     world: World | None = None,
-    device: str = "cpu",
-    compile: bool = False,
     on_progress: Progress = lambda done, words: None,
+    **given: Any,
 ) -> Manifest:
     """Make synthetic episodes, and write those that are kept as a shard set.
 
@@ -181,9 +180,8 @@ def augment(
         lerobot: folder for the same episodes as a LeRobotDataset v3.0; one that is finished is kept. Its
             state is read off the images, if the shards or the simulator have one to learn it from.
         world: a world instead of a checkpoint.
-        device: of the world made from the checkpoint, and of policies that are networks.
-        compile: of that world, as of `World`.
         on_progress: called with the frames made, of `episodes` × `frames`, and what is done.
+        given: of the world made from the checkpoint, as of `load_world`: device, compile.
 
     Raises:
         HMAError: the robot, the shards or the policy do not fit, the folder holds something else, the judge
@@ -193,8 +191,8 @@ def augment(
     if lerobot is not None:
         require_dataset(as_path(lerobot))
     world = world or load_world(
-        checkpoint, device=device, unmask_steps=settings.unmask_steps, temperature=settings.temperature,
-        precision=settings.precision, compile=compile,
+        checkpoint, unmask_steps=settings.unmask_steps, temperature=settings.temperature,
+        precision=settings.precision, **given,
     )  # fmt: skip
     if (views := world.model.config.views) > 1 and (shards is None or settings.looked_at):
         fault = f"the laboratory's simulator shows one camera, and the model sees {views}"

@@ -26,7 +26,7 @@ from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.sources.lerobot import writer as lerobot_writer
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
-from hma_data.storage.files import read_json, sync_folder
+from hma_data.storage.files import sync_folder
 from hma_model.evaluation.recorded_state import Reader
 from hma_model.play.save import embodiment_of
 from hma_model.worlds.prompts import seen_frames
@@ -148,9 +148,10 @@ def holds_dataset(folder: Path, made_by: dict[str, Any]) -> bool:
     A dataset gets the folder's name when it is whole, so that one that is there is finished.
     """
     require_dataset(folder)
-    if not (folder / lerobot_writer.ORIGIN).is_file():
+    found = lerobot_writer.origin_of(folder)
+    if not found:
         return False
-    if read_json(folder / lerobot_writer.ORIGIN, OutputError) != json.loads(json.dumps(made_by)):
+    if found != json.loads(json.dumps(made_by)):
         raise OutputError(folder, "holds another dataset", "remove it or choose another folder")
     return True
 
@@ -180,10 +181,8 @@ def write_as_lerobot(
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     try:
-        write_lerobot(part, own, _decoded(made, own, tokenizer, reader), on_progress)
-        (part / "embodiment.yaml").write_text(own.to_yaml(), encoding="utf-8")
-        facts = json.dumps(made.manifest.plan["made_by"], indent=1)
-        (part / lerobot_writer.ORIGIN).write_text(facts, encoding="utf-8")
+        decoded = _decoded(made, own, tokenizer, reader)
+        write_lerobot(part, own, decoded, on_progress, made.manifest.plan["made_by"])
         for path in (*part.rglob("*"), part):
             sync_folder(path)
         part.rename(folder)

@@ -70,19 +70,21 @@ class EpisodePart:
             UsageError: they do not fit the episode, or cross a pause.
         """
         count = default_frames(model) if self.frames is None else self.frames
-        span, length = (count - 1) * stride, parts[-1].stop
+        span = (count - 1) * stride
+        start = 0 if self.start is None else self.start // frame_stride
         if self.start is None:
             start = next((part.start for part in parts if span < len(part)), 0)
-        else:
-            start = self.start // frame_stride
-        fault = f"from row {start} on do not fit an episode of {length} rows"
-        if start >= 0 and start + span < length:
-            part = next(part for part in parts if start in part)
-            fault = f"from row {start} on cross the pause after row {part.stop - 1}"
-            if 0 <= span < part.stop - start:
-                return np.arange(start, start + span + 1, stride)
-        apart = "" if stride == 1 else f", {stride} rows apart"
-        raise UsageError("prompt", f"{count} frames{apart}, {fault}", "choose another start or fewer frames")
+        part = next((part for part in parts if start in part), range(0))
+        if span < 0 or start + span not in part:
+            apart = "" if stride == 1 else f", {stride} rows apart"
+            pauses = ", ".join(str(part.stop - 1) for part in parts[:-1])
+            fault = (
+                f"{count} frames{apart}, from row {start} on do not fit an episode of {parts[-1].stop} rows"
+            )
+            if pauses:
+                fault += f" that pauses after row {pauses}"
+            raise UsageError("prompt", fault, "choose another start or fewer frames")
+        return np.arange(start, start + span + 1, stride)
 
 
 def default_frames(model: "HMA") -> int:

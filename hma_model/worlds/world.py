@@ -101,7 +101,7 @@ class World:
         return self._specs[embodiment]
 
     def open(
-        self, embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None = None, *, seed: int = 0
+        self, embodiment: str, frames: NDArray[Any], chunks: Floats | None = None, *, seed: int = 0
     ) -> int:
         """Open a session that starts from known frames, and return its number.
 
@@ -126,7 +126,7 @@ class World:
         return session
 
     def reset(
-        self, session: int, frames: NDArray[Any], chunks: ArrayLike | None = None, *, seed: int | None = None
+        self, session: int, frames: NDArray[Any], chunks: Floats | None = None, *, seed: int | None = None
     ) -> None:
         """Start a session anew, as `open` does; without a seed, with the one that it had."""
         one = self._at(session)
@@ -298,20 +298,20 @@ class World:
     # -- prompts --------------------------------------------------------------------------------------------
 
     def _prompt(
-        self, embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None
+        self, embodiment: str, frames: NDArray[Any], chunks: Floats | None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return stored frames (P, ...), chunks (P - 1, K), and which are known (P - 1,)."""
         spec = self.action_spec(embodiment)
         stored = self.encoded(embodiment, np.asarray(frames)[-self.model.config.frames :])
-        rows = [] if chunks is None else [spec.read(chunk) for chunk in np.asarray(chunks)]
         if chunks is None:
-            rows = [(np.zeros(spec.stride * len(spec.names), np.float32), False)] * (len(stored) - 1)
-        elif len(rows) != len(frames) - 1:
-            fault = f"has {len(rows)} chunks for {len(frames)} frames"
+            chunks = np.full((len(frames) - 1, spec.stride * len(spec.names)), np.nan)
+        if len(chunks) != len(frames) - 1:
+            fault = f"has {len(chunks)} chunks for {len(frames)} frames"
             raise HMAError("prompt", fault, f"give {len(frames) - 1}, one from each frame to the next")
-        rows = rows[len(rows) - len(stored) + 1 :]
-        known = torch.tensor([known for _, known in rows], dtype=torch.bool)
-        values = np.stack([chunk for chunk, _ in rows]) if rows else np.zeros((0, 1), np.float32)
+        # A prompt longer than the model's window has lost its first frames, and the chunks between them.
+        read = [spec.read(chunk) for chunk in np.asarray(chunks)[len(frames) - len(stored) :]]
+        known = torch.tensor([known for _, known in read], dtype=torch.bool)
+        values = np.stack([chunk for chunk, _ in read]) if read else np.zeros((0, 1), np.float32)
         return torch.from_numpy(stored), torch.from_numpy(values), known
 
     def _encoded(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:

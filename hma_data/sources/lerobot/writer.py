@@ -5,6 +5,7 @@ Episodes are read one by one, so that only one is in memory.
 T frames of an episode, A action dims, S state dims.
 """
 
+import json
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -47,6 +48,7 @@ def write_lerobot(
     embodiment: Embodiment,
     episodes: Iterable[LeRobotEpisode],
     on_progress: Callable[[int, str], None] = lambda done, words: None,
+    made_by: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a LeRobotDataset v3.0 with lerobot's own writer; videos are H.264.
 
@@ -58,6 +60,7 @@ def write_lerobot(
         embodiment: one with a whole number of frames a second.
         episodes: at least one; each has the embodiment's cameras and widths, and the same further features.
         on_progress: called with the frames written so far, and what is done.
+        made_by: what made episodes that no robot recorded; it and the embodiment are then written too.
 
     Raises:
         MissingDependencyError: lerobot cannot be imported.
@@ -106,6 +109,9 @@ def write_lerobot(
                 writer.save_episode(parallel_encoding=False)  # otherwise it forks this process, once a camera
         finally:
             writer.finalize()  # after a failure too; else it would write to a removed folder when collected
+    if made_by is not None:
+        (folder / "embodiment.yaml").write_text(embodiment.to_yaml(), encoding="utf-8")
+        (folder / ORIGIN).write_text(json.dumps(made_by, indent=1), encoding="utf-8")
 
 
 @contextmanager

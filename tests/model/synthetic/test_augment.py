@@ -433,9 +433,10 @@ def test_the_same_call_keeps_a_finished_dataset_and_finishes_one_that_was_cut_of
     stopped, written, dataset = [True], list[Path](), tmp_path / "rails"
     (tmp_path / ".rails.part").mkdir()  # of a process that was killed
 
-    def write(folder: Path, *_: Any) -> None:
+    def write(folder: Path, *given: Any) -> None:
         folder.mkdir()
         (folder / "meta").mkdir()
+        (folder / "synthetic.json").write_text(json.dumps(given[-1]))
         if stopped.pop():
             raise KeyboardInterrupt
         written.append(folder)
