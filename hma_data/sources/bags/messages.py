@@ -9,6 +9,7 @@ import dataclasses
 import json
 import struct
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import lru_cache, partial
 from typing import Any
 
@@ -96,12 +97,26 @@ def _decoder(channel: Channel) -> Decode:
 
 
 def _protobuf_decoder(channel: Channel) -> Decode:
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory  # type: ignore[import-untyped]
+    from google.protobuf import (  # type: ignore[import-untyped]
+        descriptor_pb2,
+        descriptor_pool,
+        duration_pb2,  # noqa: F401 (makes the default pool know the type)
+        message_factory,
+        timestamp_pb2,  # noqa: F401
+    )
 
     files, pool = descriptor_pb2.FileDescriptorSet(), descriptor_pool.DescriptorPool()
     files.ParseFromString(channel.schema)
-    for item in files.file:
-        pool.Add(item)
+    waiting = {item.name: item for item in files.file}
+    for name in {name for item in files.file for name in item.dependency} - waiting.keys():
+        with suppress(KeyError):  # a schema may leave out the types that come with protobuf
+            known = descriptor_pb2.FileDescriptorProto()
+            descriptor_pool.Default().FindFileByName(name).CopyToProto(known)
+            waiting[name] = known
+    while waiting:  # a pool takes a file after its dependencies; a schema lists them in any order
+        ready = [name for name, item in waiting.items() if not waiting.keys() & set(item.dependency)]
+        for name in ready or list(waiting):
+            pool.Add(waiting.pop(name))
     kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(channel.type))
     return lambda data: kind.FromString(bytes(data))
 

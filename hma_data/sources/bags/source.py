@@ -294,7 +294,8 @@ class _EpisodeReading:
         topics = dict.fromkeys(topic for topic, stamp in others if not (stamp or primary.stamp))
         clocks = []
         for topic in (primary.key, *topics):
-            track, rows = self._tracks[topic], np.arange(len(self._tracks[topic]))
+            track = self._tracks[topic]
+            rows: Rows = np.arange(len(track))
             if self._segment:  # clocks may begin anew between the episodes of a bag
                 received = track.received()
                 rows = rows[(received >= self._segment.first_ns) & (received <= self._segment.last_ns)]

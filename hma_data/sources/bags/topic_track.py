@@ -12,7 +12,7 @@ topic is `header` or `receive`.
 import re
 import struct
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
@@ -86,9 +86,28 @@ class Field:
             message = message[step]
         return message
 
-    def owner(self, message: Any, where: str) -> Any:
-        """Return the message that holds the last field."""
-        return Field(self.key, self.topic, self.steps[:-1]).value(message, where)
+    def owners(self, message: Any, where: str) -> Iterator[Any]:
+        """Yield the messages around the value, from the one that holds it to the whole message."""
+        for count in range(len(self.steps) - 1, -1, -1):
+            yield Field(self.key, self.topic, self.steps[:count]).value(message, where)
+
+
+def name_list(field: Field, message: Any, width: int, where: str) -> tuple[str, ...]:
+    """Return the names that a message gives to the values at a key; empty where it names none.
+
+    The message that holds the values names them in a list such as `name`. Trajectories and the states of
+    controllers name them further out (`joint_names`), so there a list counts if it is as long as the values.
+    """
+    for depth, owner in enumerate(field.owners(message, where)):
+        for name in field_names(owner):
+            if not name.endswith(("name", "names")) or name == field.steps[-1]:
+                continue
+            stated = child(owner, name)
+            if not is_list(stated) or not all(isinstance(one, str) for one in stated):
+                continue
+            if len(stated) == width or (not depth and name == "name" and len(stated)):
+                return tuple(stated)
+    return ()
 
 
 def parse_key(key: str, topics: Iterable[str], where: str) -> Field:
@@ -137,9 +156,9 @@ def missing_topic(key: str, topics: Iterable[str], where: str) -> EpisodeError:
 class Column:
     """The values of one component, gathered message by message.
 
-    Where the message that holds the field also has a list `name` (JointState), the component's `names` select
-    and order the values, unless the key or the YAML slices. Messages of another publisher, with none of those
-    names, are left out.
+    Where the message also names its values (see `name_list`: JointState, JointTrajectory, JointJog), the
+    component's `names` select and order them, unless the key or the YAML slices. Messages of another
+    publisher, with none of those names, are left out.
     """
 
     def __init__(self, component: Component, field: Field, where: str) -> None:
@@ -197,11 +216,9 @@ class Column:
 
     def _pick(self, message: Any, width: int) -> list[int] | None:
         """Return the indices of the wanted names; None where the message has none of them."""
-        owner = self.field.owner(message, self._where)
-        stated = child(owner, "name") if "name" in field_names(owner) else ()
-        if not is_list(stated) or not len(stated):
+        names = name_list(self.field, message, width, self._where)
+        if not names:
             return list(range(width))
-        names = tuple(stated)
         if names not in self._picks:
             self._picks[names] = self._indices(names)
         picks = self._picks[names]

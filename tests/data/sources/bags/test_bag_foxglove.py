@@ -12,6 +12,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hma_data.errors import EpisodeError
 from hma_data.inspection.inspect import examine, inspect_recording
+from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.messages import decode
 from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.training.frames import recording_films
@@ -219,3 +221,18 @@ def _spec() -> TokenizerSpec:
     from hma_data.tokenizers import get_tokenizer
 
     return get_tokenizer("raw").spec
+
+
+@pytest.mark.parametrize("left_out", [(), ("google/protobuf/timestamp.proto",)])
+def test_a_schema_may_list_its_files_in_any_order(left_out: tuple[str, ...]) -> None:
+    from google.protobuf import descriptor_pb2
+
+    name, encoding, schema, encode = protobuf_encoder("CompressedImage")
+    files, turned = descriptor_pb2.FileDescriptorSet(), descriptor_pb2.FileDescriptorSet()
+    files.ParseFromString(schema)
+    turned.file.extend(item for item in reversed(files.file) if item.name not in left_out)
+    message = {"frame_id": "cam", "data": np.frombuffer(b"jpeg", np.uint8), "format": "jpeg"}
+    decoded = decode(
+        Channel("/cam", name, encoding, "protobuf", turned.SerializeToString()), encode(7, message), ""
+    )
+    assert decoded.frame_id == "cam" and bytes(decoded.data) == b"jpeg"
