@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import shutil
 import tempfile
 from collections import Counter
@@ -36,6 +37,7 @@ from hma_data.storage.yaml_io import read_yaml
 SUFFIXES = (".bag", ".mcap", ".db3")
 MAX_EXPANSION = 200  # most times its packed size that a file may have unpacked, against decompression bombs
 Container = McapFile | Ros1File | SqliteFile
+PART_NAME = re.compile(r"(?P<begin>.*_)(?P<number>\d+)(?P<end>\.\w+(?:\.zstd)?)")
 BagPlace = tuple[int, int, int]  # of a message: the file of the bag, and two numbers for the place in it
 log = logging.getLogger(__name__)
 
@@ -89,7 +91,7 @@ class Bag:
         if self._counts is None:
             packed = any(path.suffix == ".zstd" for path in self._paths)
             counts = self._stated_counts() if packed else Counter[Channel]()
-            for file in () if packed else self.files():
+            for file in () if counts else self.files():
                 counts.update(file.counts())
             self._counts = counts
         return self._counts
@@ -263,12 +265,35 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 
 def _listed(folder: Path, metadata: dict[str, Any]) -> list[Path]:
-    """List the files of metadata.yaml by their last name, because older versions put the folder before it."""
+    """List the files of a bag in recording order.
+
+    metadata.yaml may be stale: a recorder that is killed leaves it as it was when the recording began. Then
+    the folder holds later parts that it does not name, and they belong to the recording.
+    """
     where, names = folder / "metadata.yaml", metadata.get("relative_file_paths")
     if not isinstance(names, list) or not names:
         raise EpisodeError(where, "relative_file_paths names no files", "run ros2 bag reindex")
-    paths = [folder / PurePosixPath(str(name)).name for name in names]
-    missing = [path.name for path in paths if not path.is_file()]
-    if missing:
-        raise EpisodeError(where, f"names {missing[0]}, which is not in the folder", "run ros2 bag reindex")
+    paths = []
+    for name in names:
+        path = folder / PurePosixPath(str(name)).name  # older versions put the folder before it
+        packed = path.with_name(f"{path.name}.zstd")  # Foxy names compressed files without their suffix
+        if not path.is_file() and not packed.is_file():
+            raise EpisodeError(
+                where, f"names {path.name}, which is not in the folder", "run ros2 bag reindex"
+            )
+        paths.append(path if path.is_file() else packed)
+    series = {_part_of(path.name)[0] for path in paths}
+    for path in sorted(folder.iterdir(), key=lambda path: _part_of(path.name)):
+        if path in paths or not path.name.removesuffix(".zstd").endswith(SUFFIXES):
+            continue
+        if _part_of(path.name)[0] not in series:
+            fault = f"does not name {path.name}, which is in the folder"
+            raise EpisodeError(where, fault, "move it out, or run ros2 bag reindex")
+        paths.append(path)
     return paths
+
+
+def _part_of(name: str) -> tuple[str, int]:
+    """Return what the parts of a recording share in their names, and the number of the part."""
+    match = PART_NAME.fullmatch(name)
+    return (match["begin"] + match["end"], int(match["number"])) if match else (name, 0)
