@@ -28,18 +28,16 @@ _LAYOUT: dict[str, Any] = {
     "final_norm": False,
     "add_at": "layers",
 }
-_EXPORTED = ("time_position", "action_alignment", "temporal_norm", "final_norm")  # what an export needs
-_OURS = (
-    "merge",
-    "masked_input",
-    "told_noise",
-    "digit_order",
-    "copy_previous",
-    "action_waves",
-)  # and what must be off
-_CONTINUOUS_NEEDS: dict[str, Any] = {
-    "action_loss": "diffusion", "latent_scale": LATENT_SCALE, "diffusion_train_steps": 1000,
-    "diffusion_target": "noise",
+# What an export need not keep: read by training alone, or folded into the weights.
+_FREE = {
+    "action_target", "diffusion_variance", "dropout", "label_smoothing", "latent_noise", "mask_ratio_min",
+    "modulation_out", "objectives", "position_init", "rotary_base", "shared_modulation", "tokenizer",
+    "training_pass", "whole_share",
+}  # fmt: skip
+_DISCRETE_ONLY = {"factored", "corrupt_max", "history_probability", "history_frames"}
+_CONTINUOUS_ONLY = {
+    "channels", "patch", "latent_scale", "diffusion_target", "diffusion_depth", "diffusion_width",
+    "diffusion_train_steps", "diffusion_sample_steps", "diffusion_clip", "diffusion_repeats",
 }  # fmt: skip
 # Their field: ours with the same meaning.
 _SAME = {
@@ -190,11 +188,8 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
     """Convert a configuration to the released `config.json`, without its action domains.
 
     Raises:
-        CheckpointError: the released layout cannot express it; the error names every reason.
+        CheckpointError: the released layout cannot express it: read back, it would be another one.
     """
-    if faults := _inexpressible(config):
-        fault = f"the released layout cannot express {'; '.join(faults)}"
-        raise CheckpointError(where, fault, "the released code cannot read it")
     discrete = config.kind == "discrete"
     named = {"concat": "concat", "modulation": "modulate", "add": "mlp"}
     same = _SAME | _SAME_DISCRETE | ({} if discrete else _SAME_CONTINUOUS)
@@ -208,32 +203,24 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
     }
     if not discrete:
         values |= {"Diffusion": True, "num_sampling_steps": str(config.diffusion_sample_steps)}
+    free = _FREE | (_CONTINUOUS_ONLY if discrete else _DISCRETE_ONLY)
+    free |= set() if config.mup else {"base_width"}
+    free |= set() if "add" in config.conditioning else {"add_at"}
+    try:
+        again = config_from_released(values, where=where)
+        faults = [
+            f"{name} {value!r}"
+            for name, value in vars(config).items()
+            if name not in free and value != getattr(again, name)
+        ]
+    except CheckpointError as fault:
+        faults = [fault.fault]
+    trained = [name for name, weight in config.objectives.items() if weight > 0]
+    for name in sorted(trained):
+        readout = OBJECTIVES[name].readout
+        if readout == INVERSE or (readout == POLICY and config.absent_action != "tokens"):
+            faults.append(f"objective {name} with absent_action {config.absent_action!r}")
+    if faults:
+        fault = f"the released layout cannot express {'; '.join(faults)}"
+        raise CheckpointError(where, fault, "the released code cannot read it")
     return values
-
-
-def _inexpressible(config: HMAConfig) -> list[str]:
-    """Return each field and value that the released code cannot express."""
-    continuous, tokens = config.kind == "continuous", math.prod(config.grid)
-    needed = {name: _LAYOUT[name] for name in _EXPORTED} | {name: getattr(HMAConfig, name) for name in _OURS}
-    needed |= _CONTINUOUS_NEEDS if continuous else {"action_loss": "mse"}
-    needed |= {"base_width": 256} if config.mup else {}
-    faults = [f"{name} {getattr(config, name)!r}" for name in needed if getattr(config, name) != needed[name]]
-    inside = set(config.conditioning) - {"concat"}
-    trained = sorted(name for name, weight in config.objectives.items() if weight > 0)
-    policy = any(OBJECTIVES[name].readout == POLICY for name in trained)
-    faults += [f"objective {name}" for name in trained if OBJECTIVES[name].readout == INVERSE]
-    if "cross_attention" in inside or len(inside) > 1 or ("add" in inside and config.add_at != "layers"):
-        faults.append(f"conditioning {'+'.join(config.conditioning)} (add_at {config.add_at})")
-    if config.absent_action == "embedding" or (policy and config.absent_action != "tokens"):
-        faults.append(f"objectives {', '.join(trained)} with absent_action {config.absent_action!r}")
-    if config.qk_norm != (config.norms == "qk"):
-        faults.append(f"qk_norm {config.qk_norm} with norms {config.norms!r}")
-    if config.views > 1:
-        faults.append(f"frames of {config.views} cameras")
-    if math.isqrt(tokens) ** 2 != tokens:
-        faults.append(f"a frame of {tokens} tokens, which is no square")
-    if continuous and config.mup and config.width != 256:
-        faults.append(f"muP at width {config.width} in a continuous model")
-    if not continuous and len(set(config.factored)) > 1:
-        faults.append(f"unequal digits {config.factored}")
-    return faults
