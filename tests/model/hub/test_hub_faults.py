@@ -204,37 +204,6 @@ def test_pulls_at_once_fetch_every_byte_once(published, source):
     assert len(folders) == 1 and published.sent() == sizes(source, ARM)
 
 
-@pytest.mark.parametrize("damaged", [False, True])
-def test_processes_that_pull_at_once_all_end_well(published, source, tmp_path, damaged):
-    still = damage(hub.pull(REPO, ["arm"]) / STEM) if damaged else None
-    published.log.clear()
-    script = (
-        "from hma_data.hub.repository import Repository\n"
-        f"store = Repository({REPO!r})\nstore.files()\nprint(store.pull({list(ARM)!r}))"
-    )
-    facts = {"HF_ENDPOINT": published.url, "HF_HUB_CACHE": str(tmp_path / "cache"), "HF_TOKEN": TOKEN}
-    published.fail("GET .*/tree/", stall=60.0, late=True, times=2)  # so that they begin together
-    pulls = [
-        subprocess.Popen(
-            [sys.executable, "-c", script],
-            env={**os.environ, **facts, "HF_HUB_DISABLE_XET": "1"},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for _ in range(2)
-    ]
-    published.await_count("GET .*/tree/", 2)
-    published.stalled.set()
-    for pull in pulls:
-        shown, said = pull.communicate(timeout=60)
-        assert pull.returncode == 0 and shown, said
-    if still:
-        assert not still() and set(published.sent()) == {STEM}
-    else:
-        assert published.sent() == sizes(source, ARM)
-
-
 # -- answers
 
 
