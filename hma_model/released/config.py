@@ -213,8 +213,8 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
             for name, value in vars(config).items()
             if name not in free and value != getattr(again, name)
         ]
-    except CheckpointError as fault:
-        faults = [fault.fault]
+    except CheckpointError as error:
+        faults = [error.fault]
     trained = [name for name, weight in config.objectives.items() if weight > 0]
     for name in sorted(trained):
         readout = OBJECTIVES[name].readout
