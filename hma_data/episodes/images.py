@@ -26,12 +26,7 @@ LIMITED, FULL = 1, 2  # FFmpeg's AVCOL_RANGE: luma of 16 to 235, or of 0 to 255
 
 
 def opencv() -> Any:
-    """Import and return the cv2 module.
-
-    Raises:
-        MissingDependencyError: the import fails, usually because a build for displays replaced the headless
-            one.
-    """
+    """Import and return the cv2 module."""
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # OpenCV reads it when it is loaded
     try:
         import cv2
@@ -42,11 +37,7 @@ def opencv() -> Any:
 
 
 def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
-    """Decode a JPEG, PNG or other still picture to (H, W, 3) RGB.
-
-    Raises:
-        EpisodeError: the bytes are not a colour picture, or the picture claims more than MAX_PIXELS.
-    """
+    """Decode a JPEG, PNG or other still picture to (H, W, 3) RGB."""
     cv2 = opencv()
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
     head = buffer[:26].tobytes()
@@ -274,9 +265,6 @@ def picture_flags(seen: PictureCheck, rule: Quality, episode_id: str, camera: st
     """Return the flags of one camera in one episode: name -> number of pictures.
 
     The first that applies counts: a blank camera is also still, and a still one repeats its pictures.
-
-    Raises:
-        EpisodeError: the rule refuses the episode.
     """
     share = seen.repeated / max(seen.pictures - 1, 1)
     for name, met, count, said in (

@@ -78,9 +78,6 @@ class Repository:
     Attributes:
         address: address of its page.
         from_cache: whether the hub was out of reach, so that `files` listed the cache.
-
-    Raises:
-        HubError: the repository is to be written, and there is no token.
     """
 
     def __init__(
@@ -243,11 +240,7 @@ class Repository:
     # -- pushing
 
     def prepare(self, name: str) -> None:
-        """Make the repository and its branch if they do not exist.
-
-        Raises:
-            HubError: the token may not write a file of this name.
-        """
+        """Make the repository and its branch if they do not exist."""
         from huggingface_hub import CommitOperationAdd
 
         self._make()
@@ -263,9 +256,6 @@ class Repository:
 
         Args:
             changes: returns contents by name, None to delete; it calls `files`.
-
-        Raises:
-            HubError: the hub refuses the commit, or others keep committing.
         """
         files = changes()
         if self._absent:

@@ -60,7 +60,8 @@ class ActionStats:
 class Checkpoint:
     """A checkpoint's folder, checked as far as possible without reading weights.
 
-    It is opened once and passed on: each file is hashed once for each object.
+    It is opened once and passed on: each file is hashed once for each object. What is missing, damaged or
+    does not belong together raises a CheckpointError with the file and the reason.
 
     Attributes:
         config: of the network; the tokenizer's spec is in it.
@@ -82,9 +83,6 @@ class Checkpoint:
 
         Args:
             checkpoint: str or path of it; an open one is returned as it is.
-
-        Raises:
-            CheckpointError: there is none, it is damaged, or of a format this release does not read.
         """
         if isinstance(checkpoint, Checkpoint):
             return checkpoint
@@ -107,11 +105,7 @@ class Checkpoint:
         return self._hashes[path]
 
     def trunk(self) -> Path:
-        """Return the path of trunk.safetensors, after checking its SHA-256.
-
-        Raises:
-            CheckpointError: it is not the file that config.json names.
-        """
+        """Return the path of trunk.safetensors, after checking its SHA-256."""
         path = inside(self.folder, TRUNK)
         if self._sha256(path) != self.trunk_sha256:
             remedy = "pull the checkpoint again, into a new folder"
@@ -119,11 +113,7 @@ class Checkpoint:
         return path
 
     def chosen(self, embodiments: Iterable[str] | None) -> list[str]:
-        """Return the requested embodiments, each once; None requests all.
-
-        Raises:
-            CheckpointError: not an id, or it has no such embodiment.
-        """
+        """Return the requested embodiments, each once; None requests all."""
         wanted = list(dict.fromkeys(self.embodiments if embodiments is None else embodiments))
         for name in wanted:
             check_id(name, self.name)
@@ -133,11 +123,7 @@ class Checkpoint:
         return wanted
 
     def path(self, embodiment: str, part: str) -> Path:
-        """Return the path of a file of an embodiment.
-
-        Raises:
-            CheckpointError: not an id, or no such embodiment or file.
-        """
+        """Return the path of a file of an embodiment."""
         self.chosen([embodiment])
         return inside(self.folder, f"embodiments/{embodiment}/{part}")
 
@@ -182,11 +168,7 @@ class Checkpoint:
         return [one for one in sets if one.embodiment.id in self.embodiments]
 
     def check(self, embodiment: str) -> None:
-        """Check that an embodiment's parts belong to this trunk, tokenizer and statistics.
-
-        Raises:
-            CheckpointError: a part does not belong to them; it names the first such part and the reason.
-        """
+        """Check that an embodiment's parts belong to this trunk, tokenizer and statistics."""
         path, card = self.path(embodiment, STEM), self.card(embodiment)
         stem = read_metadata(path)
         stats = self._sha256(self.path(embodiment, STATS))
@@ -204,11 +186,7 @@ class Checkpoint:
 
 
 def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
-    """Return the network's config, read from the values of config.json.
-
-    Raises:
-        CheckpointError: the values are of another library or format version, or are not valid.
-    """
+    """Return the network's config, read from the values of config.json."""
     if values.get("library") != LIBRARY:
         remedy = "give a checkpoint of hma train; hma hub import converts one of the paper's release"
         raise CheckpointError(where, f"is not of {LIBRARY}: library is {values.get('library')!r}", remedy)
@@ -234,9 +212,6 @@ def resolve(folder: StrPath) -> Path:
 
     Args:
         folder: str or path of it; `embedded` is the checkpoint bundled with the package.
-
-    Raises:
-        CheckpointError: there is none.
     """
     folder = as_path(folder)
     if (folder / CONFIG).is_file():
@@ -258,11 +233,7 @@ def training_checkpoints(run: StrPath) -> list[Path]:
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """Read the metadata in the header of a safetensors file.
-
-    Raises:
-        CheckpointError: the file is damaged, truncated or of another format.
-    """
+    """Read the metadata in the header of a safetensors file."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -311,11 +282,7 @@ def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -
 
 
 def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:
-    """Return the mean and std of the actions from the values of stats.json.
-
-    Raises:
-        CheckpointError: they are not there, or not lists of numbers.
-    """
+    """Return the mean and std of the actions from the values of stats.json."""
     try:
         action = stats["action"]
         rule = str(action.get("zero_variance", "zero"))

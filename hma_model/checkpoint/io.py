@@ -157,11 +157,7 @@ def add_embodiment(model: "HMA", checkpoint: Checkpoint, embodiment: str) -> Non
 def read_embodiment(
     checkpoint: Checkpoint, embodiment: str
 ) -> tuple[ActionSpace, weights.State, weights.State]:
-    """Return an embodiment's action space and the tensors of its stem and head, all checked.
-
-    Raises:
-        CheckpointError: parts do not belong together, or are damaged.
-    """
+    """Return an embodiment's action space and the tensors of its stem and head, all checked."""
     checkpoint.check(embodiment)
     yaml, path = checkpoint.embodiment(embodiment), checkpoint.path(embodiment, STATS)
     if yaml.id != embodiment:

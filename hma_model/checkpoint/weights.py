@@ -31,11 +31,7 @@ _REMEDY = "pull the checkpoint again; if it stays so, do not use it"
 
 
 def read_tensors(path: Path) -> State:
-    """Read all tensors of a safetensors file to the CPU.
-
-    Raises:
-        CheckpointError: the file is damaged, truncated or of another format.
-    """
+    """Read all tensors of a safetensors file to the CPU."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -53,9 +49,6 @@ def write_tensors(
 
     Args:
         half: weights become float16, statistics do not.
-
-    Raises:
-        CheckpointError: a weight is too large for float16.
     """
     from safetensors.torch import save_file
 
@@ -81,12 +74,7 @@ def write_tensors(
 
 
 def trunk(checkpoint: Checkpoint) -> State:
-    """Read the trunk's tensors.
-
-    Raises:
-        CheckpointError: the file is damaged, is another trunk than config.json names, or does not fit its
-            network.
-    """
+    """Read the trunk's tensors."""
     path = checkpoint.trunk()
     state = read_tensors(path)
     _require_values(path, state)
@@ -95,11 +83,7 @@ def trunk(checkpoint: Checkpoint) -> State:
 
 
 def embodiment(checkpoint: Checkpoint, name: str, space: "ActionSpace") -> tuple[State, State]:
-    """Read the tensors of an embodiment's stem and head; `space` is the action space of its YAML.
-
-    Raises:
-        CheckpointError: a file is damaged, or too small for the action space.
-    """
+    """Read the tensors of an embodiment's stem and head; `space` is the action space of its YAML."""
     states = []
     for part in ("stem", "head"):
         path = checkpoint.path(name, f"{part}.safetensors")

@@ -82,11 +82,7 @@ def push(
 
 
 def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None = None) -> str:
-    """Publish a model as `HMA.push_to_hub` does, with the YAML, statistics and cards that it was loaded with.
-
-    Raises:
-        HubError: an embodiment has no YAML, neither in the model's source nor in the registry.
-    """
+    """Publish a model as `HMA.push_to_hub` does, with the YAML, statistics and cards of its source."""
     source = model.source
     # The trunk's file is taken over where it is unchanged: its hash tells which stems fit it.
     base = source if source and source.config == model.config else None
@@ -229,9 +225,6 @@ def located(
     Args:
         source: str or path of a checkpoint or training run, a URI, `org/name` or `org/name@revision`.
         embodiments: ids; None for all.
-
-    Raises:
-        HubError, CheckpointError: as `pull`.
     """
     address, revision = addressed(as_address(source), revision)
     if is_repository(address) or "://" in str(address):

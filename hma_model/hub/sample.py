@@ -29,10 +29,6 @@ def add_samples(checkpoint: StrPath | Checkpoint, data: Iterable[StrPath]) -> li
 
     Returns:
         The paths of the pictures and films.
-
-    Raises:
-        CheckpointError: the checkpoint lacks the embodiment, or was trained on another tokenizer.
-        UsageError: a shard set has no window long enough.
     """
     from hma_data.shards.reader import ShardSet
 

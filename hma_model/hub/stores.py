@@ -39,9 +39,6 @@ class FolderStore:
     Args:
         address: a path or an fsspec URI.
         write: make the folder if it does not exist.
-
-    Raises:
-        HubError: the folder does not exist, or its file system is not known.
     """
 
     repo: str | None = None
@@ -188,9 +185,6 @@ def open_store(
         address: str or path: `org/name`, a folder or a URI; `org/name@revision` too unless `write` is true.
         private: make a new repository a private one.
         kind: of a repository: model or dataset.
-
-    Raises:
-        HubError: the hub does not exist, or cannot be reached.
     """
     place = as_address(address)
     if not write:

@@ -90,10 +90,6 @@ def config_from_released(
         config: the released configuration.
         case: may give `grid`, the tokenizer's (h, w), if a frame is not square.
         where: the file, for the errors.
-
-    Raises:
-        CheckpointError: the configuration needs something that the released code cannot do or does wrongly,
-            lacks a field, or has a value that is not allowed.
     """
     continuous = bool(config.get("Diffusion", config.get("image_vocab_size", 0) is None))
     given = {key: value for key, value in config.items() if value is not None}
@@ -185,11 +181,7 @@ def _continuous(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
-    """Convert a configuration to the released `config.json`, without its action domains.
-
-    Raises:
-        CheckpointError: the released layout cannot express it: read back, it would be another one.
-    """
+    """Convert a configuration to the released `config.json`, without its action domains."""
     discrete = config.kind == "discrete"
     named = {"concat": "concat", "modulation": "modulate", "add": "mlp"}
     same = _SAME | _SAME_DISCRETE | ({} if discrete else _SAME_CONTINUOUS)

@@ -57,9 +57,6 @@ def state_from_released(state: Mapping[str, Tensor], config: HMAConfig) -> tuple
 
     Returns:
         The state for `HMA.load_trunk`, and the stem and head of each embodiment, all float32.
-
-    Raises:
-        CheckpointError: a tensor is missing.
     """
     source = {name: tensor.float() for name, tensor in state.items()}
     try:
