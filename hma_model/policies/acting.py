@@ -24,7 +24,7 @@ OPTIONS: dict[str, type] = {"horizon": int, "memory": int, "temperature": float,
 
 
 class Follower:
-    """The sessions of a world that follow an arena: they see its images and what was actioned between.
+    """The sessions of a world that follow an arena: they see its images and the actions between.
 
     Args:
         memory: images that they remember, the newest among them; None for as many as the model can.

@@ -10,7 +10,7 @@ N episodes, T frames, S pixels a side, P parts. Places are px of an image of 128
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -136,11 +136,15 @@ class StateJudge:
 
     def score(self, images: Images) -> Floats:
         """Return the scores (N,) of episodes (N, T, S, S, 3)."""
-        return _read_score(self.task, self.probe, images)
+        places, areas = self.probe.read(images), self.probe.areas(images)
+        loose = last_seen(places[..., self.probe.loose, :], areas[..., self.probe.loose])
+        own = places[..., self.probe.own, :]
+        return self.task.score(np.concatenate([own, loose], axis=-2), len(self.probe.own))
 
     def true_score(self, parts: Floats) -> Floats:
-        """Return the scores (N,) of true places (N, T, P, 2)."""
-        return _true_score(self.task, self.probe, parts)
+        """Return the scores (N,) of true places (N, T, P, 2), by readable own parts and loose ones."""
+        kept = np.concatenate([self.probe.own, np.arange(self.probe.driven, parts.shape[-2])])
+        return self.task.score(parts[..., kept, :], len(self.probe.own))
 
     def success(self, scores: Floats) -> Bools:
         """Return which scores are judged a success."""
@@ -189,12 +193,12 @@ def train_judge(
         set(range(frames)) if task.name == "reached" else {0, *range(max(frames - END_FRAMES, 1), frames)}
     )
     numbers = range(FIRST + EPISODES, FIRST + EPISODES + examples)
+    judge = StateJudge(robot, task, probe, task.limit, accuracy(np.ones(1, bool), np.ones(1, bool)))
     true, read = np.empty(examples), np.empty(examples)
     for row, number in enumerate(numbers):
         made = truth.episode(robot, frames, stride, seed, number, looked, wander=task.name != "placed")
         shown = as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures))
-        true[row] = _true_score(task, probe, made.parts[None])[0]
-        read[row] = _read_score(task, probe, shown[None])[0]
+        true[row], read[row] = judge.true_score(made.parts[None])[0], judge.score(shown[None])[0]
         tell(f"training the judge: episode {row + 1} of {examples}")
     half, success = examples // 2, true >= task.limit
     limit = best_limit(read[:half], success[:half], task.limit)
@@ -205,7 +209,7 @@ def train_judge(
         factor = 0.5 if rare and (task.name == "moved") == (rare == "successes") else 2
         remedy = f"try another task or limit, such as --judge {task.name}={factor * abs(task.limit):g}"
         raise HMAError(f"judge of {robot}", f"is no better than chance: {found}", remedy)
-    return StateJudge(robot, task, probe, limit, found)
+    return replace(judge, limit=limit, held_out=found)
 
 
 def best_limit(read: Floats, success: Bools, limit: float) -> float:
@@ -227,20 +231,6 @@ def best_limit(read: Floats, success: Bools, limit: float) -> float:
     error = np.sqrt((top * (1 - top) / counts).sum()) / 2
     good = tried[balanced >= balanced.max() - error - 1e-12]
     return float(good[np.abs(good - limit).argmin()])
-
-
-def _read_score(task: Task, probe: Probe, images: Images) -> Floats:
-    """Return the scores (N,) of episodes (N, T, S, S, 3), by the parts that a probe can read."""
-    places = probe.read(images)
-    loose = last_seen(places[..., probe.loose, :], probe.areas(images)[..., probe.loose])
-    own = places[..., probe.own, :]
-    return task.score(np.concatenate([own, loose], axis=-2), len(probe.own))
-
-
-def _true_score(task: Task, probe: Probe, parts: Floats) -> Floats:
-    """Return the scores (N,) of true places, by the own parts that can be read and all loose ones."""
-    kept = np.concatenate([probe.own, np.arange(probe.driven, parts.shape[-2])])
-    return task.score(parts[..., kept, :], len(probe.own))
 
 
 def last_seen(places: Floats, areas: Floats) -> Floats:

@@ -24,7 +24,7 @@ from hma_data.lab.scripted import steerable
 from hma_data.lab.simulator import simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
-from hma_data.shards.reader import ShardSet
+from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.windows import episode_pieces
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
@@ -47,7 +47,7 @@ from hma_model.synthetic.recorder import (
     write_shards,
 )
 from hma_model.worlds.images import Prompt, seen_cameras
-from hma_model.worlds.prompts import default_frames, read_prompt
+from hma_model.worlds.prompts import default_frames, require_fit, shard_window
 from hma_model.worlds.scenes import at_rest
 from hma_model.worlds.world import World, load_world
 
@@ -110,7 +110,7 @@ class Augmentation:
 class SyntheticBatch:
     """Episodes of one pass: stored frames (n, P + T, …), chunks (n, P + T - 1, K), and what to choose by.
 
-    Of a policy's episodes P is one: what was actioned before is none of its own.
+    Of a policy's episodes P is one: the actions before it are none of its own.
 
     Attributes:
         uncertainty: (n,) how unsure the model was of the generated frames, their mean; see `Rollout`.
@@ -258,11 +258,12 @@ class _Maker:
         self.policy = self._policy(settings.commands)
         self.judge: StateJudge | None = None
         self.probe: Probe | None = None
-        self._long = [] if shards is None else self._long_enough(shards)
-        if shards is None:
-            self.cameras = [self.robot.primary_camera.name]
-        else:
+        self.cameras = [self.robot.primary_camera.name]
+        if shards is not None:
+            require_fit(world.model, name, shards)
+            self._long = self._long_enough(shards)
             self.cameras = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
+            self._reader = EpisodeReader(shards, shards.columns(self.cameras))
 
     def _policy(self, commands: str) -> Policy:
         kind, _, number = commands.partition("=")
@@ -407,8 +408,8 @@ class _Maker:
         for draw in range(MAX_DRAWS):
             row = self._long[(number + draw) % len(self._long)]
             start = row["begin"] + int(rng.integers(row["room"])) // every * every
-            given = {"shards": shards.folder, "episode": row["episode_index"], "start": start}
-            window = read_prompt(self.world.model, self.scenes.name, given | {"frames": length})
+            at = start // every + shards.row_stride * np.arange(length)
+            window = shard_window(shards, self._reader, row, self.cameras, at)
             if np.isfinite(window.chunks[:needed]).all():
                 return row, window
         fault = f"has hardly a window of {length} frames whose actions are all known"

@@ -191,18 +191,34 @@ def _strided(model: "HMA", embodiment: str, frames: NDArray[Any], actions: Array
 
 def _of_shards(model: "HMA", embodiment: str, folder: StrPath, part: EpisodePart) -> Prompt:
     shards = ShardSet(folder)
+    require_fit(model, embodiment, shards)
+    rows = shards.episodes.to_pylist()
+    chosen = rows[part.number([row["id"] for row in rows], shards.folder)]
+    every = shards.manifest.frame_stride
+    at = part.rows(model, episode_pieces(shards, chosen), shards.row_stride, every)
+    names = seen_cameras(cameras_for(model, shards), shards.manifest.cameras)
+    return shard_window(shards, EpisodeReader(shards, shards.columns(names)), chosen, names, at)
+
+
+def require_fit(model: "HMA", embodiment: str, shards: ShardSet) -> None:
+    """Check that an embodiment of a model can go on from the frames of shards; raise HMAError if not."""
     require_tokenizer(model.config, shards.spec, shards.folder)
     described(model, embodiment)
     space, robot = model.embodiments[embodiment], shards.embodiment
     if (robot.stride, robot.action_dim) != (space.stride, space.action_dim):
         fault = f"is of {robot.id}, with {robot.stride} actions of {robot.action_dim} values in a chunk"
         raise HMAError(shards.folder, fault, f"{embodiment} takes {space.stride} of {space.action_dim}")
-    rows = shards.episodes.to_pylist()
-    chosen = rows[part.number([row["id"] for row in rows], shards.folder)]
-    names = seen_cameras(cameras_for(model, shards), shards.manifest.cameras)
-    frames, columns = seen_frames(shards, EpisodeReader(shards, shards.columns(names)), chosen, names)
-    every = shards.manifest.frame_stride
-    at = part.rows(model, episode_pieces(shards, chosen), shards.row_stride, every)
+
+
+def shard_window(
+    shards: ShardSet,
+    reader: EpisodeReader,
+    row: Mapping[str, Any],
+    cameras: Sequence[str],
+    at: NDArray[np.int64],
+) -> Prompt:
+    """Return the frames at some rows (P,) of an episode, as of `seen_frames`, and the chunks between them."""
+    frames, columns = seen_frames(shards, reader, row, cameras)
     chunks = _chunks(columns["action"], columns.get("action_known"), at, shards.row_stride)
     return Prompt(frames[at], chunks)
 

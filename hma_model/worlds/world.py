@@ -323,7 +323,7 @@ class World:
 
 
 def require_actor(config: "HMAConfig", where: str) -> None:
-    """Check that a model was trained to action; an HMAError says how that is done."""
+    """Check that a model was trained to act; an HMAError says how that is done."""
     trained = [OBJECTIVES[name] for name, weight in config.objectives.items() if weight > 0]
     if not any(one.readout == POLICY for one in trained):
         fault = f"was not trained to act, but for {', '.join(one.name for one in trained)}"

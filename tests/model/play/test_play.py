@@ -65,7 +65,7 @@ def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, request: pytest
     yaml.write_text(Checkpoint.open("embedded").embodiment("mover_10").to_yaml().replace("mover_10", "rover"))
     words = ["convert", "-e", str(yaml), "--source", str(record("mover_10", tmp_path, 2)), "--tokenizer"]
     assert main([*words, "fsq-lab", "--out", str(tmp_path / "shards"), "--workers", "1"]) == 0
-    small = ["steps=1", "images=0", "report=false", "batch_size=1", "device=cpu", "eval_windows=1"]
+    small = ["steps=1", "pictures=0", "report=false", "batch_size=1", "device=cpu", "eval_windows=1"]
     data, out = str(tmp_path / "shards"), str(tmp_path / "run")
     assert main(["finetune", "--from", "embedded", "--data", data, "--out", out, *small]) == 0
     assert json.loads((tmp_path / "run/recipe.json").read_text())["data"] == [data]

@@ -1,4 +1,4 @@
-"""A model acts in scenes: it actions what `predict_actions` says of all that it saw and did."""
+"""A model acts in scenes: it gives what `predict_actions` says of all that it saw and did."""
 
 import numpy as np
 import pytest

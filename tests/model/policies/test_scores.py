@@ -290,7 +290,7 @@ def test_a_random_action_is_held_for_a_chunk_and_stays_in_range(world: World) ->
 
 
 class Wild:
-    """A policy that actions what no robot was trained on."""
+    """A policy whose actions no robot was trained on."""
 
     def __call__(self, image: np.ndarray) -> list[float]:
         return [900, 0]

@@ -252,15 +252,15 @@ def test_episodes_of_the_same_beginning_differ(
 def test_windows_with_unknown_actions_are_left_out(
     world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read, unknown = augment_module.read_prompt, [True]
+    read, unknown = augment_module.shard_window, [True]
 
-    def gaps(model: Any, name: str, prompt: Any) -> Any:
-        frames, chunks = read(model, name, prompt)
+    def gaps(*given: Any) -> Prompt:
+        frames, chunks = read(*given)
         chunks = chunks.copy()
-        chunks[2, 0] = np.nan if all(unknown) or prompt["start"] % 2 else chunks[2, 0]
+        chunks[2, 0] = np.nan if all(unknown) or given[-1][0] % 2 else chunks[2, 0]
         return Prompt(frames, chunks)
 
-    monkeypatch.setattr(augment_module, "read_prompt", gaps)
+    monkeypatch.setattr(augment_module, "shard_window", gaps)
     with pytest.raises(UsageError, match="hardly a window of 6 frames whose actions are all known"):
         augment(tmp_path / "none", asked(source="real"), world=world, shards=real)
     unknown.append(False)
