@@ -6,7 +6,7 @@ something up and down in the image has keys for up and down.
 """
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -125,23 +125,18 @@ def hint(robot: Drivable) -> str:
 def labels(robot: Drivable) -> list[str]:
     """Return a readable label of each value: its name in the YAML, else the end of its key and a number."""
     parts, found = robot.embodiment.action.components, []
+    ends = {part.key: part.key.rstrip("/").rpartition("/")[2] for part in parts}
     for part in parts:
         names = part.names
         if names is None:
-            end = _end(part.key, {other.key for other in parts if other.key != part.key})
+            end = ends[part.key]
+            if list(ends.values()).count(end) > 1:  # only whole keys tell these values apart
+                end = part.key
             first = part.slice[0] if part.slice else 0
             alone = part.dims == 1 and not part.slice
             names = (end,) if alone else tuple(f"{end} {first + i}" for i in range(part.dims))
-        found += [re.sub(r"[_.\s]+", " ", name).strip() or name for name in names]
+        found += [re.sub(r"[/_.\s]+", " ", name).strip() or name for name in names]
     return found
-
-
-def _end(key: str, others: Collection[str]) -> str:
-    """Return the end of a key: as many words of its path as tell it from the other keys."""
-    paths = [other.strip("/").split("/") for other in others]
-    words = key.strip("/").split("/")
-    counts = (n for n in range(1, len(words)) if all(path[-n:] != words[-n:] for path in paths))
-    return " ".join(words[-next(counts, len(words)) :])
 
 
 def describe(robot: Drivable) -> dict[str, Any]:

@@ -76,7 +76,13 @@ class Guard:
             own = origin is None or urlsplit(origin).netloc == host
         except ValueError:
             return "refused: the host or the origin cannot be read"
-        if not self._known(name):
+        # An address cannot be rebound; of names, only this server's own are let in.
+        own_name = name in (*LOOPBACK, self.host)
+        if not own_name and self.host not in LOOPBACK:
+            with contextlib.suppress(ValueError):
+                own_name = bool(ipaddress.ip_address(name))
+            own_name = own_name or name == socket.gethostname()
+        if not own_name:
             return f"refused: the host {host[:80]!r} is not this server's"
         if not own:
             return f"refused: a page of {origin!r:.80} may not connect here"
@@ -84,15 +90,6 @@ class Guard:
         if self.token and not secrets.compare_digest(given.encode(), self.token.encode()):
             return "refused: the token is missing or wrong; use the address that hma play printed"
         return ""
-
-    def _known(self, name: str) -> bool:
-        if name in (*LOOPBACK, self.host):
-            return True
-        if self.host in LOOPBACK:
-            return False
-        with contextlib.suppress(ValueError):  # an address cannot be rebound
-            return bool(ipaddress.ip_address(name))
-        return name == socket.gethostname()
 
 
 class Server:

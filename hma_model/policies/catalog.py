@@ -1,6 +1,7 @@
 """Make policies from the words of a command: scripted, random, still, a function, one of lerobot, a model."""
 
 import importlib
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,21 +53,14 @@ def read_policy(words: str, scenes: Scenes, world: "World | None" = None) -> Pol
     if kind in ("scripted", "reach"):
         if kind == "reach" and not FAMILY.fullmatch(scenes.name):
             raise UsageError("policy reach", f"{scenes.name} has no driver that reaches", "give scripted")
-        return Scripted(_noise(words, kind, rest), kind == "reach")
+        match = re.fullmatch(r"(?:noise=(\d*\.?\d+|\d+\.))?", rest)
+        share = float(match.group(1) or 0) if match else np.nan
+        if not share <= 1:
+            raise UsageError("policy", f"{words!r} is unknown", f"give {kind}:noise=SHARE, from 0 to 1")
+        return Scripted(share, kind == "reach")
     if rest:
         return Called(_named(words), f"policy {words}")
     raise UsageError("policy", f"{words!r} is unknown", POLICY_FORMS)
-
-
-def _noise(words: str, kind: str, rest: str) -> float:
-    name, _, value = rest.partition("=")
-    try:
-        share = float(value) if rest else 0.0
-    except ValueError:
-        share = np.nan
-    if (rest and name != "noise") or not 0 <= share <= 1:
-        raise UsageError("policy", f"{words!r} is unknown", f"give {kind}:noise=SHARE, from 0 to 1")
-    return share
 
 
 def _named(words: str) -> Any:

@@ -65,7 +65,7 @@ class Dimension:
     kind: str
 
 
-class Scene(Protocol):
+class DrivenScene(Protocol):
     """The scene of a robot, and what truly happens there.
 
     Attributes:
@@ -103,7 +103,7 @@ class Drivable(Protocol):
     cameras: list[str]
     source: str
 
-    def scene(self, number: int) -> Scene:
+    def scene(self, number: int) -> DrivenScene:
         """Return the scene of that number; there is one for every number from 0 on."""
 
 
