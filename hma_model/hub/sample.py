@@ -1,7 +1,6 @@
-"""Make the picture and the film of a model card: the truth, a short rollout, and one with other actions."""
+"""Make the image and the film of a model card: recorded frames beside a short rollout."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -82,14 +81,8 @@ def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
     middle, tokenizer = len(windows) // 2, tokenizer_of(shards)
     batch = windows.batch([middle])
     true = rollout(model, tokenizer, batch)
-    backwards = replace(batch, actions=batch.actions.flip(1), action_mask=batch.action_mask.flip(1))
-    other = rollout(model, tokenizer, backwards, truth=true.truth)
     picks = np.unique(np.linspace(0, true.truth.shape[1] - 1, COLUMNS).astype(int))
-    rows = {
-        "truth": true.truth[0],
-        f"predicted from frame {true.prompt} on": true.predicted[0],
-        "with the actions in reverse": other.predicted[0],
-    }
+    rows = {"truth": true.truth[0], f"predicted from frame {true.prompt} on": true.predicted[0]}
     # Small frames are enlarged, large ones subsampled, to about SIDE pixels.
     side = true.truth.shape[2]
     scale, every = max(1, -(-SIDE // side)), max(1, side // SIDE)
