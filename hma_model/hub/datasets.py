@@ -9,7 +9,16 @@ from typing import Any
 
 from hma_data.conversion.publish import SMALL, publish
 from hma_data.errors import HubError, ShardError
-from hma_data.shards.manifest import BESIDE, EPISODES, FINDER, MANIFEST, SHARD_NAME, Manifest, seal_problem
+from hma_data.shards.manifest import (
+    BESIDE,
+    EPISODES,
+    FINDER,
+    MANIFEST,
+    SHARD_NAME,
+    Manifest,
+    damaged_files,
+    seal_problem,
+)  # fmt: skip
 from hma_data.storage.files import file_sha256, write_atomic
 from hma_data.storage.paths import REPOSITORY, StrPath, as_address, as_path
 from hma_data.storage.yaml_io import write_yaml
@@ -42,7 +51,16 @@ def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str
         HubError: the target holds another shard set, or cannot be reached or written.
     """
     folder = as_path(folder)
-    manifest = _whole_manifest(folder)
+    manifest = Manifest.load(folder)
+    problem, damaged = seal_problem((folder / MANIFEST).read_bytes()), damaged_files(folder, manifest)
+    shards = {folder / shard.path: shard.sha256 for shard in manifest.shards}
+    damaged += [path for path, sha256 in shards.items() if not _has_sha256(path, sha256)]
+    if problem or damaged:
+        where, fault = folder / MANIFEST, problem
+        if damaged:
+            where, fault = damaged[0], f"is not the file that {MANIFEST} names"
+        remedy = f"hma shards verify {folder} tells all; hma shards restat {folder} writes small files anew"
+        raise ShardError(where, fault, remedy)
     store = _open(as_address(target), write=True, private=private)
     page = _page(manifest, store.repo)
     _refuse_others(store, manifest)
@@ -84,22 +102,6 @@ def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> 
 
 
 # -- checks
-
-
-def _whole_manifest(folder: Path) -> Manifest:
-    """Return the manifest of a set, after checking all its files against it."""
-    manifest = Manifest.load(folder)
-    if problem := seal_problem((folder / MANIFEST).read_bytes()):
-        raise ShardError(folder / MANIFEST, problem, f"hma shards restat {folder} writes it anew")
-    for shard in manifest.shards:
-        path = folder / shard.path
-        if not _has_sha256(path, shard.sha256):
-            raise ShardError(path, "is not the shard its manifest names", f"run hma shards verify {folder}")
-    for name, sha256 in manifest.files.items():
-        if name not in SMALL or not _has_sha256(folder / name, sha256):
-            remedy = f"hma shards restat {folder} writes it anew"
-            raise ShardError(folder / name, "is not the file its manifest names", remedy)
-    return manifest
 
 
 def _open(

@@ -141,7 +141,9 @@ def test_a_dataset_of_something_else_is_left_alone(server, shards):
 def test_a_damaged_shard_is_not_published(server, shards):
     path = shards / "train/shard-00000.parquet"
     path.write_bytes(path.read_bytes()[:-1] + b"x")
-    with pytest.raises(ShardError, match="is not the shard its manifest names"):
+    with pytest.raises(
+        ShardError, match=r"train/shard-00000\.parquet: is not the file that manifest\.json names"
+    ):
         push_data(shards, REPO)
     assert server.log == []
 
