@@ -135,9 +135,9 @@ def _tokenizer_problems(tokenizer: Any) -> list[str]:
     except PluginError as fault:
         return [str(fault)]
     except TokenizerError:
-        return [f"tokenizer {str(name)[:60]!r} is not one of this release: pictures need it"]
+        return [f"tokenizer {str(name)[:60]!r} is not one of this release: decoding needs it"]
     if isinstance(tokenizer, Mapping) and (digest := other_weights(tokenizer)):
-        return [f"tokenizer {name} has weights of its own ({digest[:12]}…): pictures need them"]
+        return [f"tokenizer {name} has weights of its own ({digest[:12]}…): decoding needs them"]
     missing = entry.missing()
     return [f"tokenizer {name} needs {', '.join(missing)}: {entry.extra}"] if missing else []
 

@@ -119,7 +119,7 @@ def test_a_shard_sets_code_runs_as_pasted(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path / "cache")
     made: dict[str, Any] = {}
     exec(found[1], made)
-    assert made["pictures"].shape == (8, 128, 128, 3) and made["pictures"].dtype == np.uint8
+    assert made["images"].shape == (8, 128, 128, 3) and made["images"].dtype == np.uint8
 
 
 @pytest.mark.parametrize(
