@@ -46,7 +46,8 @@ class DivergenceDetector:
         """Compare the model's frame of a number with the true one."""
         if self.parted is not None:
             return
-        made, now = _thumbnail(image), _thumbnail(true)
+        made = _thumbnail(image)
+        now = _thumbnail(true)
         self._moments = np.concatenate([self._moments, now[None]])[-MEMORY:]
         errors = np.square(self._moments - made).mean(axis=(1, 2, 3))
         # A frame that is a little late is not lost: it may be of any moment of the last half second.

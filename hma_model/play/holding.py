@@ -53,7 +53,8 @@ def holdings(checkpoint: Checkpoint) -> dict[str, Holding]:
     found = {}
     for name in checkpoint.embodiments:
         if name in known:
-            seconds, at_least = known[name]["seconds"], known[name]["at_least"]
+            seconds = known[name]["seconds"]
+            at_least = known[name]["at_least"]
             found[name] = Holding(seconds, at_least, at_least or seconds > FOLLOWS_S)
         else:
             verdict = (checkpoint.card(name).get("evaluation") or {}).get("verdict", "")

@@ -101,7 +101,9 @@ def _arm(mechanism: Arm, found: list[Pad]) -> list[Pad]:
     """Return pads in which a drag moves the first link the way that it goes, if the arm stands at an edge."""
     if mechanism.axes[0].high > EDGE_TURN:
         return found  # it turns about: no way is its own
-    first, (across, along) = found[0], (-np.sin(mechanism.facing), np.cos(mechanism.facing))
+    first = found[0]
+    across = -np.sin(mechanism.facing)
+    along = np.cos(mechanism.facing)
     if abs(across) > abs(along):
         return [replace(first, flips=(bool(across < 0), first.flips[1])), *found[1:]]
     return [replace(first, x=first.y, y=first.x, flips=(False, bool(along < 0))), *found[1:]]
@@ -109,7 +111,8 @@ def _arm(mechanism: Arm, found: list[Pad]) -> list[Pad]:
 
 def hint(robot: Drivable) -> str:
     """Return what a drag on the image does, as a sentence without its full stop."""
-    found, shown = pads(robot), labels(robot)
+    found = pads(robot)
+    shown = labels(robot)
     if not found:
         return "Use the sliders"
     if found[0].low is not None:
@@ -124,7 +127,8 @@ def hint(robot: Drivable) -> str:
 
 def labels(robot: Drivable) -> list[str]:
     """Return a readable label of each value: its name in the YAML, else the end of its key and a number."""
-    parts, found = robot.embodiment.action.components, []
+    parts = robot.embodiment.action.components
+    found = []
     ends = {part.key: part.key.rstrip("/").rpartition("/")[2] for part in parts}
     for part in parts:
         names = part.names

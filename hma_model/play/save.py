@@ -69,14 +69,16 @@ def film(
 
 def told_by(session: Session, kind: str) -> Told:
     """Return what tells a session's viewer how far a file is: new words at once, frames now and then."""
-    before, words_before = 0.0, ""
+    before = 0.0
+    words_before = ""
 
     def tell(words: str, done: int, total: int) -> None:
         nonlocal before, words_before
         now = time.monotonic()
         if words == words_before and now - before < TELL_S:
             return
-        before, words_before = now, words
+        before = now
+        words_before = words
         if viewer := session.viewer:
             viewer.tell({"kind": "saving", "file": kind, "text": words, "done": done, "total": total})
 
@@ -123,7 +125,8 @@ def lerobot_episode(robot: Drivable, frames: Sequence[Frame]) -> tuple[LeRobotEp
     last action is held. For each camera another one, with `_true` at the end of its name, has the true
     images.
     """
-    stride, views = robot.embodiment.stride, len(robot.cameras)
+    stride = robot.embodiment.stride
+    views = len(robot.cameras)
     following = [*frames[1:], frames[-1]]
     actions = np.concatenate([frame.actions for frame in following])
     shown = {"": [frame.model for frame in frames]}
@@ -147,7 +150,9 @@ class _Views(Sequence[Image]):
     """One of several views side by side in JPEG images; an image is decoded when it is asked for."""
 
     def __init__(self, images: Sequence[bytes], view: int, views: int) -> None:
-        self._images, self._view, self._views = images, view, views
+        self._images = images
+        self._view = view
+        self._views = views
 
     def __len__(self) -> int:
         return len(self._images)
@@ -198,7 +203,8 @@ def embodiment_of(
 
 def _packed(vector: dict[str, Any], key: str) -> list[dict[str, Any]]:
     """Return a vector's components as slices of one feature."""
-    parts, start = [], 0
+    parts = []
+    start = 0
     for part in vector["components"]:
         facts = {
             name: part[name] for name in ("names", "unit", "range", "normalize", "gripper") if name in part

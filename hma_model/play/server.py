@@ -57,7 +57,9 @@ class Guard:
     """Refuse requests with a foreign Host or Origin, or without the token."""
 
     def __init__(self, app: ASGIApp, host: str, token: str | None) -> None:
-        self.app, self.host, self.token = app, host, token
+        self.app = app
+        self.host = host
+        self.token = token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] in ("http", "websocket") and (fault := self._fault(scope)):
@@ -70,7 +72,8 @@ class Guard:
 
     def _fault(self, scope: Scope) -> str:
         headers = {name.decode().lower(): value.decode("latin-1") for name, value in scope["headers"]}
-        host, origin = headers.get("host", ""), headers.get("origin")
+        host = headers.get("host", "")
+        origin = headers.get("origin")
         try:
             name = urlsplit(f"//{host}").hostname or ""
             own = origin is None or urlsplit(origin).netloc == host
@@ -112,7 +115,9 @@ class Server:
         first: str | None = None,
         holdings: Mapping[str, Holding] | None = None,
     ) -> None:
-        self.stepper, self.model, self.first = stepper, model, first or FIRST_ROBOT
+        self.stepper = stepper
+        self.model = model
+        self.first = first or FIRST_ROBOT
         self.holdings = holdings or {}
         self.viewers = 0
         self._page = files("hma_model.play").joinpath("page.html").read_text("utf-8")
@@ -141,7 +146,8 @@ class Server:
 
     async def save(self, request: Request) -> Response:
         """Return what was driven in a session as a file."""
-        kind, name = request.query_params.get("kind", ""), request.query_params.get("session", "")
+        kind = request.query_params.get("kind", "")
+        name = request.query_params.get("session", "")
         session = self.stepper.sessions.get(name)
         if session is None or kind not in FILE_KINDS:
             return PlainTextResponse("there is no such session, or no such kind of file\n", 404)
@@ -201,11 +207,14 @@ class Connection:
     """
 
     def __init__(self, server: Server, websocket: WebSocket) -> None:
-        self.stepper, self.websocket = server.stepper, websocket
+        self.stepper = server.stepper
+        self.websocket = websocket
         self.session: Session | None = None
         self.fault = ""
-        self._credit, self._filled = MESSAGE_BURST, time.monotonic()
-        self._loop, self._wake = asyncio.get_running_loop(), asyncio.Event()
+        self._credit = MESSAGE_BURST
+        self._filled = time.monotonic()
+        self._loop = asyncio.get_running_loop()
+        self._wake = asyncio.Event()
         self._messages: deque[dict[str, Any]] = deque(maxlen=100)
         self._latest: tuple[Frame, dict[str, Any]] | None = None
         self._sent = self._shown = 0  # serial numbers of frames
@@ -253,7 +262,8 @@ class Connection:
                     await self.websocket.send_text(json.dumps(self._messages.popleft()))
             # The socket buffers megabytes; the page's word on what it has shown keeps frames from piling up.
             if self._latest and self._sent - self._shown < FRAMES_AHEAD:
-                (frame, facts), self._latest = self._latest, None
+                (frame, facts) = self._latest
+                self._latest = None
                 if not self._sent - self._shown:
                     self._heard = time.monotonic()  # it had nothing to read before
                 self._sent += 1
@@ -352,16 +362,22 @@ class Connection:
                     self._show_all(session)
                     return
                 case messages.StepMessage(do="step"):
-                    session.paused, session.steps, session.due = True, 1, session.touched
+                    session.paused = True
+                    session.steps = 1
+                    session.due = session.touched
                 case messages.StepMessage(do="sync"):
                     session.sync()
                     self.show(session.last(), {})  # in the place of an older one that still waits
                 case messages.SwitchMessage(do="run"):
-                    session.paused, session.due, session.steps = not message.on, session.touched, 0
+                    session.paused = not message.on
+                    session.due = session.touched
+                    session.steps = 0
                 case messages.SwitchMessage(do="fast"):
-                    session.fast, session.due = message.on, session.touched
+                    session.fast = message.on
+                    session.due = session.touched
                 case messages.SwitchMessage(do="replay"):
-                    session.replays, session.ended = message.on, False
+                    session.replays = message.on
+                    session.ended = False
                 case messages.SampleMessage():
                     way = FrameSampling(message.passes, round(message.temperature, 1), message.order)
                     self.stepper.change(session, way)
@@ -375,14 +391,16 @@ class Connection:
             fault = f"has {len(message.action)} values, this robot takes {len(session.held)}"
             self.tell({"kind": "error", "text": f"action: {fault}"})
             return
-        session.held, session.input = np.array(message.action, np.float32), message.input
+        session.held = np.array(message.action, np.float32)
+        session.input = message.input
         if session.warned:
             return
         beyond = []
         for dim, name, value in zip(
             session.robot.dimensions, labels(session.robot), message.action, strict=True
         ):
-            middle, half = (dim.high + dim.low) / 2, (dim.high - dim.low) / 2
+            middle = (dim.high + dim.low) / 2
+            half = (dim.high - dim.low) / 2
             if abs(value - middle) > 1.05 * half:  # sliders and pads may end a little beyond
                 beyond.append(f"{name} {dim.low:g} to {dim.high:g}")
         if beyond:

@@ -88,10 +88,15 @@ class Session:
     def __init__(
         self, name: str, robot: Drivable, number: int, world: "World", sampling: FrameSampling, now: float
     ) -> None:
-        self.name, self.robot, self._world, self.sampling = name, robot, world, sampling
+        self.name = name
+        self.robot = robot
+        self._world = world
+        self.sampling = sampling
         self.viewer: Viewer | None = None
         self.due = self.touched = now
-        self.paused, self.replays, self.fast = True, False, False
+        self.paused = True
+        self.replays = False
+        self.fast = False
         self.warned = False  # that actions are outside the range of the page
         self.steps = 0  # single steps asked for
         self.input = 0  # number of the newest input, by which the page measures latency
@@ -112,13 +117,16 @@ class Session:
         self._set_start()
 
     def _begin(self, number: int) -> None:
-        self.number, self.scene = number, self.robot.scene(number)
+        self.number = number
+        self.scene = self.robot.scene(number)
         prompt = self.scene.prompt
         self._true: deque[Image] = deque(prompt.frames, maxlen=RESTART_FRAMES)
         self._chunks: deque[Floats] = deque(prompt.chunks, maxlen=RESTART_FRAMES - 1)
         self.held = self.scene.action.copy()
         self.frames: deque[Frame] = deque(maxlen=KEPT_FRAMES)
-        self.count, self.ended, self.steps = 0, False, 0
+        self.count = 0
+        self.ended = False
+        self.steps = 0
 
     def _set_start(self) -> None:
         """Take the prompt's last frame as the tokenizer shows it, which the model cannot surpass."""
@@ -128,7 +136,8 @@ class Session:
 
     def _restarted(self, frame: Frame) -> Frame:
         """Return a frame with the images from which the model goes on; divergence is looked for anew."""
-        shown, true = self._world.image(self.row), self._true[-1]
+        shown = self._world.image(self.row)
+        true = self._true[-1]
         rate = self.robot.embodiment.rate_hz / self.robot.embodiment.stride
         self._divergence = DivergenceDetector(true, shown, round(rate))
         self._still = true
@@ -152,7 +161,8 @@ class Session:
 
     def _history(self) -> tuple[Image, Floats]:
         """Return the true last frames, and the chunks between them."""
-        frames, chunks = list(self._true), list(self._chunks)
+        frames = list(self._true)
+        chunks = list(self._chunks)
         return np.stack(frames), np.stack(chunks[len(chunks) - len(frames) + 1 :])
 
     # -- one step
@@ -191,7 +201,8 @@ class Session:
             self._true.append(self._truth)
         score = still = None
         if self._truth is not None:
-            score, still = psnr(image, self._truth), psnr(self._still, self._truth)
+            score = psnr(image, self._truth)
+            still = psnr(self._still, self._truth)
             self._divergence.look(self.count, image, self._truth)
         stride = self.robot.embodiment.stride
         actions = self._chunks[-1].reshape(stride, -1)
@@ -200,7 +211,8 @@ class Session:
         self.frames.append(frame)
         self._last = frame
         if self.replays:
-            self.touched, self.held = now, actions[-1].copy()
+            self.touched = now
+            self.held = actions[-1].copy()
         if self.viewer:
             facts: dict[str, Any] = {
                 "ms": round(1000 * took, 1),

@@ -52,8 +52,12 @@ class Stepper:
         most: int = MAX_SESSIONS,
         idle_s: float = IDLE_S,
     ) -> None:
-        self.robots, self.orders, self.most, self.idle_s = robots, orders, most, idle_s
-        self._world, self._sampling = world, FrameSampling(world.unmask_steps, world.temperature, world.order)
+        self.robots = robots
+        self.orders = orders
+        self.most = most
+        self.idle_s = idle_s
+        self._world = world
+        self._sampling = FrameSampling(world.unmask_steps, world.temperature, world.order)
         self.sessions: dict[str, Session] = {}
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="stepper", daemon=True)
@@ -199,7 +203,8 @@ class Stepper:
         for session in sessions:
             chunk = self._guarded(session, session.next_chunk)
             if chunk is not None:
-                chunks[session.row], rows[session.row] = chunk, session
+                chunks[session.row] = chunk
+                rows[session.row] = session
             elif session.name in self.sessions and session.viewer:
                 session.viewer.tell(session.status())  # its recording has ended
         if not chunks:

@@ -39,22 +39,28 @@ class Follower:
     """
 
     def __init__(self, world: World, scenes: Scenes, where: str, memory: int | None = None) -> None:
-        self.world, self.spec, self.sessions = world, world.action_spec(scenes.name), list[int]()
-        self._memory, self._where = memory, where
-        own, robot = self.spec, scenes.robot.embodiment
+        self.world = world
+        self.spec = world.action_spec(scenes.name)
+        self.sessions = list[int]()
+        self._memory = memory
+        self._where = where
+        own = self.spec
+        robot = scenes.robot.embodiment
         if (own.stride, len(own.names)) != (robot.stride, robot.action_dim):
             fault = f"takes {own.stride} actions of {len(own.names)} values of {scenes.name} in a chunk"
             raise HMAError(where, fault, f"the scenes take {robot.stride} of {robot.action_dim}")
 
     def begin(self, arena: Arena) -> None:
         """Begin with the arena's prompts; an HMAError says that it shows more or fewer cameras."""
-        (high, wide), (height, width) = self.world.image_shape[:2], arena.images.shape[1:3]
+        (high, wide) = self.world.image_shape[:2]
+        (height, width) = arena.images.shape[1:3]
         if wide * height != width * high:
             fault = f"sees {wide // high} views, and the images show {width // height}"
             raise HMAError(self._where, fault, "give a policy that sees the same cameras")
         for session in self.sessions:
             self.world.close(session)
-        name, seed = arena.scenes.name, arena.scenes.seed
+        name = arena.scenes.name
+        seed = arena.scenes.seed
         self._prompts = [self._newest(prompt) for prompt in arena.prompts]
         self.sessions = [
             self.world.open(name, *prompt, seed=seed + row) for row, prompt in enumerate(self._prompts)
@@ -120,7 +126,8 @@ class Acting:
         for name, value in {"horizon": horizon, "memory": memory}.items():
             if value is not None and value < 1:
                 raise UsageError(where, f"{name}={value} is not allowed", "give 1 or more")
-        self._follower, self._horizon = Follower(world, scenes, where, memory), horizon
+        self._follower = Follower(world, scenes, where, memory)
+        self._horizon = horizon
 
     def begin(self, arena: Arena) -> None:
         self._follower.begin(arena)
@@ -134,7 +141,9 @@ class Acting:
 
     def _chosen(self) -> list[Floats]:
         """Return the actions (N, A) of the chunks up to the horizon."""
-        world, sessions, made = self._follower.world, self._follower.sessions, list[Floats]()
+        world = self._follower.world
+        sessions = self._follower.sessions
+        made = list[Floats]()
         kept = {session: world.snapshot(session) for session in sessions if self._horizon > 1}
         for chunk in range(self._horizon):
             given = {one: self._follower.spec.clip(said) for one, said in world.act(sessions).items()}
@@ -149,6 +158,7 @@ class Acting:
 def read_acting(words: str, scenes: Scenes, device: str = "cpu") -> Acting:
     """Return the policy of `CHECKPOINT` or `CHECKPOINT,memory=1,horizon=2,temperature=0.5,unmask_steps=2`."""
     checkpoint, options = split_options("hma", words, OPTIONS)
-    horizon, memory = options.pop("horizon", 1), options.pop("memory", None)
+    horizon = options.pop("horizon", 1)
+    memory = options.pop("memory", None)
     world = load_world(checkpoint, device=device, **options)
     return Acting(world, scenes, horizon, f"policy hma:{checkpoint}", memory)

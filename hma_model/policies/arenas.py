@@ -60,7 +60,8 @@ class Scenes:
         Raises:
             HMAError: the model lacks the robot, or it is none of the laboratory.
         """
-        found, spec = described(world.model, embodiment), world.action_spec(embodiment)
+        found = described(world.model, embodiment)
+        spec = world.action_spec(embodiment)
         if simulator and not simulated(embodiment):
             remedy = "choose a robot of the laboratory; hma play shows those of a checkpoint"
             raise HMAError(embodiment, "has no true simulator to compare with", remedy)
@@ -147,7 +148,10 @@ class TrueArena:
     """
 
     def __init__(self, scenes: Scenes, size: int, drawn: bool = True) -> None:
-        self.scenes, self._size, self._drawn, self._steps = scenes, size, drawn, 0
+        self.scenes = scenes
+        self._size = size
+        self._drawn = drawn
+        self._steps = 0
         self._begun = scenes.begin()
         self.prompts: Sequence[Prompt] = [scene.prompt for scene in self._begun]
         self.held = np.stack([scene.action for scene in self._begun])
@@ -211,8 +215,11 @@ class ModelArena:
     """
 
     def __init__(self, world: "World", true: Beginning, probe: "Probe | None") -> None:
-        self.scenes, self.held = true.scenes, true.held
-        self._world, self._told, self._probe = world, true.told, probe
+        self.scenes = true.scenes
+        self.held = true.held
+        self._world = world
+        self._told = true.told
+        self._probe = probe
         self.prompts: Sequence[Prompt] = [Prompt(world.shown(one.frames), one.chunks) for one in true.prompts]
         self._sessions: list[int] = []
         for number, prompt in zip(self.scenes.numbers, true.prompts, strict=True):

@@ -72,7 +72,8 @@ def checked(name: str, policy: Policy, arena: Arena) -> Floats:
     Raises:
         HMAError: it raises, or returns another shape or values that are not finite.
     """
-    where, width = f"policy {name}", len(arena.scenes.dimensions)
+    where = f"policy {name}"
+    width = len(arena.scenes.dimensions)
     with _named_errors(name):
         actions = np.asarray(policy.act(arena), np.float32)
     if actions.shape != (len(arena.images), width):

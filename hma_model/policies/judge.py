@@ -136,7 +136,8 @@ class StateJudge:
 
     def score(self, images: Images) -> Floats:
         """Return the scores (N,) of episodes (N, T, S, S, 3)."""
-        places, areas = self.probe.read(images), self.probe.areas(images)
+        places = self.probe.read(images)
+        areas = self.probe.areas(images)
         loose = last_seen(places[..., self.probe.loose, :], areas[..., self.probe.loose])
         own = places[..., self.probe.own, :]
         return self.task.score(np.concatenate([own, loose], axis=-2), len(self.probe.own))
@@ -194,13 +195,16 @@ def train_judge(
     )
     numbers = range(FIRST + EPISODES, FIRST + EPISODES + examples)
     judge = StateJudge(robot, task, probe, task.limit, accuracy(np.ones(1, bool), np.ones(1, bool)))
-    true, read = np.empty(examples), np.empty(examples)
+    true = np.empty(examples)
+    read = np.empty(examples)
     for row, number in enumerate(numbers):
         made = truth.episode(robot, frames, stride, seed, number, looked, wander=task.name != "placed")
         shown = as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures))
-        true[row], read[row] = judge.true_score(made.parts[None])[0], judge.score(shown[None])[0]
+        true[row] = judge.true_score(made.parts[None])[0]
+        read[row] = judge.score(shown[None])[0]
         tell(f"training the judge: episode {row + 1} of {examples}")
-    half, success = examples // 2, true >= task.limit
+    half = examples // 2
+    success = true >= task.limit
     limit = best_limit(read[:half], success[:half], task.limit)
     found = accuracy(success[half:], read[half:] >= limit)
     if not found.better_than_chance:

@@ -39,7 +39,8 @@ class LeRobotPolicy:
         try:
             with redirect_stdout(sys.stderr):  # it prints what it loads
                 config = PreTrainedConfig.from_pretrained(source)
-                config.device, config.pretrained_path = device, source
+                config.device = device
+                config.pretrained_path = source
                 self._policy: Any = get_policy_class(config.type).from_pretrained(source, config=config)
                 there = {"device_processor": {"device": device}}
                 self._before, self._after = make_pre_post_processors(
@@ -65,7 +66,8 @@ class LeRobotPolicy:
             raise HMAError(self.name, f"takes {wanted}", "a world model gives the image of one camera")
         self._camera = cameras[0]
         self._size = config.input_features[self._camera].shape[1:]
-        state, action = config.input_features.get(STATE), config.action_feature
+        state = config.input_features.get(STATE)
+        action = config.action_feature
         self._state = None if state is None else int(state.shape[0])
         if action.shape != (len(scenes.dimensions),):
             fault = f"gives actions of {action.shape[0]} values"

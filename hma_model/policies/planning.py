@@ -53,10 +53,13 @@ class Cost:
     """
 
     def __init__(self, world: World, embodiment: str, judge: "StateJudge | None" = None) -> None:
-        self.world, self.embodiment, self.judge = world, embodiment, judge
+        self.world = world
+        self.embodiment = embodiment
+        self.judge = judge
         own = world.action_spec(embodiment)
         space = world.model.embodiments[embodiment]
-        self._own, self._mean = own, np.array(space.mean, np.float32)
+        self._own = own
+        self._mean = np.array(space.mean, np.float32)
         self._std = np.array(space.std, np.float32)
         self.sessions: list[int] = []
         self.first: Image | None = None  # (N, S, S, 3) in which the judged episodes began
@@ -65,12 +68,14 @@ class Cost:
     def space(self) -> gymnasium.spaces.Box:
         """Return the space of a candidate's action (A,), in standard deviations from the mean."""
         scale = np.maximum(self._std, 1e-6)
-        low, high = (self._own.low - self._mean) / scale, (self._own.high - self._mean) / scale
+        low = (self._own.low - self._mean) / scale
+        high = (self._own.high - self._mean) / scale
         return gymnasium.spaces.Box(low, high, dtype=np.float32)
 
     def actions(self, candidates: NDArray[Any]) -> Floats:
         """Return candidates (…, A), held for a chunk, or (…, K), as actions (…, stride, A)."""
-        width, stride = len(self._own.names), self._own.stride
+        width = len(self._own.names)
+        stride = self._own.stride
         held = candidates.shape[-1] == width
         rows = candidates[..., None, :] if held else candidates.reshape(*candidates.shape[:-1], stride, width)
         actions = self._own.clip(self._mean + self._std * rows).astype(np.float32)
@@ -168,7 +173,8 @@ class Planning:
         own = World(world.model, world.tokenizer, unmask_steps=unmask_steps, temperature=temperature)
         self._follower = Follower(own, scenes, "policy plan")
         self.cost = Cost(own, scenes.name)
-        self._kind, self._seed = solver, scenes.seed
+        self._kind = solver
+        self._seed = scenes.seed
         self._sizes = horizon, samples, steps, receding
 
     def judged(self, judge: "StateJudge") -> None:
@@ -177,9 +183,11 @@ class Planning:
 
     def begin(self, arena: Arena) -> None:
         self._follower.begin(arena)
-        self.cost.sessions, self.cost.first = self._follower.sessions, arena.images
+        self.cost.sessions = self._follower.sessions
+        self.cost.first = arena.images
         made, configured = solver_of(self._kind)
-        count, one = len(arena.images), self.cost.space
+        count = len(arena.images)
+        one = self.cost.space
         horizon, samples, steps, receding = self._sizes
         self._solver = made(
             self.cost, batch_size=max(1, MAX_ROWS // samples), num_samples=samples, n_steps=steps,

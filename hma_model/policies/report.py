@@ -97,7 +97,8 @@ def _share(found: Estimate) -> str:
 
 def _alike(found: PolicyEvaluation, where: int) -> str:
     place = "the simulator" if where == TRUE else "the model"
-    pairs, count = found.alike(where), len(found.policies)
+    pairs = found.alike(where)
+    count = len(found.policies)
     if len(pairs) == count * (count - 1) // 2:
         return f"by success in {place}, no two policies can be told apart"
     names = [" and ".join(pair) for pair in pairs[:LISTED_PAIRS]]
@@ -144,7 +145,8 @@ def html(found: PolicyEvaluation) -> str:
         (_value(found.followed), f"correlation of the scores of single episodes{_ends(found.followed)}"),
     ]
     if not found.refusal:
-        pearson, ranks = found.success["pearson"], found.success["spearman"]
+        pearson = found.success["pearson"]
+        ranks = found.success["spearman"]
         figures = [
             (_value(pearson), f"correlation of success rates{_ends(pearson)}"),
             (_value(ranks), f"correlation of their ranks{_ends(ranks)}"),
@@ -211,7 +213,8 @@ def _plot(found: PolicyEvaluation) -> bytes:
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color="#999999", ls=":", lw=1)
     for i, row in enumerate(found.rows()):
-        x, y = row["true_success"], row["model_success"]
+        x = row["true_success"]
+        y = row["model_success"]
         ends = ((x, row["true_success_interval"]), (y, row["model_success_interval"]))
         bars = [[[max(at - low, 0)], [max(high - at, 0)]] for at, (low, high) in ends]
         look: dict[str, Any] = {

@@ -260,7 +260,8 @@ def evaluate_policies(
             scored.append(Scored(name, **(score() if kept is None else kept.part(key, score))))
     success = np.stack([one.success for one in scored], axis=1)  # (3, M, N)
     scores = np.stack([one.scores for one in scored], axis=1)
-    judged, replayed = success[MODEL].ravel(), success[REPLAYED].ravel()
+    judged = success[MODEL].ravel()
+    replayed = success[REPLAYED].ravel()
     return PolicyEvaluation(
         embodiment,
         str(checkpoint),
@@ -302,7 +303,8 @@ def score_policy(
     tell: Progress = lambda done, where: None,
 ) -> dict[str, NDArray[Any]]:
     """Return what comes of one policy in the simulator and in the model: the arrays of `Scored`."""
-    size, limit = world.image_shape[0], judge.task.limit
+    size = world.image_shape[0]
+    limit = judge.task.limit
     shown = np.unique(np.linspace(0, frames, SHOWN_FRAMES).round().astype(int))
     true = TrueArena(scenes, size)
     true_images, _ = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
@@ -336,7 +338,9 @@ def run(
     Raises:
         HMAError: the policy fails.
     """
-    images, actions, said = [arena.images], list[Floats](), ""
+    images = [arena.images]
+    actions = list[Floats]()
+    said = ""
     begin(name, policy, arena)
     for _ in range(frames * arena.scenes.stride):
         actions.append(checked(name, policy, arena))

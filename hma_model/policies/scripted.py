@@ -52,7 +52,9 @@ class Scripted:
     """
 
     def __init__(self, noise: float = 0.0, reach: bool = False) -> None:
-        self.noise, self.reach, self._random = noise, reach, Random()
+        self.noise = noise
+        self.reach = reach
+        self._random = Random()
 
     def begin(self, arena: Arena) -> None:
         self._random.begin(arena)

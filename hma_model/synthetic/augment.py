@@ -250,7 +250,9 @@ class _Maker:
     """A maker of batches of synthetic episodes."""
 
     def __init__(self, world: World, settings: Augmentation, shards: ShardSet | None) -> None:
-        self.world, self.settings, self.shards = world, settings, shards
+        self.world = world
+        self.settings = settings
+        self.shards = shards
         name = settings.embodiment
         self.prompt_frames = default_frames(world.model)
         self.scenes = Scenes.of(world, name, settings.episodes, settings.seed, simulator=shards is None)
@@ -307,7 +309,8 @@ class _Maker:
 
     def run(self, kept: KeptParts, on_progress: Progress) -> list[SyntheticBatch]:
         """Return all batches; those that are kept are not made again."""
-        count, frames = self.settings.episodes, self.settings.frames
+        count = self.settings.episodes
+        frames = self.settings.frames
         batches = []
         for begin in range(0, count, BATCH):
             numbers = range(begin, min(begin + BATCH, count))
@@ -327,8 +330,11 @@ class _Maker:
         settings = self.settings
         if self.probe is not None or not settings.looked_at:
             return
-        name, seed = settings.embodiment, settings.seed
-        tokenizer, stride, tell = self.world.tokenizer, self.scenes.stride, partial(on_progress, 0)
+        name = settings.embodiment
+        seed = settings.seed
+        tokenizer = self.world.tokenizer
+        stride = self.scenes.stride
+        tell = partial(on_progress, 0)
         self.probe = train_probe(name, tokenizer, stride, seed, tell)
         if settings.judge:
             task = task_of(name, settings.judge)
@@ -342,7 +348,8 @@ class _Maker:
     def _make(self, numbers: range, tell: Callable[[float], None]) -> SyntheticBatch:
         begun = self._simulated(numbers) if self.shards is None else self._recorded(self.shards, numbers)
         arena = ModelArena(self.world, begun, self.probe)
-        kept, uncertainty = [], []
+        kept = []
+        uncertainty = []
 
         def look(done: float) -> None:
             kept.append(arena.stored())
@@ -364,7 +371,8 @@ class _Maker:
         before = np.stack([prompt.chunks for prompt in begun.prompts])
         own = np.stack(actions, axis=1).reshape(len(numbers), -1, self.robot.chunk_dim)
         if not self.settings.recorded:  # the actions of the prompt are none of the policy's
-            first, before = first[:, -1:], before[:, :0]
+            first = first[:, -1:]
+            before = before[:, :0]
         return SyntheticBatch(
             np.concatenate([first, generated], axis=1),
             np.concatenate([before, own], axis=1),
@@ -384,8 +392,11 @@ class _Maker:
 
     def _recorded(self, shards: ShardSet, numbers: range) -> RealBeginnings:
         """Return beginnings from episodes of shards, with their actions."""
-        scenes, known = self.scenes.take(numbers), self.prompt_frames
-        prompts, told, groups = [], [], []
+        scenes = self.scenes.take(numbers)
+        known = self.prompt_frames
+        prompts = []
+        told = []
+        groups = []
         for number in numbers:
             row, (frames, chunks) = self._window(shards, number)
             prompts.append(Prompt(frames[:known], chunks[: known - 1]))
@@ -403,7 +414,8 @@ class _Maker:
             UsageError: there is hardly such a window.
         """
         rng = np.random.default_rng((self.settings.seed, 5, number))
-        length, every = self.prompt_frames + self.settings.frames, shards.manifest.frame_stride
+        length = self.prompt_frames + self.settings.frames
+        every = shards.manifest.frame_stride
         needed = None if self.settings.recorded else self.prompt_frames
         for draw in range(MAX_DRAWS):
             row = self._long[(number + draw) % len(self._long)]
@@ -435,7 +447,8 @@ def _chosen(
         raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")
     chosen &= success
     judged = True if settings.judge else None
-    found, number = [], 0
+    found = []
+    number = 0
     for batch in batches:
         for stored, chunks, group in zip(batch.stored, batch.chunks, batch.groups, strict=True):
             if chosen[number]:

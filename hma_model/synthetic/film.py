@@ -80,7 +80,8 @@ def read_film(world: World, place: StrPath, embodiment: str, hz: float) -> list[
     Raises:
         UsageError: it is neither, or its rate is no multiple of that.
     """
-    path, found = as_path(place), find_film(place)
+    path = as_path(place)
+    found = find_film(place)
     if isinstance(found, ShardSet):
         require_tokenizer(world.model.config, found.spec, found.folder)
         rows_hz = found.embodiment.rate_hz / found.manifest.frame_stride
@@ -119,7 +120,8 @@ class ShardFilm:
     """
 
     def __init__(self, world: World, shards: ShardSet, step: int, embodiment: str | None = None) -> None:
-        self._shards, self._step = shards, step
+        self._shards = shards
+        self._step = step
         rows = shards.episodes.to_pylist()
         self._parts = [(row, part) for row in rows for part in episode_pieces(shards, row, step)]
         cameras = trained_cameras(card(world.model, embodiment or shards.embodiment.id))
@@ -193,7 +195,8 @@ def _encoded_video(world: World, file: Path, robot: Embodiment | None, hz: float
     times = frame_table(file).times
     ticks = np.arange(times[0], times[-1] + 1e-6, 1 / hz)
     nearest = np.searchsorted((times[1:] + times[:-1]) / 2, ticks)
-    video, stored = VideoFile(file), []
+    video = VideoFile(file)
+    stored = []
     for indices in batched(nearest.tolist(), DECODED):
         images = fitted(video.frames(list(indices)), world.model.config, robot)
         stored.append(world.tokenizer.encode(images))

@@ -161,7 +161,8 @@ def infer(model: "HMA", spec: Commands, stored: NDArray[Any]) -> Floats:
 
     A chunk is read off a window in whose later half it lies, except those of the first window.
     """
-    count, width = len(stored), min(model.config.frames, len(stored))
+    count = len(stored)
+    width = min(model.config.frames, len(stored))
     hop = max(1, width // 2)
     starts = sorted({*range(0, count - width, hop), count - width})
     frames = torch.from_numpy(stored.astype(np.int64 if model.config.kind == "discrete" else np.float32))
@@ -189,15 +190,18 @@ def measure(
     """
     film = ShardFilm(world, shards, shards.row_stride, spec.embodiment)
     split = "val" if film.numbers("val") else "train"
-    numbers, width = film.numbers(split)[:MAX_CHECKED], len(spec.names)
-    misses, true = list[Floats](), list[Floats]()
+    numbers = film.numbers(split)[:MAX_CHECKED]
+    width = len(spec.names)
+    misses = list[Floats]()
+    true = list[Floats]()
     for done, number in enumerate(numbers):
         on_progress(done, "checking on labelled film", len(numbers))
         stored, actions, known = film.labelled(number)
         if len(stored) < 2:
             continue
         # The last frame has a chunk after it, but no frame to which it led.
-        chunks, compared = actions[:-1], known[:-1]
+        chunks = actions[:-1]
+        compared = known[:-1]
         miss = infer(world.model, spec, stored) - chunks
         misses.append(miss[compared].reshape(-1, width))
         true.append(chunks[compared].reshape(-1, width))
@@ -241,7 +245,8 @@ def _label(
     on_progress: Callable[[float, str, float], None],
 ) -> "tuple[_Labelled, list[Refused]]":
     """Infer the actions of all episodes that are not kept yet."""
-    usable, refused = list[FilmEpisode](), list[Refused]()
+    usable = list[FilmEpisode]()
+    refused = list[Refused]()
     for number, episode in enumerate(film):
         on_progress(number, "labelling", len(film))
         found = kept.part(_part(episode), partial(_labels_of, model, spec, episode))
@@ -273,7 +278,8 @@ class _Labelled(Sequence[SyntheticEpisode]):
     """Labelled episodes, each read from its file when it is asked for: together they may not fit memory."""
 
     def __init__(self, kept: KeptParts, film: Sequence[FilmEpisode]) -> None:
-        self._kept, self._film = kept, film
+        self._kept = kept
+        self._film = film
 
     def __len__(self) -> int:
         return len(self._film)
@@ -281,7 +287,8 @@ class _Labelled(Sequence[SyntheticEpisode]):
     def __getitem__(self, number: Any) -> Any:
         episode = self._film[number]
         with np.load(self._kept.path(_part(episode))) as arrays:
-            stored, chunks = arrays["stored"], arrays["chunks"]
+            stored = arrays["stored"]
+            chunks = arrays["chunks"]
         counts = {"inferred_actions": len(chunks)}
         return SyntheticEpisode(
             episode.id, stored, chunks, counts, episode.group, instruction=episode.instruction

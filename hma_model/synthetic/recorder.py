@@ -110,10 +110,12 @@ def write_shards(
     left = tuple(refused)
     for unit in plan.units:
         (folder / unit.name).parent.mkdir(exist_ok=True)
-        stats, rows = layout.empty_stats(), []
+        stats = layout.empty_stats()
+        rows = []
         with ShardWriter(folder / unit.name, layout.schema, spec) as writer:
             for index, ref in unit.episodes:
-                one, length = episodes[index], len(episodes[index].chunks)
+                one = episodes[index]
+                length = len(episodes[index].chunks)
                 times = np.arange(length) / own.effective_hz
                 rows.append(
                     EpisodeRow(
@@ -172,7 +174,8 @@ def write_as_lerobot(
         stated: the real robot, and what reads its state off the images; None for a dataset without one.
         on_progress: as of `write_lerobot`.
     """
-    made, size = ShardSet(shards), tokenizer.spec.image_size
+    made = ShardSet(shards)
+    size = tokenizer.spec.image_size
     robot, reader = stated or (made.embodiment, None)
     own = embodiment_of(robot, ORIGIN, (size, size), made.manifest.cameras, reader is not None)
     if reader is not None:

@@ -52,7 +52,8 @@ class EpisodeSession:
     """One session as episodes: actions gather to chunks, images become observations and rewards."""
 
     def __init__(self, env: "_Environment") -> None:
-        self.env, self.world = env, env.world
+        self.env = env
+        self.world = env.world
         self.session: int | None = None
         self.image: Image = np.zeros(self.world.image_shape, np.uint8)
 
@@ -65,7 +66,8 @@ class EpisodeSession:
         else:
             self.world.reset(self.session, *start, seed=seed)
         self.image = self.world.image(self.session)
-        self.steps, self.frames = 0, 0
+        self.steps = 0
+        self.frames = 0
         self.waiting: list[Floats] = []
         self.past = [self.image]  # kept for a judge only
         self.chunks: list[Floats] = []
@@ -88,7 +90,8 @@ class EpisodeSession:
         """End a step: return observation, reward, whether it is terminated or truncated, and facts."""
         assert self.session is not None
         self.steps += 1
-        reward, terminated = 0.0, False
+        reward = 0.0
+        terminated = False
         if self.session in made:
             self.image = made[self.session]
             self.frames += 1
@@ -138,13 +141,20 @@ class _Environment:
             raise UsageError("control", f"{control!r} is unknown", f"give {' or '.join(CONTROLS)}")
         if size is not None and world.image_shape[0] != world.image_shape[1]:
             raise UsageError("size", "is for models of one view", "leave it out")
-        self.world, self.embodiment, self.prompt, self.control = world, embodiment, prompt, control
-        self.horizon, self.judge, self.render_mode = horizon, judge, render_mode
-        self.clip, self.size = clip, size
+        self.world = world
+        self.embodiment = embodiment
+        self.prompt = prompt
+        self.control = control
+        self.horizon = horizon
+        self.judge = judge
+        self.render_mode = render_mode
+        self.clip = clip
+        self.size = size
         self.action_spec = spec = world.action_spec(embodiment)
         self.action_names = spec.names
         rate = spec.rate_hz or 10.0
-        low, high = spec.low, spec.high
+        low = spec.low
+        high = spec.high
         if control == "chunk":
             rate /= spec.stride
             low, high = (np.tile(bound, (spec.stride, 1)) for bound in (low, high))
@@ -260,9 +270,11 @@ class WorldModelVectorEnv(_Environment, VectorEnv[Image, Floats, NDArray[Any]]):
         **settings: Any,
     ) -> None:
         super().__init__(*others, **settings)
-        self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
+        self.num_envs = num_envs
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata["autoreset_mode"] = self.autoreset_mode
-        self.single_action_space, self.single_observation_space = self.action_space, self.observation_space
+        self.single_action_space = self.action_space
+        self.single_observation_space = self.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.drives = [self.drive, *(EpisodeSession(self) for _ in range(num_envs - 1))]

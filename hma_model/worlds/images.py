@@ -100,7 +100,8 @@ def fitted(images: NDArray[Any], config: HMAConfig, robot: "Embodiment | None") 
     if images.ndim != 4 or images.shape[-1] != 3 or images.dtype != np.uint8 or not len(images):
         fault = f"frames are {images.dtype} of the shape {images.shape}"
         raise HMAError("prompt", fault, "give images (P, H, W, 3) uint8, or stored tokens")
-    spec, shape = TokenizerSpec.from_json(dict(config.tokenizer)), image_shape(config)
+    spec = TokenizerSpec.from_json(dict(config.tokenizer))
+    shape = image_shape(config)
     if images.shape[1:] == shape:
         return images
     if config.views > 1:
@@ -115,5 +116,6 @@ def sample_image(checkpoint: Checkpoint, embodiment: str) -> Image | None:
     path = checkpoint.folder / "embodiments" / embodiment / SAMPLE
     if not path.is_file():
         return None
-    sheet, (height, width, _) = read_image(path), image_shape(checkpoint.config)
+    sheet = read_image(path)
+    (height, width, _) = image_shape(checkpoint.config)
     return first_of_grid(sheet, height, width)

@@ -177,7 +177,8 @@ def _of_frames(
 def _strided(model: "HMA", embodiment: str, frames: NDArray[Any], actions: ArrayLike) -> Prompt:
     """Return every stride-th frame, the last one included, and the chunks between them."""
     described(model, embodiment)
-    space, values = model.embodiments[embodiment], np.asarray(actions, np.float32)
+    space = model.embodiments[embodiment]
+    values = np.asarray(actions, np.float32)
     if values.shape != (len(frames) - 1, space.action_dim):
         fault = f"has actions of the shape {values.shape} for {len(frames)} frames"
         raise HMAError("prompt", fault, f"give ({len(frames) - 1}, {space.action_dim})")
@@ -204,7 +205,8 @@ def require_fit(model: "HMA", embodiment: str, shards: ShardSet) -> None:
     """Check that an embodiment of a model can go on from the frames of shards; raise HMAError if not."""
     require_tokenizer(model.config, shards.spec, shards.folder)
     described(model, embodiment)
-    space, robot = model.embodiments[embodiment], shards.embodiment
+    space = model.embodiments[embodiment]
+    robot = shards.embodiment
     if (robot.stride, robot.action_dim) != (space.stride, space.action_dim):
         fault = f"is of {robot.id}, with {robot.stride} actions of {robot.action_dim} values in a chunk"
         raise HMAError(shards.folder, fault, f"{embodiment} takes {space.stride} of {space.action_dim}")
@@ -256,7 +258,9 @@ def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
     keys = [key.key for key in open_source("lerobot").inspect(folder, 1).keys if key.kind == "camera"]
     if len(keys) < len(robot.cameras):
         raise HMAError(folder, f"has {len(keys)} cameras, {robot.id} has {len(robot.cameras)}", PROMPT_FORMS)
-    values, at, parts = robot.to_dict(), 0, []
+    values = robot.to_dict()
+    at = 0
+    parts = []
     for part in robot.action.components:
         parts.append({"key": "action", "dims": part.dims, "slice": [at, at + part.dims]})
         at += part.dims

@@ -116,7 +116,9 @@ class LabRobot:
     source = "simulator"
 
     def __init__(self, embodiment: Embodiment, stats: Mapping[str, Any], size: int = SIZE) -> None:
-        self.key, self.embodiment, self.size = embodiment.id, embodiment, size
+        self.key = embodiment.id
+        self.embodiment = embodiment
+        self.size = size
         self.dimensions = dimensions(embodiment, stats)
         self.seen = seen_range(stats)
         self.cameras = [embodiment.primary_camera.name]
@@ -131,7 +133,9 @@ class LabScene:
     def __init__(
         self, embodiment: Embodiment, dims: tuple[Dimension, ...], number: int, size: int = SIZE
     ) -> None:
-        self.stride, self.width, self.size = embodiment.stride, embodiment.action_dim, size
+        self.stride = embodiment.stride
+        self.width = embodiment.action_dim
+        self.size = size
         self.simulator = LabSimulator(embodiment.id)
         frames = [self._fitted(self.simulator.reset(seed=SCENE_SEED, episode=number))]
         chunks = []
@@ -180,7 +184,9 @@ class RecordedRobot:
         self.embodiment = shards.embodiment
         self.key = f"{self.embodiment.id}:recordings"
         self.dimensions = dimensions(self.embodiment, stats)
-        self._shards, self._tokenizer, self._cameras = shards, tokenizer, cameras
+        self._shards = shards
+        self._tokenizer = tokenizer
+        self._cameras = cameras
         self.cameras = seen_cameras(cameras, shards.manifest.cameras)
 
     @cached_property
@@ -233,7 +239,8 @@ class RecordedScene:
     def __init__(
         self, prompt: Prompt, action: Floats, frames: Image | tuple[()] = (), chunks: Floats | tuple[()] = ()
     ) -> None:
-        self.prompt, self.action = prompt, action
+        self.prompt = prompt
+        self.action = action
         self._rest = iter(zip(chunks, frames, strict=True))
         self._followed = True  # whether all actions were the recorded ones
 
@@ -263,7 +270,8 @@ class ImageRobot:
         images: Image,
         cameras: Cameras = FIRST,
     ) -> None:
-        self.embodiment, self.key = embodiment, f"{embodiment.id}:images"
+        self.embodiment = embodiment
+        self.key = f"{embodiment.id}:images"
         self.cameras = seen_cameras(cameras, recorded_cameras(embodiment))
         self.dimensions = dims = dimensions(embodiment, stats)
         means = stats["action"]["mean"]
@@ -319,7 +327,8 @@ def drivable(
         found[robot.key] = robot
     recorded = {robot.embodiment.id for robot in found.values()}
     for name in checkpoint.embodiments:
-        embodiment, stats = checkpoint.embodiment(name), checkpoint.stats(name)
+        embodiment = checkpoint.embodiment(name)
+        stats = checkpoint.stats(name)
         cameras = trained_cameras(checkpoint.card(name))
         begun = list(images)
         if simulated(name):
@@ -367,7 +376,8 @@ def trained_on(checkpoint: Checkpoint) -> list[ShardSet]:
 def seen_range(stats: Mapping[str, Any]) -> tuple[Array, Array]:
     """Return the least and the greatest action (A,) seen in training; about them where nobody knows."""
     action = stats["action"]
-    mean, std = np.array(action["mean"]), np.array(action["std"])
+    mean = np.array(action["mean"])
+    std = np.array(action["std"])
     return np.array(action.get("min", mean - 2 * std)), np.array(action.get("max", mean + 2 * std))
 
 

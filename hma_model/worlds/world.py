@@ -76,11 +76,16 @@ class World:
         precision: str = "float32",
     ) -> None:
         require_tokenizer(model.config, tokenizer.spec, "the model")
-        self.model, self.tokenizer, self.compile, self.precision = model, tokenizer, compile, precision
+        self.model = model
+        self.tokenizer = tokenizer
+        self.compile = compile
+        self.precision = precision
         self.unmask_steps = unmask_steps
         self.temperature = default_temperature(model.config) if temperature is None else temperature
-        self.order, self.sample_steps = order, sample_steps
-        self.measure, self.uncertainty = False, dict[int, float]()
+        self.order = order
+        self.sample_steps = sample_steps
+        self.measure = False
+        self.uncertainty = dict[int, float]()
         products_in(precision, model.device, compile)  # checks that the device has them
         self._decoding()
         self.image_shape = image_shape(model.config)
@@ -120,7 +125,8 @@ class World:
         taken = {one.row for one in self._sessions.values()}
         row = next(row for row in range(len(taken) + 1) if row not in taken)
         self._reserve(row, embodiment)
-        session, self._opened = self._opened, self._opened + 1
+        session = self._opened
+        self._opened = self._opened + 1
         self._sessions[session] = _Session(row, embodiment, seed)
         self._begin(session, *prompt)
         return session
@@ -229,9 +235,11 @@ class World:
         )  # fmt: skip
         names = [one.embodiment for one in ones]
         running = Rollout(self.model, names, len(ones), compile=self.compile, precision=self.precision)
-        kept, place = sorted(set(rows)), {row: i for i, row in enumerate(sorted(set(rows)))}
+        kept = sorted(set(rows))
+        place = {row: i for i, row in enumerate(sorted(set(rows)))}
         running.restore(range(len(rows)), self._running().snapshot(kept).take([place[row] for row in rows]))
-        other._rollout, other._opened = running, len(ones)
+        other._rollout = running
+        other._opened = len(ones)
         other._sessions = {number: replace(one, row=number) for number, one in enumerate(ones)}
         return other
 
