@@ -16,7 +16,7 @@ from hma_model.checkpoint.folder import EMBEDDED, FILM, SAMPLE, Checkpoint, requ
 if TYPE_CHECKING:
     from hma_data.shards.reader import ShardSet
 
-COLUMNS, SIDE = 6, 128  # pictures in a row, and pixels of a side
+COLUMNS, SIDE = 6, 128  # frames in a row of the image, and pixels of a side
 
 
 def add_samples(checkpoint: StrPath | Checkpoint, data: Iterable[StrPath]) -> list[Path]:
@@ -27,7 +27,7 @@ def add_samples(checkpoint: StrPath | Checkpoint, data: Iterable[StrPath]) -> li
         data: str or path of shard sets, one an embodiment.
 
     Returns:
-        The paths of the pictures and films.
+        The paths of the images and films.
     """
     from hma_data.shards.reader import ShardSet
 
@@ -61,7 +61,7 @@ def at_hand(checkpoint: Checkpoint, embodiments: Iterable[str] | None = None) ->
 
 
 def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
-    """Return a PNG of truth and predictions over a window, and a GIF of both with the commands."""
+    """Return a PNG of recorded and predicted frames, and a GIF of both with their actions."""
     from hma_data.episodes.sheets import gif_bytes, grid, png_bytes
     from hma_data.loading.dataset import WindowDataset
     from hma_data.shards.preview import tokenizer_of

@@ -124,7 +124,7 @@ def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[
     values["d_actions"] = [model.embodiments[name].chunk_dim for name in domains.values()] or None
     parts = {domain: (model.stem_state(name), model.head_state(name)) for domain, name in domains.items()}
     if waved := [name for name in domains.values() if model.stem(name).waves is not None]:
-        fault = f"the stem of {_some(waved)} takes waves of the commands; the released layout has none"
+        fault = f"the stem of {_some(waved)} takes waves of the actions; the released layout has none"
         raise CheckpointError(opened.folder, fault, "the released code cannot read it")
     state = state_to_released(model.trunk_state(), parts, opened.config)
     for name, tensor in model.trunk_state().items():
