@@ -107,5 +107,5 @@ class MissingDependencyError(HMAError):
 def install_command(extra: str = "") -> str:
     """Return the command that installs what the toolkit or an extra of it needs: uv in a checkout, or pip."""
     if _CHECKOUT.is_file():
-        return f"uv sync --inexact --extra {extra}" if extra else "uv sync"
+        return f"uv sync --inexact --extra {extra}" if extra else "uv sync --inexact"
     return f"pip install 'hma-toolkit[{extra}]'" if extra else "pip install hma-toolkit"
