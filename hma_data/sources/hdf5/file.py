@@ -40,6 +40,8 @@ MAX_DEPTH = 4  # of the groups above the episodes
 MAX_GROUPS_SAMPLED = 8  # most groups looked into to see whether they and their like are episodes
 MIN_ENCODED = 64  # bytes a row: no image has fewer
 TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
+# Attributes that state how many rows of preallocated series were recorded
+RECORDED = ("num_samples", "num_steps", "num_frames", "episode_length", "episode_len", "length")
 MAX_KEYS = 5_000  # datasets and groups of an episode that are listed
 _EPISODE_NAME = re.compile(r"(demo|episode|ep|traj|trajectory|rollout)[_-]?\d+")
 _PART = re.compile(  # of a robot or a scene; one episode holds several
@@ -146,10 +148,11 @@ def explained(where: object, error: type[HMAError] = EpisodeError) -> Iterator[N
 
 @dataclass(frozen=True)
 class EpisodeGroup:
-    """The place of an episode: a file and the group in it."""
+    """The place of an episode: a file and the group in it; or why the group cannot be read."""
 
     file: Path
     group: str = WHOLE_FILE
+    fault: str = ""
 
     def __str__(self) -> str:
         return str(self.file) if self.group == WHOLE_FILE else f"{self.file}:{self.group}"
@@ -224,6 +227,8 @@ class EpisodeFinder:
 
     def group(self, place: EpisodeGroup) -> h5py.Group:
         """Return the episode's group, in the open file."""
+        if place.fault:
+            raise EpisodeError(place, place.fault, "copy the group into this file")
         return member(self._files.get(place.file), place.group, str(place))
 
     def _inside(self, file: Path, pattern: str | None) -> dict[str, EpisodeGroup]:
@@ -259,19 +264,23 @@ def _episodes(handle: h5py.File, file: Path, pattern: str | None) -> dict[str, E
     parts = pattern.split("/")
     fixed = next((i for i, part in enumerate(parts) if re.search(r"[*?\[]", part)), len(parts) - 1)
     found: dict[str, EpisodeGroup] = {}
-    for group in sorted(_matching(handle, parts), key=_natural):
+    matching = dict(_matching(handle, parts))
+    for group in sorted(matching, key=_natural):
         name = "/".join(map(_safe, group.split("/")[fixed:]))
         if name in found:
             raise SourceError(file, f"two of its groups give an episode called {name!r}", "rename one")
-        found[name] = EpisodeGroup(file, group)
+        found[name] = EpisodeGroup(file, group, matching[group])
     return found
 
 
 def _guess_pattern(handle: h5py.File) -> str:
-    data = handle.get("data")
-    if isinstance(data, h5py.Group) and all(isinstance(data.get(name), h5py.Group | None) for name in data):
+    data = inside(handle, "data")
+    is_demos = isinstance(data, h5py.Group) and not any(
+        isinstance(inside(data, name), h5py.Dataset) for name in data
+    )
+    if is_demos:
         return "data/*"
-    groups = [name for name in handle if isinstance(handle.get(name), h5py.Group)]
+    groups = [name for name in handle if isinstance(inside(handle, name), h5py.Group)]
     if groups and len(groups) == len(handle) and all(_EPISODE_NAME.fullmatch(name) for name in groups):
         return "*"
     found = _numbered(handle)
@@ -284,7 +293,7 @@ def _numbered(group: h5py.Group, depth: int = 0) -> tuple[str, int] | None:
     They differ in a number, and most hold images and actions. Numbered cameras and arms are none: they do
     not hold both, or are named as such, or what is as long lies beside them.
     """
-    inner = {name: group[name] for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)}
+    inner = {name: item for name in group if (item := inside(group, name)) is not None}
     groups = {name: item for name, item in inner.items() if isinstance(item, h5py.Group)}
     if not groups or depth > MAX_DEPTH:
         return None
@@ -365,16 +374,29 @@ def _rows_of_episode(group: h5py.Group) -> int:
     return max((count for count in images for other in values if abs(count - other) <= 1), default=0)
 
 
-def _matching(group: h5py.Group, parts: list[str]) -> list[str]:
-    """Return the paths of the groups that match a pattern, one part a level; links are not followed."""
-    found = []
+def inside(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
+    """Return a member of a group that lies in the same file; None for a link out of it, or to nothing."""
+    if isinstance(group.get(name, getlink=True), h5py.ExternalLink):
+        return None
+    item = group.get(name)
+    # A soft link may pass through an external one.
+    return item if item is not None and item.file.filename == group.file.filename else None
+
+
+def _matching(group: h5py.Group, parts: list[str]) -> Iterator[tuple[str, str]]:
+    """Yield the paths of the groups that match a pattern, one part a level, and why one cannot be read."""
     for name in group:
-        if fnmatchcase(name, parts[0]) and isinstance(group.get(name, getlink=True), h5py.HardLink):
-            item = group[name]
-            if isinstance(item, h5py.Group):
-                below = [f"/{rest}" for rest in _matching(item, parts[1:])] if parts[1:] else [""]
-                found += [name + rest for rest in below]
-    return found
+        if not fnmatchcase(name, parts[0]):
+            continue
+        item = inside(group, name)
+        if item is None:
+            link = group.get(name, getlink=True)
+            other = f"{link.filename}:" if isinstance(link, h5py.ExternalLink) else ""
+            yield name, f"is a link to {other}{link.path}, which is not in this file"
+        elif isinstance(item, h5py.Group) and parts[1:]:
+            yield from ((f"{name}/{rest}", fault) for rest, fault in _matching(item, parts[1:]))
+        elif isinstance(item, h5py.Group):
+            yield name, ""
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
@@ -475,20 +497,52 @@ def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDA
 
 
 def walk(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
-    """Yield every dataset below `group` with its path, up to 5,000 keys; do not follow links or cycles."""
+    """Yield every dataset below `group` with its path, up to 5,000 keys; no cycle and no link elsewhere."""
     pending: list[tuple[str, h5py.Group, tuple[h5py.Group, ...]]] = [("", group, (group,))]
     seen = 0
     while pending and seen <= MAX_KEYS:
         prefix, current, above = pending.pop(0)
         seen += len(current)
         for name in current:
-            if not isinstance(current.get(name, getlink=True), h5py.HardLink):
-                continue
-            item = current[name]
+            item = inside(current, name)
             if isinstance(item, h5py.Group) and item not in above:
                 pending.append((f"{prefix}{name}/", item, (*above, item)))
             elif isinstance(item, h5py.Dataset):
                 yield f"{prefix}{name}", item
+
+
+class Recorded:
+    """How many rows of an episode's series were recorded: all, or fewer where preallocated buffers say so.
+
+    Args:
+        capacity: rows of the actions.
+    """
+
+    def __init__(self, group: h5py.Group, capacity: int) -> None:
+        self.rows, self._capacity, self._is_stated = capacity, capacity, False
+        for name in RECORDED:
+            stated = group.attrs.get(name)
+            if stated is None and isinstance(found := inside(group, name), h5py.Dataset) and not found.shape:
+                stated = found[()]
+            if isinstance(stated, int | np.integer) and 0 < stated <= capacity:
+                self.rows, self._is_stated = int(stated), True
+                break
+
+    def of(self, length: int) -> int:
+        """Return how many rows of a series are recorded; one row more than actions may be an observation."""
+        is_buffer = self._is_stated and (self.rows < self._capacity or length > self.rows + 1)
+        return min(length, self.rows) if is_buffer else length
+
+
+def masks_of(handle: h5py.File) -> dict[str, set[str]]:
+    """Return robomimic's filter keys: name -> names of demos."""
+    mask = inside(handle, "mask")
+    lists = mask.items() if isinstance(mask, h5py.Group) else ()
+    return {
+        name: {text(row).rsplit("/", 1)[-1] for row in found[()]}
+        for name, found in lists
+        if isinstance(found, h5py.Dataset) and found.ndim == 1
+    }
 
 
 def text(value: Any) -> str:

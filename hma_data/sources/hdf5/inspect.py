@@ -23,9 +23,11 @@ from hma_data.sources.hdf5.file import (
     EpisodeFinder,
     EpisodeGroup,
     OpenFiles,
+    Recorded,
     explained,
     is_plausible,
     json_of,
+    masks_of,
     numbers,
     rows,
     text,
@@ -77,22 +79,35 @@ def inspect(
             with explained(place):
                 group = finder.group(place)
                 sizes = {key: item.shape[0] for key, item in walk(group) if item.shape}
-                lengths[name] = _length(sizes)
+                recorded = Recorded(group, _length(sizes))
+                lengths[name] = recorded.rows
                 if not lengths[name]:
                     raise EpisodeError(name, "has no frames")
+                if unused := max(sizes.values()) - recorded.of(max(sizes.values())):
+                    said = f"{name}: {unused:,} rows beyond the {recorded.rows:,} that it states are left out"
+                    survey.note(Finding("rows", "info", said, numbers={"rows": unused}))
+                sizes = {key: recorded.of(size) for key, size in sizes.items()}
                 if not first.keys:
                     first.name = name
                     _tell(first, group, files, place)
                     _end_to_end(name, group, place, survey)
                 held.update(sizes)
-                inside = (key for key, info in first.keys.items() if info.kind in ("camera", "vector"))
-                series = [key for key in inside if not is_video(key)]
+                kinds = {key: info.kind for key, info in first.keys.items() if not is_video(key)}
+                series = [key for key, kind in kinds.items() if kind in ("camera", "vector")]
                 survey.lengths(name, lengths[name], sizes, series)
                 if name in chosen:
                     survey.episode(name)
-                    _look(name, group, first, survey, pairs)
+                    _look(name, group, first, survey, pairs, recorded)
         except HMAError as fault:
             survey.fault(name, fault)
+    for file in {found[name].file for name in chosen}:
+        with explained(file):
+            masks = masks_of(files.get(file))
+        demos = {place.group.rsplit("/", 1)[-1] for place in found.values() if place.file == file}
+        for mask, names in masks.items():
+            if absent := sorted(names - demos):
+                said = f"mask/{mask} names {listed(absent)}, which {file.name} has not"
+                survey.note(Finding("keys", "warn", said, numbers={"demos": len(absent)}))
     lacking = [key for key, count in held.items() if key not in first.keys and 2 * count >= len(lengths)]
     if lacking:
         survey.note(Finding("keys", "warn", f"{first.name}: has no {listed(lacking)}, which others have"))
@@ -123,9 +138,10 @@ def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: EpisodeGrou
     first.keys = {info.key: info for info in _keys(group, place, first.pixels)}
     first.facts = _facts(group, said, place)
     first.facts["pixels"] = next(iter(first.pixels.values()), "")
-    first.facts["videos beside it"] = listed(videos_beside(place.file))
-    if place.group == WHOLE_FILE and all(info.kind != "camera" for info in first.keys.values()):
-        first.keys |= {info.key: info for info in video_keys(place.file)}
+    if all(info.kind != "camera" for info in first.keys.values()):
+        first.facts["videos beside it"] = listed(videos_beside(place.file))
+        films = video_keys(place.file) if place.group == WHOLE_FILE else ()
+        first.keys |= {info.key: info for info in films}
     first.rate, first.facts["rate"], first.facts["timestamps"] = _rate(group, said, first.keys, str(place))
 
 
@@ -156,7 +172,9 @@ def _environment(handle: h5py.File) -> dict[str, Any]:
     return {**found, **inner} if isinstance(inner, dict) else found
 
 
-def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: int) -> None:
+def _look(
+    name: str, group: h5py.Group, first: _First, survey: Survey, pairs: int, recorded: Recorded
+) -> None:
     """Hand one episode's numbers, times and some frames to the survey."""
     for key, info in first.keys.items():
         item = group.get(key)
@@ -166,9 +184,13 @@ def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: in
         try:
             with explained(where):
                 if info.kind == "camera":
-                    _images(name, key, item, info, survey, pairs, first.pixels.get(key))
+                    layout = Hdf5Layout.model_validate({"pixels": first.pixels.get(key)})
+                    chosen = checks.choose(recorded.of(item.shape[0]), pairs)
+                    for run in checks.runs(chosen):
+                        _images(name, key, item, info, survey, run, layout)
                 elif info.kind == "vector" and item.size <= MAX_VALUES:
-                    _values(name, key, numbers(group, key, name), info, survey, first)
+                    values = numbers(group, key, name)
+                    _values(name, key, values[: recorded.of(len(values))], info, survey, first)
         except HMAError as fault:
             survey.fault(name, fault, key)
 
@@ -197,20 +219,18 @@ def _pixels(group: h5py.Group) -> dict[str, str]:
 
 
 def _images(
-    name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, pairs: int, pixels: str | None
+    name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, run: Any, layout: Hdf5Layout
 ) -> None:
-    layout = Hdf5Layout.model_validate({"pixels": pixels})
-    for run in checks.runs(checks.choose(item.shape[0], pairs)):
-        found = rows(item, run)
-        if info.codec == "raw":
-            found = as_bytes(found, layout, f"{name} {key}")
-            survey.pictures(name, key, as_rgb(found), run, info.codec)
-            continue
-        images = [
-            decode_image(encoded(row), f"{name} {key}, frame {i}") for row, i in zip(found, run, strict=True)
-        ]
-        for start, frames in checks.stacked(images):
-            survey.pictures(name, key, frames, run[start : start + len(frames)], info.codec)
+    found = rows(item, run)
+    if info.codec == "raw":
+        found = as_bytes(found, layout, f"{name} {key}")
+        survey.pictures(name, key, as_rgb(found), run, info.codec)
+        return
+    images = [
+        decode_image(encoded(row), f"{name} {key}, frame {i}") for row, i in zip(found, run, strict=True)
+    ]
+    for start, frames in checks.stacked(images):
+        survey.pictures(name, key, frames, run[start : start + len(frames)], info.codec)
 
 
 def _length(sizes: dict[str, int]) -> int:
@@ -250,7 +270,8 @@ def _rate(
     )
     if key is None:
         return stated, holder, ""
-    values = numbers(group, key, where).reshape(-1)
+    buffer = numbers(group, key, where).reshape(-1)
+    values = buffer[: Recorded(group, len(buffer)).rows]
     unit = seconds_a_unit(values, key) if values.dtype.kind in "fiu" else None
     if unit is None:
         return stated, holder, ""

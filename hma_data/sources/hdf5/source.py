@@ -22,7 +22,6 @@ T frames of an episode, n of them asked for, H×W pixels, C channels.
 
 import hashlib
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -42,10 +41,12 @@ from hma_data.sources.hdf5.file import (
     EpisodeFinder,
     EpisodeGroup,
     OpenFiles,
+    Recorded,
     dataset,
     explained,
     is_elsewhere,
     json_of,
+    masks_of,
     member,
     numbers,
     text,
@@ -104,7 +105,8 @@ class Hdf5Source:
             fingerprint = file_fingerprint(file)
             films = video_fingerprints(file, embodiment.cameras, layout) if embodiment else ""
             whole = any(place.group == WHOLE_FILE for place in places.values())
-            masks = {} if whole else self._masks(file)
+            with explained(file, SourceError):
+                masks = {} if whole else masks_of(self._files.get(file))
             known |= set(masks)
             for episode_id, place in places.items():
                 name = place.group.rsplit("/", 1)[-1]
@@ -131,8 +133,9 @@ class Hdf5Source:
         with explained(where):
             group = self._finder.group(place)
             actions = _vector(group, embodiment.action, where)
-            check = partial(_check_length, layout, where, len(actions))
-            times = _times(group, embodiment, layout, len(actions), where)
+            recorded = Recorded(group, len(actions))
+            check = partial(_check_length, layout, where, recorded)
+            times = _times(group, embodiment, layout, recorded, where)
             check(layout.timestamps or "", len(times))
             observed: NDArray[np.float32] | None = None
             if embodiment.state:
@@ -145,7 +148,10 @@ class Hdf5Source:
                 else:
                     cameras[camera.name] = self._images(place, group, camera.key, layout, times)
                 check(camera.key, cameras[camera.name].rows, layout.frames_missing * is_video(camera.key))
-            length = min(len(actions), *(images.rows for images in cameras.values()))
+            # Rows beyond the stated number are empty buffers; a video beside the file has none.
+            length = min(recorded.rows, *(images.rows for images in cameras.values()))
+            longest = max(len(actions), *(images.rows for images in cameras.values()))
+            unused = longest - recorded.of(longest)
             times = times[:length]
             for images in cameras.values():
                 images.timestamps = times
@@ -158,7 +164,7 @@ class Hdf5Source:
                 instruction=_instruction(group, embodiment.source.instruction, where),
                 success=_success(group),
                 source=where,
-                metadata=_metadata(group),
+                metadata=_metadata(group) | ({"flags": {"rows_without_record": unused}} if unused else {}),
             )
 
     def _images(
@@ -181,21 +187,10 @@ class Hdf5Source:
                 group = self._finder.group(place)
                 key = next((key for key in keys if key.strip("/") in group), None)
                 if key:
-                    return len(dataset(group, key, str(place)))
+                    return Recorded(group, len(dataset(group, key, str(place)))).rows
                 return max((item.shape[0] for _, item in walk(group) if item.shape), default=0)
         except HMAError:
             return 0
-
-    def _masks(self, file: Path) -> dict[str, set[str]]:
-        """Return robomimic's filter keys: name -> names of demos."""
-        with explained(file, SourceError):
-            mask = self._files.get(file).get("mask")
-            lists = mask.items() if isinstance(mask, h5py.Group) else ()
-            return {
-                name: {text(row).rsplit("/", 1)[-1] for row in found[()]}
-                for name, found in lists
-                if isinstance(found, h5py.Dataset) and found.ndim == 1
-            }
 
 
 open = Hdf5Source
@@ -209,13 +204,14 @@ def _split_of(demo: str, masks: dict[str, set[str]]) -> str | None:
 
 
 def _check_length(
-    layout: Hdf5Layout, where: str, actions: int, key: str, length: int, missing: int = 0
+    layout: Hdf5Layout, where: str, recorded: Recorded, key: str, rows: int, missing: int = 0
 ) -> None:
     """Raise an EpisodeError where a series is not as long as the actions, or one row longer to be dropped.
 
     Args:
         missing: rows by which the series may be shorter.
     """
+    actions, length = recorded.rows, recorded.of(rows)
     one_more = length == actions + 1
     if one_more and layout.last_observation == "drop":
         return
@@ -230,12 +226,15 @@ def _check_length(
         raise EpisodeError(where, f"its series differ in length: actions {actions}, {key} {length}", remedy)
 
 
-def _times(group: h5py.Group, embodiment: Embodiment, layout: Hdf5Layout, length: int, where: str) -> Floats:
+def _times(
+    group: h5py.Group, embodiment: Embodiment, layout: Hdf5Layout, recorded: Recorded, where: str
+) -> Floats:
     """Return the seconds of the frames: the episode's own where the YAML names their key."""
     key, hz = layout.timestamps, embodiment.frequency_hz
     if key is None:  # With an unknown rate a recording can be looked at; converting it is refused before.
-        return rate_times(length, 1.0 if hz == "unknown" else embodiment.rate_hz)
+        return rate_times(recorded.rows, 1.0 if hz == "unknown" else embodiment.rate_hz)
     values = numbers(group, key, where)
+    values = values[: recorded.of(len(values))]
     if values.dtype.kind not in "fiu" or values.size != len(values):
         raise EpisodeError(where, f"{key!r} holds {values.shape} {values.dtype}, not a time a frame")
     times = values.reshape(-1)
