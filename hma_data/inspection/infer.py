@@ -129,6 +129,15 @@ def action_offsets(found: Inspection) -> dict[str, Offset]:
         return {}
 
 
+def held_actions(found: Inspection) -> dict[str, float]:
+    """Return the topics of the action that end before the first frame, and by how many seconds."""
+    try:
+        topics = infer_topics.about(_Draft(found).action.keys)
+    except SourceError:
+        return {}
+    return {topic.name: topic.held_s for topic in topics if topic.held_s is not None}
+
+
 def lacking(found: Inspection) -> str:
     """Return what a recording lacks for `infer`, as "has no colour camera"; empty where it lacks nothing."""
     if found.format == "hands":
@@ -192,6 +201,9 @@ class _Draft:
     def __init__(self, found: Inspection) -> None:
         self.found = found
         self.bag = found.format == "rosbag"
+        if self.bag:  # what was measured by a clock that was set back says nothing
+            keys = [_by_a_running_clock(key) for key in found.keys]
+            self.found = found = replace(found, keys=tuple(keys))
         self.timed = found.format not in ONE_INDEX  # each key has its own times
         self.seen, self.looks = _showing(cameras(found.keys), found.findings)
         if not self.seen.keys:
@@ -213,6 +225,11 @@ class _Draft:
         self.states = chosen_states(numbers, () if rh20t else self.action.keys)
         if not self.action.keys:
             raise _lacks(found, "has nothing that could be an action", self.seen.keys)
+        self.clock = infer_topics.clock_of([*self.seen.keys, *self.action.keys, *self.states])
+        if self.clock.reason:  # what is proposed is measured by the clock that is proposed
+            self.seen = replace(self.seen, keys=_all_by_receipt(self.seen.keys))
+            self.action = replace(self.action, keys=_all_by_receipt(self.action.keys))
+            self.states = _all_by_receipt(self.states)
         hz = self.seen.keys[0].hz if self.bag else found.hz
         self.hz = hz if hz is not None and 0 < hz <= MAX_HZ else None
         self.used = [*self.seen.keys, *self.action.keys, *self.states]
@@ -312,9 +329,12 @@ class _Draft:
         }
         tolerance = infer_topics.tolerance_ms(self.offsets.values())
         skew = infer_topics.max_skew_ms(self.seen.keys[1:], self.action.keys, self.states)
-        late = infer_topics.needs_receive_times(self.used)
         sync |= {"tolerance_ms": tolerance} if tolerance else {}
-        return sync | ({"max_skew_ms": skew} if skew else {}) | ({"stamp": "receive"} if late else {})
+        return (
+            sync
+            | ({"max_skew_ms": skew} if skew else {})
+            | ({"stamp": "receive"} if self.clock.reason else {})
+        )
 
     def _instruction(self) -> str | None:
         facts = self.found.facts
@@ -334,8 +354,13 @@ class _Draft:
             said["target_hz"] = (
                 f"so that a model sees {FRAMES_PER_EPISODE} frames of an episode of {length}, if it has them"
             )
-        if self.action.question:
-            said["action"] = f"{TODO}: {self.action.question}"
+        names = {topic.name for topic in infer_topics.about(self.used)}
+        mixed = [one.message for one in self.found.findings if one.check == "keys" and one.key in names]
+        asked = [self.action.question, *(f"{one}; is it the right one?" for one in mixed)]
+        if asked := [one for one in asked if one]:
+            said["action"] = f"{TODO}: {' '.join(asked)}"
+        if padded := [one.message for one in self.found.findings if one.check == "padding"]:
+            said["last_step"] = "; ".join(padded)
         if self.seen.question or self.looks:
             asked = [f"{TODO}: {self.seen.question}"] if self.seen.question else []
             said["cameras"] = "; ".join([*asked, *self.looks])
@@ -349,8 +374,10 @@ class _Draft:
             if gaps:
                 factor = f"{infer_topics.MARGIN:g} times the longest interval held"
                 said["max_skew_ms"] = f"{factor}; intervals, measured: {gaps}"
-            if late := infer_topics.needs_receive_times(self.used):
-                said["stamp"] = late
+            if self.clock.asks:
+                said["stamp"] = f"{TODO}: {self.clock.reason}; is it right to pair by the times of receipt?"
+            elif self.clock.reason:
+                said["stamp"] = self.clock.reason
             if pause := self._pause():
                 said["segments"] = str(pause)
         return said
@@ -372,6 +399,16 @@ class _Draft:
         rates = dict.fromkeys(f"{key.topic.name if key.topic else key.key} {_hz(key)}" for key in moved)
         beside = f"; beside it {shown(rates)}" if rates else ""
         return f"measured: {camera.key} {_hz(camera)}{beside}"
+
+
+def _by_a_running_clock(key: KeyInfo) -> KeyInfo:
+    topic = key.topic
+    set_back = topic is not None and topic.goes_back and not topic.receipt_goes_back
+    return infer_topics.timed_by_receipt(key) if set_back else key
+
+
+def _all_by_receipt(keys: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
+    return tuple(infer_topics.timed_by_receipt(key) for key in keys)
 
 
 def _showing(seen: Choice, findings: Iterable[Finding]) -> tuple[Choice, list[str]]:

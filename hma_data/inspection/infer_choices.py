@@ -29,8 +29,8 @@ NOISE = _set("""
     torques effort efforts contact contacts tactile object objects obj cube obstacle bbox bounds attention
     feature features latent latents rosout diagnostics clock log parameter tf marker markers map scan cloud
     pointcloud color colour pad padding next acceleration accelerations acc error errors duration status
-    feedback result event events environment noise
-    time
+    feedback result event events environment noise time version crc checksum tick mode reserve reserved
+    counter heartbeat kp kd stiffness damping tau
 """)
 _COMMANDS = (
     (5, _set("action actions command commands commanded cmd cmds cmdvel")),
@@ -43,8 +43,8 @@ STATES = _set("""
     state states joint joints jointstates qpos proprio proprioception pose eef ee tcp effector tool position
     positions pos gripper odom odometry encoder encoders xyz
 """)
-MOTION = _set("velocity velocities vel vels qvel jvel twist")
-PLACE = _set("position positions pos pose poses qpos angle angles")
+MOTION = _set("velocity velocities vel vels qvel jvel twist dq qd")
+PLACE = _set("position positions pos pose poses qpos angle angles q")
 BASE = _set("base displacement torso waist head body chassis wheel wheels")
 ROTATION = _set("rotation rot quat quaternion orientation euler rpy axis angular")
 JOINT = _set("joint joints qpos")

@@ -2,7 +2,8 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 from hma_data.episodes.offset import Offset
 from hma_data.inspection.infer_choices import (
@@ -20,12 +21,12 @@ from hma_data.inspection.infer_choices import (
     strength,
     words,
 )
+from hma_data.sources.bags.clocks import Clock, apart
 from hma_data.sources.common.inspection import KeyInfo, TopicInfo
 
 _COMMAND_TYPE = re.compile(r"(Twist|JointTrajectory|Command|Cmd|Ackermann|Joy)[A-Za-z]*$")
 _NEVER = re.compile(r"(^|/)(rosout|parameter_events|clock|diagnostics|_action)(/|$)|_service_event$")
 SLOWEST_HZ = 1.0  # a topic with a lower rate is no stream of actions or states
-CLOCKS_APART_MS = 1000.0  # header stamps that differ so much between topics are not of one clock
 WEAK = 1  # strength of a topic called goal, control or joy; see `strength`
 MARGIN = 1.5  # factor on the longest interval measured
 
@@ -61,13 +62,19 @@ def commanding_topics(found: list[KeyInfo]) -> Choice:
         or (is_gripper(_name(topic)) and not is_gripper(_name(best)))
     ]
     chosen.sort(key=lambda topic: (is_gripper(_name(topic)), _name(topic)))
-    keys = tuple(key for topic in chosen for key in _commanded_fields(topic))
+    fields = [key for topic in chosen for key in _commanded_fields(topic)]
+    keys = tuple(key for key in fields if not _rests(key, fields))
+    still = shown(key.key for key in fields if key not in keys)
+    asked = []
+    if still:
+        asked.append(f"{still} never changes in the bag looked at and is left out; does it in others?")
     others = [topic[0] for _, topic in commanding if topic not in chosen]
     (clear, ticks, *_), _ = commanding[0]
     if clear <= WEAK or not ticks:
         others += [key for key in found if key not in keys and key not in others]
-        return Choice(keys, question(keys, others))
-    return Choice(keys, question(keys, others) if others else "")
+    if others or clear <= WEAK or not ticks:
+        asked.insert(0, question(keys, others))
+    return Choice(keys, " ".join(asked))
 
 
 def measured_topics(found: list[KeyInfo]) -> Choice:
@@ -123,7 +130,16 @@ def _other_side(topic: Topic, best: Topic) -> bool:
 def _commanded_fields(topic: Topic) -> list[KeyInfo]:
     """Return the fields of a topic that are the action: desired values, and of these positions, if any."""
     desired = [key for key in topic if {"desired", "reference"} & set(words(_path(key)))]
-    return _positions(desired or list(topic))
+    fields = desired or list(topic)
+    # Whole numbers beside others are modes, counters and checksums.
+    moving = [key for key in fields if not key.dtype.startswith(("int", "uint")) or is_gripper(key.key)]
+    return _positions(moving or fields)
+
+
+def _rests(key: KeyInfo, fields: list[KeyInfo]) -> bool:
+    """Check whether a field never changes while others of its message do; the halves of a Twist stay."""
+    beside = [one for one in fields if _name((one,)) == _name((key,)) and not one.constant]
+    return key.constant and bool(beside) and not key.key.endswith((".linear", ".angular"))
 
 
 def _positions(fields: list[KeyInfo]) -> list[KeyInfo]:
@@ -152,16 +168,45 @@ def about(keys: Iterable[KeyInfo]) -> list[TopicInfo]:
     return list(dict.fromkeys(key.topic for key in keys if key.topic))
 
 
-def needs_receive_times(keys: Iterable[KeyInfo]) -> str:
-    """Return why header stamps cannot be the clock of all these topics; empty where they can."""
+@dataclass(frozen=True)
+class ClockChoice:
+    """Whether the topics of an embodiment are timed by receipt, and why.
+
+    Attributes:
+        reason: empty where header stamps are the clock.
+        asks: whether the reason is no proof, so that the user must choose.
+    """
+
+    reason: str = ""
+    asks: bool = False
+
+
+def clock_of(keys: Sequence[KeyInfo]) -> ClockChoice:
+    """Return the clock that times all these topics; the first key is the primary camera's."""
     used = about(keys)
-    back = [topic.name for topic in used if topic.goes_back]
-    if back:
-        return f"header stamps of {shown(back)} go back in time"
-    delays = [topic.delay_ms or 0.0 for topic in used]
-    if delays and max(delays) - min(delays) > CLOCKS_APART_MS:
-        return f"header stamps are up to {(max(delays) - min(delays)) / 1e3:.3g} s apart between topics"
-    return ""
+    if not used or any(topic.receipt_goes_back for topic in used):
+        return ClockChoice()  # receipt cannot replace the header stamps
+    if back := [topic.name for topic in used if topic.goes_back]:
+        return ClockChoice(f"header stamps of {shown(back)} go back in time")
+    period_s = 1 / keys[0].hz if keys[0].hz else 0.0
+    for topic in used[1:]:
+        if reason := apart(_clock(used[0]), _clock(topic), period_s):
+            return ClockChoice(reason, asks=True)
+    return ClockChoice()
+
+
+def _clock(topic: TopicInfo) -> Clock:
+    by_header = topic.delay_ms is not None
+    return Clock(topic.name, by_header, (topic.delay_ms or 0.0) / 1e3, topic.drift_ms / 1e3)
+
+
+def timed_by_receipt(key: KeyInfo) -> KeyInfo:
+    """Return a key with the timing of its topic by receipt in place of that by header stamps."""
+    if key.topic is None:
+        return key
+    timing = key.topic.by_receipt
+    topic = replace(key.topic, gap_ms=timing.gap_ms, offsets=timing.offsets)
+    return replace(key, hz=timing.hz, jitter_ms=timing.jitter_ms, topic=topic)
 
 
 def offsets(actions: Iterable[KeyInfo], camera: KeyInfo) -> dict[str, Offset]:

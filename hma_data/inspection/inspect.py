@@ -27,7 +27,7 @@ from hma_data.episodes.episode import Clip, Floats
 from hma_data.episodes.images import describe_resize
 from hma_data.episodes.offset import Offset, measure
 from hma_data.errors import HMAError, SourceError
-from hma_data.inspection.infer import action_offsets, lacking
+from hma_data.inspection.infer import action_offsets, held_actions, lacking
 from hma_data.registry.components import Sync
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment, find
 from hma_data.sources.base import SAMPLE, Inspection, LaidOut, Source, open_source
@@ -173,6 +173,9 @@ def unanswered(inspection: Inspection) -> Iterator[Finding]:
         yield Finding(
             "robot", "warn", said, "record cameras and the robot's actions or joint states together"
         )
+    for topic, seconds in held_actions(inspection).items():
+        said = f"{topic}: its last message is {seconds:.3g} s before the first frame, held throughout"
+        yield Finding("offset", "warn", said, "an action of one value teaches nothing; name another", topic)
     if inspection.format in ONE_INDEX and not inspection.hz:
         yield Finding(
             "rate", "info", "the recording states no rate", "state frequency_hz in the robot's YAML"

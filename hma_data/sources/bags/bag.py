@@ -8,6 +8,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path, PurePosixPath
@@ -56,7 +57,16 @@ class Bag:
     def __init__(self, path: Path, root: Path | None = None) -> None:
         self.path = path
         self._metadata = _metadata(path) if path.is_dir() else {}
-        self._paths = _listed(path, self._metadata) if path.is_dir() else [path]
+        self.remarks: tuple[str, ...] = ()  # what its folder has beside what is read, one sentence each
+        self._paths = [path]
+        self._stated = False  # whether the metadata describes all of its files
+        if path.is_dir():
+            self._paths, self.remarks = _listed(path, self._metadata)
+            self._stated = not self.remarks
+        elif root is not None and root != path and (parts := following_parts(path)):
+            self._paths = [path, *parts]
+            said = f"{path.name} to {parts[-1].name} follow each other without a pause"
+            self.remarks = (f"{said}: the {len(self._paths)} files are read as one recording",)
         self._message_packed = str(self._metadata.get("compression_mode", "")).lower() == "message"
         self._unpacked: tempfile.TemporaryDirectory[str] | None = None
         self._files: list[Container] | None = None
@@ -90,11 +100,16 @@ class Bag:
         """Count the messages of each channel, from indexes where there are any."""
         if self._counts is None:
             packed = any(path.suffix == ".zstd" for path in self._paths)
-            counts = self._stated_counts() if packed else Counter[Channel]()
+            counts = self._stated_counts() if packed and self._stated else Counter[Channel]()
             for file in () if counts else self.files():
                 counts.update(file.counts())
             self._counts = counts
         return self._counts
+
+    def span(self) -> tuple[int, int]:
+        """Return the earliest and latest time of receipt."""
+        spans = [file.span() for file in self.files()]
+        return min(first_ns for first_ns, _ in spans), max(last_ns for _, last_ns in spans)
 
     def records(self, wanted: RecordFilter = ALL) -> Iterator[tuple[BagPlace, Record]]:
         """Yield the wanted messages, file by file; a time range costs about its own bytes."""
@@ -195,7 +210,8 @@ def find_bags(root: Path) -> dict[str, Path]:
     """Return episode id -> bag at or under a path, in order of the ids.
 
     An id is the path relative to `root` without suffix; the suffix stays where two ids would be equal. A
-    folder with rosbag2's metadata.yaml is one bag; elsewhere every bag file is one.
+    folder with rosbag2's metadata.yaml is one bag. Elsewhere every bag file is one, but files that a recorder
+    split (run_0.mcap, run_1.mcap) are one bag together, with the path of the first and the id `run`.
     """
     if root.is_file() or is_bag_folder(root):
         return {root.stem if root.is_file() else root.name: root}
@@ -203,6 +219,12 @@ def find_bags(root: Path) -> dict[str, Path]:
     for path, is_folder in (_remote_bags if isinstance(root, RemotePath) else _local_bags)(root):
         name = path.relative_to(root)
         found[path] = (name if is_folder else name.with_suffix("")).as_posix()
+    for path in sorted(path for path in found if _part_number(path) is not None):
+        parts = following_parts(path) if path in found else []
+        if parts and (match := SPLIT_PART.fullmatch(path.name)):
+            found[path] = (path.relative_to(root).parent / match["stem"]).as_posix()
+        for part in parts:
+            del found[part]
     counts = Counter(found.values())
     named = {
         name if counts[name] == 1 else path.relative_to(root).as_posix(): path for path, name in found.items()
@@ -223,11 +245,11 @@ def _local_bags(root: Path) -> Iterator[tuple[Path, bool]]:
 
 def _remote_bags(root: Path) -> Iterator[tuple[Path, bool]]:
     """Yield the same of a store, where bag files are known by their names alone."""
-    files = [path for path in root.rglob("*") if path.name.endswith((*SUFFIXES, "metadata.yaml"))]
+    files = [path for path in root.rglob("*") if _is_bag_name(path.name) or path.name == "metadata.yaml"]
     folders = {path.parent for path in files if path.name == "metadata.yaml" and is_bag_folder(path.parent)}
     yield from ((folder, True) for folder in sorted(folders))
     for path in files:
-        if path.suffix in SUFFIXES and folders.isdisjoint(path.parents):
+        if _is_bag_name(path.name) and folders.isdisjoint(path.parents):
             yield path, False
 
 
@@ -237,7 +259,7 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def _is_bag_file(path: Path) -> bool:
-    return path.suffix in SUFFIXES or first_bytes(path, 8).startswith((b"#ROSBAG", MCAP_MAGIC))
+    return _is_bag_name(path.name) or first_bytes(path, 8).startswith((b"#ROSBAG", MCAP_MAGIC))
 
 
 def _container(path: Path, chunks: ChunkCache) -> Container:
@@ -264,36 +286,95 @@ def _metadata(folder: Path) -> dict[str, Any]:
     return information
 
 
-def _listed(folder: Path, metadata: dict[str, Any]) -> list[Path]:
-    """List the files of a bag in recording order.
+def _listed(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], tuple[str, ...]]:
+    """Return the files of a bag's folder in order, and remarks on files that metadata.yaml does not name.
 
-    metadata.yaml may be stale: a recorder that is killed leaves it as it was when the recording began. Then
-    the folder holds later parts that it does not name, and they belong to the recording.
+    A recorder that was killed leaves a metadata.yaml that names only some of the parts.
     """
     where, names = folder / "metadata.yaml", metadata.get("relative_file_paths")
     if not isinstance(names, list) or not names:
         raise EpisodeError(where, "relative_file_paths names no files", "run ros2 bag reindex")
-    paths = []
-    for name in names:
-        path = folder / PurePosixPath(str(name)).name  # older versions put the folder before it
-        packed = path.with_name(f"{path.name}.zstd")  # Foxy names compressed files without their suffix
-        if not path.is_file() and not packed.is_file():
-            raise EpisodeError(
-                where, f"names {path.name}, which is not in the folder", "run ros2 bag reindex"
-            )
-        paths.append(path if path.is_file() else packed)
-    series = {_part_of(path.name)[0] for path in paths}
-    for path in sorted(folder.iterdir(), key=lambda path: _part_of(path.name)):
-        if path in paths or not path.name.removesuffix(".zstd").endswith(SUFFIXES):
-            continue
-        if _part_of(path.name)[0] not in series:
-            fault = f"does not name {path.name}, which is in the folder"
-            raise EpisodeError(where, fault, "move it out, or run ros2 bag reindex")
-        paths.append(path)
-    return paths
+    paths = [_named_file(folder, PurePosixPath(str(name)).name, where) for name in names]
+    others = [path for path in folder.iterdir() if path not in paths and _is_bag_name(path.name)]
+    stems = {_split_stem(path) for path in paths} - {None}
+    parts = [path for path in others if _split_stem(path) in stems]
+    left_out = sorted(path.name for path in others if path not in parts)
+    remarks = []
+    if parts:
+        remarks.append(f"{where} names {len(paths)} of its {len(paths) + len(parts)} files: all are read")
+        paths = sorted([*paths, *parts], key=lambda path: _part_number(path) or 0)
+    if left_out:
+        remarks.append(f"{where} does not name {', '.join(left_out[:3])}: left out ({len(left_out)} in all)")
+    return paths, tuple(remarks)
 
 
-def _part_of(name: str) -> tuple[str, int]:
-    """Return what the parts of a recording share in their names, and the number of the part."""
-    match = PART_NAME.fullmatch(name)
-    return (match["begin"] + match["end"], int(match["number"])) if match else (name, 0)
+def _named_file(folder: Path, name: str, where: Path) -> Path:
+    """Return a file that metadata.yaml names: by its last name, because older versions put the folder before.
+
+    Foxy names packed files without the suffix of their packing.
+    """
+    path = folder / name
+    packed = folder / f"{name}.zstd"
+    if not path.is_file() and packed.is_file():
+        return packed
+    if not path.is_file():
+        remedy = "copy it in, or run ros2 bag reindex to leave it out"
+        if any(item.suffix == ".zstd" for item in folder.iterdir()):  # reindex cannot open packed files
+            remedy = "copy it in, or remove it from relative_file_paths"
+        raise EpisodeError(where, f"names {name}, which is not in the folder", remedy)
+    return path
+
+
+# -- recordings that a recorder split
+
+SPLIT_PART = re.compile(
+    r"(?P<stem>.+?)(_\d{4}(-\d\d){5})?_(?P<number>\d+)(?P<suffix>\.(bag|mcap|db3)(\.zstd)?)"
+)
+MAX_PAUSE_NS = 10**9  # between two parts of one recording; episodes that are recorded apart pause longer
+
+
+def _part_number(path: Path) -> int | None:
+    match = SPLIT_PART.fullmatch(path.name)
+    return int(match["number"]) if match else None
+
+
+def _split_stem(path: Path) -> tuple[str, str] | None:
+    """Return what the names of all parts of a recording share."""
+    match = SPLIT_PART.fullmatch(path.name)
+    return (match["stem"], match["suffix"].removesuffix(".zstd")) if match else None
+
+
+def _is_bag_name(name: str) -> bool:
+    return name.removesuffix(".zstd").endswith(SUFFIXES)
+
+
+def following_parts(path: Path) -> list[Path]:
+    """Return the files that continue a recording after its first part; empty where there are none.
+
+    They are numbered on, and each begins when the one before ends. Names alone do not tell: episodes recorded
+    one after the other are often numbered too.
+    """
+    stem, number = _split_stem(path), _part_number(path)
+    if stem is None or number is None:
+        return []
+    siblings = {_part_number(item): item for item in path.parent.iterdir() if _split_stem(item) == stem}
+    if (before := siblings.get(number - 1)) and _continues(before, path):
+        return []  # it is no first part
+    parts = [path]
+    while (following := siblings.get(number + len(parts))) and _continues(parts[-1], following):
+        parts.append(following)
+    return parts[1:]
+
+
+def _continues(path: Path, following: Path) -> bool:
+    try:
+        last_ns = _span(path, Bag(path).state())[1]
+        first_ns = _span(following, Bag(following).state())[0]
+    except EpisodeError:  # reading it raises its error
+        return False
+    return abs(first_ns - last_ns) <= MAX_PAUSE_NS
+
+
+@lru_cache(maxsize=4096)
+def _span(path: Path, state: tuple[Any, ...]) -> tuple[int, int]:
+    return Bag(path).span()

@@ -23,6 +23,7 @@ MAX_LATE_S = 1.0  # a message that is overtaken by more was not delayed: its clo
 ALWAYS_LATE_NS = SECOND_NS // 100  # lateness that threads of a recorder cause
 MAX_OVERTAKEN = 3  # messages in a row that may be overtaken by any time, where arrival mixes two runs
 CROWDED = 0.75  # of the usual interval: sorted messages closer than this were not made one after the other
+CROWDED_SHARE = 0.3  # of such steps beside the messages that sorting moved
 AHEAD_S = 0.05  # by which stamps may be later than receipt; more shows a clock ahead of the recorder's
 BEHIND_S = 0.1  # of delay between exposure and receipt that cameras and networks cause
 DAY_S = 86_400.0
@@ -61,12 +62,11 @@ def _crowded(times: Times, order: NDArray[np.int64], behind: NDArray[np.bool_]) 
     A clock that was set back runs through the same times twice: its messages then fall between, or on, those
     from before. Delayed messages leave a gap in which they fit.
     """
-    intervals = np.diff(times)
-    usual = float(np.median(intervals[intervals > 0])) if (intervals > 0).any() else 0.0
     steps = np.diff(times[order])
+    usual = float(np.median(steps))
     moved = behind[order]
     beside_moved = moved[1:] | moved[:-1]
-    return bool(beside_moved.any() and np.mean(steps[beside_moved] < CROWDED * usual) > 0.5)
+    return bool(beside_moved.any() and np.mean(steps[beside_moved] < CROWDED * usual) > CROWDED_SHARE)
 
 
 def set_back(times: Times) -> tuple[int, float]:
@@ -95,7 +95,7 @@ class Clock:
     @classmethod
     def of(cls, topic: str, stamps: Times | None, received: Times) -> "Clock":
         """Measure a clock; without stamps, it is that of receipt."""
-        if stamps is None:
+        if stamps is None or not len(stamps):
             return cls(topic, False)
         delays = (received - stamps) / SECOND_NS
         third = max(len(delays) // 3, 1)

@@ -205,6 +205,13 @@ class IndexedFile(ABC):
                         file.blocks.keep(record.place, bytes(record.data))
                     yield record
 
+    def span(self) -> tuple[int, int]:
+        """Return the earliest and latest time of receipt; (FOREVER, -1) without messages."""
+        with reading(self.path), self._file.open() as file:
+            pieces = self._index(file).pieces
+        first_ns = min((piece.first_ns for piece in pieces), default=FOREVER)
+        return first_ns, max((piece.last_ns for piece in pieces), default=-1)
+
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
         """Return each topic's last message before a time; topics without one are left out."""
         found: dict[str, Record] = {}

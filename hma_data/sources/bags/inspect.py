@@ -32,12 +32,14 @@ from hma_data.sources.bags.messages import (
     field_names,
     is_list,
     is_message,
+    is_message_list,
     numbers,
+    value_names,
 )
 from hma_data.sources.bags.topic_track import Field, TopicTrack, camera_stream, parse_key
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, StreamTimes, measure, skew
-from hma_data.sources.common.inspection import Inspection, KeyInfo, TopicInfo
+from hma_data.sources.common.inspection import Inspection, KeyInfo, Timing, TopicInfo
 from hma_data.sources.common.places import unfollowed
 from hma_data.sources.common.survey import Survey, sampled
 
@@ -47,10 +49,14 @@ MAX_LENGTHS = 1000
 MAX_FIELDS = 64  # most numeric keys of a topic whose values are checked
 MAX_HELD = 1 << 16  # most numbers of a key in memory
 MAX_WIDTH = 4096  # most values of an action or state; wider fields are maps or point clouds
-LOGS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")  # not streams
+# Topics that are no streams.
+LOG_TOPICS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")
+# Fields of points, poses and twists.
+GEOMETRY = {"x", "y", "z", "w", "theta", "position", "orientation", "linear", "angular"}
+GEOMETRY |= {"translation", "rotation"}
 PAIRS = 4  # runs of neighbouring frames looked at, for a camera
 APART_S = 1.0  # header stamps further than this from receive times are reported
-WHOLE = (0.0, 65535.0)  # levels at which frames in mono16 are looked at
+ALL_LEVELS = (0.0, 65535.0)  # levels at which frames in mono16 are looked at
 
 
 @dataclass
@@ -89,12 +95,16 @@ class _Topic:
     named: int = 0
     fault: str = ""
     values: list[_Values] = field(default_factory=list)
+    others: dict[str, Any] = field(default_factory=dict)  # by type, first messages of other types
 
-    def look_at(self, message: Any, where: str) -> None:
+    def look_at(self, message: Any, where: str, kind: str) -> None:
         """Add a message's values, and keep it as the sample where it names more joints.
 
         Two publishers of one JointState topic may name different joints.
         """
+        if kind != self.track.channels[0].type:
+            self.others.setdefault(kind, message)
+            return
         named = child(message, "name") if "name" in field_names(message) else ""
         count = len(named) if is_list(named) else 0
         first = self.sample is None
@@ -111,18 +121,10 @@ class _Topic:
 
 @dataclass
 class _Clock:
-    """The times (T,) of one topic of one bag, by both clocks, in order of receipt."""
+    """The times (T,) of one topic of one bag, by both clocks, each in its own order."""
 
     header: Floats
     receive: Floats
-
-    def beside(self, other: "_Clock") -> tuple[Floats, Floats]:
-        """Return the times of both topics; by receipt where their header stamps are not of one clock."""
-        delays = [float(np.median(one.receive - one.header)) for one in (self, other)]
-        back = any((np.diff(one.header) < 0).any() for one in (self, other))
-        if back or abs(delays[0] - delays[1]) > APART_S:
-            return self.receive, other.receive
-        return self.header, other.header
 
 
 @dataclass
@@ -151,6 +153,8 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
     for name, path in bags.items():
         try:
             bag = Bag(path, root)
+            for remark in bag.remarks:
+                survey.note(Finding("files", "info" if path.is_file() else "warn", remark))
             counts: Counter[str] = Counter()
             for channel, count in bag.counts().items():
                 counts[channel.topic] += count
@@ -208,14 +212,15 @@ def _with_offsets(keys: list[KeyInfo], clocks: list[dict[str, _Clock]], survey: 
     cameras = [key.topic.name for key in keys if key.kind == "camera" and key.topic]
     topics = {key.topic.name: key.topic for key in keys if key.kind == "vector" and key.topic}
     for name, topic in topics.items():
-        found = [
-            measure_offset(
-                [bag[name].beside(bag[camera]) for bag in clocks if name in bag and camera in bag], camera
-            )
-            for camera in cameras
-            if name not in LOGS
-        ]
-        topics[name] = replace(topic, offsets=tuple(one for one in found if one))
+        if name in LOG_TOPICS:
+            continue
+        by_header, by_receipt = [], []
+        for camera in cameras:
+            both = [(bag[name], bag[camera]) for bag in clocks if name in bag and camera in bag]
+            by_header.append(measure_offset([(own.header, seen.header) for own, seen in both], camera))
+            by_receipt.append(measure_offset([(own.receive, seen.receive) for own, seen in both], camera))
+        timing = replace(topic.by_receipt, offsets=tuple(one for one in by_receipt if one))
+        topics[name] = replace(topic, offsets=tuple(one for one in by_header if one), by_receipt=timing)
         survey.made |= {"offset"} if topics[name].offsets else set()
     return [replace(key, topic=topics.get(key.topic.name, key.topic)) if key.topic else key for key in keys]
 
@@ -242,14 +247,10 @@ class _BagInspection:
         if self._frozen:
             said = f"{', '.join(self._frozen[:8])}: header stamps never change; receive times are used"
             survey.note(Finding("stamps", "warn", said, numbers={"topics": self._frozen}))
+        self.clocks = {name: _clock(topic.track) for name, topic in self._topics.items() if len(topic.track)}
         self._skew()
-        self.keys = self._with_gaps()
-        self.clocks: dict[str, _Clock] = {}
-        for name, topic in self._topics.items():
-            if len(topic.track):
-                order = topic.track.by_receipt()
-                times = [topic.track.seconds(clock)[order] for clock in ("header", "receive")]
-                self.clocks[name] = _Clock(*times)
+        cameras = {key.topic.name for key in self.keys if key.kind == "camera" and key.topic}
+        self.keys = [self._timed(key, cameras) for key in self.keys]
 
     def _measure(self, budget: _Budget) -> None:
         where = str(self.bag.path)
@@ -262,7 +263,7 @@ class _BagInspection:
                 message = None if topic.fault else decode(record.channel, record.data, where)
                 topic.track.add(record.channel, record.log_ns, place, message)
                 if message is not None:
-                    topic.look_at(message, where)
+                    topic.look_at(message, where, record.channel.type)
                 for value in topic.values:
                     if len(value.held) > MAX_HELD:
                         value.hand_on(self._survey, self._name)
@@ -277,24 +278,32 @@ class _BagInspection:
         if topic.fault:
             self._survey.note(Finding("readable", "warn", topic.fault, key=name))
         stated = track.channels[0]
-        kind = image_kind(stated.type)
-        times = track.seconds("header")[track.by_receipt()]
-        measured = measure(times) if name in LOGS else self._times(track, times, bool(kind))
+        kind = track.kind
+        times = _clock(track).header
+        measured = measure(times) if name in LOG_TOPICS else self._times(track, times, bool(kind))
         found: list[KeyInfo] = []
         if not topic.fault:
             found = [self._camera(topic, kind)] if kind else _values(name, topic.sample)
+            known = {key.key for key in found}
+            for other in topic.others.values():
+                found += [key for key in _values(name, other) if key.key not in known]
+        if topic.others:
+            types = " and ".join(sorted([stated.type, *topic.others]))
+            said = f"{name} carries {types}; a key reads the messages that have its field"
+            self._survey.note(Finding("keys", "warn", said, key=name))
         found = found or [KeyInfo(name, "other", (), stated.type or stated.encoding)]
         for value in topic.values:
             value.hand_on(self._survey, self._name)
-        steps, delay_ms = np.diff(times), None
-        if track.stamped and not topic.fault:
-            delay_ms = float(np.median(track.seconds("receive") - track.seconds("header")) * 1e3)
+        clock = track.clock("header", np.arange(len(track)))
+        stamped = clock.by_header and not topic.fault
+        everything = np.arange(len(track))
         about = TopicInfo(
             name,
             stated.type or stated.encoding,
-            gap_ms=float(steps.max() * 1e3) if len(steps) else None,
-            delay_ms=delay_ms,
-            goes_back=bool(len(steps) and steps.min() < 0),
+            delay_ms=clock.delay_s * 1e3 if stamped else None,
+            drift_ms=clock.drift_s * 1e3 if stamped else 0.0,
+            goes_back=stamped and track.sorted_rows("header", everything) is None,
+            receipt_goes_back=track.sorted_rows("receive", everything) is None,
         )
         hz, jitter_ms = measured.hz, measured.jitter_ms
         return [replace(key, hz=hz, count=topic.count, jitter_ms=jitter_ms, topic=about) for key in found]
@@ -310,6 +319,14 @@ class _BagInspection:
                 self._survey.note(
                     Finding("stamps", "warn", said, key=track.topic, numbers={"seconds": apart})
                 )
+        everything = np.arange(len(track))
+        clock = "header" if track.stamped else "receive"
+        if track.sorted_rows(clock, everything) is None:
+            remedy = track.set_back_error(clock, str(self.bag.path), everything).remedy
+            return self._survey.times(self._name, track.topic, times, camera, remedy)
+        if late := int(np.sum(np.diff(track.stamps()) < 0)) if track.stamped else 0:
+            said = f"{track.topic}: {late} messages arrived out of order; their header stamps order them"
+            self._survey.note(Finding("back", "info", said, key=track.topic, numbers={"count": late}))
         return self._survey.times(self._name, track.topic, times, camera)
 
     def _camera(self, topic: _Topic, kind: str) -> KeyInfo:
@@ -317,7 +334,7 @@ class _BagInspection:
         stored = track.codec if kind == VIDEO else codec(topic.sample, kind)
         high = None
         try:
-            stream = camera_stream(self.bag, track, "receive", levels=WHOLE)
+            stream = camera_stream(self.bag, track, "stored", levels=ALL_LEVELS)
             keyframes = track.keyframes() if kind == VIDEO else None
             indices = checks.choose(len(stream.timestamps), PAIRS, _starts(keyframes))
             for run in checks.runs(indices):
@@ -340,22 +357,23 @@ class _BagInspection:
             high=high,
         )
 
-    def _with_gaps(self) -> list[KeyInfo]:
-        """Return the keys; leave intervals in which no camera saw anything out of the topics' `gap_ms`."""
-        names = {key.topic.name for key in self.keys if key.kind == "camera" and key.topic}
-        seen = [self._topics[name].track.seconds("header") for name in names]
-        return [
-            replace(key, topic=replace(key.topic, gap_ms=self._gap_ms(key.topic, np.concatenate(seen))))
-            if seen and key.topic and key.topic.name not in names
-            else key
-            for key in self.keys
-        ]
-
-    def _gap_ms(self, topic: TopicInfo, seen: Floats) -> float | None:
-        times = np.sort(self._topics[topic.name].track.seconds("header"))
-        during = np.searchsorted(times, seen, side="right") - 1
-        during = during[(during >= 0) & (during < len(times) - 1)]
-        return float(np.diff(times)[during].max() * 1e3) if len(during) else topic.gap_ms
+    def _timed(self, key: KeyInfo, cameras: set[str]) -> KeyInfo:
+        """Return the key with the longest intervals of its topic, and its timing by the times of receipt."""
+        if key.topic is None:
+            return key
+        own = self.clocks[key.topic.name]
+        seen = [self.clocks[name] for name in cameras if name != key.topic.name]
+        seen = [] if key.topic.name in cameras else seen
+        received = measure(own.receive)
+        timing = Timing(
+            received.hz, received.jitter_ms, _gap_ms(own.receive, [clock.receive for clock in seen])
+        )
+        gap_ms = _gap_ms(np.sort(own.header), [clock.header for clock in seen])
+        # A topic is timed beside the first frame by receipt, which all topics share.
+        first = min((clock.receive[0] for clock in seen), default=own.receive[-1])
+        ends_before = float(first - own.receive[-1])
+        held_s = ends_before if ends_before > 0 else None
+        return replace(key, topic=replace(key.topic, gap_ms=gap_ms, held_s=held_s, by_receipt=timing))
 
     def _skew(self) -> None:
         """Measure the skew of each camera and vector stream from the frames of the first camera."""
@@ -365,12 +383,31 @@ class _BagInspection:
         cameras = [name for name, kind in topics.items() if kind == "camera"]
         if not cameras:
             return
-        primary = self._topics[cameras[0]].track.seconds("header")
+        primary = self.clocks[cameras[0]].header
         period_s = float(np.median(np.diff(np.sort(primary)))) if len(primary) > 1 else 0.0
         for name in topics:
             if name != cameras[0]:
-                found = skew(self._topics[name].track.seconds("header"), primary)
-                self._survey.skew(name, found, period_s)
+                self._survey.skew(name, skew(self.clocks[name].header, primary), period_s)
+
+
+def _clock(track: TopicTrack) -> _Clock:
+    """Return the times of a topic by both clocks; those of a clock that was set back in order of receipt."""
+    by_receipt = track.by_receipt()
+    order = track.sorted_rows("header", np.arange(len(track)))
+    header = track.seconds("header")[by_receipt if order is None else order]
+    return _Clock(header, track.seconds("receive")[by_receipt])
+
+
+def _gap_ms(times: Floats, seen: list[Floats]) -> float | None:
+    """Return the longest interval; leave out intervals in which no camera saw anything."""
+    intervals = np.diff(times)
+    if not len(intervals):
+        return None
+    if seen:
+        during = np.searchsorted(times, np.concatenate(seen), side="right") - 1
+        during = during[(during >= 0) & (during < len(intervals))]
+        intervals = intervals[during] if len(during) else intervals
+    return float(intervals.max() * 1e3)
 
 
 def _starts(keyframes: Any) -> Any:
@@ -384,53 +421,67 @@ def _starts(keyframes: Any) -> Any:
 # -- keys
 
 
-def _values(key: str, value: Any) -> list[KeyInfo]:
-    """Return the keys that a YAML could name at or below a key."""
+def _values(key: str, value: Any, owners: tuple[Any, ...] = ()) -> list[KeyInfo]:
+    """Return the keys that a YAML could name at or below a key; `owners` hold the value, innermost first."""
     if isinstance(value, str):
         return [KeyInfo(key, "text", (), "string")]
+    if is_message_list(value):
+        return _element_values(key, value, owners)
     if not is_message(value):
-        return _vector(key, value)
+        return _vector(key, value, owners)
     names = field_names(value)
-    if names and all(_is_number(child(value, name)) for name in names):
+    if names and all(_is_number(child(value, name)) for name in names) and not _mixed(value):
         return [KeyInfo(key, "vector", (len(names),), "float64", names=tuple(names))]
-    trajectory = _trajectory(key, value, names)
-    return trajectory + [
-        found
-        for name in names
-        if name not in ("header", "stamp", "timestamp") and not (trajectory and name == "points")
-        for found in _named(_values(f"{key}.{name}", child(value, name)), value, name)
-    ]
+    found: list[KeyInfo] = []
+    for name in names:
+        if name in ("header", "stamp", "timestamp"):
+            continue
+        inside = child(value, name)
+        if name == "points" and is_message_list(inside) and "time_from_start" in field_names(inside[0]):
+            # The first point of a JointTrajectory is in force when the message is sent.
+            found += _values(f"{key}.points[0]", inside[0], (value, *owners))
+        else:
+            found += _values(f"{key}.{name}", inside, (value, *owners))
+    return found
 
 
-def _trajectory(key: str, value: Any, names: list[str]) -> list[KeyInfo]:
-    """Return the first point of a JointTrajectory, which is in force when the message is sent."""
-    points: Any = child(value, "points") if {"points", "joint_names"} <= set(names) else ()
-    if not is_list(points) or not len(points) or not is_message(points[0]):
-        return []
-    stated = child(value, "joint_names")
-    labels = tuple(map(str, stated)) if is_list(stated) else ()
-    found = _values(f"{key}.points[0]", points[0])
-    fits = [bool(labels) and item.shape == (len(labels),) for item in found]
-    return [replace(item, names=labels) if fit else item for item, fit in zip(found, fits, strict=True)]
+def _element_values(key: str, elements: Any, owners: tuple[Any, ...]) -> list[KeyInfo]:
+    """Return the keys of a list of messages: each field over all elements, as of the motors of a robot.
+
+    Points, poses and the like stay together: their fields mean nothing alone.
+    """
+    names = [name for name in field_names(elements[0]) if name not in ("header", "stamp", "timestamp")]
+    if set(names) <= GEOMETRY:
+        return _vector(key, elements, owners)
+    found: list[KeyInfo] = []
+    for name in names:
+        inside = [child(element, name) for element in elements]
+        if _is_number(inside[0]) or is_list(inside[0]):
+            found += _vector(f"{key}.{name}", inside, (elements, *owners))
+    return found
 
 
-def _named(found: list[KeyInfo], owner: Any, name: str) -> list[KeyInfo]:
-    """Add the names from the owner's list `name`, where that list has the vector's length (JointState)."""
-    labels = child(owner, "name") if "name" in field_names(owner) and name != "name" else ()
-    if len(found) != 1 or not is_list(labels) or found[0].shape != (len(labels),) or not len(labels):
-        return found
-    return [replace(found[0], names=tuple(map(str, labels)))]
+def _mixed(message: Any) -> bool:
+    """Check whether whole numbers stand beside others: modes and counters beside measurements."""
+    return len({isinstance(child(message, name), float | np.floating) for name in field_names(message)}) > 1
 
 
-def _vector(key: str, value: Any) -> list[KeyInfo]:
+def _vector(key: str, value: Any, owners: tuple[Any, ...]) -> list[KeyInfo]:
     try:
         count = len(numbers(value))
     except TypeError:
         return []
-    dtype = "bool" if isinstance(value, bool) else "float64"
-    if isinstance(value, np.ndarray | np.generic):
-        dtype = str(value.dtype)
-    return [KeyInfo(key, "vector", (count,), dtype)] if count else []
+    if not count:
+        return []
+    first = value[0] if isinstance(value, list) and len(value) else value
+    dtype = "float64"
+    if isinstance(first, np.ndarray | np.generic):
+        dtype = str(first.dtype)
+    elif isinstance(first, bool):
+        dtype = "bool"
+    elif isinstance(first, int):
+        dtype = "int64"
+    return [KeyInfo(key, "vector", (count,), dtype, names=value_names(owners, count) or None)]
 
 
 def _is_number(value: Any) -> bool:

@@ -11,6 +11,7 @@ import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import lru_cache, partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ IDL_SEPARATOR = "=" * 80 + "\n"
 TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
 TIME = "builtin_interfaces/msg/Time"
 HEADER = "std_msgs/msg/Header"
+WELL_KNOWN = "google/protobuf/"
 STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))
 
 
@@ -107,16 +109,25 @@ def _protobuf_decoder(channel: Channel) -> Decode:
 
     files, pool = descriptor_pb2.FileDescriptorSet(), descriptor_pool.DescriptorPool()
     files.ParseFromString(channel.schema)
-    waiting = {item.name: item for item in files.file}
-    for name in {name for item in files.file for name in item.dependency} - waiting.keys():
-        with suppress(KeyError):  # a schema may leave out the types that come with protobuf
-            known = descriptor_pb2.FileDescriptorProto()
-            descriptor_pool.Default().FindFileByName(name).CopyToProto(known)
-            waiting[name] = known
-    while waiting:  # a pool takes a file after its dependencies; a schema lists them in any order
-        ready = [name for name, item in waiting.items() if not waiting.keys() & set(item.dependency)]
-        for name in ready or list(waiting):
-            pool.Add(waiting.pop(name))
+    missing = {item.name: item for item in files.file}
+
+    def add(name: str) -> None:
+        """Add a file after those that it depends on: a set may list them in any order."""
+        item = missing.pop(name, None)
+        if item is None and name.startswith(WELL_KNOWN):  # some writers leave out what protobuf brings along
+            import_module(f"{name.removesuffix('.proto').replace('/', '.')}_pb2")
+            item = descriptor_pb2.FileDescriptorProto()
+            descriptor_pool.Default().FindFileByName(name).CopyToProto(item)
+        if item is None or name in added:
+            return
+        added.add(name)
+        for dependency in item.dependency:
+            add(dependency)
+        pool.Add(item)
+
+    added: set[str] = set()
+    for name in list(missing):
+        add(name)
     kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(channel.type))
     return lambda data: kind.FromString(bytes(data))
 
@@ -198,6 +209,40 @@ def child(message: Any, name: str) -> Any:
 def is_list(value: Any) -> bool:
     """Check whether a value is a list or an array, not text or bytes."""
     return isinstance(value, np.ndarray | Sequence) and not isinstance(value, str | bytes)
+
+
+def is_message_list(value: Any) -> bool:
+    """Check whether a value is a list of messages, such as the motors of a robot."""
+    return is_list(value) and len(value) > 0 and is_message(value[0])
+
+
+NAMES_FIRST = ("name", "joint_names", "names")  # lists of names, before others that a message may have
+ELEMENT_NAMES = ("name", "joint_name", "child_frame_id", "label")  # of the elements of a list
+
+
+def value_names(owners: Sequence[Any], width: int) -> tuple[str, ...]:
+    """Return the names that a message gives its values; empty where it gives none.
+
+    JointState lists them beside the values, JointTrajectory a message above, others in a list's elements.
+
+    Args:
+        owners: the messages, or lists of messages, that hold the values; the innermost first.
+        width: number of values.
+    """
+    for owner in owners:
+        if is_message_list(owner):
+            fields = [name for name in ELEMENT_NAMES if name in field_names(owner[0])]
+            lists = [[child(element, name) for element in owner] for name in fields]
+        else:
+            fields = [*NAMES_FIRST, *(name for name in field_names(owner) if name not in NAMES_FIRST)]
+            lists = [child(owner, name) for name in fields if name in field_names(owner)]
+        for names in lists:
+            if not is_list(names) or len(names) != width:
+                continue
+            texts = [name for name in names if isinstance(name, str)]
+            if len(set(texts)) == width:
+                return tuple(texts)
+    return ()
 
 
 def numbers(value: Any) -> list[float]:

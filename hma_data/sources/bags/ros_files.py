@@ -245,6 +245,12 @@ class SqliteFile:
                     data = _payload(base, row_id)
                 yield Record(channel, log_ns, data, (0, row_id))
 
+    def span(self) -> tuple[int, int]:
+        """See IndexedFile."""
+        with self._opened() as (base, _):
+            first_ns, last_ns = base.execute("SELECT min(timestamp), max(timestamp) FROM messages").fetchone()
+        return (FOREVER, -1) if first_ns is None else (first_ns, last_ns)
+
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
         """See IndexedFile."""
         found: dict[str, Record] = {}

@@ -6,9 +6,11 @@ memory does not grow with the size of a bag. Streams keep their own clocks; `ali
 An episode inside a bag is read together with the earlier messages that are still in force.
 """
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from itertools import chain
 from pathlib import Path
 
@@ -30,6 +32,7 @@ from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_valu
 from hma_data.sources.common.places import existing_path, nothing_there
 from hma_data.storage.paths import StrPath, as_text
 
+log = logging.getLogger(__name__)
 PART = re.compile(r"(?P<bag>.+)/(?P<number>[0-9]{4,9})")
 
 
@@ -94,6 +97,11 @@ def _bags(uri: str) -> dict[str, Path]:
     return bags
 
 
+@cache
+def _say_once(remark: str) -> None:
+    log.warning("%s", remark)
+
+
 def _part_id(name: str, number: int) -> str:
     return f"{name}/{number:04d}"
 
@@ -103,6 +111,8 @@ def _refs(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> l
     fingerprint = ""
     try:
         bag = Bag(path, root)
+        for remark in bag.remarks:
+            _say_once(remark)
         fingerprint = bag.fingerprint()
         segments = embodiment.source.segments if embodiment else None
         if not embodiment or not segments:
@@ -172,17 +182,33 @@ class _EpisodeReading:
             streams[camera.name] = primary if same else self._stream(camera, shown)
         clocks = {topic: "header" if track.stamped else "receive" for topic, track in self._tracks.items()}
         parted = self._table is not None and len(self._table.segments) > 1
+        action_signals = tuple(self._signal(column, shown) for column in actions)
+        flags = self._held_actions(actions, action_signals, shown)
         return Episode(
             id=self._id,
             streams=streams,
-            actions=tuple(self._signal(column, shown) for column in actions),
+            actions=action_signals,
             states=tuple(self._signal(column, shown) for column in states),
             rate_stamped=False,
             instruction=self._instruction() or notes.get("instruction", ""),
             success=None if parted else {"true": True, "false": False}.get(notes.get("success", "").lower()),
             source=str(self._bag.path),
-            metadata={"clocks": clocks, "notes": notes} | self._about(),
+            metadata={"clocks": clocks, "notes": notes} | ({"flags": flags} if flags else {}) | self._about(),
         )
+
+    def _held_actions(
+        self, columns: list[Column], signals: tuple[Signal, ...], shown: Floats
+    ) -> dict[str, int]:
+        """Return the flag of an episode with an action that never comes after its first frame; log it."""
+        flags: dict[str, int] = {}
+        for column, signal in zip(columns, signals, strict=True):
+            before_s = float(shown[0] - signal.timestamps[-1])
+            if before_s > 0 and len(shown) > 1:
+                fault = f"the last message is {before_s:.3g} s before the first frame"
+                key, frames = column.field.key, len(shown)
+                log.warning("%s: %s: %s, and is held for all %d frames", self._where, key, fault, frames)
+                flags["held_actions"] = frames
+        return flags
 
     # -- the pass
 
@@ -192,7 +218,9 @@ class _EpisodeReading:
     def _columns(self, components: tuple[Component, ...]) -> list[Column]:
         columns = []
         for component in components:
-            column = Column(component, parse_key(component.key, self._counts, self._where), self._where)
+            place = parse_key(component.key, self._counts, self._where)
+            types = {channel.type for channel in self._bag.counts() if channel.topic == place.topic}
+            column = Column(component, place, self._where, len(types) > 1)
             self._track(column.field.topic).columns.append(column)
             columns.append(column)
         return columns
@@ -296,11 +324,11 @@ class _EpisodeReading:
         for topic in (primary.key, *topics):
             track = self._tracks[topic]
             rows: Rows = np.arange(len(track))
+            if track.sorted_rows("receive", rows) is None:
+                return  # the recorder's clock was set back, so it cannot compare the others
             if self._segment:  # clocks may begin anew between the episodes of a bag
                 received = track.received()
                 rows = rows[(received >= self._segment.first_ns) & (received <= self._segment.last_ns)]
-            if track.sorted_rows("receive", rows) is None:
-                return  # the recorder's clock was set back, so it cannot compare the others
             if len(rows):
                 clocks.append(track.clock(stated, rows))
         period_s = float(np.median(np.diff(shown))) if len(shown) > 1 else 0.0

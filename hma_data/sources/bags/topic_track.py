@@ -2,7 +2,8 @@
 
 A camera's key is its topic. A number's key is the topic and a path into its messages:
 `/joint_states.position`, `/joint_states.position[0:7]`, `/markers.poses[2].position.x`, `/cmd_vel`,
-`/cmd_vel.linear` (a message of numbers gives them in the order of its fields).
+`/cmd_vel.linear` (a message of numbers gives them in the order of its fields), `/lowcmd.motors.q` (the
+field of each message in a list).
 
 Of a message only its times and its place are kept, a few bytes; a camera's frames are read again by these
 places on demand. T messages of a topic, A values of a component; times are float64 seconds; the clock of a
@@ -40,12 +41,15 @@ from hma_data.sources.bags.images import (
     video_codec,
 )
 from hma_data.sources.bags.messages import (
+    NAMES_FIRST,
     child,
     field_names,
     head_stamp,
     is_list,
+    is_message_list,
     numbers,
     stamp_ns,
+    value_names,
 )
 
 STEP = re.compile(r"\.(?P<name>[A-Za-z_]\w*)|\[(?P<start>\d*)(?P<colon>:?)(?P<stop>\d*)\]")
@@ -68,46 +72,33 @@ class Field:
         Raises:
             EpisodeError: there is none; the error names the fields that are there.
         """
+        return self.path(message, where)[-1]
+
+    def path(self, message: Any, where: str) -> list[Any]:
+        """Return the message, what each step leads to, and last the value; see `value`.
+
+        A field of a list of messages is that field of each of them.
+        """
+        found = [message]
         for step in self.steps:
+            here = found[-1]
             if isinstance(step, str):
                 try:
-                    message = child(message, step)
+                    several = is_message_list(here)
+                    found.append([child(one, step) for one in here] if several else child(here, step))
                 except KeyError as fault:
-                    known = ", ".join(field_names(message)) or "none, it is not a message"
+                    known = ", ".join(field_names(here)) or "none, it is not a message"
                     raise EpisodeError(
                         where, f"{self.key}: there is no field {step!r}", f"the fields there: {known}"
                     ) from fault
                 continue
-            if not is_list(message):
+            if not is_list(here):
                 raise EpisodeError(where, f"{self.key}: what is before [ is not a list")
-            if (step + 1 if isinstance(step, int) else step.stop or 0) > len(message):
-                fault_of = f"{self.key}: the list has {len(message)} values in one of the messages"
+            if (step + 1 if isinstance(step, int) else step.stop or 0) > len(here):
+                fault_of = f"{self.key}: the list has {len(here)} values in one of the messages"
                 raise EpisodeError(where, fault_of)
-            message = message[step]
-        return message
-
-    def owners(self, message: Any, where: str) -> Iterator[Any]:
-        """Yield the messages around the value, from the one that holds it to the whole message."""
-        for count in range(len(self.steps) - 1, -1, -1):
-            yield Field(self.key, self.topic, self.steps[:count]).value(message, where)
-
-
-def name_list(field: Field, message: Any, width: int, where: str) -> tuple[str, ...]:
-    """Return the names that a message gives to the values at a key; empty where it names none.
-
-    The message that holds the values names them in a list such as `name`. Trajectories and the states of
-    controllers name them further out (`joint_names`), so there a list counts if it is as long as the values.
-    """
-    for depth, owner in enumerate(field.owners(message, where)):
-        for name in field_names(owner):
-            if not name.endswith(("name", "names")) or name == field.steps[-1]:
-                continue
-            stated = child(owner, name)
-            if not is_list(stated) or not all(isinstance(one, str) for one in stated):
-                continue
-            if len(stated) == width or (not depth and name == "name" and len(stated)):
-                return tuple(stated)
-    return ()
+            found.append(here[step])
+        return found
 
 
 def parse_key(key: str, topics: Iterable[str], where: str) -> Field:
@@ -156,13 +147,15 @@ def missing_topic(key: str, topics: Iterable[str], where: str) -> EpisodeError:
 class Column:
     """The values of one component, gathered message by message.
 
-    Where the message also names its values (see `name_list`: JointState, JointTrajectory, JointJog), the
-    component's `names` select and order them, unless the key or the YAML slices. Messages of another
-    publisher, with none of those names, are left out.
+    Where a message names its values (see `value_names`), the component's `names` select and order them,
+    unless the key or the YAML slices. Messages of another publisher, with none of those names, are left out;
+    so are those of another type without the field, where a topic has several types.
     """
 
-    def __init__(self, component: Component, field: Field, where: str) -> None:
+    def __init__(self, component: Component, field: Field, where: str, several_types: bool = False) -> None:
         self.component, self.field = component, field
+        self._several_types = several_types
+        self._type: str | None = None  # of the messages that have the field
         self._where = where
         self._values, self._rows = array("d"), array("q")
         self._width: int | None = None
@@ -170,9 +163,18 @@ class Column:
         whole = not component.slice and field.steps and isinstance(field.steps[-1], str)
         self._selects = bool(component.names and whole)
 
-    def add(self, message: Any, row: int) -> None:
-        """Add the values of message `row`."""
-        value = self.field.value(message, self._where)
+    def add(self, message: Any, row: int, kind: str) -> None:
+        """Add the values of message `row`, which is of that type."""
+        try:
+            path = self.field.path(message, self._where)
+        except EpisodeError:
+            if self._several_types and kind != self._type:
+                return
+            raise
+        if self._type not in (None, kind):
+            fault = f"{self.field.key}: {self._type} and {kind} on this topic both have it"
+            raise EpisodeError(self._where, fault, "filter the recording to one of them")
+        self._type, value = kind, path[-1]
         try:
             values = numbers(value)
         except TypeError as fault:
@@ -183,7 +185,7 @@ class Column:
                 f"name a field of it: {known}" if known else "",
             ) from fault
         if self._selects:
-            picks = self._pick(message, len(values))
+            picks = self._pick(path, len(values))
             if picks is None:
                 return
             values = [values[i] for i in picks]
@@ -202,6 +204,8 @@ class Column:
         Raises:
             EpisodeError: none did.
         """
+        if self._type is None:
+            raise EpisodeError(self._where, f"{self.field.key}: no type of messages on this topic has it")
         if not self._rows:
             seen = sorted({name for names in self._picks for name in names})[:SHOWN]
             names = ", ".join(self.component.names or ())
@@ -214,11 +218,16 @@ class Column:
         """Return the values (T, A) as recorded."""
         return np.frombuffer(self._values, np.float64).reshape(len(self._rows), -1)
 
-    def _pick(self, message: Any, width: int) -> list[int] | None:
+    def _pick(self, path: list[Any], width: int) -> list[int] | None:
         """Return the indices of the wanted names; None where the message has none of them."""
-        names = name_list(self.field, message, width, self._where)
+        owners = path[-2::-1]
+        names = value_names(owners, width)
         if not names:
-            return list(range(width))
+            beside = next((name for name in NAMES_FIRST if name in field_names(owners[0])), "")
+            stated = child(owners[0], beside) if beside else ()
+            if not is_list(stated) or not len(stated):
+                return list(range(width))
+            names = tuple(map(str, stated))  # as many names as values are wanted beside them
         if names not in self._picks:
             self._picks[names] = self._indices(names)
         picks = self._picks[names]
@@ -283,7 +292,7 @@ class TopicTrack:
     def add(self, channel: Channel, log_ns: int, place: BagPlace, message: Any) -> None:
         """Add the next message; a message that cannot be decoded is None, and keeps its time of receipt."""
         for column in self.columns:
-            column.add(message, len(self))
+            column.add(message, len(self), channel.type)
         if not len(self) or channel not in self.channels:
             self.kind = content_kind(message, image_kind(channel.type))
         if message is not None and self.kind == VIDEO:
@@ -322,8 +331,12 @@ class TopicTrack:
         """
         rows = np.arange(len(self)) if rows is None else rows
         order = self.sorted_rows(clock, rows)
-        if order is not None:
-            return order
+        if order is None:
+            raise self.set_back_error(clock, where, rows)
+        return order
+
+    def set_back_error(self, clock: str, where: str, rows: NDArray[np.int64]) -> EpisodeError:
+        """Return the error of a clock that was set back; its remedy makes no data worse."""
         by_header = clock == "header" and self.stamped
         at, seconds = set_back((self.stamps() if by_header else self.received())[rows])
         other = "receive" if by_header else "header"
@@ -333,18 +346,19 @@ class TopicTrack:
             fault = f"header stamps go back by {seconds:.3g} s at message {at}: their clock was set back"
             fault += ", or a simulation began anew"
             if usable:
-                remedy = (
-                    "source.segments: {gap_s: 1} makes the parts episodes of their own; "
-                    "sync: {stamp: receive} joins them by the times of receipt"
-                )
+                remedy = "sync: {stamp: receive} reads on by the times of receipt"
+                if seconds > 1:  # segments divide where a clock jumps back as far as they state
+                    remedy = f"source.segments: {{gap_s: 1}} makes the parts episodes of their own; {remedy}"
         else:
             fault = f"times of receipt go back by {seconds:.3g} s at message {at}: "
             fault += "the recorder's clock was set back"
             remedy = "sync: {stamp: header} takes the header stamps, which are in order" if usable else remedy
-        raise EpisodeError(where, fault, remedy)
+        return EpisodeError(where, fault, remedy)
 
     def sorted_rows(self, clock: str, rows: NDArray[np.int64]) -> NDArray[np.int64] | None:
-        """Return the order of rows by a clock; None where it was set back."""
+        """Return the order of rows by a clock, or as they are stored; None where the clock was set back."""
+        if clock == "stored":
+            return np.arange(len(rows))
         times = self.stamps() if clock == "header" and self.stamped else self.received()
         return sorted_by(times[rows], self.places()[rows, 0])
 
@@ -403,7 +417,7 @@ def camera_stream(
     """Return the stream of a camera whose topic was recorded.
 
     Args:
-        clock: header or receive.
+        clock: header, receive, or stored for the order of the file.
         shown: [from, to) of the frames, in order of receipt; all by default. Video may need other
             messages too, to be decoded.
         levels: of the camera, for frames in mono16.
@@ -455,6 +469,8 @@ def _video_stream(bag: Bag, track: TopicTrack, clock: str, shown: tuple[int, int
     else:
         rows = np.sort(rows[first:stop])
         rows = rows[track.order(clock, where, rows)]
+        overtaken = int(np.argmax(keyframes[rows]))  # messages that arrived late, from before the key frame
+        rows, begin = rows[overtaken:], max(begin - overtaken, first)
         times = track.seconds(clock)[rows]
     messages = Messages(bag, track.channels, track.places()[rows], where)
     decoder_rows = keyframes[rows]

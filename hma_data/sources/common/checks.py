@@ -181,8 +181,7 @@ def time_findings(key: str, times: StreamTimes, camera: bool = False, episode: s
     if times.repeated:
         yield found("repeated", f"{times.repeated} stamps equal the stamp before", count=times.repeated)
     if times.back:
-        remedy = "set stamp: receive in the YAML" if not episode else ""
-        yield found("back", f"{times.back} stamps go back in time", remedy, count=times.back)
+        yield found("back", f"{times.back} stamps go back in time", count=times.back)
     if times.regular >= STREAM and times.gap_s > pause_s(times.period_s):
         said = f"pauses for {times.gap_s:.3g} s after {times.gap_at_s:.3g} s"
         yield found("gaps", said, gap_s=times.gap_s, at_s=times.gap_at_s)

@@ -8,6 +8,16 @@ from hma_data.sources.common.checks import Finding
 
 
 @dataclass(frozen=True)
+class Timing:
+    """The timing of a topic by the times of receipt; see TopicInfo and KeyInfo."""
+
+    hz: float | None = None
+    jitter_ms: float | None = None
+    gap_ms: float | None = None
+    offsets: tuple[Offset, ...] = ()
+
+
+@dataclass(frozen=True)
 class TopicInfo:
     """The topic of a bag that holds a key, as measured from its messages.
 
@@ -17,7 +27,11 @@ class TopicInfo:
         gap_ms: the longest interval between two of them in which a camera saw something; of a camera, the
             longest interval; None for fewer than two.
         delay_ms: median from header stamp to receipt; None where messages carry no time.
-        goes_back: whether header stamps go back in time.
+        drift_ms: by how much the delay grows over the recording.
+        goes_back: whether the clock of the header stamps was set back.
+        receipt_goes_back: whether the recorder's clock was set back.
+        held_s: from its last message to the first frame, where that comes later; None elsewhere.
+        by_receipt: its timing by the times of receipt.
         offsets: how the messages lie between the images of each camera; of topics with numbers only.
     """
 
@@ -25,7 +39,11 @@ class TopicInfo:
     type: str
     gap_ms: float | None = None
     delay_ms: float | None = None
+    drift_ms: float = 0.0
     goes_back: bool = False
+    receipt_goes_back: bool = False
+    held_s: float | None = None
+    by_receipt: Timing = field(default_factory=Timing)
     offsets: tuple[Offset, ...] = ()
 
 

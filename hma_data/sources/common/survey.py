@@ -37,6 +37,7 @@ CHECKS = {  # the checks of an inspection, in the order they are printed
     "rate": "rate as stated",
     "skew": "skew between streams",
     "offset": "actions beside frames",
+    "padding": "actions of last steps",
     "finite": "NaN and infinity",
     "constant": "values that never change",
     "size": "images of one size",
@@ -72,6 +73,7 @@ class _Times:
 
     met: dict[str, StreamTimes] = field(default_factory=dict)
     camera: bool = False
+    back_remedy: str = ""
     skew: tuple[float, float, float] | None = None
 
 
@@ -159,10 +161,16 @@ class Survey:
         look.add(frames, indices, again=self._shown.get(key) == name)
         self._shown[key] = name
 
-    def times(self, name: str, key: str, seconds: Floats, camera: bool = False) -> StreamTimes:
-        """Add the times (T,) of one key of an episode, in the order of receipt; return what they show."""
+    def times(
+        self, name: str, key: str, seconds: Floats, camera: bool = False, back_remedy: str = ""
+    ) -> StreamTimes:
+        """Add the times (T,) of one key of an episode, in the order of receipt; return what they show.
+
+        `back_remedy` is what helps where they go back.
+        """
         self.made |= {"repeated", "back", "gaps"} | ({"frames"} if camera else set())
         held = self._times.setdefault(key, _Times(camera=camera))
+        held.back_remedy = held.back_remedy or back_remedy
         found = held.met[name] = checks.measure(seconds)
         return found
 
@@ -276,7 +284,7 @@ class Survey:
             for check, count in Counter(one.check for one in found).items():
                 first = next(one for one in found if one.check == check)
                 more = f" (and in {count - 1} more episodes)" if count > 1 else ""
-                remedy = first.remedy
+                remedy = held.back_remedy if check == "back" else first.remedy
                 if check == "gaps" and held.camera and self.by_field:  # a bag may be divided there
                     period = max(times.period_s for times in held.met.values())
                     remedy = f"no window crosses it; {divide_remedy(checks.pause_s(period))}"

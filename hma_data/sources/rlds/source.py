@@ -10,11 +10,13 @@ T steps.
 import hashlib
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
+
+import numpy as np
 
 from hma_data.episodes.episode import Episode, Floats, Pictures, Signal, rate_times
 from hma_data.errors import EpisodeError, SourceError
@@ -87,8 +89,11 @@ class RldsSource:
         _check_keys(folder, embodiment)
         example, path = folder.example(episode_id)
         steps = Steps(example, folder.step_features, episode_id)
+        _require_one_episode(steps)
+        keys = [part.key for part in embodiment.action.components]
+        padded = _ends_with_padding(steps, keys)
         hz = embodiment.frequency_hz
-        times = rate_times(steps.count, hz if isinstance(hz, float) else embodiment.rate_hz)
+        times = rate_times(steps.count - padded, hz if isinstance(hz, float) else embodiment.rate_hz)
         cameras = {camera.name: steps.decoder(camera.key) for camera in embodiment.cameras}
         return Episode(
             id=episode_id,
@@ -98,7 +103,7 @@ class RldsSource:
             instruction=_instruction(folder, steps, embodiment.source.instruction),
             success=_success(folder, steps),
             source=path,
-            metadata=_metadata(folder, example),
+            metadata=_metadata(folder, example) | ({"flags": {"padded_steps": 1}} if padded else {}),
         )
 
     def expect(self, uri: StrPath, episode_ids: Sequence[str]) -> None:
@@ -240,8 +245,36 @@ def _signals(steps: Steps, vector: Vector | None, times: Floats) -> tuple[Signal
     if vector is None:
         return ()
     found = {key: steps.numbers(key) for key in dict.fromkeys(part.key for part in vector.components)}
-    pieces = [found[part.key] for part in vector.components]
+    # Without the padding that a last step may have; see `_ends_with_padding`.
+    pieces = [found[part.key][: len(times)] for part in vector.components]
     return (Signal(times, compose(vector, pieces, steps.name)),)
+
+
+def _require_one_episode(steps: Steps) -> None:
+    """Raise EpisodeError if a record holds several episodes, one after the other."""
+    if "is_first" not in steps.features:
+        return
+    first = steps.numbers("is_first").reshape(-1) != 0
+    again = np.flatnonzero(first[1:]) + 1
+    if len(again) and not first.all():
+        fault = f"is_first again at step {again[0]}: the record holds {len(again) + 1} episodes"
+        raise EpisodeError(steps.name, fault, "write each as a record of its own")
+
+
+def _ends_with_padding(steps: Steps, keys: Iterable[str]) -> bool:
+    """Check whether the action of the last step is padding.
+
+    RLDS says that a step with `is_last` is only an observation, and leaves its action undefined: some writers
+    put zeros or NaN there.
+    """
+    if "is_last" not in steps.features or steps.count < 2 or not steps.numbers("is_last").reshape(-1)[-1]:
+        return False
+    values = [steps.numbers(key).reshape(steps.count, -1) for key in dict.fromkeys(keys)]
+    floats = [value for value in values if value.dtype.kind == "f"]
+    if not all(np.isfinite(value[-1]).all() for value in floats):
+        return all(np.isfinite(value[:-1]).all() for value in floats)
+    moved = any(value[:-1].any() for value in floats)
+    return moved and not any(value[-1].any() for value in floats)
 
 
 def _instruction(folder: Folder, steps: Steps, key: str | None) -> str:
@@ -334,6 +367,7 @@ def _survey(
         name = refs[i].id
         try:
             steps = Steps(folder.example(name)[0], folder.step_features, name)
+            _require_one_episode(steps)
         except EpisodeError as fault:
             survey.fault(name, fault)
             continue
@@ -357,6 +391,10 @@ def _look(steps: Steps, survey: Survey, pairs: int) -> None:
                         survey.pictures(steps.name, key, frames, run[start : start + len(frames)], codec)
             elif feature.kind == "number" and 0 < (feature.width or 0) <= MAX_VECTOR:
                 values = steps.numbers(key)
+                if "action" in key and _ends_with_padding(steps, [key]):
+                    said = f"{key}: the action of the last step (is_last) is padding; the step is left out"
+                    survey.note(Finding("padding", "info", said, key=key))
+                    values = values[:-1]
                 survey.numbers(steps.name, key, values)
                 seconds = seconds_of(values, key) if is_times(key, values.shape[1:]) else None
                 if seconds is not None:

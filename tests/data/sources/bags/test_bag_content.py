@@ -1,0 +1,191 @@
+"""What messages of images hold goes before what they are called: video, its order, and mosaics."""
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from hma_data.errors import EpisodeError
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.bags.clocks import SECOND_NS
+from hma_data.sources.bags.images import has_b_slices
+from tests.data import ros2
+from tests.data.bag_files import SOURCE
+from tests.data.sources.bags.test_bag_pairing import at, pairs, robot
+
+FRAMES = 24
+VIDEO = ros2.define(
+    "foxglove_msgs/msg/CompressedVideo",
+    "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n",
+)
+STREAMS = {
+    "h264": ("libx264", {"bf": "0", "tune": "zerolatency"}),
+    "h264 with B-frames": ("libx264", {"bf": "2", "x264-params": "b-adapt=0:scenecut=0"}),
+    "h264 with a pyramid of B-frames": (
+        "libx264",
+        {"bf": "4", "x264-params": "b-adapt=0:scenecut=0:b-pyramid=normal"},
+    ),
+    "h265": ("libx265", {"x265-params": "log-level=none:bframes=0"}),
+    "h265 with B-frames": (
+        "libx265",
+        {"x265-params": "log-level=none:bframes=3:b-adapt=0:scenecut=0:open-gop=0"},
+    ),
+}
+
+
+def packets(name: str) -> list[tuple[int, bytes]]:
+    """The frame and the bytes of each packet, in the order of the stream."""
+    encoder, options = STREAMS[name]
+    context = av.CodecContext.create(encoder, "w")
+    context.width = context.height = 96
+    context.pix_fmt, context.gop_size = "yuv420p", 8
+    context.time_base, context.framerate = Fraction(1, 10), Fraction(10, 1)
+    context.options = options | {"crf": "4"}
+    found = []
+    for i in [*range(FRAMES), None]:
+        frame = None
+        if i is not None:
+            frame = av.VideoFrame.from_ndarray(ros2.pixels(i, 96), format="rgb24")
+            frame.pts = i
+        found += [(packet.pts, bytes(packet)) for packet in context.encode(frame)]
+    return found
+
+
+def bag(path: Path, name: str, message, stamped_as_shown: bool = False) -> Path:
+    messages = []
+    for i, (shown, data) in enumerate(packets(name)):
+        ns = at(shown if stamped_as_shown else i)
+        messages += [("/cam", message(ns, name, data), at(i)), ("/cmd", ros2.array([i]), at(i) + 10**6)]
+    return ros2.write(path, messages)
+
+
+def foxglove(ns: int, name: str, data: bytes):
+    return VIDEO(ros2.stamp(ns), "x", np.frombuffer(data, np.uint8), name.split()[0])
+
+
+def labelled(format_: str):
+    return lambda ns, name, data: ros2.compressed(ns, format_.format(name.split()[0]), data)
+
+
+IN_ORDER = [(i, i) for i in range(FRAMES)]
+
+
+@pytest.mark.parametrize("name", STREAMS)
+@pytest.mark.parametrize("stamped_as_shown", [False, True])
+def test_video_is_in_the_order_in_which_it_is_shown(
+    name: str, stamped_as_shown: bool, tmp_path: Path
+) -> None:
+    path = bag(tmp_path / "run", name, foxglove, stamped_as_shown)
+    assert pairs(path, robot(sync=", stamp: receive")) == IN_ORDER
+    if not stamped_as_shown:
+        assert pairs(path, robot()) == IN_ORDER
+
+
+@pytest.mark.parametrize("name", ["h264 with B-frames", "h265 with B-frames"])
+def test_frames_of_reordered_video_may_be_asked_for_in_any_order(name: str, tmp_path: Path) -> None:
+    path = bag(tmp_path / "run", name, foxglove)
+    stream = SOURCE.read(str(path), "run", robot()).streams["cam"]
+    wanted = [20, 3, 9, 9, 0, 23, 10]
+    found = [round((float(np.median(frame)) - 40) / ros2.LEVELS) for frame in stream.frames(wanted)]
+    assert found == wanted
+
+
+def test_a_lost_reference_of_reordered_video_shifts_no_frame(tmp_path: Path) -> None:
+    stream = packets("h264 with B-frames")
+    lost = next(i for i, (_, data) in enumerate(stream) if i > 8 and not has_b_slices(data))
+    messages = []
+    for i, (_, data) in enumerate(stream):
+        messages += [] if i == lost else [("/cam", foxglove(at(i), "h264", data), at(i))]
+        messages.append(("/cmd", ros2.array([i]), at(i) + 10**6))
+    path = ros2.write(tmp_path / "run", messages)
+    with pytest.raises(EpisodeError, match=r"lack one|damaged|cannot be decoded"):
+        pairs(path, robot())
+
+
+def test_an_episode_in_reordered_video_has_its_own_frames(tmp_path: Path) -> None:
+    messages = []
+    for i, (_, data) in enumerate(packets("h264 with B-frames")):
+        ns = at(i) + (3 * SECOND_NS if i >= 8 else 0)  # the second group of frames comes after a pause
+        messages += [("/cam", foxglove(ns, "h264", data), ns), ("/cmd", ros2.array([i]), ns + 10**6)]
+    path = ros2.write(tmp_path / "run", messages)
+    parts = robot().to_dict() | {"source": {"format": "rosbag", "segments": {"gap_s": 1}}}
+    embodiment = Embodiment.from_values(parts, "")
+    assert pairs(path, embodiment, "run/0000") == IN_ORDER[:8]
+    assert pairs(path, embodiment, "run/0001") == IN_ORDER[8:]
+
+
+@pytest.mark.parametrize("name", ["h264", "h264 with B-frames", "h265"])
+@pytest.mark.parametrize("format_", ["{}", "bgr8; {} compressed", "jpeg", ""])
+def test_video_in_compressed_images_is_read_as_video(name: str, format_: str, tmp_path: Path) -> None:
+    path = bag(tmp_path / "run", name, labelled(format_))
+    assert pairs(path, robot()) == IN_ORDER
+    camera = next(key for key in SOURCE.inspect(str(path)).keys if key.key == "/cam")
+    assert (camera.kind, camera.codec, camera.shape) == ("camera", name.split()[0], (96, 96, 3))
+
+
+def test_a_jpeg_that_is_called_h264_is_read_as_a_jpeg(tmp_path: Path) -> None:
+    messages = []
+    for i in range(FRAMES):
+        data = cv2.imencode(".jpg", ros2.pixels(i))[1].tobytes()
+        messages += [("/cam", ros2.compressed(at(i), "h264", data), at(i)), ("/cmd", ros2.array([i]), at(i))]
+    assert pairs(ros2.write(tmp_path / "run", messages), robot()) == IN_ORDER
+
+
+def test_b_slices_are_told() -> None:
+    assert any(has_b_slices(data) for _, data in packets("h264 with B-frames"))
+    assert not any(has_b_slices(data) for _, data in packets("h264"))
+
+
+# -- mosaics
+
+PATTERNS = {"rggb": (0, 0), "bggr": (1, 1), "gbrg": (1, 0), "grbg": (0, 1)}  # where the red pixel is
+
+
+def mosaic(colour: tuple[int, int, int], red_at: tuple[int, int]) -> np.ndarray:
+    found = np.full((32, 32), colour[1], np.uint8)
+    row, column = red_at
+    found[row::2, column::2] = colour[0]
+    found[1 - row :: 2, 1 - column :: 2] = colour[2]
+    return found
+
+
+def only_frame(path: Path) -> np.ndarray:
+    episode = SOURCE.read(str(path), "run", robot())
+    return episode.streams["cam"].frames([0])[0]
+
+
+def mosaic_bag(path: Path, format_: str, pixels: np.ndarray, suffix: str = ".png") -> Path:
+    data = cv2.imencode(suffix, pixels)[1].tobytes()
+    messages = [("/cam", ros2.compressed(at(i), format_, data), at(i)) for i in range(3)]
+    return ros2.write(path, [*messages, ("/cmd", ros2.array([1]), at(0))])
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("kind", ["png", "jpeg"])
+def test_a_compressed_mosaic_is_given_its_colours(pattern: str, kind: str, tmp_path: Path) -> None:
+    colour = (200, 90, 30)
+    path = mosaic_bag(
+        tmp_path / "run",
+        f"bayer_{pattern}8; {kind} compressed ",
+        mosaic(colour, PATTERNS[pattern]),
+        f".{kind}",
+    )
+    frame = only_frame(path)[8:24, 8:24].reshape(-1, 3).mean(axis=0)
+    assert np.abs(frame - colour).max() < (2 if kind == "png" else 12)
+    camera = next(key for key in SOURCE.inspect(str(path)).keys if key.key == "/cam")
+    assert camera.shape == (32, 32, 3)
+
+
+def test_a_mosaic_that_was_made_colour_before_is_left_as_it_is(tmp_path: Path) -> None:
+    pixels = np.full((32, 32, 3), (30, 90, 200), np.uint8)  # as OpenCV has it, blue first
+    frame = only_frame(mosaic_bag(tmp_path / "run", "bayer_rggb8; jpeg compressed bgr8", pixels, ".jpg"))
+    assert np.abs(frame.reshape(-1, 3).mean(axis=0) - (200, 90, 30)).max() < 6
+
+
+def test_a_mosaic_of_16_bits_is_refused(tmp_path: Path) -> None:
+    path = mosaic_bag(tmp_path / "run", "bayer_rggb16; png compressed ", np.full((32, 32), 4000, np.uint16))
+    with pytest.raises(EpisodeError, match="16 bits of grey"):
+        only_frame(path)

@@ -1,0 +1,114 @@
+"""The files of a recording that a recorder split: with metadata that names them, or only some, or without."""
+
+from pathlib import Path
+
+import pytest
+import zstandard
+
+from hma_data.episodes.align import to_clip
+from hma_data.errors import EpisodeError
+from hma_data.sources.bags.clocks import SECOND_NS
+from tests.data import ros2
+from tests.data.bag_files import SOURCE
+from tests.data.sources.bags.test_bag_pairing import at, pairs, robot
+
+KINDS = ("db3", "mcap")
+METADATA = "rosbag2_bagfile_information:\n  relative_file_paths: [{}]\n  topics_with_message_count: []\n"
+
+
+def part(target: Path, frames: range, later_ns: int = 0, packed: bool = False) -> Path:
+    """One file of a split recording, with those frames."""
+    messages = []
+    for i in frames:
+        ns = at(i) + later_ns
+        messages += [("/cam", ros2.image(ns, i), ns), ("/cmd", ros2.array([i]), ns + 10**6)]
+    folder = ros2.write(target.parent / "made", messages, mcap=".mcap" in target.name)
+    (made,) = [item for item in folder.iterdir() if item.name != "metadata.yaml"]
+    if packed:
+        target.write_bytes(zstandard.ZstdCompressor().compress(made.read_bytes()))
+    else:
+        made.rename(target)
+    for rest in folder.iterdir():
+        rest.unlink()
+    folder.rmdir()
+    return target
+
+
+def split(folder: Path, suffix: str, count: int = 12, pause_ns: int = 0, packed: bool = False) -> Path:
+    """Twelve parts by default, so that their numbers sort otherwise than their names."""
+    folder.mkdir()
+    for k in range(count):
+        part(folder / f"rec_{k}.{suffix}", range(3 * k, 3 * k + 3), k * pause_ns, packed)
+    return folder
+
+
+def same(count: int) -> list[tuple[int, int]]:
+    return [(i, i) for i in range(count)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_parts_without_metadata_are_one_recording_and_that_is_said(kind: str, tmp_path: Path, caplog) -> None:
+    folder = split(tmp_path / "run", kind)
+    (ref,) = SOURCE.index(str(folder), robot())
+    assert (ref.id, ref.frames) == ("rec", 36)
+    assert pairs(folder, robot(), "rec") == same(36)
+    (line,) = {record.message for record in caplog.records}
+    assert line.startswith(f"rec_0.{kind} to rec_11.{kind} follow each other") and "12 files" in line
+    found = SOURCE.inspect(str(folder))
+    assert (found.episodes, found.frames) == (1, 36)
+    assert any("one recording" in one.message for one in found.findings)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_numbered_episodes_with_pauses_between_stay_apart(kind: str, tmp_path: Path) -> None:
+    folder = split(tmp_path / "run", kind, 3, pause_ns=2 * SECOND_NS)
+    assert SOURCE.episode_ids(str(folder)) == ["rec_0", "rec_1", "rec_2"]
+
+
+def test_a_missing_part_divides_the_recording(tmp_path: Path) -> None:
+    folder = split(tmp_path / "run", "mcap", 5)
+    (folder / "rec_2.mcap").unlink()
+    ids = SOURCE.episode_ids(str(folder))
+    assert len(ids) == 2
+    found = [pairs(folder, robot(), name) for name in ids]
+    assert sorted(found) == [same(6), [(i, i) for i in range(9, 15)]]
+
+
+def test_one_part_given_alone_is_read_alone(tmp_path: Path) -> None:
+    folder = split(tmp_path / "run", "mcap", 3)
+    assert len(pairs(folder / "rec_1.mcap", robot(), "rec_1")) == 3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_stale_metadata_leaves_no_part_out(kind: str, tmp_path: Path, caplog) -> None:
+    folder = split(tmp_path / "run", kind)
+    (folder / "metadata.yaml").write_text(METADATA.format(f"rec_0.{kind}"))
+    assert SOURCE.index(str(folder), robot())[0].frames == 36
+    assert pairs(folder, robot(), "run") == same(36)
+    assert any("names 1 of its 12 files: all are read" in record.message for record in caplog.records)
+    assert any("names 1 of its 12" in problem for problem in SOURCE.inspect(str(folder)).problems)
+
+
+def test_a_file_of_another_name_is_left_out_and_named(tmp_path: Path) -> None:
+    folder = split(tmp_path / "run", "db3", 2)
+    (folder / "metadata.yaml").write_text(METADATA.format("rec_0.db3, rec_1.db3"))
+    part(folder / "backup.db3", range(40, 43))
+    assert pairs(folder, robot(), "run") == same(6)
+    (problem,) = SOURCE.inspect(str(folder)).problems
+    assert "does not name backup.db3: left out" in problem
+
+
+@pytest.mark.parametrize("named", ["rec_{}.db3", "rec_{}.db3.zstd", "old/rec_{}.db3"])
+@pytest.mark.parametrize("stale", [False, True])
+def test_packed_parts_are_found_by_either_name(named: str, stale: bool, tmp_path: Path) -> None:
+    folder = split(tmp_path / "run", "db3.zstd", 2, packed=True)
+    names = [named.format(k) for k in range(1 if stale else 2)]
+    (folder / "metadata.yaml").write_text(METADATA.format(", ".join(names)))
+    assert pairs(folder, robot(), "run") == same(6)
+
+
+def test_the_remedy_for_a_missing_packed_part_works(tmp_path: Path) -> None:
+    folder = split(tmp_path / "run", "db3.zstd", 2, packed=True)
+    (folder / "metadata.yaml").write_text(METADATA.format("rec_0.db3, rec_7.db3"))
+    with pytest.raises(EpisodeError, match=r"names rec_7\.db3.*copy it in, or remove it"):
+        to_clip(SOURCE.read(str(folder), "run", robot()), robot())

@@ -1,0 +1,214 @@
+"""Which numbers of a message become an action: by name wherever names stand, and those that move."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from mcap.writer import Writer
+
+from hma_data.errors import EpisodeError
+from hma_data.inspection.infer import infer
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.bags.messages import value_names
+from hma_data.storage.yaml_io import parse_yaml
+from tests.data import ros2
+from tests.data.bag_files import SOURCE
+from tests.data.sources.bags.test_bag_pairing import at, pairs, robot
+
+FRAMES = 12
+NAMES = ("pan", "lift", "elbow")
+ros2.define("toy/msg/Named", "string name\nuint8 mode\nfloat32 q\nfloat32 tau\n")
+ros2.define("toy/msg/NamedArray", "std_msgs/Header header\ntoy/Named[] motors\n")
+ros2.define("toy/msg/Inner", "float64[] values\n")
+ros2.define("toy/msg/Above", "std_msgs/Header header\nstring[] actuators\ntoy/Inner inner\n")
+ros2.define("toy/msg/MotorCmd", "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 tau\n")
+ros2.define(
+    "toy/msg/LowCmd", "uint32[2] version\nuint8 mode_pr\ntoy/MotorCmd[5] motor_cmd\nuint32 tick\nuint32 crc\n"
+)
+T = ros2.TYPES.types
+
+
+def trajectory(ns: int, names: list[str], values: list[float]):
+    none = np.zeros(0)
+    duration = T["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
+    point = T["trajectory_msgs/msg/JointTrajectoryPoint"](np.array(values), none, none, none, duration)
+    return T["trajectory_msgs/msg/JointTrajectory"](ros2.header(ns), names, [point])
+
+
+def named_array(ns: int, names: list[str], values: list[float]):
+    motors = [T["toy/msg/Named"](name, 1, value, 0.0) for name, value in zip(names, values, strict=True)]
+    return T["toy/msg/NamedArray"](ros2.header(ns), motors)
+
+
+def above(ns: int, names: list[str], values: list[float]):
+    return T["toy/msg/Above"](ros2.header(ns), names, T["toy/msg/Inner"](np.array(values)))
+
+
+MESSAGES = {
+    "/cmd.position": ros2.joints,
+    "/cmd.points[0].positions": trajectory,
+    "/cmd.motors.q": named_array,
+    "/cmd.inner.values": above,
+}
+
+
+def picked(key: str, names: tuple[str, ...]) -> Embodiment:
+    values = robot().to_dict()
+    values["action"]["components"] = [{"key": key, "dims": len(names), "names": list(names)}]
+    return Embodiment.from_values(values, "")
+
+
+def shuffled_bag(path: Path, key: str) -> Path:
+    """Joint k has the value 100 k + i in message i; the order of the joints changes from each to the next."""
+    messages = []
+    for i in range(FRAMES):
+        order = np.random.default_rng(i).permutation(3)
+        message = MESSAGES[key](at(i), [NAMES[k] for k in order], [100.0 * k + i for k in order])
+        messages += [("/cam", ros2.image(at(i), i), at(i)), ("/cmd", message, at(i))]
+    return ros2.write(path, messages)
+
+
+@pytest.mark.parametrize("key", MESSAGES)
+def test_names_pick_the_values_wherever_a_message_has_them(key: str, tmp_path: Path) -> None:
+    path = shuffled_bag(tmp_path / "run", key)
+    for names in (NAMES, ("elbow", "pan")):
+        episode = SOURCE.read(str(path), "run", picked(key, names))
+        expected = [[100.0 * NAMES.index(name) + i for name in names] for i in range(FRAMES)]
+        np.testing.assert_array_equal(episode.actions[0].values, expected)
+
+
+@pytest.mark.parametrize("key", MESSAGES)
+def test_infer_names_them(key: str, tmp_path: Path) -> None:
+    path = shuffled_bag(tmp_path / "run", key)
+    (found,) = [info for info in SOURCE.inspect(str(path)).keys if info.key == key]
+    assert sorted(found.names) == sorted(NAMES)
+
+
+def test_a_list_of_other_texts_names_nothing() -> None:
+    assert value_names([{"values": [1, 2], "joints": ["a"]}], 2) == ()
+    assert value_names([{"values": [1, 2], "units": ["rad", "rad"]}], 2) == ()
+    assert value_names([{"values": [1, 2]}, {"joint_names": ["a", "b"]}], 2) == ("a", "b")
+
+
+# -- what moves
+
+
+def motors_bag(path: Path) -> Path:
+    messages = []
+    for i in range(FRAMES):
+        motors = [T["toy/msg/MotorCmd"](1, float(i + k / 100), 0.0, 0.0) for k in range(5)]
+        low = T["toy/msg/LowCmd"](np.array([1, 2], np.uint32), 0, motors, i, i * 7919 % 1000)
+        messages += [("/cam", ros2.image(at(i), i), at(i)), ("/lowcmd", low, at(i))]
+    return ros2.write(path, messages)
+
+
+def test_infer_takes_the_fields_that_move_not_counters_and_checksums(tmp_path: Path) -> None:
+    values = parse_yaml(infer(str(motors_bag(tmp_path / "run")), "x"), "x")
+    assert values["action"]["components"] == [{"key": "/lowcmd.motor_cmd.q", "dims": 5}]
+
+
+def test_a_field_of_a_list_is_read_from_each_and_may_be_sliced(tmp_path: Path) -> None:
+    path = motors_bag(tmp_path / "run")
+    values = robot().to_dict()
+    values["action"]["components"] = [{"key": "/lowcmd.motor_cmd[1:3].q", "dims": 2}]
+    episode = SOURCE.read(str(path), "run", Embodiment.from_values(values, ""))
+    expected = [[i + 0.01, i + 0.02] for i in range(FRAMES)]
+    np.testing.assert_allclose(episode.actions[0].values, expected, atol=1e-5)
+
+
+# -- two types on one topic
+
+
+def mcap_of_two_types(path: Path) -> Path:
+    """JointState with i, and an array with 500 + i a millisecond later, both on /cmd."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        channels = {}
+        for i in range(FRAMES):
+            for topic, message, late in (
+                ("/cam", ros2.image(at(i), i), 0),
+                ("/cmd", ros2.joints(at(i), ["a"], [i]), 0),
+                ("/cmd", ros2.array([500 + i]), 10**6),
+            ):
+                kind = message.__msgtype__
+                if (topic, kind) not in channels:
+                    text = ros2.TYPES.generate_msgdef(kind, ros_version=2)[0].encode()
+                    schema = writer.register_schema(kind, "ros2msg", text)
+                    channels[topic, kind] = writer.register_channel(topic, "cdr", schema)
+                data = bytes(ros2.TYPES.serialize_cdr(message, kind))
+                writer.add_message(channels[topic, kind], at(i) + late, data, at(i))
+        writer.finish()
+    return path
+
+
+def test_a_key_reads_the_type_that_has_its_field_and_infer_asks(tmp_path: Path) -> None:
+    path = mcap_of_two_types(tmp_path / "run.mcap")
+    assert pairs(path, robot(action="/cmd.position")) == [(i, i) for i in range(FRAMES)]
+    assert {action for _, action in pairs(path, robot(action="/cmd.data"))} <= set(range(499, 512))
+    with pytest.raises(EpisodeError, match="no type of messages on this topic has it"):
+        pairs(path, robot(action="/cmd.effortless"))
+    said = "/cmd carries sensor_msgs/msg/JointState and std_msgs/msg/Float64MultiArray"
+    assert any(said in problem for problem in SOURCE.inspect(str(path)).problems)
+    asked = parse_yaml(infer(str(path), "x"), "x")["provenance"]["action"]
+    assert asked.startswith("TODO") and said in asked
+
+
+# -- descriptors of protobuf
+
+F = descriptor_pb2.FieldDescriptorProto
+
+
+def descriptor(name: str, fields: list[tuple[str, int, str, int]], needs: list[str]):
+    package, message = name.split(".")
+    found = descriptor_pb2.FileDescriptorProto(
+        name=f"{package}/{message}.proto", package=package, syntax="proto3", dependency=needs
+    )
+    kind = found.message_type.add(name=message)
+    for number, (field, type_, of, label) in enumerate(fields, 1):
+        added = kind.field.add(name=field, number=number, type=type_, label=label)
+        if of:
+            added.type_name = of
+    return found
+
+
+def descriptors() -> list[descriptor_pb2.FileDescriptorProto]:
+    """The file of the message last, as protoc writes them."""
+    time = descriptor_pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(time)
+    vector = descriptor("toy.Vector", [("v", F.TYPE_DOUBLE, "", 3)], [])
+    stamp = ("timestamp", F.TYPE_MESSAGE, ".google.protobuf.Timestamp", 1)
+    command = descriptor(
+        "toy.Command", [stamp, ("joints", F.TYPE_MESSAGE, ".toy.Vector", 1)], [time.name, vector.name]
+    )
+    return [time, vector, command]
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (2, 0, 1), (2, 1)])
+def test_a_set_of_descriptors_is_read_in_any_order(order: tuple[int, ...], tmp_path: Path) -> None:
+    """The last one lacks the file of Timestamp, which comes along with protobuf."""
+    files, pool = descriptors(), descriptor_pool.DescriptorPool()
+    for file in files:
+        pool.Add(file)
+    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("toy.Command"))
+    chosen = descriptor_pb2.FileDescriptorSet(file=[files[i] for i in order])
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as out:
+        writer = Writer(out)
+        writer.start()
+        schema = writer.register_schema("toy.Command", "protobuf", chosen.SerializeToString())
+        commands = writer.register_channel("/cmd", "protobuf", schema)
+        text = ros2.TYPES.generate_msgdef("sensor_msgs/msg/CompressedImage", ros_version=2)[0].encode()
+        images = writer.register_schema("sensor_msgs/msg/CompressedImage", "ros2msg", text)
+        camera = writer.register_channel("/cam", "cdr", images)
+        for i in range(FRAMES):
+            image = ros2.image(at(i), i)
+            data = bytes(ros2.TYPES.serialize_cdr(image, image.__msgtype__))
+            writer.add_message(camera, at(i), data, at(i))
+            message = kind()
+            message.timestamp.seconds, message.timestamp.nanos = divmod(at(i), 10**9)
+            message.joints.v.append(float(i))
+            writer.add_message(commands, at(i), message.SerializeToString(), at(i))
+        writer.finish()
+    assert pairs(path, robot(action="/cmd.joints.v")) == [(i, i) for i in range(FRAMES)]
