@@ -187,7 +187,8 @@ def clock_of(keys: Sequence[KeyInfo]) -> ClockChoice:
     if not used or any(topic.receipt_goes_back for topic in used):
         return ClockChoice()  # receipt cannot replace the header stamps
     if back := [topic.name for topic in used if topic.goes_back]:
-        return ClockChoice(f"header stamps of {shown(back)} go back in time")
+        # Receipt joins the runs before and after; `segments` would keep them apart.
+        return ClockChoice(f"header stamps of {shown(back)} go back in time", asks=True)
     period_s = 1 / keys[0].hz if keys[0].hz else 0.0
     for topic in used[1:]:
         if reason := apart(_clock(used[0]), _clock(topic), period_s):
