@@ -9,7 +9,6 @@ import dataclasses
 import json
 import struct
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import lru_cache, partial
 from importlib import import_module
 from typing import Any

@@ -254,7 +254,8 @@ class Survey:
             yield Finding("readable", severity, said, numbers={"episodes": rest})
         missing = any(one.check == "files" and one.severity == "warn" for one in self._extra)
         shown = any(look.images for look in self.looks.values())
-        if (faulty or missing) and not shown and any(key.kind == "camera" for key in keys):
+        told = bool(groups) and severity == "error"  # no episode could be read at all
+        if (faulty or missing) and not shown and not told and any(key.kind == "camera" for key in keys):
             yield Finding("readable", "error", "not one image of the episodes looked at can be read")
 
     def _keys(self) -> Iterator[Finding]:

@@ -12,7 +12,7 @@ import os
 import re
 from collections import Counter, OrderedDict
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
@@ -378,7 +378,9 @@ def inside(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
     """Return a member of a group that lies in the same file; None for a link out of it, or to nothing."""
     if isinstance(group.get(name, getlink=True), h5py.ExternalLink):
         return None
-    item = group.get(name)
+    item = None
+    with suppress(OSError, RuntimeError):  # a soft link that leads to itself
+        item = group.get(name)
     # A soft link may pass through an external one.
     return item if item is not None and item.file.filename == group.file.filename else None
 

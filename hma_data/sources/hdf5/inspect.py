@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Container, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -101,7 +102,8 @@ def inspect(
         except HMAError as fault:
             survey.fault(name, fault)
     for file in {found[name].file for name in chosen}:
-        with explained(file):
+        masks: dict[str, set[str]] = {}
+        with suppress(HMAError), explained(file):  # what a damaged file lacks is told of its episodes
             masks = masks_of(files.get(file))
         demos = {place.group.rsplit("/", 1)[-1] for place in found.values() if place.file == file}
         for mask, names in masks.items():

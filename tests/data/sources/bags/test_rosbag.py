@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zstandard
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
@@ -322,36 +321,6 @@ def test_a_ros2_folder_in_several_files_is_one_episode(tmp_path: Path, recording
     assert SOURCE.index(str(folder), arm())[0].frames == 12
     pictures = np.concatenate([part.pictures for part in parts])
     np.testing.assert_array_equal(episode.streams["front"].frames(range(12)), pictures)
-
-
-def three_parts(folder: Path, listed: int) -> list[Recording]:
-    """Write a recording in three parts; metadata.yaml names the first ones."""
-    folder.mkdir()
-    parts = [later(make_recording(4, seed=i), 400_000_000 * i) for i in range(3)]
-    for i, part in enumerate(parts):
-        KINDS["mcap-cdr-zstd"](folder, part).rename(folder / f"run_{i}.mcap")
-    names = "\n".join(f"    - run_{i}.mcap" for i in range(listed))
-    (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{names}\n")
-    return parts
-
-
-def test_parts_that_a_stale_metadata_does_not_name_belong_to_the_recording(tmp_path: Path) -> None:
-    parts = three_parts(tmp_path / "run", listed=1)
-    frames = read(tmp_path / "run", arm()).streams["front"].frames(range(12))
-    np.testing.assert_array_equal(frames, np.concatenate([part.pictures for part in parts]))
-    (tmp_path / "run/run_2.mcap").rename(tmp_path / "run/other.mcap")
-    with pytest.raises(EpisodeError, match=r"does not name other\.mcap"):
-        read(tmp_path / "run", arm())
-
-
-def test_packed_parts_may_be_named_without_their_suffix(tmp_path: Path) -> None:
-    parts = three_parts(tmp_path / "run", listed=3)
-    for path in (tmp_path / "run").glob("*.mcap"):
-        packed = zstandard.ZstdCompressor().compress(path.read_bytes())
-        path.with_name(f"{path.name}.zstd").write_bytes(packed)
-        path.unlink()
-    frames = read(tmp_path / "run", arm()).streams["front"].frames(range(12))
-    np.testing.assert_array_equal(frames, np.concatenate([part.pictures for part in parts]))
 
 
 def test_a_listed_file_that_is_missing_is_told(bags: dict[str, Path], tmp_path: Path) -> None:

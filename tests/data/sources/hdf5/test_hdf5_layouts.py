@@ -280,7 +280,9 @@ def test_a_soft_link_through_another_file_is_refused(tmp_path: Path) -> None:
         file["data/demo_0/obs/agentview_image"] = h5py.SoftLink("/away/image")
         file["data/demo_1"] = h5py.SoftLink("/away")
     assert "keeps its values in other files" in refusal(path)
-    assert open_source("hdf5").episode_ids(str(path)) == ["demo_0"]
+    assert open_source("hdf5").episode_ids(str(path)) == ["demo_0", "demo_1"]
+    with pytest.raises(EpisodeError, match="demo_1: is a link to .* which is not in this file"):
+        open_source("hdf5").read(str(path), "demo_1", embodiment())
 
 
 @pytest.mark.parametrize("dtype", [h5py.ref_dtype, h5py.regionref_dtype, h5py.vlen_dtype(np.float64)])
