@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-FIRST_ROBOT = "rails_03"  # the robot that a page opens with: it follows its actions longest (docs/results.md)
+FIRST_ROBOT = "rails_03"  # the robot that a page opens with: it follows, and is easy to drive
 MAX_VIEWERS = 32
 MESSAGES_PER_S, MESSAGE_BURST = 200.0, 400.0  # messages of a viewer a second, and at once
 SCENE_COST = 20.0  # messages that one counts as which begins a scene: all other sessions wait for it
