@@ -54,7 +54,12 @@ def test_it_holds_registry_recipes_and_weights(installed: Path) -> None:
     assert "hma_data/shipped/registry/lab/pusht_fast.yaml" in files
     assert any(name.startswith("hma_data/shipped/recipes/") and name.endswith(".yaml") for name in files)
     assert any(name.startswith("hma_data/tokenizers/weights/") for name in files)
-    assert {"hma_model/play/page.html", "hma_data/py.typed", "hma_model/py.typed"} <= files
+    assert {
+        "hma_model/play/page.html",
+        "hma_model/play/holding.json",
+        "hma_data/py.typed",
+        "hma_model/py.typed",
+    } <= files
     assert "hma_model/embedded/trunk.safetensors" in files
     assert not any(name.startswith(("tests/", "docs/")) for name in files)
 

@@ -18,7 +18,7 @@ SIDE = 32  # pixels of thumbnails: where parts are, not how sharp they are
 LOST_FACTOR = 4.0  # times the squared error of the tokenizer alone: 6 dB
 NEARER = 0.8  # of the squared error: another moment must be nearer by 1 dB
 OWN_ERROR = 1.0  # of the tokenizer alone, at least
-MEMORY = 1000  # moments that are remembered
+MEMORY = 300  # moments that are remembered: comparing with them takes a few milliseconds a frame
 MIN_ROW = 3  # lost frames in a row, for robots of few frames a second
 
 
