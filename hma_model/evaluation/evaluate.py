@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
@@ -29,6 +30,7 @@ from hma_model.config import OBJECTIVES
 from hma_model.evaluation.actions import gaussian, shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, SHARE, rounded, summary
 from hma_model.evaluation.losses import (
+    episodes_of,
     masked_val_loss,
     no_window,
     opened,
@@ -39,7 +41,7 @@ from hma_model.evaluation.losses import (
 from hma_model.evaluation.metrics import masked_scores, perplexity, perplexity_summary, teacher_forced
 from hma_model.evaluation.perceptual import Judge, Networks
 from hma_model.evaluation.rollouts import Pictures, Sampling, rollout
-from hma_model.evaluation.scores import ROLLOUTS, Rolled, Scores, counted
+from hma_model.evaluation.scores import ROLLOUTS, Rolled, Scores
 from hma_model.generation.decode import cameras_for, default_prompt
 
 if TYPE_CHECKING:
@@ -76,6 +78,43 @@ class Settings:
     sampling: Mapping[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What the settings come to for a model and a shard set.
+
+    Attributes:
+        cameras: that the windows show.
+        frames, prompt: T of a window, and how many of its frames are given.
+        windows: their number.
+    """
+
+    cameras: Cameras
+    frames: int
+    prompt: int
+    windows: int
+
+    @classmethod
+    def of(cls, model: "HMA", shards: ShardSet, settings: Settings) -> "Plan":
+        """Return the plan; raise CheckpointError or UsageError where the three do not fit together."""
+        require_tokenizer(model.config, shards.spec, shards.folder)
+        cameras = cameras_for(model, shards, settings.cameras)
+        frames = settings.frames or model.config.frames
+        prompt = default_prompt(frames) if settings.prompt is None else settings.prompt
+        if prompt >= frames:
+            fault = f"{prompt} true frames leave none to predict in windows of {frames}"
+            raise UsageError("--prompt", fault, "give fewer, or more --frames")
+        there = len(WindowDataset(shards, settings.split, frames, cameras=cameras))
+        if not there:
+            raise no_window(shards, settings.split, frames)
+        return cls(cameras, frames, prompt, min(settings.windows, there))
+
+    def predicted_frames(self, settings: Settings) -> int:
+        """Return how many frames the rollouts predict."""
+        kinds = 2 + settings.draws  # true actions, none, and each draw of shuffled ones
+        of_paper = 1 + settings.draws if settings.paper else 0
+        return self.windows * ((self.frames - self.prompt) * kinds + of_paper)
+
+
 @dataclass
 class Measured:
     """The result of `measure`.
@@ -89,8 +128,8 @@ class Measured:
 
     found: dict[str, Any]
     by_window: dict[str, Floats]
-    batches: list[Batch] = field(default_factory=list)
-    predicted: dict[str, list[torch.Tensor]] = field(default_factory=dict)
+    batches: list[Batch]
+    predicted: dict[str, list[torch.Tensor]]
 
 
 def evaluate(
@@ -157,53 +196,58 @@ def measure(
         model, tokenizer, data: as of `evaluate`.
         settings: the options; `state` is not measured here.
         networks: the networks of LPIPS, FID and FVD.
-        on_frames: is told after each batch of rollouts how many frames it predicted.
+        on_frames: is told after each rollout how many frames are predicted so far.
 
     Raises:
         CheckpointError, UsageError: as of `evaluate`.
     """
     shards = opened(data)
-    require_tokenizer(model.config, shards.spec, shards.folder)
-    length = settings.frames or model.config.frames
-    first = default_prompt(length) if settings.prompt is None else settings.prompt
-    split, seed, draws = settings.split, settings.seed, settings.draws
-    cameras = cameras_for(model, shards, settings.cameras)
-    if not len(WindowDataset(shards, split, length, cameras=cameras)):
-        raise no_window(shards, split, length)
-    batches = list(windows(shards, split, length, settings.windows, settings.batch_size, cameras))
-    if not model.config.sees_actions:  # it knows only how frames without commands go on
+    plan = Plan.of(model, shards, settings)
+    first, seed, draws = plan.prompt, settings.seed, settings.draws
+    batches = list(
+        windows(shards, settings.split, plan.frames, settings.windows, settings.batch_size, plan.cameras)
+    )
+    if not model.config.sees_actions:  # it knows only how frames without actions go on
         batches = [without_actions(batch) for batch in batches]
-    episodes = _episodes(batches)
-    table, by_window = _losses(model, shards, batches, episodes, cameras, draws, seed)
+    episodes = episodes_of(batches)
+    table, by_window = _losses(model, shards, batches, episodes, plan.cameras, draws, seed)
     on_frames(0)  # the losses are done: the clock of the time left starts here
-    roll = partial(rollout, model, tokenizer, **settings.sampling)
+    predicted = 0
+
+    def roll(batch: Batch, **options: Any) -> Pictures:
+        nonlocal predicted
+        made = rollout(model, tokenizer, batch, **options, **settings.sampling)
+        predicted += made.finite.size
+        on_frames(predicted)
+        return made
+
     rolled = Rolled(first, Judge(networks or Networks()))
     for number, batch in enumerate(batches):
-        rolled.add(batch, counted(partial(roll, prompt=first, seed=seed + number), on_frames), draws, seed)
+        rolled.add(batch, partial(roll, prompt=first, seed=seed + number), draws, seed)
     joined = {name: Scores.join(parts) for name, parts in rolled.scores.items()}
     by_window |= {key: value for name, part in joined.items() for key, value in part.by_window(name).items()}
     gain = by_window["true.psnr_last"] - by_window["shuffled.psnr_last"]
     by_window["psnr_action_gain_last"] = gain
-    frechet, missing = rolled.judge.figures(length - first)
+    frechet, missing = rolled.judge.figures(plan.frames - first)
     figures = {name: joined[name].figures(seed, episodes) | frechet.get(name, {}) for name in ROLLOUTS}
     extra: dict[str, Any] = {}
     if settings.paper:
-        extra["paper"] = _paper(roll, batches, episodes, shards, by_window, draws, seed, on_frames)
+        extra["paper"] = _paper(roll, batches, episodes, shards, by_window, draws, seed)
     else:
         missing = {**missing, "paper": "not measured: --paper follows the paper's protocol"}
     found = {
         "embodiment": shards.embodiment.id,
-        "split": split,
+        "split": settings.split,
         "windows": len(gain),
         "unmoved_windows": rolled.still,
         "episodes": len(np.unique(episodes)),
-        "frames": length,
+        "frames": plan.frames,
         "prompt": first,
         "draws": draws,
         "sees_actions": model.config.sees_actions,
         "merge": model.config.merge,
         "against": "decoded tokens",
-        "cameras": cameras if isinstance(cameras, str) else ", ".join(cameras),
+        "cameras": plan.cameras if isinstance(plan.cameras, str) else ", ".join(plan.cameras),
         **table,
         **figures,
         **summary("psnr_action_gain_last", gain, seed, digits=6, episodes=episodes),
@@ -214,11 +258,6 @@ def measure(
     }
     by_window["episode"] = episodes.astype(np.float64)
     return Measured(found, by_window, batches, rolled.predicted)
-
-
-def _episodes(batches: list[Batch]) -> NDArray[np.int64]:
-    """Return the episode (N,) of each window."""
-    return np.concatenate([np.arange(len(b)) if b.episode is None else b.episode.numpy() for b in batches])
 
 
 def _losses(
@@ -267,12 +306,11 @@ def _paper(
     by_window: dict[str, Floats],
     draws: int,
     seed: int,
-    on_frames: Callable[[int], None],
 ) -> dict[str, Any]:
     """Follow the paper's protocol: its perplexity, and ΔPSNR of a last frame under Gaussian actions."""
     scores: dict[str, list[Scores]] = {"true": [], "gaussian": []}
     for number, batch in enumerate(batches):
-        last = counted(partial(roll, prompt=batch.actions.shape[1] - 1, seed=seed + number), on_frames)
+        last = partial(roll, prompt=batch.actions.shape[1] - 1, seed=seed + number)
         true = last(batch)
         scores["true"].append(Scores.of(true))
         drawn = (

@@ -76,6 +76,11 @@ def windows(
     yield from map(dataset.batch, parts)
 
 
+def episodes_of(batches: Sequence[Batch]) -> NDArray[np.int64]:
+    """Return the episode (N,) of each window; windows whose episode is unknown count as one each."""
+    return np.concatenate([np.arange(len(b)) if b.episode is None else b.episode.numpy() for b in batches])
+
+
 def no_window(shards: ShardSet, split: str, frames: int) -> UsageError:
     """Return the error of a split that has no window of so many frames."""
     if shards.manifest.splits[split]["episodes"]:

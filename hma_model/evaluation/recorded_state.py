@@ -27,6 +27,7 @@ from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded
+from hma_model.evaluation.losses import episodes_of
 from hma_model.evaluation.probe import (
     SHARPNESS,
     UNREADABLE,
@@ -200,7 +201,7 @@ def measure_recorded_state(
             errors.setdefault(kind, []).append(found_errors)
     joined = {kind: np.concatenate(parts) for kind, parts in errors.items()}
     kept = np.isfinite(joined["copy"]).all(axis=(1, 2))
-    whose = np.concatenate([np.arange(len(b)) if b.episode is None else b.episode.numpy() for b in batches])
+    whose = episodes_of(batches)
     if not kept.any():
         return nothing | {"missing": "the states of all windows are unknown in part"}, unknown
     here = joined["reconstruction"][kept].mean(axis=(0, 1))  # the windows may be unlike what it learned from

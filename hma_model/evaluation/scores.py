@@ -129,14 +129,3 @@ class Rolled:
         self.scores[kind].append(Scores.mean([Scores.of(pictures, self.judge) for pictures in draws]))
         if kind in self.predicted:
             self.predicted[kind].append(draws[0].stored)
-
-
-def counted(roll: Callable[..., Pictures], on_frames: Callable[[int], None]) -> Callable[..., Pictures]:
-    """Return a function that rolls out, and then tells how many frames it predicted."""
-
-    def counting(batch: Batch, **options: Any) -> Pictures:
-        made = roll(batch, **options)
-        on_frames(made.finite.size)
-        return made
-
-    return counting

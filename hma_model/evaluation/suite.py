@@ -13,10 +13,10 @@ bytes of results.json.
 import hashlib
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,22 +27,20 @@ from numpy.typing import NDArray
 from hma_data.console import Update, progress, short_paths
 from hma_data.errors import OutputError, UsageError
 from hma_data.lab.simulator import simulated
-from hma_data.loading.dataset import WindowDataset
+from hma_data.loading.views import Cameras
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import finite, to_json, write_atomic
 from hma_data.storage.kept import kept_arrays
 from hma_data.storage.paths import StrPath, as_path, as_text, is_repository
-from hma_model.checkpoint.folder import EMBEDDED, require_tokenizer
+from hma_model.checkpoint.folder import EMBEDDED
 from hma_model.checkpoint.io import record_evaluation
-from hma_model.evaluation.evaluate import Settings, measure
-from hma_model.evaluation.losses import no_window
+from hma_model.evaluation.evaluate import Plan, Settings, measure
 from hma_model.evaluation.perceptual import Networks
 from hma_model.evaluation.recorded_state import measure_recorded_state
 from hma_model.evaluation.simulated import measure_state
 from hma_model.evaluation.verdict import verdict
-from hma_model.generation.decode import cameras_for, default_prompt
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -100,80 +98,57 @@ def evaluate_all(
     names = [shards.embodiment.id for shards in sets]
     from hma_model.network.model import HMA
 
-    models: dict[str, HMA] = {}
-    for checkpoint in checkpoints:  # what is wrong with any of them is said before the first is computed
+    work: list[_Work] = []
+    for checkpoint in checkpoints:  # all are checked before the first is measured
         model = HMA.from_pretrained(checkpoint, embodiments=names, device=device).eval()
-        models[as_text(checkpoint)] = model
-        for shards in sets:
-            _check(model, shards, settings)
+        work += [_Work.of(as_text(checkpoint), model, shards, settings) for shards in sets]
     parts, done = [], 0
-    work = [(label, model, shards) for label, model in models.items() for shards in sets]
-    total = sum(_frames(model, shards, settings) for _, model, shards in work)
-    shown = short_paths(list(models))
-    with progress("evaluate", total) as update:
-        for label, model, shards in work:
-            mark = fingerprint(model, shards, settings, networks)
-            part = _kept(folder, mark, label, shards) if folder else None
-            about = f"{shown[label]}, {shards.embodiment.id}"
+    shown = short_paths(list(dict.fromkeys(one.label for one in work)))
+    with progress("evaluate", sum(one.frames for one in work)) as update:
+        for one in work:
+            mark = fingerprint(one.model, one.shards, settings, networks)
+            part = _kept(folder, mark, one.label, one.shards) if folder else None
+            about = f"{shown[one.label]}, {one.shards.embodiment.id}"
             if part is None:
-                counter = _Counter(update, done, about)
-                counter.begins("losses first")
-                part = _measured(label, model, shards, settings, networks, counter)
+                part = _measured(one, settings, networks, partial(_tell, update, done, about))
                 if folder:
                     _keep(folder, mark, part)
-            _record(label, model, part, settings)
+            _record(one.label, one.model, part, settings)
             parts.append(part)
-            done += _frames(model, shards, settings)
+            done += one.frames
             update(done, about)
     return parts
 
 
-@dataclass
-class _Counter:
-    """Adds predicted frames up, and shows them; also what takes time and predicts none of them."""
+def _tell(update: Update, done: int, about: str, frames: int, what: str = "") -> None:
+    """Show how many frames of a part are predicted, and what is measured that predicts none."""
+    update(done + frames, f"{about}: {what}" if what else about)
 
-    update: Update
-    done: int
-    about: str
 
-    def begins(self, what: str) -> None:
-        self.update(self.done, f"{self.about}: {what}")
+@dataclass(frozen=True)
+class _Work:
+    """A checkpoint and a shard set that go together; `frames` are predicted for their rollouts."""
 
-    def __call__(self, frames: int) -> None:
-        self.done += frames
-        self.update(self.done, self.about)
+    label: str
+    model: "HMA"
+    shards: ShardSet
+    cameras: Cameras
+    frames: int
+
+    @classmethod
+    def of(cls, label: str, model: "HMA", shards: ShardSet, settings: Settings) -> "_Work":
+        plan = Plan.of(model, shards, settings)
+        if settings.state and not simulated(shards.embodiment.id) and not shards.embodiment.state:
+            fault = "is no robot of the laboratory, and its shards have no states"
+            remedy = "leave --state out, or name the recorded states in its YAML and convert again"
+            raise UsageError(shards.embodiment.id, fault, remedy)
+        return cls(label, model, shards, plan.cameras, plan.predicted_frames(settings))
 
 
 def _once(names: Sequence[str], what: str) -> None:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise UsageError(twice, f"is the {what} of two arguments", "give each once")
-
-
-def _check(model: "HMA", shards: ShardSet, settings: Settings) -> None:
-    """Raise if a shard set cannot be evaluated on a model."""
-    require_tokenizer(model.config, shards.spec, shards.folder)
-    cameras = cameras_for(model, shards, settings.cameras)
-    length = settings.frames or model.config.frames
-    if (settings.prompt or 1) >= length:
-        fault = f"{settings.prompt} true frames leave none to predict in windows of {length}"
-        raise UsageError("--prompt", fault, "give fewer, or more --frames")
-    if not len(WindowDataset(shards, settings.split, length, cameras=cameras)):
-        raise no_window(shards, settings.split, length)
-    if settings.state and not simulated(shards.embodiment.id) and not shards.embodiment.state:
-        fault = "is no robot of the laboratory, and its shards have no states"
-        remedy = "leave --state out, or name the recorded states in its YAML and convert again"
-        raise UsageError(shards.embodiment.id, fault, remedy)
-
-
-def _frames(model: "HMA", shards: ShardSet, settings: Settings) -> int:
-    """Return how many frames are predicted for a part, without those of its state."""
-    length = settings.frames or model.config.frames
-    first = default_prompt(length) if settings.prompt is None else settings.prompt
-    cameras = cameras_for(model, shards, settings.cameras)
-    count = min(settings.windows, len(WindowDataset(shards, settings.split, length, cameras=cameras)))
-    last = (1 + settings.draws) if settings.paper else 0
-    return count * ((length - first) * (2 + settings.draws) + last)
 
 
 def fingerprint(model: "HMA", shards: ShardSet, settings: Settings, networks: Networks) -> str:
@@ -200,36 +175,32 @@ def _tokenizer(folder: str, device: str) -> "Tokenizer":
     return tokenizer_of(ShardSet(folder), device=device)
 
 
-def _measured(
-    label: str,
-    model: "HMA",
-    shards: ShardSet,
-    settings: Settings,
-    networks: Networks,
-    counter: _Counter,
-) -> Part:
+def _measured(work: _Work, settings: Settings, networks: Networks, tell: Callable[..., None]) -> Part:
+    model, shards, robot = work.model, work.shards, work.shards.embodiment.id
     tokenizer = _tokenizer(str(shards.folder), str(model.device))
-    sampling: Any = dict(settings.sampling)
-    measured = measure(model, tokenizer, shards, settings, networks, counter)
-    found, robot = measured.found, shards.embodiment.id
+    tell(0, "losses first")
+    measured = measure(model, tokenizer, shards, settings, networks, tell)
+    found = measured.found
     if settings.state and not simulated(robot):
-        counter.begins("its state, as it was recorded")
+        tell(work.frames, "its state, as it was recorded")
         found["state"], measured.by_window["state.error_sd_last"] = measure_recorded_state(
-            tokenizer, shards, measured.batches, measured.predicted, prompt=found["prompt"],
-            cameras=cameras_for(model, shards, settings.cameras), seed=settings.seed,
+            tokenizer, shards, measured.batches, measured.predicted,
+            prompt=found["prompt"], cameras=work.cameras, seed=settings.seed,
         )  # fmt: skip
     elif settings.state:
-        counter.begins("its state, in new episodes")
+        tell(work.frames, "its state, in new episodes")
+        sampling: Any = dict(settings.sampling)
         found["state"] = measure_state(
-            model, tokenizer, robot, frames=found["frames"], prompt=found["prompt"], episodes=settings.state,
-            seed=settings.seed, **sampling,
+            model, tokenizer, robot, frames=found["frames"], prompt=found["prompt"],
+            episodes=settings.state, seed=settings.seed, **sampling,
         )  # fmt: skip
+    elif simulated(robot) or shards.embodiment.state:
+        found["missing"]["state"] = "not measured: --state reads what the robot does off its images"
     else:
         found["missing"]["state"] = (
-            "not measured: --state reads what the robot does off its pictures"
-            if simulated(robot) or shards.embodiment.state
-            else "not measured: the shards have no states, and the robot is none of the laboratory"
+            "not measured: the shards have no states, and the robot is none of the laboratory"
         )
+    label = work.label
     found = {"checkpoint": label, "data": str(shards.folder), **found}
     if networks.facts:
         found["networks"] = networks.facts
