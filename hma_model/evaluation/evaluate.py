@@ -38,7 +38,14 @@ from hma_model.evaluation.losses import (
     validation_losses,
     windows,
 )
-from hma_model.evaluation.metrics import masked_scores, perplexity, perplexity_summary, teacher_forced
+from hma_model.evaluation.metrics import (
+    PSNR_GAIN_RANGE,
+    PSNR_RANGE,
+    masked_scores,
+    perplexity,
+    perplexity_summary,
+    teacher_forced,
+)
 from hma_model.evaluation.perceptual import Judge, Networks
 from hma_model.evaluation.rollouts import Pictures, Sampling, rollout
 from hma_model.evaluation.scores import ROLLOUTS, Rolled, Scores
@@ -250,7 +257,7 @@ def measure(
         "cameras": plan.cameras if isinstance(plan.cameras, str) else ", ".join(plan.cameras),
         **table,
         **figures,
-        **summary("psnr_action_gain_last", gain, seed, digits=6, episodes=episodes),
+        **summary("psnr_action_gain_last", gain, seed, 6, episodes, PSNR_GAIN_RANGE),
         **extra,
         "missing": missing,
         "notes": _notes(model, joined, table, rolled.still, len(gain), len(np.unique(episodes))),
@@ -321,8 +328,9 @@ def _paper(
     true_db, gaussian_db = (Scores.join(scores[name]).psnr[:, 0] for name in ("true", "gaussian"))
     by_window["paper.delta_psnr"] = true_db - gaussian_db
     mean = partial(summary, seed=seed, episodes=episodes)
-    found = mean("psnr_last", true_db) | mean("gaussian_psnr_last", gaussian_db)
-    found |= mean("delta_psnr", true_db - gaussian_db) | {"draws": draws}
+    found = mean("psnr_last", true_db, within=PSNR_RANGE)
+    found |= mean("gaussian_psnr_last", gaussian_db, within=PSNR_RANGE)
+    found |= mean("delta_psnr", true_db - gaussian_db, within=PSNR_GAIN_RANGE) | {"draws": draws}
     if "accuracy" in by_window:  # exp of each batch's mean, then the mean: above the exp of the mean
         nats = by_window["loss"]
         parts = np.array_split(nats, range(PAPER_BATCH, len(nats), PAPER_BATCH))

@@ -117,7 +117,10 @@ def ends_of(ends: Floats, digits: int = 4) -> list[float] | None:
 
 
 def over_datasets(
-    sets: Sequence[NDArray[Any]], seed: int = 0, episodes: Sequence[Episodes] | None = None
+    sets: Sequence[NDArray[Any]],
+    seed: int = 0,
+    episodes: Sequence[Episodes] | None = None,
+    within: tuple[float, float] = ANY,
 ) -> tuple[float, list[float] | None]:
     """Return the mean over datasets of their means of values (N,), and its interval.
 
@@ -130,6 +133,6 @@ def over_datasets(
     ]
     sets = [values[k] for values, k in zip(sets, kept)]
     means = [resampled_means(v, seed + n, e) for n, (v, e) in enumerate(zip(sets, own))]
-    low, high = np.percentile(np.mean(means, axis=0), LEVELS)
+    low, high = np.percentile(np.mean(means, axis=0), LEVELS).clip(*within)
     ends = [float(low), float(high)] if np.isfinite(low) else None
     return float(np.mean([values.mean() for values in sets])), ends

@@ -32,6 +32,9 @@ Floats = NDArray[np.float64]
 Values = NDArray[Any]
 SSIM_WINDOW = 7
 PSNR_LIMIT = 60.0  # dB; where the PSNR of equal images, and with it a mean over frames, would be infinite
+# what values can be, so that no interval of few episodes leaves it
+PSNR_RANGE, PSNR_GAIN_RANGE = (0.0, PSNR_LIMIT), (-PSNR_LIMIT, PSNR_LIMIT)
+SSIM_RANGE = (-1.0, 1.0)
 
 
 def psnr(truth: Values, pictures: Values, data_range: float = 255.0, limit: float = math.inf) -> Floats:

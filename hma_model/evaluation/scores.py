@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from hma_data.loading.dataset import Batch
 from hma_model.evaluation.actions import shuffled, without_actions
-from hma_model.evaluation.intervals import Episodes, horizon_summary
-from hma_model.evaluation.metrics import PSNR_LIMIT, psnr, ssim
+from hma_model.evaluation.intervals import NATURAL, Episodes, horizon_summary
+from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, SSIM_RANGE, psnr, ssim
 from hma_model.evaluation.perceptual import Judge
 from hma_model.evaluation.rollouts import Pictures
 
@@ -69,10 +69,10 @@ class Scores:
 
     def figures(self, seed: int, episodes: Episodes = None) -> dict[str, Any]:
         """Return the means over windows, with their intervals; `episodes` are the windows' own."""
-        found = horizon_summary("psnr", self.psnr, seed, 6, episodes)
-        found |= horizon_summary("ssim", self.ssim, seed, 6, episodes)
+        found = horizon_summary("psnr", self.psnr, seed, 6, episodes, PSNR_RANGE)
+        found |= horizon_summary("ssim", self.ssim, seed, 6, episodes, SSIM_RANGE)
         if self.lpips is not None:
-            found |= horizon_summary("lpips", self.lpips, seed, episodes=episodes)
+            found |= horizon_summary("lpips", self.lpips, seed, episodes=episodes, within=NATURAL)
         return found
 
     def by_window(self, rollout: str) -> dict[str, Floats]:

@@ -22,7 +22,7 @@ from hma_data.lab import truth
 from hma_data.loading.dataset import Batch
 from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded, summary
-from hma_model.evaluation.metrics import PSNR_LIMIT, perplexity_summary, psnr, teacher_forced
+from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, perplexity_summary, psnr, teacher_forced
 from hma_model.evaluation.probe import Probe, as_seen, state_errors, train_probe
 from hma_model.evaluation.rollouts import Pictures, Sampling, rollout
 
@@ -135,8 +135,8 @@ def _perturbed(
     for mark, pictures, windows in (("", true, batch), ("_star", made, other)):
         given = pictures.truth[:, pictures.prompt :]
         signal = psnr(given, pictures.predicted[:, pictures.prompt :], limit=PSNR_LIMIT)
-        found |= summary(f"psnr{mark}", signal.mean(axis=1), seed)
-        found |= summary(f"psnr{mark}_last", signal[:, -1], seed)
+        found |= summary(f"psnr{mark}", signal.mean(axis=1), seed, within=PSNR_RANGE)
+        found |= summary(f"psnr{mark}_last", signal[:, -1], seed, within=PSNR_RANGE)
         if model.config.kind == "discrete":
             nats, _ = teacher_forced(model, windows.to(model.device))
             found |= perplexity_summary(f"perplexity{mark}", nats.double().cpu().numpy().mean(axis=1), seed)

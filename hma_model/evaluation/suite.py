@@ -40,13 +40,13 @@ from hma_model.evaluation.evaluate import Plan, Settings, measure
 from hma_model.evaluation.perceptual import Networks
 from hma_model.evaluation.recorded_state import measure_recorded_state
 from hma_model.evaluation.simulated import measure_state
-from hma_model.evaluation.verdict import verdict
+from hma_model.evaluation.verdict import follows, verdict
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
-VERSION = 5  # raise it when the same part gives other figures
+VERSION = 6  # raise it when the same part gives other figures
 PARTS, RESULTS = "parts", "results.json"
 
 
@@ -219,7 +219,7 @@ def _record(label: str, model: "HMA", part: Part, settings: Settings) -> None:
         return
     said = verdict(part.found)
     figures = ("episodes", "windows", "psnr_action_gain_last", "psnr_action_gain_last_95")
-    facts = {"verdict": said, "follows": said.startswith("follows ")}
+    facts = {"verdict": said, "follows": follows(part.found)}
     facts |= {name: part.found.get(name) for name in figures}
     with suppress(OSError):  # a folder that may only be read
         record_evaluation(source, part.found["embodiment"], facts)

@@ -13,7 +13,8 @@ from typing import Any
 from hma_data.console import human_count, short_paths
 from hma_data.storage.files import finite
 from hma_data.tables import Table
-from hma_model.evaluation.intervals import over_datasets
+from hma_model.evaluation.intervals import ANY, NATURAL, SHARE, over_datasets
+from hma_model.evaluation.metrics import PSNR_GAIN_RANGE, PSNR_RANGE, SSIM_RANGE
 from hma_model.evaluation.suite import Part
 from hma_model.evaluation.verdict import verdict
 
@@ -37,6 +38,7 @@ class Figure:
         digits: after the point.
         meaning: in words.
         by_window: its key among the values of windows, of which the mean over sets is made; empty if none.
+        within: what those values can be.
         exponential: whether it is exp of the mean of those values.
         detail: whether only the list of a single checkpoint and set has it.
     """
@@ -46,12 +48,13 @@ class Figure:
     digits: int
     meaning: str
     by_window: str = ""
+    within: tuple[float, float] = ANY
     exponential: bool = False
     detail: bool = False
 
 
-def _of_windows(name: str, path: str, digits: int, meaning: str) -> Figure:
-    return Figure(name, path, digits, meaning, by_window=path)
+def _of_windows(name: str, path: str, digits: int, meaning: str, within: tuple[float, float]) -> Figure:
+    return Figure(name, path, digits, meaning, by_window=path, within=within)
 
 
 FIGURES = (
@@ -61,25 +64,27 @@ FIGURES = (
     Figure(
         "perplexity", "perplexity", 2,
         "of whole masked frames, given the true past; of squares, where the model takes squares",
-        by_window="loss", exponential=True,
+        by_window="loss", within=NATURAL, exponential=True,
     ),
     Figure("nats/token", "stored_loss", 3, "loss a stored token: comparable between models of a tokenizer"),
     Figure(
         "masked", "masked_perplexity", 2, "perplexity of the tokens that training masks, among its masks",
-        by_window="masked_loss", exponential=True,
+        by_window="masked_loss", within=NATURAL, exponential=True,
     ),
     Figure("masked accuracy", "masked_accuracy", 3, "share of these tokens predicted right", detail=True),
-    _of_windows("accuracy", "accuracy", 3, "share of tokens (or of squares of tokens), given the true past"),
-    _of_windows("PSNR", "true.psnr", 2, "dB, mean over the horizon of rollouts"),
-    _of_windows("PSNR last", "true.psnr_last", 2, "dB, last frame"),
-    _of_windows("ΔPSNR", "psnr_action_gain_last", 2, "dB, last frame, true less shuffled actions"),
-    _of_windows("SSIM", "true.ssim", 3, "mean over the horizon"),
-    _of_windows("LPIPS", "true.lpips", 3, "AlexNet, mean over the horizon"),
+    _of_windows("accuracy", "accuracy", 3, "share of tokens (or of their squares), true past", SHARE),
+    _of_windows("PSNR", "true.psnr", 2, "dB, mean over the horizon of rollouts", PSNR_RANGE),
+    _of_windows("PSNR last", "true.psnr_last", 2, "dB, last frame", PSNR_RANGE),
+    _of_windows(
+        "ΔPSNR", "psnr_action_gain_last", 2, "dB, last frame, true less shuffled actions", PSNR_GAIN_RANGE
+    ),
+    _of_windows("SSIM", "true.ssim", 3, "mean over the horizon", SSIM_RANGE),
+    _of_windows("LPIPS", "true.lpips", 3, "AlexNet, mean over the horizon", NATURAL),
     Figure("FID", "true.fid", 1, "of all predicted frames"),
     Figure("FVD", "true.fvd", 1, "of the predicted parts of windows"),
     _of_windows(
         "ΔPSNR (paper)", "paper.delta_psnr", 2,
-        "dB, last frame after the true past, true less Gaussian actions",
+        "dB, last frame after the true past, true less Gaussian actions", PSNR_GAIN_RANGE,
     ),
     Figure("PSNR last (paper)", "paper.psnr_last", 2, "dB, the same frame, true actions", detail=True),
     Figure("PSNR Gaussian (paper)", "paper.gaussian_psnr_last", 2, "dB, Gaussian actions", detail=True),
@@ -88,10 +93,10 @@ FIGURES = (
     Figure(
         "state sd", "state.true.error_sd_last", 2,
         "error of the recorded state at the last frame, in its standard deviations",
-        by_window="state.error_sd_last",
+        by_window="state.error_sd_last", within=NATURAL,
     ),
-    _of_windows("PSNR none", "none.psnr_last", 2, "dB, last frame, without actions"),
-    _of_windows("PSNR copy", "copy.psnr_last", 2, "dB, last frame, the prompt's last frame repeated"),
+    _of_windows("PSNR none", "none.psnr_last", 2, "dB, last frame, without actions", PSNR_RANGE),
+    _of_windows("PSNR copy", "copy.psnr_last", 2, "dB, the prompt's last frame repeated", PSNR_RANGE),
 )  # fmt: skip
 MEANINGS = {figure.name: figure.meaning for figure in FIGURES}
 OF_ROLLOUTS = (("PSNR dB", "psnr", 2), ("last frame dB", "psnr_last", 2), ("SSIM", "ssim", 3),
@@ -141,7 +146,8 @@ def means(parts: Sequence[Part]) -> list[dict[str, Any]]:
                 row[figure.path] = round(sum(of_sets) / len(of_sets), 4)
                 continue
             episodes = [part.by_window.get("episode") for part in own]
-            mean, ends = over_datasets([part.by_window[figure.by_window] for part in own], episodes=episodes)
+            values = [part.by_window[figure.by_window] for part in own]
+            mean, ends = over_datasets(values, episodes=episodes, within=figure.within)
             scaled = math.exp if figure.exponential else float
             row[figure.path] = round(scaled(mean), 4)
             row[f"{figure.path}_95"] = ends and [round(scaled(end), 4) for end in ends]

@@ -1,36 +1,73 @@
-"""Say in a sentence whether a model follows its actions: one rule for every command, page and card."""
+"""Decide whether a model follows its actions: one rule for every command, page and card.
+
+A model follows its actions if the last frame of its rollouts is nearer to the truth with their own actions
+than with other ones: by FOLLOWS_DB or more in the mean, and the 95 % interval of the mean lies above 0. The
+interval is over held-out episodes, so that a single episode decides nothing.
+"""
 
 from collections.abc import Mapping
 from typing import Any
 
+from hma_data.console import human_count
 from hma_model.config import token_words
 
-FOLLOWS_DB = 0.5  # gain of the last frame's PSNR from which a model is said to follow its actions
-SENSITIVE = 1.2  # and times the loss with shuffled actions from which it is said to be sensitive to them
+FOLLOWS_DB = 0.5  # least mean gain of the last frame's PSNR
+SENSITIVE = 1.2  # times the loss with shuffled actions, from which a model is said to be sensitive to them
+FEW_EPISODES = 5  # fewer are said to be few
+
+
+def follows(found: Mapping[str, Any]) -> bool:
+    """Check whether a result of `evaluate` shows that the model follows its actions."""
+    gain, ends = found.get("psnr_action_gain_last"), found.get("psnr_action_gain_last_95")
+    if _unjudged(found) or gain is None or not ends:
+        return False
+    return bool(gain >= FOLLOWS_DB and ends[0] > 0)
 
 
 def verdict(found: Mapping[str, Any]) -> str:
-    """Return a sentence about the result of `evaluate`: whether the model follows its actions."""
-    if not found.get("sees_actions", True):
-        return "was trained without actions"
-    if 2 * found.get("unmoved_windows", 0) > found.get("windows", 0):
-        return "cannot be judged: most of the true pictures never change"
-    gain = found["psnr_action_gain_last"]
-    if gain is None or found.get("loss", 0.0) is None:
-        return "cannot be judged: its predictions are not finite"
-    ends, count = found.get("psnr_action_gain_last_95"), found.get("episodes", 0)
-    said = f"{gain:+.1f} dB on the last frame, true less shuffled actions"
-    if ends:
-        said += f", 95 %: {ends[0]:+.1f} to {ends[1]:+.1f} over {count} episodes"
-    elif count == 1:
-        said += ", of one episode"
-    if gain >= FOLLOWS_DB and ends and ends[0] <= 0:
-        return f"may follow its actions: {said}, too few to be sure"
-    if gain >= FOLLOWS_DB:
+    """Return a sentence about a result of `evaluate`: whether the model follows its actions."""
+    if reason := _unjudged(found):
+        return reason
+    said = _measured(found)
+    if follows(found):
         return f"follows its actions: {said}"
+    if found["psnr_action_gain_last"] >= FOLLOWS_DB:
+        return f"may follow its actions: {said}, too few to be sure"
     loss, shuffled_loss = found.get("loss"), found.get("shuffled_loss")
     if loss and shuffled_loss and shuffled_loss >= SENSITIVE * loss:
         unit = token_words(found.get("merge") or 1)
         nats = f"{loss:.2f} nats a {unit}, {shuffled_loss:.2f} with shuffled ones"
         return f"is sensitive to its actions ({nats}), but its rollouts show little of it yet: {said}"
     return f"does not follow its actions yet ({said})"
+
+
+def horizon(found: Mapping[str, Any]) -> float | None:
+    """Return the seconds from the last given frame to the last predicted one; None if they are not stated."""
+    if "seconds_a_frame" not in found:
+        return None
+    return float((found["frames"] - found["prompt"]) * found["seconds_a_frame"])
+
+
+def _unjudged(found: Mapping[str, Any]) -> str:
+    """Return why nothing can be said about the actions; empty if it can."""
+    if not found.get("sees_actions", True):
+        return "was trained without actions"
+    if 2 * found.get("unmoved_windows", 0) > found.get("windows", 0):
+        return "cannot be judged: most of the true images never change"
+    if found["psnr_action_gain_last"] is None or found.get("loss", 0.0) is None:
+        return "cannot be judged: its predictions are not finite"
+    return ""
+
+
+def _measured(found: Mapping[str, Any]) -> str:
+    """Return the gain, its horizon and its interval in words."""
+    seconds, ends = horizon(found), found.get("psnr_action_gain_last_95")
+    count = found.get("episodes", 0)
+    after = "" if seconds is None else f", {seconds:.1f} s after the prompt"
+    said = f"{found['psnr_action_gain_last']:+.1f} dB on the last frame{after}, true less shuffled actions"
+    few = "only " if count < FEW_EPISODES else ""
+    held_out = "held-out " if found.get("split", "val") == "val" else ""
+    of_episodes = f"{few}{human_count(count, f'{held_out}episode')}"
+    if not ends:
+        return f"{said}, no interval from {of_episodes}"
+    return f"{said}, 95 %: {ends[0]:+.1f} to {ends[1]:+.1f} over {of_episodes}"

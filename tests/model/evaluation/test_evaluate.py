@@ -14,7 +14,7 @@ import torch
 from hma_data.errors import CheckpointError, UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.shards.reader import ShardSet
-from hma_model.evaluation import actions
+from hma_model.evaluation import actions, tables
 from hma_model.evaluation.actions import gaussian, shuffled, shuffled_actions, without_actions
 from hma_model.evaluation.evaluate import Settings, evaluate, measure
 from hma_model.evaluation.intervals import NATURAL, SHARE, interval, over_datasets
@@ -27,7 +27,9 @@ from hma_model.evaluation.losses import (
 )
 from hma_model.evaluation.metrics import masked_scores, teacher_forced, token_hits, token_nats
 from hma_model.evaluation.rollouts import rollout
-from hma_model.evaluation.verdict import verdict
+from hma_model.evaluation.suite import Part
+from hma_model.evaluation.tables import FIGURES, means
+from hma_model.evaluation.verdict import follows, verdict
 from hma_model.network.model import HMA
 from tests.model.robots import CONFIG, SPEC, make_model
 from tests.model.shards import make_shards
@@ -312,12 +314,18 @@ def test_a_split_without_windows_is_refused(model, data):
         evaluate(model, Blocks(), data, frames=40)
 
 
+GAIN = {"psnr_action_gain_last": 2.13, "psnr_action_gain_last_95": [1.2, 6.2], "episodes": 8}
+NO_GAIN = GAIN | {"psnr_action_gain_last": 0.1, "psnr_action_gain_last_95": [-0.1, 0.3]}
+
+
 def test_the_verdict_says_whether_the_model_follows_its_actions() -> None:
-    assert verdict({"psnr_action_gain_last": 2.13}).startswith(
-        "follows its actions: +2.1 dB on the last frame"
+    said = (
+        "+2.1 dB on the last frame, true less shuffled actions, 95 %: +1.2 to +6.2 over 8 held-out episodes"
     )
-    assert verdict({"psnr_action_gain_last": 0.1}).startswith("does not follow its actions yet (+0.1 dB")
-    heard = {"psnr_action_gain_last": 0.1, "loss": 2.0, "shuffled_loss": 4.0}
+    assert follows(GAIN) and verdict(GAIN) == f"follows its actions: {said}"
+    assert not follows(NO_GAIN)
+    assert verdict(NO_GAIN).startswith("does not follow its actions yet (+0.1 dB")
+    heard = NO_GAIN | {"loss": 2.0, "shuffled_loss": 4.0}
     assert verdict(heard).startswith(
         "is sensitive to its actions (2.00 nats a token, 4.00 with shuffled ones), but"
     )
@@ -325,16 +333,20 @@ def test_the_verdict_says_whether_the_model_follows_its_actions() -> None:
     assert verdict(heard | {"shuffled_loss": 2.1}).startswith("does not follow its actions yet")
 
 
-def test_the_verdict_states_its_interval_and_doubts_a_gain_of_too_few_episodes() -> None:
-    found = {"psnr_action_gain_last": 3.705, "psnr_action_gain_last_95": [1.2, 6.2], "episodes": 3}
-    said = "+3.7 dB on the last frame, true less shuffled actions"
-    assert verdict(found) == f"follows its actions: {said}, 95 %: +1.2 to +6.2 over 3 episodes"
-    wide = found | {"psnr_action_gain_last_95": [-2.59, 8.77]}
-    assert verdict(wide) == (
-        f"may follow its actions: {said}, 95 %: -2.6 to +8.8 over 3 episodes, too few to be sure"
-    )
-    one = found | {"psnr_action_gain_last_95": None, "episodes": 1}
-    assert verdict(one) == f"follows its actions: {said}, of one episode"
+def test_the_verdict_states_its_horizon_and_says_when_the_episodes_are_few() -> None:
+    timed = GAIN | {"frames": 8, "prompt": 2, "seconds_a_frame": 0.1}
+    assert "+2.1 dB on the last frame, 0.6 s after the prompt, true" in verdict(timed)
+    assert verdict(GAIN | {"episodes": 4}).endswith("over only 4 held-out episodes")
+    assert verdict(GAIN | {"split": "train"}).endswith("over 8 episodes")
+
+
+def test_no_model_follows_without_an_interval_above_zero() -> None:
+    wide = GAIN | {"psnr_action_gain_last_95": [-2.59, 8.77], "episodes": 3}
+    assert not follows(wide) and verdict(wide).startswith("may follow its actions: +2.1 dB")
+    assert verdict(wide).endswith("95 %: -2.6 to +8.8 over only 3 held-out episodes, too few to be sure")
+    one = GAIN | {"psnr_action_gain_last_95": None, "episodes": 1}
+    assert not follows(one) and verdict(one).startswith("may follow its actions: +2.1 dB")
+    assert verdict(one).endswith("no interval from only 1 held-out episode, too few to be sure")
 
 
 # -- intervals, other commands, words
@@ -381,6 +393,24 @@ def test_intervals_of_few_episodes_stay_within_what_is_possible():
     assert low < 0 and high > 1
     assert interval(values, episodes=episodes, within=SHARE).tolist() == [0, 1]
     assert interval(values, episodes=episodes, within=NATURAL).tolist() == [0, high]
+
+
+def test_no_interval_of_two_episodes_leaves_what_a_figure_can_be(tmp_path, model):
+    data = make_shards(tmp_path / "two", "arm", held_out=2)
+    found = evaluate(model, Blocks(), data, count=4, prompt=1)
+    assert found["episodes"] == 2
+    for kind in ("true", "shuffled", "none", "copy"):
+        low, high = np.array([found[kind]["psnr_last_95"], *found[kind]["psnr_by_frame_95"]]).T
+        assert low.min() >= 0 and high.max() <= 60
+        assert found[kind]["ssim_95"][0] >= -1 and found[kind]["ssim_95"][1] <= 1
+    part = Part(
+        "one", "two", found, {"true.psnr": np.array([1.0, 59.0]), "episode": np.array([0.0, 1.0])}, {}
+    )
+    figures = [figure for figure in FIGURES if figure.path == "true.psnr"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tables, "FIGURES", figures)
+        (mean,) = means([part])
+    assert mean["true.psnr_95"] == [0, 60]
 
 
 def test_intervals_are_the_middle_of_resampled_means(tmp_path, model):
