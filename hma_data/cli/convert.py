@@ -76,8 +76,9 @@ def convert(
     ] = None,
     shard_frames: Annotated[int | None, _rare(min=1, help="Frames in a shard, about.")] = None,
     val_fraction: Annotated[
-        float, _data(help="Share of episodes for validation; a recording with a split of its own keeps that.")
-    ] = 0.05,
+        float | None,
+        _data(help="Share of episodes for validation; default: 5 %, of small sets 5 episodes or a quarter."),
+    ] = None,
     seed: Annotated[int, _data(help="Seed of the split.")] = 0,
     max_quarantine: Annotated[
         float, _bad(min=0, max=1, help="Fail if a larger share of episodes is refused.")
@@ -314,6 +315,7 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
                 "left_out": summary.left_out,
                 "changed": summary.changed,
                 "warning": summary.warning,
+                "held_out": summary.held_out,
                 "notes": list(summary.notes),
                 "reasons": summary.reasons,
                 "too_many_quarantined": summary.too_many,
@@ -325,6 +327,7 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
         robot, size = manifest.embodiment, manifest.tokenizer.image_size
         _print_cameras(manifest.cameras_line, summary.pictures, robot, size)
         _print_left_out(summary.left_out)
+        print(summary.held_out)
         if summary.flags:
             counts = [f"{count:,} {flag_words(name)}" for name, count in summary.flags.items()]
             print(f"flags: {', '.join(counts)}")

@@ -225,7 +225,9 @@ def shards_merge(
 def shards_split(
     folder: Folder,
     out: Out,
-    val_fraction: Annotated[float, Option(help="Share of episodes for validation.")] = 0.05,
+    val_fraction: Annotated[
+        float | None, Option(help="Share of episodes for validation; default: as of hma convert.")
+    ] = None,
     seed: Annotated[int, Option(help="Seed of the split.")] = 0,
     by: Annotated[
         Literal["episode", "instruction", "source"], Option(help="What stays together in one split.")

@@ -38,6 +38,7 @@ from hma_data.conversion.report import (
     Progress,
     Shared,
     Summary,
+    held_out_line,
     rate_warning,
     refusal_reasons,
     training_notes,
@@ -92,7 +93,8 @@ def plan_conversion(
     plan = make_plan(chosen, embodiment, tokenizer, settings, uri)
     if form == "lerobot":
         plan = plan.with_origin(origin_of(place(uri)))
-    return replace(plan, left_out=len(refs) - len(chosen)), uri
+    own_split = any(chosen.column("split").unique().to_pylist())
+    return replace(plan, left_out=len(refs) - len(chosen), own_split=own_split), uri
 
 
 def convert(
@@ -198,6 +200,7 @@ class Conversion:
             changed=run.changed,
             warning=warning,
             notes=notes,
+            held_out=held_out_line(manifest, run.whole),
         )
 
     def run_share(self, share: Share, on_progress: OnProgress = lambda progress: None) -> Shared:

@@ -39,6 +39,8 @@ from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 
 FRAMES, TRIED = 64, 5  # of an estimate: pictures tokenized, episodes tried
 SHARDS_A_WORKER = 4  # so that the last shards of a job do not leave most workers waiting
+VAL_FRACTION = 0.05
+HELD_OUT = 5  # episodes of a small set: fewer give a verdict on a model no interval to speak of
 SMALLEST_SHARD, LARGEST_SHARD, SHARDS_WANTED = 4_096, 170_000, 32  # frames; 170,000 are about 100 MB
 
 
@@ -49,7 +51,8 @@ class Settings:
     Attributes:
         frames: all rows at the recording's rate, or only the model's grid with whole action chunks.
         cameras: names; ("all",) takes all of the YAML; the primary camera by default.
-        val_fraction: fraction of episodes for validation, chosen by hash of their id.
+        val_fraction: fraction of episodes for validation, chosen by hash of their id; None takes
+            VAL_FRACTION, and more of a small set (see `choose_splits`).
         seed: of that hash.
         limit: take only so many episodes, from the first on; None takes all.
         shard_frames: frames a shard, about; None lets the size of the recording decide.
@@ -58,7 +61,7 @@ class Settings:
 
     frames: Literal["all", "strided"] = "all"
     cameras: tuple[str, ...] = ()
-    val_fraction: float = 0.05
+    val_fraction: float | None = None
     seed: int = 0
     limit: int | None = None
     shard_frames: int | None = None
@@ -66,7 +69,7 @@ class Settings:
     exclude: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not 0 <= self.val_fraction < 1:
+        if self.val_fraction is not None and not 0 <= self.val_fraction < 1:
             raise UsageError("--val-fraction", f"must lie in 0..1, is {self.val_fraction}")
         if self.limit is not None and self.limit < 1:
             raise UsageError("--limit", f"must be at least 1, is {self.limit}")
@@ -121,11 +124,13 @@ class Plan:
 
     Attributes:
         left_out: number of the recording's episodes that `only` and `exclude` leave out.
+        own_split: whether the recording states which episodes are for validation.
     """
 
     units: tuple[ShardUnit, ...]
     facts: dict[str, Any]
     left_out: int = 0
+    own_split: bool = False
 
     @classmethod
     def of(cls, units: Sequence[ShardUnit], facts: dict[str, Any]) -> "Plan":
@@ -223,11 +228,12 @@ def cut_json(units: Sequence[ShardUnit]) -> Iterator[str]:
     return json_list([(unit.name, unit.numbers.to_pylist())] for unit in units)
 
 
-def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) -> list[str]:
+def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float | None, seed: int) -> list[str]:
     """Return train or val for each episode: the source's own split, or else by hash of the group's id.
 
     An episode without a group is a group of its own. With two or more groups and a fraction above zero, at
-    least one group is val and at least one is train.
+    least one group is val and at least one is train. Without a fraction it is VAL_FRACTION, and at least
+    HELD_OUT groups are val, or a quarter of the groups where that is fewer.
     """
     known = Records.of(EpisodeRef, refs)
     own, group = known.column("split"), known.column("group")
@@ -235,9 +241,10 @@ def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) ->
         return [split or "train" for split in values_of(own)]
     groups = pc.if_else(pc.equal(group, ""), known.column("id"), group).combine_chunks().dictionary_encode()
     draws = _unit_intervals(pc.binary_join_element_wise(str(seed), groups.dictionary, "/"))
-    held = draws < val_fraction
-    if len(draws) >= 2 and val_fraction > 0:
-        held[draws.argmin()] = True
+    held = draws < (VAL_FRACTION if val_fraction is None else val_fraction)
+    if len(draws) >= 2 and val_fraction != 0:
+        least = 1 if val_fraction is not None else max(1, min(HELD_OUT, len(draws) // 4))
+        held[np.argsort(draws, kind="stable")[:least]] = True
         held[draws.argmax()] = False
     return ["val" if is_held else "train" for is_held in held[to_numpy(groups.indices)]]
 

@@ -7,8 +7,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from hma_data.console import human_count
 from hma_data.conversion.engines import Notice, Retry
-from hma_data.conversion.plan import Plan
+from hma_data.conversion.plan import HELD_OUT, VAL_FRACTION, Plan
 from hma_data.conversion.worker import Seen, Tick
 from hma_data.errors import RegistryError
 from hma_data.inspection.shard_flags import pause_finding, rate_finding, window_finding
@@ -52,6 +53,7 @@ class Summary:
         changed: what the YAML says now that a finished set did not say yet; empty if nothing.
         warning: the fault of a rate that the recordings do not have; empty if there is none.
         notes: what else to mend before training, as `hma doctor` says it: no window, pauses.
+        held_out: how many episodes are for validation, and by what rule.
     """
 
     out: Path
@@ -67,6 +69,7 @@ class Summary:
     changed: str = ""
     warning: str = ""
     notes: tuple[str, ...] = ()
+    held_out: str = ""
 
 
 @dataclass(frozen=True)
@@ -124,10 +127,27 @@ def training_notes(folder: Path, out: Path, plan: Plan) -> tuple[str, ...]:
     return tuple(notes)
 
 
+def held_out_line(manifest: Manifest, plan: Plan) -> str:
+    """Return how many episodes are held out for validation, and by what rule."""
+    count = manifest.splits["val"]["episodes"]
+    total = count + manifest.splits["train"]["episodes"]
+    fraction = plan.facts["settings"]["val_fraction"]
+    said = f"{count:,} of {human_count(total, 'episode')} held out for validation, "
+    if plan.own_split:
+        said += "by the recording's own split, which goes before --val-fraction"
+    elif fraction is None:
+        said += f"{VAL_FRACTION:.0%} or at least {HELD_OUT}, of few a quarter; --val-fraction changes it"
+    else:
+        said += f"by --val-fraction {fraction:g}"
+    if 0 < count < HELD_OUT:
+        said += f"; fewer than {HELD_OUT} say little about a model: record more episodes"
+    return said
+
+
 def _empty_val(manifest: Manifest, plan: Plan) -> str:
     """Return why a set of several episodes has none for validation; empty where it has one or wants none."""
     settings = plan.facts["settings"]
-    if manifest.splits["val"]["episodes"] or plan.episodes < 2 or not settings["val_fraction"]:
+    if manifest.splits["val"]["episodes"] or plan.episodes < 2 or settings["val_fraction"] == 0:
         return ""
     if any(unit.split == "val" for unit in plan.units):
         return "its episodes were refused, see quarantine.jsonl"

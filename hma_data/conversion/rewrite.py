@@ -254,7 +254,7 @@ def split(
     folder: StrPath,
     out: StrPath,
     *,
-    val_fraction: float = 0.05,
+    val_fraction: float | None = None,
     seed: int = 0,
     by: str = "episode",
     workers: int = 1,
@@ -265,6 +265,7 @@ def split(
     Args:
         folder: str or path of the set, or its URI.
         out: str or path of the new set, or its URI.
+        val_fraction, seed: as of a conversion.
         by: what stays together: episode (and its recording), instruction or source.
 
     Raises:

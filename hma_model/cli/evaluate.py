@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 def evaluate(
     checkpoint: Checkpoint,
     data: Annotated[list[Path], Argument(help="Shard sets.")],
-    beside: Annotated[
+    compare: Annotated[
         list[str] | None, Option(help="Another checkpoint to compare; repeat for more.")
     ] = None,
     split: Split = "val",
@@ -78,7 +78,7 @@ def evaluate(
     """
     from hma_data.shards.reader import ShardSet
 
-    checkpoints = [checkpoint, *(beside or [])]
+    checkpoints = [checkpoint, *(compare or [])]
     for folder in data:
         ShardSet(folder)  # it and the checkpoints are refused before torch is imported
     for name in checkpoints:

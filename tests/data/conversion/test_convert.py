@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -125,6 +126,27 @@ def test_a_limit_that_leaves_val_empty_is_told(
         file["mask/valid"] = np.array(["demo_2"], "S")
     summary = run(toy_arm, path, tmp_path / "out", block_tokenizer, Settings(limit=limit))
     assert any("val is empty" in note and "--limit" in note for note in summary.notes) == empty
+
+
+def test_it_is_said_how_many_episodes_are_held_out_and_why(toy_arm, tmp_path, block_tokenizer) -> None:
+    path = tmp_path / "eight.hdf5"
+    write_toy(path, [20] * 8)
+    few = "fewer than 5 say little about a model: record more episodes"
+    for fraction, wanted in (
+        (None, f"2 of 8 episodes held out for validation, 5% or at least 5, of few a quarter; .*; {few}"),
+        (0.2, r"\d of 8 episodes held out for validation, by --val-fraction 0.2"),
+        (0.0, "0 of 8 episodes held out for validation, by --val-fraction 0$"),
+    ):
+        out = tmp_path / f"out-{fraction}"
+        summary = run(toy_arm, path, out, block_tokenizer, Settings(val_fraction=fraction))
+        assert re.match(wanted, summary.held_out), summary.held_out
+    with h5py.File(path, "a") as file:
+        file["mask/train"] = np.array([f"demo_{i}" for i in range(5)], "S")
+        file["mask/valid"] = np.array([f"demo_{i}" for i in range(5, 8)], "S")
+    summary = run(toy_arm, path, tmp_path / "masks", block_tokenizer, Settings(val_fraction=0.5))
+    assert summary.held_out.startswith(
+        "3 of 8 episodes held out for validation, by the recording's own split, which goes before"
+    )
 
 
 def test_overwrite_starts_anew_but_never_deletes_what_is_not_ours(

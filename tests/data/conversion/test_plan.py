@@ -61,6 +61,21 @@ def test_the_sources_own_split_wins() -> None:
     assert choose_splits(episodes, 0.9, 0) == ["val", "train", "train"]
 
 
+@pytest.mark.parametrize(("episodes", "held_out"), [(1, 0), (2, 1), (8, 2), (20, 5), (28, 5), (60, 5)])
+def test_a_small_set_holds_out_five_episodes_or_a_quarter(episodes: int, held_out: int) -> None:
+    known = [EpisodeRef(f"demo_{i}", 5) for i in range(episodes)]
+    assert max(choose_splits(known, None, seed).count("val") for seed in range(4)) >= held_out
+    assert min(choose_splits(known, None, seed).count("val") for seed in range(4)) >= held_out
+    assert choose_splits(known, 0.0, 0).count("val") == 0
+    if episodes == 28:  # a share that is asked for stays that share
+        assert choose_splits(known, 0.01, 0).count("val") == 1
+
+
+def test_a_large_set_holds_out_a_twentieth() -> None:
+    known = [EpisodeRef(f"demo_{i}", 5) for i in range(4_000)]
+    assert choose_splits(known, None, 0) == choose_splits(known, 0.05, 0)
+
+
 def test_the_hash_tells_plans_apart(toy_arm: Embodiment) -> None:
     same = plan(refs(9, 9), toy_arm).facts["hash"]
     assert plan(refs(9, 9), toy_arm).facts["hash"] == same

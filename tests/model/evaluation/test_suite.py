@@ -191,9 +191,9 @@ def test_the_difference_is_black_where_pictures_are_equal() -> None:
         ),
         (["{made}/one", "{made}/arm", "--prompt", "4"], "--prompt: 4 true frames leave none to predict"),
         (["{made}/one", "{made}/arm", "{made}/arm"], "arm: is the embodiment of two arguments"),
-        (["{made}/one", "{made}/arm", "--beside", "{made}/one"], "is the checkpoint of two arguments"),
+        (["{made}/one", "{made}/arm", "--compare", "{made}/one"], "is the checkpoint of two arguments"),
         (["{made}/narrow", "{made}/hand"], "hand"),
-        (["{made}/one", "{made}/arm", "--beside", "{made}/foreign"], "was trained on tokenizer"),
+        (["{made}/one", "{made}/arm", "--compare", "{made}/foreign"], "was trained on tokenizer"),
         (
             ["{made}/one", "{made}/arm", "--cameras", "top,wrist"],
             "cameras: are 2 in a frame, but the model takes 1",
