@@ -48,7 +48,7 @@ def write_hdf5(path: Path, demos: Iterable[Demo], env_args: Mapping[str, Any]) -
         mask/train mask/valid   names of demos
 
     `obs` at index t was observed before `actions[t]`; `rewards[t]` and `dones[t]` came after it. Every tenth
-    demo is for validation; with two to nine demos, the last one is.
+    demo is for validation; of fewer than fifty, five or a quarter are, and of two or three the last one.
     """
     with h5py.File(path, "w") as file:
         data = file.create_group("data")
@@ -58,9 +58,17 @@ def write_hdf5(path: Path, demos: Iterable[Demo], env_args: Mapping[str, Any]) -
             total += len(demo.actions)
         data.attrs["total"] = total
         data.attrs["env_args"] = json.dumps(env_args, sort_keys=True)
-        valid = set(range(9, count, 10)) or ({count - 1} if count > 1 else set())
+        valid = _held_out(count)
         for name, chosen in (("train", set(range(count)) - valid), ("valid", valid)):
             file.create_dataset(f"mask/{name}", data=np.array([f"demo_{i}" for i in sorted(chosen)], "S"))
+
+
+def _held_out(count: int) -> set[int]:
+    """Return the numbers of the demos for validation, spread evenly; the last one is among them."""
+    if count >= 50:
+        return set(range(9, count, 10))
+    held = max(min(5, count // 4), int(count > 1))
+    return {(number + 1) * count // held - 1 for number in range(held)}
 
 
 def _write_demo(group: h5py.Group, demo: Demo) -> None:

@@ -30,7 +30,7 @@ class Demo:
     recordings: dict[str, Path] = field(default_factory=dict)  # by robot, as all that follow
     sets: dict[str, ShardSet] = field(default_factory=dict)
     mixture: Mixture | None = None  # over the train windows
-    runs: "dict[str, TrainResult]" = field(default_factory=dict)  # by its name in the report
+    result: "TrainResult | None" = None  # of the finetuning
     pulled: dict[str, Path] = field(default_factory=dict)  # checkpoints with one robot
     figures: dict[str, dict[str, Any]] = field(default_factory=dict)  # of `evaluate` on held-out windows
     films: dict[str, "RolloutVideo"] = field(default_factory=dict)  # held-out rollouts
@@ -41,6 +41,12 @@ class Demo:
     def tokenizer(self) -> str:
         """Return the name of the trunk's tokenizer."""
         return str(self.start.config.tokenizer["name"])
+
+    @property
+    def run(self) -> "TrainResult":
+        """Return the result of the finetuning, which later stages need."""
+        assert self.result is not None
+        return self.result
 
     @contextmanager
     def stage(self, number: int, name: str) -> Iterator[None]:

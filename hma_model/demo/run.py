@@ -1,10 +1,9 @@
 """Run the whole pipeline on two new robots (`hma demo`), with the same functions as every other verb.
 
 The demo records two laboratory robots in two formats, converts the recordings to tokenized shards and mixes
-them. It finetunes the embedded trunk, which has seen neither robot, on both, and trains the same network from
-scratch for comparison. It publishes the finetuned model to a folder hub, pulls it back one robot at a time,
-rolls it out on episodes that it has not seen, and writes a report of one page. It downloads nothing. A second
-run in the same folder continues an interrupted one.
+them. It finetunes the embedded trunk, which has seen neither robot, on both. It publishes the finetuned model
+to a folder hub, pulls it back one robot at a time, rolls it out on episodes that it has not seen, and writes
+a report of one page. It downloads nothing. A second run in the same folder continues an interrupted one.
 """
 
 import json
@@ -32,19 +31,19 @@ from hma_data.shards.windows import WindowIndex
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
-from hma_model.config import token_words
-from hma_model.demo.report import FINETUNED, SCRATCH, SHOWN, TAU, write_report
+from hma_model.demo.report import write_report
 from hma_model.demo.results import TIMINGS, Demo
 
 if TYPE_CHECKING:
     from hma_model.evaluation.rollout_video import RolloutVideo
     from hma_model.evaluation.rollouts import Sampling
-    from hma_model.training.loop import TrainResult
 
 START, ROBOTS = EMBEDDED_NAME, HELD_OUT  # the trunk, and robots that it has not seen
-RECIPES = {FINETUNED: "demo", SCRATCH: "demo_scratch"}
+RECIPE = "demo"
+TAU = 3.0  # temperature of the mixture
+FILMED = 3  # windows of a robot's film
 RESULTS, SETTINGS = "results.json", "settings.json"
-OURS = {"recordings", "shards", "run", "scratch", "hub", "pulled", "report.html", TIMINGS, RESULTS, SETTINGS}
+OURS = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS, RESULTS, SETTINGS}
 WINDOWS = 24  # held-out windows of each robot; the figures are means over them
 LONGEST = 10  # frames of a window of the film
 FILM: "Sampling" = {"unmask_steps": 8, "order": "confidence"}  # slower than the figures, and limbs stay whole
@@ -78,7 +77,7 @@ def demo(out: StrPath, *, episodes: int = 32, steps: int | None = None, seed: in
     with made.stage(2, "mix"):
         mix(made)
     with made.stage(3, "train"):
-        train_both(made, steps, seed)
+        train(made, steps, seed)
     with made.stage(4, "publish and pull"):
         publish(made)
     with made.stage(5, "roll out"):
@@ -119,7 +118,7 @@ def _worker(out: Path, tokenizer: str, episodes: int, seed: int, workers: int) -
         report(("recorded", episodes))
         summary = convert(
             find(robot), str(recording), tokenizer, out / "shards" / robot,
-            settings=Settings(val_fraction=0.15, frames="strided"),
+            settings=Settings(frames="strided"),
             on_progress=lambda state: report(("converted", state.episodes)),
         )  # fmt: skip
         return robot, recording, summary.too_many
@@ -167,36 +166,20 @@ def mix(made: Demo) -> None:
         print(f"  {name}: {count:,} windows, drawn with p = {p:.3f}", flush=True)
 
 
-def train_both(made: Demo, steps: int | None, seed: int) -> None:
-    """Finetune the trunk on both robots, and train the same network from scratch (stage 3)."""
-    from hma_model.training.loop import finetune, train
-    from hma_model.training.recipe import load_recipe, network_values
+def train(made: Demo, steps: int | None, seed: int) -> None:
+    """Finetune the trunk on both robots (stage 3)."""
+    from hma_model.training.loop import finetune
+    from hma_model.training.recipe import load_recipe
 
     data = [str(shards.folder.absolute()) for shards in made.sets.values()]
     own = [f"seed={seed}", f"mixture.temperature={TAU}"]
-    recipes = {name: load_recipe(file, [*own, f"data=[{', '.join(data)}]"]) for name, file in RECIPES.items()}
-    limits = {name: min(recipe.steps, steps or recipe.steps) for name, recipe in recipes.items()}
-    made.runs[FINETUNED] = _finished(
-        finetune(
-            START, data, out=made.out / "run", recipe=RECIPES[FINETUNED],
-            overrides=[*own, f"steps={limits[FINETUNED]}"],
-        )
-    )  # fmt: skip
-    config = made.start.config
-    network = {"model": network_values(config), "frames": config.frames, "digits": config.factored[0]}
-    scratch = recipes[SCRATCH].model_copy(update={**network, "steps": limits[SCRATCH]})
-    made.runs[SCRATCH] = _finished(train(scratch, out=made.out / "scratch"))
-    unit = token_words(config.merge)
-    for name, result in made.runs.items():
-        said = f"held-out loss {result.masked_val_loss:.3f} nats a {unit} after {result.seconds:.0f} s"
-        print(f"  {name}: {said}", flush=True)
-    print(f"  token frequencies alone: {made.runs[FINETUNED].baseline:.3f}", flush=True)
-
-
-def _finished(result: "TrainResult") -> "TrainResult":
+    most = load_recipe(RECIPE, [*own, f"data=[{', '.join(data)}]"]).steps
+    overrides = [*own, f"steps={min(most, steps or most)}"]
+    result = finetune(START, data, out=made.out / "run", recipe=RECIPE, overrides=overrides)
     if result.interrupted:
         raise KeyboardInterrupt  # the run has saved a checkpoint
-    return result
+    made.result = result
+    print(f"  {result.step:,} steps in {result.seconds:.0f} s", flush=True)
 
 
 def publish(made: Demo) -> None:
@@ -204,7 +187,7 @@ def publish(made: Demo) -> None:
     from hma_model.hub import publish as hub
 
     published = made.out / "hub" / "demo" / "lab"
-    hub.push(made.runs[FINETUNED].checkpoint, str(published))
+    hub.push(made.run.checkpoint, str(published))
     for robot in ROBOTS:
         made.pulled[robot] = hub.pull(str(published), [robot], made.out / "pulled" / robot)
         made.sizes[f"checkpoint for {robot} alone"] = _size(made.pulled[robot])
@@ -219,6 +202,7 @@ def roll_out(made: Demo) -> None:
     from hma_data.tokenizers.network import single_threads
     from hma_model.evaluation.evaluate import evaluate
     from hma_model.evaluation.rollout_video import lively_windows, rollout_video
+    from hma_model.evaluation.verdict import verdict
     from hma_model.generation.decode import default_prompt
     from hma_model.network.model import HMA
 
@@ -230,7 +214,7 @@ def roll_out(made: Demo) -> None:
         lengths = [row["length"] for row in shards.episodes.to_pylist() if row["split"] == "val"]
         prompt = max(2, default_prompt(model.config.frames))
         length = min(LONGEST, max(lengths) // shards.row_stride)
-        window, other = lively_windows(shards, length, prompt, count=SHOWN)
+        window, other = lively_windows(shards, length, prompt, count=FILMED)
         film = rollout_video(
             model,
             tokenizer,
@@ -247,8 +231,7 @@ def roll_out(made: Demo) -> None:
         results = list(pool.map(roll, made.sets))
     for robot, (found, film) in zip(made.sets, results, strict=True):
         made.figures[robot], made.films[robot] = found, film
-        own, other = (f"{found[key]['psnr_last']:.1f} dB" for key in ("true", "shuffled"))
-        print(f"  {robot}: last frame PSNR {own} with its actions, {other} with shuffled ones", flush=True)
+        print(f"  {robot}: the model {verdict(found)}", flush=True)
 
 
 def _size(path: Path) -> int:

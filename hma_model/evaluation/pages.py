@@ -38,15 +38,22 @@ class Page:
         """Add a table; columns of numbers are aligned to the right. A second line of a cell is small."""
         self._add("table", table=Table(columns, rows).html())
 
-    def picture(self, data: bytes, kind: str, caption: str) -> None:
+    def picture(self, data: bytes, kind: str, caption: str, dark: bytes | None = None) -> None:
         """Add an embedded picture.
 
         Args:
             data: the file's bytes.
             kind: png, webp or svg+xml; an SVG is a plot and gets a white background.
             caption: the text below it, which is also its alternative text.
+            dark: the bytes of the same picture for dark mode.
         """
-        self._add("picture", source=_data_uri(data, kind), plot=kind == "svg+xml", caption=caption)
+        self._add(
+            "picture",
+            source=_data_uri(data, kind),
+            dark=None if dark is None else _data_uri(dark, kind),
+            plot=kind == "svg+xml",
+            caption=caption,
+        )
 
     def definitions(self, pairs: Sequence[tuple[str, str]]) -> None:
         """Add a list of terms with what they mean."""

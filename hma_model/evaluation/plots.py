@@ -44,25 +44,6 @@ def loss_curves(
     return svg_bytes(figure)
 
 
-def held_out_losses(curves: Mapping[str, Sequence[tuple[float, float]]], baseline: float, unit: str) -> bytes:
-    """Plot held-out losses over the time spent in training.
-
-    Args:
-        curves: name -> (seconds, nats).
-        baseline: the loss of the token frequencies, as a dotted line.
-        unit: what the nats are of, as `token_words` has it.
-    """
-    figure, axes = _axes("seconds of training", f"held-out loss, nats a {unit}")
-    for i, (name, points) in enumerate(curves.items()):
-        seconds, nats = np.array(points, float).T
-        axes.plot(seconds, nats, color=COLOURS[i], ls=STYLES[i], marker=MARKERS[i], ms=5, label=name)
-    axes.axhline(baseline, color="#555555", ls=":", label="token frequencies alone")
-    axes.set_xlim(left=0)
-    axes.set_ylim(bottom=0)
-    axes.legend(frameon=False, fontsize=9)
-    return svg_bytes(figure)
-
-
 def course(points: Sequence[tuple[int, float]], label: str, log: bool = False) -> bytes:
     """Plot the values of (step, value) points, on a logarithmic axis if `log` is set."""
     figure, axes = _axes("training step", label)
@@ -70,21 +51,6 @@ def course(points: Sequence[tuple[int, float]], label: str, log: bool = False) -
     axes.plot(steps, values, color=COLOURS[0], lw=1.2)
     if log and (values > 0).any():
         axes.set_yscale("log")
-    return svg_bytes(figure)
-
-
-def psnr_over_horizon(curves: Mapping[str, Sequence[float]], seconds_per_frame: float) -> bytes:
-    """Plot the PSNR of each predicted frame.
-
-    Args:
-        curves: name -> PSNR in dB of each frame after the prompt.
-        seconds_per_frame: seconds between frames of the model.
-    """
-    figure, axes = _axes("seconds after the prompt", "PSNR, dB")
-    for i, (name, values) in enumerate(curves.items()):
-        time = seconds_per_frame * np.arange(1, len(values) + 1)
-        axes.plot(time, values, color=COLOURS[i], ls=STYLES[i], marker=MARKERS[i], ms=5, label=name)
-    axes.legend(frameon=False, fontsize=9)
     return svg_bytes(figure)
 
 

@@ -43,19 +43,32 @@ HOLD = 0.9  # seconds for which the end of a window stands, where another one fo
 GIVEN, PREDICTED = (150, 150, 150), (0, 158, 115)  # borders of true frames and of predictions
 SHEETS = "pictures"  # the folder of a run's sheets
 COLUMNS = 8  # frames in a row of a sheet
+TITLE_PX, MARGIN_PX, BORDER_PX = 42, 6, 4  # above a picture, beside it, around it
+DARK_PAPER = (13, 17, 23)  # what is added to mirrored white, so that it is the paper of dark pages
 
 
 @dataclass(frozen=True)
 class RolloutVideo:
     """Frames (T, H, W, 3) uint8 at `fps`; the first `prompt` of each window are true, not predictions.
 
-    `actions` (B, T, K) are the windows' own, raw; NaN where they are unknown.
+    `actions` (B, T, K) are the windows' own, raw; NaN where they are unknown. `images` (H, W) bool are the
+    pixels that show the robot, with their borders.
     """
 
     frames: NDArray[np.uint8]
     fps: float
     prompt: int
     actions: NDArray[np.float32]
+    images: NDArray[np.bool_]
+
+    def dark(self) -> NDArray[np.uint8]:
+        """Return the frames for a dark page: what is drawn around the images is light on dark."""
+        drawn = self.frames[:, ~self.images].astype(np.int16)  # (T, pixels, 3)
+        # Mirroring the lightness of a colour keeps its hue, as inverting each channel would not.
+        mirrored = drawn + 255 - drawn.max(axis=2, keepdims=True) - drawn.min(axis=2, keepdims=True)
+        frames = self.frames.copy()
+        frames[:, ~self.images] = np.clip(mirrored + DARK_PAPER, 0, 255)
+        return frames
 
 
 def rollout_video(
@@ -122,7 +135,9 @@ def rollout_video(
         if len(chosen) > 1:
             parts.append(parts[-1][-1:].repeat(round(HOLD * fps), axis=0))
     actions = batch.actions.masked_fill(~batch.action_mask.unsqueeze(-1), float("nan"))
-    return RolloutVideo(np.concatenate(parts), fps, prompt, actions.numpy())
+    frames_shown = np.concatenate(parts)
+    images = _image_pixels(frames_shown.shape[1:3], true.truth.shape[2:4], len(panels))
+    return RolloutVideo(frames_shown, fps, prompt, actions.numpy(), images)
 
 
 def lively_windows(
@@ -164,8 +179,9 @@ def _column(
 
     The border tells the first `given` frames, which are true, from those that the model predicts.
     """
-    scale = max(1, -(-SMALLEST // film.shape[2]))
-    large = np.pad(film.repeat(scale, 1).repeat(scale, 2), ((0, 0), (4, 4), (4, 4), (0, 0)))
+    scale = _scale(film.shape[2])
+    edge_px = (BORDER_PX, BORDER_PX)
+    large = np.pad(film.repeat(scale, 1).repeat(scale, 2), ((0, 0), edge_px, edge_px, (0, 0)))
     for t in range(len(large)):
         edge = np.array(GIVEN if t < given else PREDICTED, np.uint8)
         large[t, :4] = large[t, -4:] = edge
@@ -173,15 +189,29 @@ def _column(
     stats = shards.manifest.stats["action"]
     low, high = np.array(stats["min"]), np.array(stats["max"])
     barred = with_actions(large, actions[:, : len(low)], low, high, shards.embodiment.action.names())
-    padded = np.pad(barred, ((0, 0), (42, 4), (6, 6), (0, 0)), constant_values=250)
+    beside = (MARGIN_PX, MARGIN_PX)
+    padded = np.pad(barred, ((0, 0), (TITLE_PX, 4), beside, (0, 0)), constant_values=250)
     for t, sheet in enumerate(padded):
         if given == len(film):
-            about = "recorded"
+            about = "recorded, decoded from tokens"
         else:
             about = "prompt: true frames" if t < given else "predicted"
         write_text(sheet, name, (8, 17), 0.5)
         write_text(sheet, about, (8, 34), 0.4)
     return padded
+
+
+def _scale(width: int) -> int:
+    return max(1, -(-SMALLEST // width))
+
+
+def _image_pixels(shown: Sequence[int], image: Sequence[int], panels: int) -> NDArray[np.bool_]:
+    """Return (H, W), the pixels of a film's frame that are images (h, w) or their borders."""
+    height, width = (side * _scale(image[1]) + 2 * BORDER_PX for side in image)
+    found = np.zeros(shown, np.bool_)
+    for left in range(MARGIN_PX, shown[1], shown[1] // panels):
+        found[TITLE_PX : TITLE_PX + height, left : left + width] = True
+    return found
 
 
 def _with_time(film: NDArray[np.uint8], prompt: int) -> NDArray[np.uint8]:

@@ -21,6 +21,7 @@ from hma_data.lab import RECORDERS, record
 from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
 from hma_data.lab.pusht import HELD, SLOW_LOOK, Arena
 from hma_data.lab.tee_table import TeeTable
+from hma_data.lab.writers import _held_out
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.storage.paths import shipped
@@ -65,6 +66,11 @@ def arena(start: str = "near", seed: int = 0) -> Arena:
 
 
 # -- pusht_fast
+
+
+def test_masks_hold_out_five_demos_of_a_small_recording() -> None:
+    assert [len(_held_out(count)) for count in (1, 2, 8, 16, 32, 49)] == [0, 1, 2, 4, 5, 5]
+    assert _held_out(60) == {9, 19, 29, 39, 49, 59} and max(_held_out(32)) == 31
 
 
 def test_hdf5_has_robomimic_layout(fast: h5py.File) -> None:

@@ -2,8 +2,10 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hma_data.errors import OutputError
@@ -11,6 +13,9 @@ from hma_data.shards.verify import verify
 from hma_model.demo import report
 from hma_model.demo import run as demos
 from hma_model.demo.results import Demo
+from hma_model.evaluation.pages import Page
+from hma_model.evaluation.rollout_video import RolloutVideo
+from hma_model.evaluation.verdict import verdict
 from tests.model.embedded import embedded
 
 
@@ -31,7 +36,7 @@ def test_a_demo_that_was_cut_goes_on_by_the_same_command(
         demos.demo(out, episodes=4, steps=2)
     kept = {
         path: path.stat().st_mtime_ns
-        for name in ("recordings", "shards", "run/checkpoints", "scratch/checkpoints")
+        for name in ("recordings", "shards", "run/checkpoints")
         for path in _files(out / name)
     }
     assert not (out / "report.html").exists()
@@ -44,9 +49,8 @@ def test_a_demo_that_was_cut_goes_on_by_the_same_command(
         assert verify(out / "shards" / robot) == []
         assert (out / "pulled" / robot / "embodiments" / robot / "head.safetensors").is_file()
         assert set(results["embodiments"][robot]) == {"psnr_last", "psnr_last_shuffled", "psnr_last_copy"}
-        assert f"{robot}: recorded frames above" in page and f"<h2>{robot}: " in page
-    assert page.count("data:image/webp") == 2 and page.index("data:image/webp") < page.index("held-out loss")
-    for title in ("The robots", "The mixture", "Training", "Sizes and timings", "on your own data"):
+        assert f'alt="{robot}: recorded"' in page and f"<h2>{robot}: " in page
+    for title in ("The robots", "What the tokens keep", "Sizes and timings", "on your own data"):
         assert title in page
     assert "hma finetune --from embedded --data shards/my_arm" in page
 
@@ -71,22 +75,53 @@ def test_other_settings_than_the_folder_was_begun_with_are_refused(
         demos.demo(tmp_path / "demo", episodes=8, steps=2)
 
 
-@pytest.mark.parametrize(
-    ("true", "shuffled", "copy", "begins"),
-    [
-        (30.0, 27.9, 28.4, "The model follows its actions: +2.1 dB over shuffled (bar: 2) and +1.6 dB over"),
-        (30.0, 28.1, 20.0, "The bar is not reached: +1.9 dB over shuffled (bar: 2)"),
-        (30.0, 20.0, 30.5, "The bar is not reached: +10.0 dB over shuffled (bar: 2) and -0.5 dB over copy"),
-    ],
-)
-def test_the_report_says_plainly_whether_the_model_follows(
-    true: float, shuffled: float, copy: float, begins: str
-) -> None:
-    last = {"true": true, "shuffled": shuffled, "copy": copy}
-    found = {name: {"psnr_last": value} for name, value in last.items()} | {"windows": 24, "draws": 5}
-    said = report.verdict(found)
-    assert said.startswith(begins)
-    assert "30.0 dB with true actions" in said and "24 held-out windows and 5 draws" in said
+FOUND: dict[str, Any] = {
+    "psnr_action_gain_last": 2.13, "psnr_action_gain_last_95": [1.2, 3.1], "episodes": 5, "frames": 8,
+    "prompt": 2, "seconds_a_frame": 0.1, "windows": 24, "against": "decoded tokens",
+}  # fmt: skip
+
+
+def test_the_report_opens_with_decibels_and_time_under_the_rule_of_evaluate(tmp_path: Path) -> None:
+    wide = FOUND | {"psnr_action_gain_last_95": [-0.4, 4.6]}
+    page = Page("demo", "")
+    made: Any = SimpleNamespace(
+        figures={"arm3_55": FOUND, "mover_52": wide},
+        films={name: film() for name in ("arm3_55", "mover_52")},
+        run=SimpleNamespace(seconds=158.0, step=620),
+        seconds={"all": 200.0},
+    )
+    report._headline(page, made)
+    report._films(page, made)
+    shown = page.html()
+    assert "<b>+2.1 dB</b>" in shown and "after 0.6 s" in shown and "2 min 38 s" in shown
+    assert "nats" not in shown
+    for found in (FOUND, wide):
+        assert f"The model {verdict(found)}." in shown
+    assert "+2.1 dB on the last frame, 0.6 s after the prompt" in shown and "may follow" in shown
+
+
+def test_a_film_has_a_dark_version_for_dark_mode_with_the_same_images() -> None:
+    light = film()
+    dark = light.dark()
+    assert (dark[:, light.images] == light.frames[:, light.images]).all()
+    paper, ink = dark[0, 0, 0], dark[0, 0, 1]
+    assert paper.max() < 50 and ink.min() > 200
+    page = Page("demo", "")
+    page.picture(b"light", "webp", "a film", b"dark")
+    assert (
+        '<source srcset="data:image/webp;base64,ZGFyaw==" media="(prefers-color-scheme: dark)">'
+        in page.html()
+    )
+
+
+def film() -> RolloutVideo:
+    """Two frames of 4 by 4 pixels, of which 2 by 2 are an image, with one letter of ink beside it."""
+    frames = np.full((2, 4, 4, 3), 250, np.uint8)
+    frames[:, 0, 1] = 30
+    images = np.zeros((4, 4), np.bool_)
+    images[1:3, 1:3] = True
+    frames[:, images] = 90
+    return RolloutVideo(frames, 10.0, 2, np.zeros((1, 2, 2), np.float32), images)
 
 
 def _files(folder: Path) -> list[Path]:

@@ -55,6 +55,11 @@ def test_borders_tell_the_prompt_from_predictions_and_the_truth_has_none_of_thos
         colours = [tuple(panel[width // 6]) for panel in row.tolist()]
         predicted = module.GIVEN if t < PROMPT else module.PREDICTED
         assert colours == [module.GIVEN, predicted, predicted]
+    # three equal images with their borders, below the titles
+    assert not film.images[: module.TITLE_PX].any() and film.images[43].reshape(3, -1).any(axis=1).all()
+    shown = np.split(film.images, 3, axis=1)
+    assert all((part == shown[0]).all() for part in shown)
+    assert shown[0].any(axis=0).sum() == module.SMALLEST + 2 * module.BORDER_PX
     panels = np.split(film.frames, 3, axis=2)
     picture = slice(46, 46 + module.SMALLEST)
     assert (panels[0][:PROMPT, picture] == panels[1][:PROMPT, picture]).all()
