@@ -200,7 +200,8 @@ def roll_out(made: Demo) -> None:
     The robots run in parallel, each in one thread, because a second thread speeds up small products little.
     """
     from hma_data.tokenizers.network import single_threads
-    from hma_model.evaluation.evaluate import evaluate
+    from hma_model.evaluation.evaluate import Settings as EvaluationSettings
+    from hma_model.evaluation.evaluate import measure
     from hma_model.evaluation.rollout_video import lively_windows, rollout_video
     from hma_model.evaluation.verdict import verdict
     from hma_model.generation.decode import default_prompt
@@ -210,7 +211,7 @@ def roll_out(made: Demo) -> None:
         shards = made.sets[robot]
         model = HMA.from_pretrained(str(made.pulled[robot]), embodiments=[robot]).eval()
         tokenizer = tokenizer_of(shards)
-        found = evaluate(model, tokenizer, shards, count=WINDOWS, batch_size=8)
+        found = measure(model, tokenizer, shards, EvaluationSettings(windows=WINDOWS, batch_size=8)).found
         lengths = [row["length"] for row in shards.episodes.to_pylist() if row["split"] == "val"]
         prompt = max(2, default_prompt(model.config.frames))
         length = min(LONGEST, max(lengths) // shards.row_stride)

@@ -14,7 +14,7 @@ B batch, T frames, P predicted frames, N windows.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -47,7 +47,7 @@ from hma_model.evaluation.metrics import (
     teacher_forced,
 )
 from hma_model.evaluation.perceptual import Judge, Networks
-from hma_model.evaluation.rollouts import Pictures, Sampling, rollout
+from hma_model.evaluation.rollouts import Pictures, rollout
 from hma_model.evaluation.scores import ROLLOUTS, Rolled, Scores
 from hma_model.generation.decode import cameras_for, default_prompt
 
@@ -65,11 +65,17 @@ class Settings:
     """The choices that decide the figures, beside the checkpoint and the shard set.
 
     Attributes:
-        windows: their number; the other attributes up to `cameras` are as of `evaluate`.
+        split: train or val.
+        windows: their number, evenly spaced; all windows if the split has fewer.
+        frames: T of a window; by default the model's.
+        prompt: true frames a rollout starts from.
+        draws: how often each window gets the actions of another one; figures are means over the draws.
+        seed: of the rollouts.
+        cameras: as `WindowDataset` takes them; None takes those that the model was trained on.
         paper: also follow the paper's protocol.
         state: simulated episodes of a laboratory robot; of others any number measures the recorded state; 0
             measures no state.
-        sampling: options of `HMA.generate`.
+        sampling: options of `HMA.generate` for the rollouts.
     """
 
     split: str = "val"
@@ -139,56 +145,6 @@ class Measured:
     predicted: dict[str, list[torch.Tensor]]
 
 
-def evaluate(
-    model: "HMA",
-    tokenizer: "Tokenizer",
-    data: StrPath | ShardSet,
-    *,
-    split: str = "val",
-    count: int = 32,
-    frames: int | None = None,
-    prompt: int | None = None,
-    batch_size: int = 16,
-    draws: int = DRAWS,
-    seed: int = 0,
-    cameras: Cameras | None = None,
-    **sampling: Unpack[Sampling],
-) -> dict[str, Any]:
-    """Compute a model's figures on one shard set; rollouts are compared with the decoded true tokens.
-
-    Args:
-        model: a model that has the embodiment of the shard set.
-        tokenizer: the tokenizer of the shard set.
-        data: str or path of the shard set, its URI, or the set itself.
-        split: train or val.
-        count: windows, evenly spaced; all windows if the split has fewer.
-        frames: T of a window; by default the model's.
-        prompt: true frames a rollout starts from.
-        draws: how often each window gets the actions of another one; figures are means over the draws.
-        seed: of the rollouts.
-        cameras: as `WindowDataset` takes them; None takes those that the model was trained on.
-        sampling: options of `HMA.generate` for the rollouts.
-
-    Returns:
-        `loss` (nats a token); for discrete models also `shuffled_loss` (given another window's actions),
-        `baseline_loss`, `perplexity`, `accuracy`, and both of `masked_scores`. For rollouts with the `true`
-        actions, with `shuffled` ones, with `none`, and for `copy`: `psnr` and `ssim` over the horizon,
-        `psnr_last`, `psnr_by_frame` and `ssim_by_frame`. `psnr_action_gain_last` is `psnr_last` of true minus
-        that of shuffled. `unmoved_windows` counts those whose true pictures never change, `sees_actions` says
-        whether the model was trained with actions. `notes` says in words what else must be known, and
-        `missing` why a metric is absent.
-
-    Raises:
-        CheckpointError: the model was trained on another tokenizer.
-        UsageError: the split has no window.
-    """
-    settings = Settings(
-        split=split, windows=count, frames=frames, prompt=prompt, batch_size=batch_size, draws=draws,
-        seed=seed, cameras=cameras, sampling=sampling,
-    )  # fmt: skip
-    return measure(model, tokenizer, data, settings).found
-
-
 def measure(
     model: "HMA",
     tokenizer: "Tokenizer",
@@ -197,16 +153,25 @@ def measure(
     networks: Networks | None = None,
     on_frames: Callable[[int], None] = lambda frames: None,
 ) -> Measured:
-    """Compute the figures of `evaluate`, and keep what pictures are drawn from.
+    """Compute a model's figures on one shard set; rollouts are compared with the decoded true tokens.
+
+    `found` has `loss` (nats a token); for discrete models also `shuffled_loss` (given another window's
+    actions), `baseline_loss`, `perplexity`, `accuracy`, and both of `masked_scores`. For the rollouts `true`,
+    `shuffled`, `none` and `copy` it has what `Scores.figures` gives. `psnr_action_gain_last` is `psnr_last` of
+    true minus that of shuffled. `unmoved_windows` counts those whose true images never change. `notes` says
+    what else must be known, and `missing` why a metric is absent.
 
     Args:
-        model, tokenizer, data: as of `evaluate`.
+        model: a model that has the embodiment of the shard set.
+        tokenizer: the tokenizer of the shard set.
+        data: str or path of the shard set, its URI, or the set itself.
         settings: the options; `state` is not measured here.
         networks: the networks of LPIPS, FID and FVD.
         on_frames: is told after each rollout how many frames are predicted so far.
 
     Raises:
-        CheckpointError, UsageError: as of `evaluate`.
+        CheckpointError: the model was trained on another tokenizer.
+        UsageError: the split has no window, or the prompt leaves no frame to predict.
     """
     shards = opened(data)
     plan = Plan.of(model, shards, settings)

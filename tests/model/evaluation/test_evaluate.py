@@ -16,7 +16,7 @@ from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.shards.reader import ShardSet
 from hma_model.evaluation import actions, tables
 from hma_model.evaluation.actions import gaussian, shuffled, shuffled_actions, without_actions
-from hma_model.evaluation.evaluate import Settings, evaluate, measure
+from hma_model.evaluation.evaluate import Settings, measure
 from hma_model.evaluation.intervals import NATURAL, SHARE, interval, over_datasets
 from hma_model.evaluation.losses import (
     digit_frequencies,
@@ -33,6 +33,11 @@ from hma_model.evaluation.verdict import follows, verdict
 from hma_model.network.model import HMA
 from tests.model.robots import CONFIG, SPEC, make_model
 from tests.model.shards import make_shards
+
+
+def evaluate(model: HMA, tokenizer: Any, data: Any, **settings: Any) -> dict[str, Any]:
+    """Return the figures of a model on a shard set."""
+    return measure(model, tokenizer, data, Settings(**settings)).found
 
 
 class Blocks:
@@ -240,7 +245,7 @@ def test_each_picture_is_decoded_once(data, model):
             return super().decode(tokens)
 
     tokenizer = Counting()
-    found = evaluate(model, tokenizer, data, count=5, prompt=1, batch_size=2, draws=3)
+    found = evaluate(model, tokenizer, data, windows=5, prompt=1, batch_size=2, draws=3)
     truth, predicted = found["windows"] * 4, found["windows"] * 3
     assert tokenizer.decoded == truth + (1 + 3 + 1) * predicted  # true, three others, none
 
@@ -277,9 +282,9 @@ def test_figures_of_shuffled_actions_are_means_over_the_draws(data, model, monke
         monkeypatch.setattr(
             actions, "shuffled_actions", lambda *a, draw=0, only=draw: real(*a[:3], draw=only)
         )
-        one.append(evaluate(model, Blocks(), data, count=5, prompt=1, batch_size=2, draws=1))
+        one.append(evaluate(model, Blocks(), data, windows=5, prompt=1, batch_size=2, draws=1))
     monkeypatch.setattr(actions, "shuffled_actions", real)
-    found = evaluate(model, Blocks(), data, count=5, prompt=1, batch_size=2, draws=3)
+    found = evaluate(model, Blocks(), data, windows=5, prompt=1, batch_size=2, draws=3)
     assert found["true"] == one[0]["true"] and found["draws"] == 3
     for key in ("psnr_last", "ssim"):
         assert found["shuffled"][key] == pytest.approx(np.mean([part["shuffled"][key] for part in one]))
@@ -296,7 +301,7 @@ def test_a_perfect_model_has_the_highest_psnr_and_loses_it_with_shuffled_actions
     oracle = Oracle(CONFIG)
     oracle.add_embodiment(make_model({"arm": 2}).embodiments["arm"])
     oracle.truth = list(windows(data, "val", 4, 6, batch_size=3))
-    figures = evaluate(oracle.eval(), Blocks(), data, count=6, batch_size=3, prompt=1)
+    figures = evaluate(oracle.eval(), Blocks(), data, windows=6, batch_size=3, prompt=1)
     assert (figures["true"]["psnr"], figures["true"]["ssim"]) == (60.0, pytest.approx(1.0))
     assert figures["shuffled"]["psnr_last"] < 30 and figures["psnr_action_gain_last"] > 30
     assert figures["windows"] == 6 and len(figures["true"]["psnr_by_frame"]) == 3
@@ -353,7 +358,7 @@ def test_no_model_follows_without_an_interval_above_zero() -> None:
 
 
 def test_a_single_episode_has_no_interval(data, model):
-    found = evaluate(model, Blocks(), data, count=5, prompt=1)
+    found = evaluate(model, Blocks(), data, windows=5, prompt=1)
     assert found["episodes"] == 1 and found["windows"] == 5
     assert found["true"]["psnr_95"] is None and found["loss_95"] is None and found["perplexity_95"] is None
     assert any("all windows are of one episode, so no figure has an interval" in t for t in found["notes"])
@@ -380,7 +385,7 @@ def test_episodes_are_resampled_whole():
 def test_a_model_that_was_trained_without_actions_is_given_none(data, model):
     blind = make_model({"arm": 2}, config=model.config.replace(objectives={"passive": 1})).eval()
     blind.load_state_dict(model.state_dict())
-    found, seeing = (evaluate(one, Blocks(), data, count=5, prompt=1) for one in (blind, model))
+    found, seeing = (evaluate(one, Blocks(), data, windows=5, prompt=1) for one in (blind, model))
     assert verdict(found) == "was trained without actions"
     assert found["loss"] == pytest.approx(found["shuffled_loss"], abs=1e-5)
     assert found["loss"] != seeing["loss"]
@@ -397,7 +402,7 @@ def test_intervals_of_few_episodes_stay_within_what_is_possible():
 
 def test_no_interval_of_two_episodes_leaves_what_a_figure_can_be(tmp_path, model):
     data = make_shards(tmp_path / "two", "arm", held_out=2)
-    found = evaluate(model, Blocks(), data, count=4, prompt=1)
+    found = evaluate(model, Blocks(), data, windows=4, prompt=1)
     assert found["episodes"] == 2
     for kind in ("true", "shuffled", "none", "copy"):
         low, high = np.array([found[kind]["psnr_last_95"], *found[kind]["psnr_by_frame_95"]]).T
@@ -415,7 +420,7 @@ def test_no_interval_of_two_episodes_leaves_what_a_figure_can_be(tmp_path, model
 
 def test_intervals_are_the_middle_of_resampled_means(tmp_path, model):
     data = make_shards(tmp_path / "arm", "arm", held_out=3)
-    found = evaluate(model, Blocks(), data, count=15, prompt=1)
+    found = evaluate(model, Blocks(), data, windows=15, prompt=1)
     for part in (found, *(found[name] for name in ("true", "shuffled", "none", "copy"))):
         for key in [key for key in part if f"{key}_95" in part and not key.endswith("by_frame")]:
             low, high = part[f"{key}_95"]
@@ -467,7 +472,7 @@ def test_without_actions_no_command_reaches_the_model(data, model, batch):
     other = replace(batch, actions=torch.randn_like(batch.actions))
     one, same = (rollout(model, Blocks(), without_actions(windows), prompt=2) for windows in (batch, other))
     assert (one.predicted == same.predicted).all()
-    assert "not trained without commands" in " ".join(evaluate(model, Blocks(), data, count=2)["notes"])
+    assert "not trained without commands" in " ".join(evaluate(model, Blocks(), data, windows=2)["notes"])
 
 
 def test_masked_scores_are_those_of_the_training_loss(batch):
@@ -507,7 +512,7 @@ def test_predictions_that_are_not_finite_are_said_in_words(data, model, monkeypa
     monkeypatch.setattr(model, "generate", generate)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = evaluate(model, Blocks(), data, count=5)
+        found = evaluate(model, Blocks(), data, windows=5)
     assert found["true"]["psnr_last"] is None and found["copy"]["psnr_last"] is not None
     assert "predicted frames are NaN or infinite" in found["notes"][0]
     assert verdict(found) == "cannot be judged: its predictions are not finite"
@@ -525,13 +530,13 @@ def test_pictures_that_never_change_are_said_in_words(model, data):
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = evaluate(model, Dark(), data, count=5)
+        found = evaluate(model, Dark(), data, windows=5)
     assert found["true"]["psnr_last"] == found["copy"]["psnr_last"] == 60
     assert "the true pictures of 5 of 5 windows never change" in found["notes"][0]
 
 
 def test_a_metric_without_weights_is_a_row_of_words(model, data):
-    missing = evaluate(model, Blocks(), data, count=2)["missing"]
+    missing = evaluate(model, Blocks(), data, windows=2)["missing"]
     assert all(f"--{name} FILE" in missing[name] for name in ("lpips", "fid", "fvd"))
 
 

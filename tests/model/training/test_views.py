@@ -11,7 +11,7 @@ from hma_data.conversion.plan import Settings
 from hma_data.errors import RecipeError, UsageError
 from hma_data.shards.reader import ShardSet
 from hma_model.config import HMAConfig
-from hma_model.evaluation.evaluate import evaluate
+from hma_model.evaluation import evaluate
 from hma_model.evaluation.rollout_video import rollout_video
 from hma_model.generation.decode import cameras_for, decode
 from hma_model.network.model import HMA
@@ -50,7 +50,7 @@ def test_three_views_are_trained_generated_and_evaluated(made: Path, run: Path) 
     assert cameras_for(model, shards) == NAMES  # those of its training
     film = rollout_video(model, tokenizer, shards, prompt=1)
     assert film.frames.shape[2] > 3 * 3 * 64  # three panels of three views
-    found = evaluate(model, tokenizer, shards, count=2)
+    found = evaluate.measure(model, tokenizer, shards, evaluate.Settings(windows=2)).found
     assert found["cameras"] == "top, wrist, side"
     assert np.isfinite(found["loss"])
     with pytest.raises(UsageError, match="the model takes 3"):
