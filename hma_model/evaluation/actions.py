@@ -1,6 +1,6 @@
-"""Replace the commands of windows: by another window's, by random ones, or by none.
+"""Replace the actions of windows: by another window's, by random ones, or by none.
 
-How much worse a model predicts with them shows how much it uses its commands.
+How much worse a model predicts with them shows how much it uses its actions.
 
 B batch, T frames, A action dims, K = stride·A.
 """

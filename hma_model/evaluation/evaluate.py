@@ -48,7 +48,7 @@ from hma_model.evaluation.metrics import (
 )
 from hma_model.evaluation.perceptual import Judge, Networks
 from hma_model.evaluation.rollouts import Pictures, rollout
-from hma_model.evaluation.scores import ROLLOUTS, Rolled, Scores
+from hma_model.evaluation.scores import ROLLOUT_KINDS, Rolled, Scores
 from hma_model.generation.decode import cameras_for, default_prompt
 
 if TYPE_CHECKING:
@@ -157,9 +157,9 @@ def measure(
 
     `found` has `loss` (nats a token); for discrete models also `shuffled_loss` (given another window's
     actions), `baseline_loss`, `perplexity`, `accuracy`, and both of `masked_scores`. For the rollouts `true`,
-    `shuffled`, `none` and `copy` it has what `Scores.figures` gives. `psnr_action_gain_last` is `psnr_last` of
-    true minus that of shuffled. `unmoved_windows` counts those whose true images never change. `notes` says
-    what else must be known, and `missing` why a metric is absent.
+    `shuffled`, `none` and `copy` it has what `Scores.figures` gives. `psnr_action_gain_last` is `psnr_last`
+    of true minus that of shuffled. `unmoved_windows` counts those whose true images never change. `notes`
+    says what else must be known, and `missing` why a metric is absent.
 
     Args:
         model: a model that has the embodiment of the shard set.
@@ -201,7 +201,7 @@ def measure(
     gain = by_window["true.psnr_last"] - by_window["shuffled.psnr_last"]
     by_window["psnr_action_gain_last"] = gain
     frechet, missing = rolled.judge.figures(plan.frames - first)
-    figures = {name: joined[name].figures(seed, episodes) | frechet.get(name, {}) for name in ROLLOUTS}
+    figures = {name: joined[name].figures(seed, episodes) | frechet.get(name, {}) for name in ROLLOUT_KINDS}
     extra: dict[str, Any] = {}
     if settings.paper:
         extra["paper"] = _paper(roll, batches, episodes, shards, by_window, draws, seed)
@@ -333,7 +333,7 @@ def _notes(
         )
     blind = any(not OBJECTIVES[name].sees_actions for name, often in config.objectives.items() if often)
     if not blind:
-        notes.append("the model was not trained without commands, so its rollouts with none may be poor")
+        notes.append("the model was not trained without actions, so its rollouts with none may be poor")
     if episodes == 1:
         notes.append(
             "all windows are of one episode, so no figure has an interval, and others may differ much: "

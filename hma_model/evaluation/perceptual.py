@@ -33,10 +33,10 @@ from hma_model.evaluation.frechet import Moments, frechet_distance
 Images = NDArray[np.uint8]
 Network = Callable[[Tensor], Tensor]
 I3D_SIDE = 224  # pixels of the short side of I3D's videos
-SHORT_VIDEO, STRETCHED = 10, 16  # frames below which a video is stretched, and those that it then has
+SHORT_VIDEO, STRETCHED_FRAMES = 10, 16  # frames below which a video is stretched, and those that it then has
 BATCH_SIZE = 32  # pictures in a pass
 SHA256 = re.compile(r"[0-9a-f]{64}")
-HOW = {
+REMEDIES = {
     "lpips": '--lpips FILE#SHA256: torch.jit.trace of lpips.LPIPS(net="alex")',
     "fid": "--fid FILE#SHA256: inception-2015-12-05.pt of NVIDIA",
     "fvd": "--fvd FILE#SHA256: i3d_torchscript.pt of StyleGAN-V",
@@ -102,7 +102,7 @@ def open_script(file: StrPath, metric: str) -> tuple[Any, dict[str, str]]:
     try:
         script = torch.jit.load(path, map_location="cpu").eval()
     except Exception as fault:  # torch raises several kinds for a file that is no TorchScript
-        raise UsageError(option, f"{name} is no TorchScript", f"give {HOW[metric]}") from fault
+        raise UsageError(option, f"{name} is no TorchScript", f"give {REMEDIES[metric]}") from fault
     return script, {"file": Path(name).name, "sha256": found}
 
 
@@ -146,7 +146,7 @@ def stretched(frames: int) -> NDArray[np.int64]:
     """Return the indices of the frames that I3D sees of a video."""
     if frames >= SHORT_VIDEO:
         return np.arange(frames)
-    return np.round(np.linspace(0, frames - 1, STRETCHED)).astype(np.int64)
+    return np.round(np.linspace(0, frames - 1, STRETCHED_FRAMES)).astype(np.int64)
 
 
 def as_video(pictures: Tensor) -> Tensor:
@@ -187,7 +187,7 @@ class Judge:
         """
         found: dict[str, dict[str, Any]] = {}
         missing: dict[str, str] = {}
-        for metric, remedy in HOW.items():
+        for metric, remedy in REMEDIES.items():
             if metric not in self.networks.facts:
                 missing[metric] = f"not measured, for want of weights: {remedy}"
         for (metric, kind), own in self.moments.items():

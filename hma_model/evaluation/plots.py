@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D")
-SIX = (*COLOURS, "#56b4e9", "#555555")  # of plots with more curves
+SIX_COLOURS = (*COLOURS, "#56b4e9", "#555555")  # of plots with more curves
 
 
 def loss_curves(
@@ -69,7 +69,7 @@ def over_horizon(
     figure, axes = _axes("seconds after the prompt", unit)
     for i, (name, (values, ends)) in enumerate(curves.items()):
         time = seconds_per_frame * np.arange(1, len(values) + 1)
-        colour, (low, high) = SIX[i % len(SIX)], np.array(ends, float).T
+        colour, (low, high) = SIX_COLOURS[i % len(SIX_COLOURS)], np.array(ends, float).T
         style, marker = STYLES[i % len(STYLES)], MARKERS[i % len(MARKERS)]
         axes.plot(time, values, color=colour, ls=style, marker=marker, ms=5, label=name)
         axes.fill_between(time, low, high, color=colour, alpha=0.15, lw=0)

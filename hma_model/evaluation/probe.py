@@ -31,19 +31,21 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Images = NDArray[np.uint8]
 
-SIDE, MAPS = 64, 32  # of the pictures that a probe sees, and of its maps
+INPUT_SIDE, MAP_SIDE = 64, 32  # pixels of the images that a probe sees, and cells of its maps
 CHANNELS, SHARPNESS = 16, 4.0
-STEPS, BATCH, RATE, NOISE = 400, 32, 1e-2, 0.03  # noise in pictures of -1 to 1
-EPISODES, HELD_OUT = 40, 8  # simulated, and of them those that the probe's error is measured on
-FRAMES, EVERY = 60, 2  # of an episode; one in so many is kept
-FIRST = 1_000_000  # the number of the first episode of a probe; those that are measured count from 0
-STILL = 1.0  # px; a part that moves less is no part of the state
-UNREADABLE = 0.5  # share of a part's spread; a probe with a larger error does not read it
-DISTANCE, SEEN = 45.0, 3  # of RGB, up to which two colours are one; least pixels of a part that is seen
+TRAINING_STEPS, BATCH_SIZE, LEARNING_RATE = 400, 32, 1e-2
+NOISE = 0.03  # in images of -1 to 1
+EPISODES, HELD_OUT_EPISODES = 40, 8  # simulated, and of them those that the probe's error is measured on
+EPISODE_FRAMES, FRAME_STRIDE = 60, 2  # of an episode; one in so many is kept
+FIRST_EPISODE = 1_000_000  # the number of a probe's first episode; those that are measured count from 0
+LEAST_SPREAD_PX = 1.0  # a part that moves less is no part of the state
+UNREADABLE_SHARE = 0.5  # of a part's spread; a probe with a larger error does not read it
+COLOUR_DISTANCE = 45.0  # of RGB, up to which two colours are one
+LEAST_PIXELS = 3  # of a part that is seen
 
 
 def feature_maps(count: int, kernel: int) -> nn.Sequential:
-    """Return layers from pictures (N, 3, SIDE, SIDE) to maps (N, count, MAPS, MAPS)."""
+    """Return layers from pictures (N, 3, 64, 64) to maps (N, count, MAP_SIDE, MAP_SIDE)."""
     return nn.Sequential(
         nn.Conv2d(3, CHANNELS, 5, stride=2, padding=2),
         nn.GELU(),
@@ -55,12 +57,12 @@ def feature_maps(count: int, kernel: int) -> nn.Sequential:
 
 def map_grid() -> Tensor:
     """Return the places (MAPS², 2) of a map's cells, x and y from -1 to 1."""
-    line = (torch.arange(MAPS) + 0.5) * (2 / MAPS) - 1
+    line = (torch.arange(MAP_SIDE) + 0.5) * (2 / MAP_SIDE) - 1
     return torch.stack(torch.meshgrid(line, line, indexing="xy"), -1).view(-1, 2)
 
 
 class PlaceNetwork(nn.Module):
-    """A network that finds parts in pictures (N, 3, SIDE, SIDE); pixels and places (N, P, 2) are -1 to 1."""
+    """A network that finds parts in pictures (N, 3, 64, 64); pixels and places (N, P, 2) are -1 to 1."""
 
     def __init__(self, parts: int) -> None:
         super().__init__()
@@ -85,7 +87,7 @@ class Probe:
         driven: how many of the parts are the robot's own.
         error: (P,) mean distance in px from the true places on held-out true pictures.
         spread: (P,) mean distance in px of the true places from their median.
-        background: (SIDE, SIDE, 3), the median of the true pictures.
+        background: (INPUT_SIDE, INPUT_SIDE, 3), the median of the true pictures.
         colors: (P, 3), of the parts.
         tee: finds the T whose places are the last two; None for a robot without one.
     """
@@ -101,7 +103,7 @@ class Probe:
     @property
     def readable(self) -> NDArray[np.bool_]:
         """Return (P,) whether a part moves and the probe reads its place."""
-        return (self.spread > STILL) & (self.error <= UNREADABLE * self.spread)
+        return (self.spread > LEAST_SPREAD_PX) & (self.error <= UNREADABLE_SHARE * self.spread)
 
     @property
     def own(self) -> NDArray[np.int64]:
@@ -128,14 +130,14 @@ class Probe:
     def areas(self, pictures: Images) -> Floats:
         """Return (…, P), how many pixels of (…, S, S, 3) have a part's colour and not the background's."""
         flat = resized(pictures.reshape(-1, *pictures.shape[-3:]))
-        stands = np.linalg.norm(flat - self.background, axis=-1) > DISTANCE
+        stands = np.linalg.norm(flat - self.background, axis=-1) > COLOUR_DISTANCE
         counts: Floats = (stands[..., None] & self._colored(flat)).sum(axis=(1, 2), dtype=np.float64)
         return counts.reshape(*pictures.shape[:-3], len(self.colors))
 
     def _colored(self, small: Images) -> NDArray[np.bool_]:
-        """Return (N, SIDE, SIDE, P), which pixels have a part's colour."""
+        """Return (N, 64, 64, P), which pixels have a part's colour."""
         values = small.astype(np.float32)
-        near = [np.linalg.norm(values - color, axis=-1) <= DISTANCE for color in self.colors]
+        near = [np.linalg.norm(values - color, axis=-1) <= COLOUR_DISTANCE for color in self.colors]
         return np.stack(near, axis=-1)
 
     def wholeness(self, pictures: Images, true: Images) -> Floats:
@@ -144,7 +146,7 @@ class Probe:
         It is the mean over the robot's readable parts that the true picture shows.
         """
         wanted, given = (self.areas(some)[..., self.own] for some in (true, pictures))
-        seen = wanted >= SEEN
+        seen = wanted >= LEAST_PIXELS
         kept: Floats = np.where(seen, np.minimum(given / np.maximum(wanted, 1), 1), 0).sum(axis=-1)
         return kept / np.maximum(seen.sum(axis=-1), 1)
 
@@ -193,7 +195,9 @@ def train_probe(
     """
     pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
     places, driven = np.concatenate([one.parts for one in made]), made[0].driven
-    return fit(pictures, places, driven, HELD_OUT / EPISODES, seed, tee=TeeFinder.of(robot), tell=tell)
+    return fit(
+        pictures, places, driven, HELD_OUT_EPISODES / EPISODES, seed, tee=TeeFinder.of(robot), tell=tell
+    )
 
 
 def shown_episodes(
@@ -201,13 +205,15 @@ def shown_episodes(
 ) -> tuple[Images, list[truth.Episode]]:
     """Return simulated episodes, and their pictures (N, S, S, 3) as the tokenizer shows them.
 
-    The episodes have one frame of every EVERY. Arguments are those of `train_probe`.
+    The episodes have one frame of every FRAME_STRIDE. Arguments are those of `train_probe`.
     """
     shown, kept = [], []
     for count in range(EPISODES):
-        made = truth.episode(robot, FRAMES, stride, seed, FIRST + count, range(0, FRAMES, EVERY))
+        made = truth.episode(
+            robot, EPISODE_FRAMES, stride, seed, FIRST_EPISODE + count, range(0, EPISODE_FRAMES, FRAME_STRIDE)
+        )
         shown.append(as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures)))
-        kept.append(replace(made, parts=made.parts[::EVERY], states=made.states[::EVERY]))
+        kept.append(replace(made, parts=made.parts[::FRAME_STRIDE], states=made.states[::FRAME_STRIDE]))
         tell(f"simulating episode {count + 1} of {EPISODES}")
     return np.concatenate(shown), kept
 
@@ -218,7 +224,7 @@ def fit(
     driven: int,
     held_out: float = 0.2,
     seed: int = 0,
-    steps: int = STEPS,
+    steps: int = TRAINING_STEPS,
     tee: TeeFinder | None = None,
     tell: Callable[[str], None] = lambda words: None,
 ) -> Probe:
@@ -255,7 +261,7 @@ def _trained(small: Images, parts: Floats, seed: int, steps: int, tell: Callable
     def tell_step(step: int) -> None:
         tell(f"training the probe: step {step} of {steps}")
 
-    train(network, pixels(small), targets, seed, steps, RATE, 0.02, tell_step)
+    train(network, pixels(small), targets, seed, steps, LEARNING_RATE, 0.02, tell_step)
     return network.eval()
 
 
@@ -263,13 +269,15 @@ def train(
     network: nn.Module, inputs: Tensor, targets: Tensor, seed: int, steps: int, rate: float, beta: float,
     tell: Callable[[int], None] = lambda step: None,
 ) -> None:  # fmt: skip
-    """Train a network from noisy pictures (N, 3, SIDE, SIDE) to targets (N, …), by a loss of that beta."""
+    """Train a network from noisy pictures (N, 3, 64, 64) to targets (N, …), by a loss of that beta."""
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
     for step in range(steps):
-        chosen = torch.randint(0, len(inputs), (BATCH,), generator=generator)
-        noisy = inputs[chosen] + NOISE * torch.randn(BATCH, 3, SIDE, SIDE, generator=generator)
+        chosen = torch.randint(0, len(inputs), (BATCH_SIZE,), generator=generator)
+        noisy = inputs[chosen] + NOISE * torch.randn(
+            BATCH_SIZE, 3, INPUT_SIDE, INPUT_SIDE, generator=generator
+        )
         loss = nn.functional.smooth_l1_loss(network(noisy), targets[chosen], beta=beta)
         optimizer.zero_grad()
         loss.backward()
@@ -280,15 +288,17 @@ def train(
 
 def _colors(small: Images, parts: Floats) -> Floats:
     """Return the (P, 3) median colours of pictures at places within the parts."""
-    x, y = np.clip(parts * (SIDE / truth.SIZE), 0, SIDE - 1).astype(int).transpose(2, 0, 1)
+    x, y = np.clip(parts * (INPUT_SIDE / truth.SIZE), 0, INPUT_SIDE - 1).astype(int).transpose(2, 0, 1)
     found: Floats = np.median(small[np.arange(len(small))[:, None], y, x], axis=0).astype(np.float32)
     return found
 
 
 def resized(pictures: Images) -> Images:
-    """Return pictures (N, SIDE, SIDE, 3)."""
+    """Return pictures (N, 64, 64, 3)."""
     cv2 = opencv()
-    return np.stack([cv2.resize(one, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for one in pictures])
+    return np.stack(
+        [cv2.resize(one, (INPUT_SIDE, INPUT_SIDE), interpolation=cv2.INTER_AREA) for one in pictures]
+    )
 
 
 def pixels(small: Images) -> Tensor:

@@ -30,7 +30,7 @@ from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded
 from hma_model.evaluation.losses import episodes_of
 from hma_model.evaluation.probe import (
     SHARPNESS,
-    UNREADABLE,
+    UNREADABLE_SHARE,
     feature_maps,
     map_grid,
     pixels,
@@ -47,11 +47,11 @@ Floats = NDArray[np.float64]
 Images = NDArray[np.uint8]
 Tell = Callable[[str], None]
 
-POINTS, HIDDEN = 16, 128
-STEPS, RATE = 600, 4e-3
-PICTURES, EPISODES = 1500, 5  # most pictures to learn from, fewest episodes
-HELD_OUT = 0.2  # share of the pictures, the last ones, on which the reader's error is measured
-STILL = 1e-6  # a value whose standard deviation is smaller never changes
+POINTS, HIDDEN_WIDTH = 16, 128
+TRAINING_STEPS, LEARNING_RATE = 600, 4e-3
+IMAGE_LIMIT, EPISODES_NEEDED = 1500, 5  # most pictures to learn from, fewest episodes
+HELD_OUT_SHARE = 0.2  # share of the pictures, the last ones, on which the reader's error is measured
+LEAST_STD = 1e-6  # a value whose standard deviation is smaller never changes
 
 
 class StateNetwork(nn.Module):
@@ -63,7 +63,9 @@ class StateNetwork(nn.Module):
     def __init__(self, values: int) -> None:
         super().__init__()
         self.maps = feature_maps(POINTS, kernel=3)
-        self.head = nn.Sequential(nn.Linear(3 * POINTS, HIDDEN), nn.GELU(), nn.Linear(HIDDEN, values))
+        self.head = nn.Sequential(
+            nn.Linear(3 * POINTS, HIDDEN_WIDTH), nn.GELU(), nn.Linear(HIDDEN_WIDTH, values)
+        )
         self.register_buffer("grid", map_grid())
 
     def forward(self, pictures: Tensor) -> Tensor:
@@ -93,12 +95,12 @@ class Reader:
     @property
     def readable(self) -> NDArray[np.int64]:
         """Return the numbers of the values that change and that it reads."""
-        return np.flatnonzero((self.std > STILL) & (self.error <= UNREADABLE * self.spread))
+        return np.flatnonzero((self.std > LEAST_STD) & (self.error <= UNREADABLE_SHARE * self.spread))
 
     def errors(self, pictures: Images, states: Floats) -> Floats:
         """Return (…, S), how far from states (…, S) it reads pictures (…, H, W, 3), in std."""
         found = _read(self.network, resized(pictures.reshape(-1, *pictures.shape[-3:])))
-        true = (states - self.mean) / np.maximum(self.std, STILL)
+        true = (states - self.mean) / np.maximum(self.std, LEAST_STD)
         return np.abs(found.reshape(states.shape) - true)
 
     def read(self, pictures: Images) -> Floats:
@@ -113,7 +115,11 @@ class Reader:
 
 
 def learn(
-    pictures: Images, states: Floats, seed: int = 0, steps: int = STEPS, tell: Tell = lambda words: None
+    pictures: Images,
+    states: Floats,
+    seed: int = 0,
+    steps: int = TRAINING_STEPS,
+    tell: Tell = lambda words: None,
 ) -> Reader:
     """Train a reader on pictures whose state is known.
 
@@ -124,9 +130,9 @@ def learn(
         steps: of the training.
         tell: called with how far it is.
     """
-    used, small = round(len(pictures) * (1 - HELD_OUT)), resized(pictures)
+    used, small = round(len(pictures) * (1 - HELD_OUT_SHARE)), resized(pictures)
     mean, std = states[:used].mean(axis=0), states[:used].std(axis=0)
-    scaled = (states - mean) / np.maximum(std, STILL)
+    scaled = (states - mean) / np.maximum(std, LEAST_STD)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = StateNetwork(states.shape[1])
@@ -135,7 +141,7 @@ def learn(
     def tell_step(step: int) -> None:
         tell(f"learning to read the state: step {step} of {steps}")
 
-    train(network, pixels(small[:used]), targets, seed, steps, RATE, 0.1, tell_step)
+    train(network, pixels(small[:used]), targets, seed, steps, LEARNING_RATE, 0.1, tell_step)
     other = scaled[used:]
     error = np.abs(_read(network.eval(), small[used:]) - other).mean(axis=0)
     spread = np.abs(other - np.median(other, axis=0)).mean(axis=0)
@@ -178,8 +184,8 @@ def measure_recorded_state(
     """
     count, nothing = sum(map(len, batches)), {"windows": 0}
     unknown = np.full(count, np.nan)
-    if (episodes := shards.manifest.splits["train"]["episodes"]) < EPISODES:
-        few = f"{episodes} training episodes are too few to learn to read their states, {EPISODES} are needed"
+    if (episodes := shards.manifest.splits["train"]["episodes"]) < EPISODES_NEEDED:
+        few = f"{episodes} training episodes are too few to read their states, {EPISODES_NEEDED} are needed"
         return nothing | {"missing": few}, unknown
     states = _States(shards)
     hashable: Any = tokenizer
@@ -205,7 +211,7 @@ def measure_recorded_state(
     if not kept.any():
         return nothing | {"missing": "the states of all windows are unknown in part"}, unknown
     here = joined["reconstruction"][kept].mean(axis=(0, 1))  # the windows may be unlike what it learned from
-    own = np.array([n for n in reader.readable if here[n] <= UNREADABLE * reader.spread[n]], np.int64)
+    own = np.array([n for n in reader.readable if here[n] <= UNREADABLE_SHARE * reader.spread[n]], np.int64)
     if not len(own):
         cannot = "no recorded state can be read off the true pictures; more training episodes may help"
         return nothing | {"missing": cannot}, unknown
@@ -237,7 +243,7 @@ def recorded_reader(
         tell: called with how far it is.
     """
     dataset = WindowDataset(shards, "train", 1, cameras=cameras)
-    numbers = np.unique(np.linspace(0, len(dataset) - 1, min(PICTURES, len(dataset))).astype(np.int64))
+    numbers = np.unique(np.linspace(0, len(dataset) - 1, min(IMAGE_LIMIT, len(dataset))).astype(np.int64))
     seen = dataset.batch(numbers)
     wanted = _States(shards).of(seen, 1)[:, 0]
     known = np.isfinite(wanted).all(axis=1)

@@ -19,6 +19,7 @@ from hma_data.storage.files import to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import over_horizon
+from hma_model.evaluation.rollout_video import GIVEN_COLOUR, PREDICTED_COLOUR
 from hma_model.evaluation.showcase import Showcase, choose
 from hma_model.evaluation.suite import RESULTS, Part
 from hma_model.evaluation.tables import (
@@ -35,7 +36,7 @@ from hma_model.evaluation.tables import (
 from hma_model.evaluation.verdict import verdict
 
 Images = NDArray[np.uint8]
-GIVEN, PREDICTED, GAP = (150, 150, 150), (0, 158, 115), (128, 128, 128)
+GAP_COLOUR = (128, 128, 128)
 GAP_PX, MARK_PX = 3, 4  # between frames, and of the line below them
 STRIP_FRAMES = 12  # at most
 BRIGHTEST = 96.0  # mean difference of a pixel's channels that is shown brightest
@@ -223,8 +224,10 @@ def strip(film: Images, columns: NDArray[np.int64], prompt: int) -> bytes:
 
     parts = []
     for frame, number in zip(film, columns, strict=True):
-        line = np.full((MARK_PX, frame.shape[1], 3), GIVEN if number < prompt else PREDICTED, np.uint8)
-        parts += [np.concatenate([frame, line]), np.full((len(frame) + MARK_PX, GAP_PX, 3), GAP, np.uint8)]
+        colour = GIVEN_COLOUR if number < prompt else PREDICTED_COLOUR
+        mark = np.full((MARK_PX, frame.shape[1], 3), colour, np.uint8)
+        gap = np.full((len(frame) + MARK_PX, GAP_PX, 3), GAP_COLOUR, np.uint8)
+        parts += [np.concatenate([frame, mark]), gap]
     buffer = io.BytesIO()
     Image.fromarray(np.concatenate(parts[:-1], axis=1)).save(buffer, "WEBP", quality=88, method=4)
     return buffer.getvalue()

@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
-SMALLEST = 192  # minimum width in pixels at which a picture is shown
-HOLD = 0.9  # seconds for which the end of a window stands, where another one follows
-GIVEN, PREDICTED = (150, 150, 150), (0, 158, 115)  # borders of true frames and of predictions
+PANEL_PX = 192  # minimum width in pixels at which a picture is shown
+HOLD_SECONDS = 0.9  # seconds for which the end of a window stands, where another one follows
+GIVEN_COLOUR, PREDICTED_COLOUR = (150, 150, 150), (0, 158, 115)  # borders of true frames and of predictions
 SHEETS = "pictures"  # the folder of a run's sheets
-COLUMNS = 8  # frames in a row of a sheet
+SHEET_COLUMNS = 8  # frames in a row of a sheet
 TITLE_PX, MARGIN_PX, BORDER_PX = 42, 6, 4  # above a picture, beside it, around it
 DARK_PAPER = (13, 17, 23)  # what is added to mirrored white, so that it is the paper of dark pages
 
@@ -133,7 +133,7 @@ def rollout_video(
         ]
         parts.append(_with_time(np.concatenate(columns, axis=2), prompt))
         if len(chosen) > 1:
-            parts.append(parts[-1][-1:].repeat(round(HOLD * fps), axis=0))
+            parts.append(parts[-1][-1:].repeat(round(HOLD_SECONDS * fps), axis=0))
     actions = batch.actions.masked_fill(~batch.action_mask.unsqueeze(-1), float("nan"))
     frames_shown = np.concatenate(parts)
     images = _image_pixels(frames_shown.shape[1:3], true.truth.shape[2:4], len(panels))
@@ -183,7 +183,7 @@ def _column(
     edge_px = (BORDER_PX, BORDER_PX)
     large = np.pad(film.repeat(scale, 1).repeat(scale, 2), ((0, 0), edge_px, edge_px, (0, 0)))
     for t in range(len(large)):
-        edge = np.array(GIVEN if t < given else PREDICTED, np.uint8)
+        edge = np.array(GIVEN_COLOUR if t < given else PREDICTED_COLOUR, np.uint8)
         large[t, :4] = large[t, -4:] = edge
         large[t, :, :4] = large[t, :, -4:] = edge
     stats = shards.manifest.stats["action"]
@@ -202,7 +202,7 @@ def _column(
 
 
 def _scale(width: int) -> int:
-    return max(1, -(-SMALLEST // width))
+    return max(1, -(-PANEL_PX // width))
 
 
 def _image_pixels(shown: Sequence[int], image: Sequence[int], panels: int) -> NDArray[np.bool_]:
@@ -221,7 +221,7 @@ def _with_time(film: NDArray[np.uint8], prompt: int) -> NDArray[np.uint8]:
     edges = np.linspace(6, width - 6, count + 1).astype(int)
     for t in range(count):
         for past in range(t + 1):
-            out[t, -6:-2, edges[past] : edges[past + 1]] = GIVEN if past < prompt else PREDICTED
+            out[t, -6:-2, edges[past] : edges[past + 1]] = GIVEN_COLOUR if past < prompt else PREDICTED_COLOUR
     return out
 
 
@@ -276,7 +276,7 @@ def write_sheets(
         return f"no pictures: {fault}"
     training = model.training
     model.eval()
-    columns = np.unique(np.linspace(0, frames - 1, COLUMNS).astype(int))
+    columns = np.unique(np.linspace(0, frames - 1, SHEET_COLUMNS).astype(int))
     for name, shards in sets.items():
         (batch,) = windows(shards, "val", frames, count, count, cameras)
         true = rollout(model, tokenizer, batch, seed=seed)

@@ -89,7 +89,7 @@ def rollout(
     known = batch.action_mask[:, : first + count].to(model.device) & model.config.sees_actions
     passive = model.config.absent_action != "embedding" and not known.any()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OutsideRangeWarning)  # nobody chose these commands
+        warnings.simplefilter("ignore", OutsideRangeWarning)  # nobody chose these actions
         predicted = model.generate(
             given, None if passive else chunks, batch.embodiment, count, generator=generator,
             known=None if passive else known, **sampling,

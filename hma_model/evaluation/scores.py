@@ -19,7 +19,7 @@ from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, SSIM_RANGE, psn
 from hma_model.evaluation.perceptual import Judge
 from hma_model.evaluation.rollouts import Pictures
 
-ROLLOUTS = ("true", "shuffled", "none", "copy")
+ROLLOUT_KINDS = ("true", "shuffled", "none", "copy")
 Floats = NDArray[np.float64]
 
 
@@ -102,9 +102,9 @@ class Rolled:
 
     first: int
     judge: Judge
-    scores: dict[str, list[Scores]] = field(default_factory=lambda: {name: [] for name in ROLLOUTS})
+    scores: dict[str, list[Scores]] = field(default_factory=lambda: {name: [] for name in ROLLOUT_KINDS})
     predicted: dict[str, list[torch.Tensor]] = field(
-        default_factory=lambda: {name: [] for name in ROLLOUTS if name != "copy"}
+        default_factory=lambda: {name: [] for name in ROLLOUT_KINDS if name != "copy"}
     )
     still: int = 0
 

@@ -1,12 +1,12 @@
-"""Measure on a laboratory robot whether the model does what its commands say: `hma evaluate --state`.
+"""Measure on a laboratory robot whether the model does what its actions say: `hma evaluate --state`.
 
 The simulator makes true episodes with states, and the model rolls out from their first frames. A probe reads
 where the robot's parts are in its pictures, and the distance from the truth is the error, in px of a picture
 of 128, at each step of the horizon. Beside it stand the probe's own error and the same error of the true
 pictures as the tokenizer shows them.
 
-PSNR* and perplexity* are the paper's (table 4): the commands after the prompt are perturbed, the simulator
-answers the perturbed commands, and the model is compared with that answer.
+PSNR* and perplexity* are the paper's (table 4): the actions after the prompt are perturbed, the simulator
+answers the perturbed actions, and the model is compared with that answer.
 
 B episodes, T frames, P predicted frames, S pixels a side, K = stride·A.
 """
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
-PERTURBATION = 0.1  # standard deviations of the commands, as the paper's
-FIRST = 500_000  # the number of the first episode; drift's count from 0, those of probes from a million
+PERTURBATION = 0.1  # standard deviations of the actions, as the paper's
+FIRST_EPISODE = 500_000  # its number; drift's episodes count from 0, those of probes from a million
 Floats = NDArray[np.float64]
 Images = NDArray[np.uint8]
 
@@ -62,7 +62,7 @@ def measure_state(
         `error_px` of the rollouts `true`, `shuffled`, `none` and `copy`, and of the true pictures as the
         tokenizer shows them (`reconstruction`): the mean over the horizon, at its last step, and by frame.
         `probe_px` is the probe's own error, `spread_px` what knows nothing would have. `perturbed` has
-        `psnr_star` and `perplexity_star`, beside `psnr` and `perplexity` of the true commands.
+        `psnr_star` and `perplexity_star`, beside `psnr` and `perplexity` of the true actions.
 
     Raises:
         UsageError: it is no robot of the laboratory.
@@ -71,7 +71,7 @@ def measure_state(
     stride = model.embodiments[robot].stride
     probe = train_probe(robot, tokenizer, stride, seed)
     simulate = partial(truth.episode, robot, frames, stride, seed)
-    made = [simulate(FIRST + number) for number in range(episodes)]
+    made = [simulate(FIRST_EPISODE + number) for number in range(episodes)]
     chunks = np.stack([one.chunks for one in made])
     batch = _batch(model, tokenizer, robot, made)
     roll = partial(rollout, model, tokenizer, prompt=prompt, seed=seed, **sampling)
@@ -89,7 +89,7 @@ def measure_state(
     found |= _controllability(probe, ways, parts, seed)
     wish = perturbed(chunks, model.embodiments[robot].action_dim, prompt, seed)
     commands = wish.reshape(episodes, -1, model.embodiments[robot].action_dim)
-    answers = [simulate(FIRST + number, commands=commands[number]) for number in range(episodes)]
+    answers = [simulate(FIRST_EPISODE + number, commands=commands[number]) for number in range(episodes)]
     other = _batch(model, tokenizer, robot, answers)
     return found | {"perturbed": _perturbed(model, true, roll(other), batch, other, seed)}
 
@@ -130,7 +130,7 @@ def _controllability(probe: Probe, ways: dict[str, Images], parts: Floats, seed:
 def _perturbed(
     model: "HMA", true: Pictures, made: Pictures, batch: Batch, other: Batch, seed: int
 ) -> dict[str, Any]:
-    """Return PSNR and perplexity under the true commands, and under the perturbed ones."""
+    """Return PSNR and perplexity under the true actions, and under the perturbed ones."""
     found: dict[str, Any] = {"scale": PERTURBATION}
     for mark, pictures, windows in (("", true, batch), ("_star", made, other)):
         given = pictures.truth[:, pictures.prompt :]

@@ -18,10 +18,10 @@ from hma_data.lab.pusher import Tee, rotation
 Floats = NDArray[np.float64]
 
 ANGLES = 48  # that are tried
-FAR = 20.0  # px of the arena; a pixel farther out of the T counts as that far
-STEP, LEAST = 8.0, 0.4  # px of the arena, of the search
-ARM = 50.0  # px of the arena by which an angle is as long as a step
-FEWEST = 0.3  # share of the T's area; of fewer pixels no pose is found
+FARTHEST_PX = 20.0  # px of the arena; a pixel farther out of the T counts as that far
+FIRST_STEP, LAST_STEP = 8.0, 0.4  # px of the arena, of the search
+TURN_RADIUS = 50.0  # px of the arena by which an angle is as long as a step
+LEAST_AREA = 0.3  # share of the T's area; of fewer pixels no pose is found
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class TeeFinder:
         y, x = np.nonzero(pixels)
         boxes = self.shape.boxes
         areas = (boxes[:, 1] - boxes[:, 0]).prod(axis=1)
-        if len(x) * size**2 < FEWEST * areas.sum():
+        if len(x) * size**2 < LEAST_AREA * areas.sum():
             return None
         points = (np.stack([x, y], axis=1).astype(np.float64) + 0.5) * size
         middle = (boxes.mean(axis=1) * areas[:, None]).sum(axis=0) / areas.sum()
@@ -66,9 +66,9 @@ class TeeFinder:
 
     def _nearer(self, points: Floats, pose: Floats) -> Floats:
         """Return the best pose near another."""
-        step, best = STEP, float(self._outside(points, pose[None])[0])
-        ways = np.concatenate([np.eye(3), -np.eye(3)]) * (1, 1, 1 / ARM)
-        while step > LEAST:
+        step, best = FIRST_STEP, float(self._outside(points, pose[None])[0])
+        ways = np.concatenate([np.eye(3), -np.eye(3)]) * (1, 1, 1 / TURN_RADIUS)
+        while step > LAST_STEP:
             tried = pose + step * ways
             found = self._outside(points, tried)
             if found.min() < best:
@@ -82,5 +82,5 @@ class TeeFinder:
         cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
         x, y = points[:, 0] - poses[:, :1], points[:, 1] - poses[:, 1:2]
         local = np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
-        far: Floats = np.clip(self.shape.distance(local), 0, FAR).mean(axis=1)
+        far: Floats = np.clip(self.shape.distance(local), 0, FARTHEST_PX).mean(axis=1)
         return far

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import truth
 from hma_model.evaluation.agreement import Accuracy, Bools, accuracy
-from hma_model.evaluation.probe import EPISODES, FIRST, Probe, as_seen, as_shown, train_probe
+from hma_model.evaluation.probe import EPISODES, FIRST_EPISODE, Probe, as_seen, as_shown, train_probe
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -193,7 +193,7 @@ def train_judge(
     looked = (
         set(range(frames)) if task.name == "reached" else {0, *range(max(frames - END_FRAMES, 1), frames)}
     )
-    numbers = range(FIRST + EPISODES, FIRST + EPISODES + examples)
+    numbers = range(FIRST_EPISODE + EPISODES, FIRST_EPISODE + EPISODES + examples)
     judge = StateJudge(robot, task, probe, task.limit, accuracy(np.ones(1, bool), np.ones(1, bool)))
     true = np.empty(examples)
     read = np.empty(examples)

@@ -472,7 +472,7 @@ def test_without_actions_no_command_reaches_the_model(data, model, batch):
     other = replace(batch, actions=torch.randn_like(batch.actions))
     one, same = (rollout(model, Blocks(), without_actions(windows), prompt=2) for windows in (batch, other))
     assert (one.predicted == same.predicted).all()
-    assert "not trained without commands" in " ".join(evaluate(model, Blocks(), data, windows=2)["notes"])
+    assert "not trained without actions" in " ".join(evaluate(model, Blocks(), data, windows=2)["notes"])
 
 
 def test_masked_scores_are_those_of_the_training_loss(batch):

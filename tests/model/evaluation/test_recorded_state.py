@@ -153,9 +153,9 @@ def test_what_cannot_be_read_off_the_windows_own_pictures_is_left_out(
 
 
 def test_too_few_episodes_are_said(disc: ShardSet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorded_state, "EPISODES", 100)
+    monkeypatch.setattr(recorded_state, "EPISODES_NEEDED", 100)
     found, last = measure_recorded_state(
         BlockTokenizer(), disc, list(windows(disc, "val", 8, 12)), {}, prompt=PROMPT, cameras="first"
     )
-    assert "too few to learn to read their states, 100 are needed" in found["missing"]
+    assert "too few to read their states, 100 are needed" in found["missing"]
     assert np.isnan(last).all() and last.shape == (12,)

@@ -45,23 +45,23 @@ def test_borders_tell_the_prompt_from_predictions_and_the_truth_has_none_of_thos
         make_model({"arm": 2}), Blocks(), shards, window=[0, 9], other=[9, 0], frames=LENGTH - PROMPT,
         prompt=PROMPT,
     )  # fmt: skip
-    held = round(module.HOLD * film.fps)
+    held = round(module.HOLD_SECONDS * film.fps)
     assert len(film.frames) == 2 * (LENGTH + held)
     assert (film.frames[LENGTH - 1 : LENGTH + held] == film.frames[LENGTH - 1]).all()
     width = film.frames.shape[2]
-    assert width >= 3 * module.SMALLEST
+    assert width >= 3 * module.PANEL_PX
     for t in range(LENGTH):
         row = film.frames[t, 43].reshape(3, width // 3, 3)  # in the upper borders of the three panels
         colours = [tuple(panel[width // 6]) for panel in row.tolist()]
-        predicted = module.GIVEN if t < PROMPT else module.PREDICTED
-        assert colours == [module.GIVEN, predicted, predicted]
+        predicted = module.GIVEN_COLOUR if t < PROMPT else module.PREDICTED_COLOUR
+        assert colours == [module.GIVEN_COLOUR, predicted, predicted]
     # three equal images with their borders, below the titles
     assert not film.images[: module.TITLE_PX].any() and film.images[43].reshape(3, -1).any(axis=1).all()
     shown = np.split(film.images, 3, axis=1)
     assert all((part == shown[0]).all() for part in shown)
-    assert shown[0].any(axis=0).sum() == module.SMALLEST + 2 * module.BORDER_PX
+    assert shown[0].any(axis=0).sum() == module.PANEL_PX + 2 * module.BORDER_PX
     panels = np.split(film.frames, 3, axis=2)
-    picture = slice(46, 46 + module.SMALLEST)
+    picture = slice(46, 46 + module.PANEL_PX)
     assert (panels[0][:PROMPT, picture] == panels[1][:PROMPT, picture]).all()
 
 
