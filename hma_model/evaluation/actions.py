@@ -27,7 +27,7 @@ def shuffled_actions(batch: Batch, begin: int = 0, seed: int = 0, draw: int = 0)
     rng = np.random.default_rng([seed, 1 + draw])
     for name in dict.fromkeys(batch.embodiment):
         own = rng.permutation([i for i, other in enumerate(batch.embodiment) if other == name])
-        if len(own) == 1:
+        if len(own) == 1:  # there is no other window to take actions from
             actions[own, begin:] = source[own].flip(1)
         else:
             actions[own, begin:] = source[np.roll(own, 1)]

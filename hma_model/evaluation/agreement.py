@@ -122,6 +122,7 @@ def correlations(one: Floats, other: Floats, seed: int = 0) -> dict[str, Estimat
         return {name: Estimate(float(measure(*means))) for name, measure in measures.items()}
     rng = np.random.default_rng(seed)
     rows = rng.integers(policies, size=(RESAMPLES, policies))
+    # two policies always correlate by 1 or -1, so draws of so few say nothing
     rows = rows[[len(set(drawn)) >= MIN_POLICIES for drawn in rows.tolist()]]
     columns = rng.integers(episodes, size=(len(rows), episodes))
     drawn = [values[rows[:, :, None], columns[:, None]].mean(axis=-1) for values in (one, other)]

@@ -34,7 +34,7 @@ def resampled_means(values: NDArray[Any], seed: int = 0, episodes: Episodes = No
         names, own = np.unique(np.asarray(episodes), return_inverse=True)
         count = len(names)
         shares = _shares(count, seed)[:, own]
-        shares /= shares.sum(axis=1, keepdims=True)
+        shares /= shares.sum(axis=1, keepdims=True)  # episodes have unequal numbers of windows
     means: Floats = (shares @ flat).reshape(RESAMPLES, *values.shape[1:])
     if count < 2:
         return np.full_like(means, np.nan)
@@ -53,6 +53,7 @@ def _stretch(count: int) -> float:
 def _shares(count: int, seed: int) -> Floats:
     """Return the share (R, N) that each of N values has in each resample."""
     chosen = np.random.default_rng(seed).integers(count, size=(RESAMPLES, count))
+    # each resample counts in cells of its own, so that one bincount serves all
     cells = chosen + count * np.arange(RESAMPLES)[:, None]
     return np.bincount(cells.ravel(), minlength=RESAMPLES * count).reshape(RESAMPLES, count) / count
 

@@ -71,6 +71,7 @@ def windows(
     if not len(dataset):
         return
     whole, rest = divmod(len(chosen), batch_size)
+    # a last batch of one window would find no other window's actions: it is spread over the others
     alone = rest == 1 and whole and batch_size > 1
     parts = np.array_split(chosen, whole + 1 if alone else range(batch_size, len(chosen), batch_size))
     yield from map(dataset.batch, parts)

@@ -164,7 +164,7 @@ def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
         own = _part(batch, slice(t + 1 - held, t + 1))
         assert own.tokens is not None
         seen = own.tokens.clone()
-        seen[:, -1] = config.vocab_size
+        seen[:, -1] = config.vocab_size  # the mask's id
         logits = model.video_logits(seen, own.actions, own.embodiment, own.action_mask, own.tokens)
         parts.append(_scored(model, own, logits[:, -1:]))
     nats, hits = (torch.cat(part, dim=1) for part in zip(*parts, strict=True))

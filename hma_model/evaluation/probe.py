@@ -68,6 +68,7 @@ class PlaceNetwork(nn.Module):
         super().__init__()
         self.maps = feature_maps(parts, kernel=1)
         self.correct = nn.Linear(2 * parts, 2 * parts)
+        # at first the places stay as they are read; training learns only what to correct
         nn.init.eye_(self.correct.weight)
         nn.init.zeros_(self.correct.bias)
         self.register_buffer("grid", map_grid())
@@ -253,7 +254,7 @@ def fit(
 
 
 def _trained(small: Images, parts: Floats, seed: int, steps: int, tell: Callable[[str], None]) -> nn.Module:
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]):  # the caller's random numbers go on as if nothing was drawn
         torch.manual_seed(seed)
         network = PlaceNetwork(parts.shape[1])
     targets = torch.tensor(parts / (truth.SIZE / 2) - 1, dtype=torch.float32)

@@ -100,5 +100,5 @@ def rollout(
     if predicted.is_floating_point():
         finite = predicted.isfinite().flatten(2).all(dim=2).cpu().numpy()
     made = decode(tokenizer, predicted.nan_to_num(0, 0, 0))
-    made[~finite] = 0
+    made[~finite] = 0  # black, so that a page shows that there is no prediction
     return Pictures(first, np.concatenate([truth[:, :first], made], axis=1), truth, predicted, finite)

@@ -113,6 +113,7 @@ class Rolled:
         first = self.first
         true = roll(batch)
         self.judge.add("truth", true.truth[:, first:])
+        # where nothing moves, a copy of the prompt is perfect and the actions cannot show
         unchanged = true.truth[:, first:] == true.truth[:, first - 1 : first]
         self.still += int(unchanged.all(axis=(1, 2, 3, 4)).sum())
         copied = true.predicted.copy()

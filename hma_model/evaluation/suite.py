@@ -244,7 +244,7 @@ def _folder(out: Path) -> Path:
 def _keep(folder: Path, mark: str, part: Part) -> None:
     """Write a part: its predictions first, so that the figures' file says that it is whole."""
     stem = folder / PARTS / f"{part.found['embodiment']}-{mark}"
-    buffer = io.BytesIO()
+    buffer = io.BytesIO()  # in memory first, so that the file appears whole
     np.savez_compressed(buffer, **part.predicted)  # type: ignore[arg-type]
     write_atomic(stem.with_suffix(".npz"), buffer.getvalue())
     rows = {name: values.tolist() for name, values in part.by_window.items()}
