@@ -30,7 +30,7 @@ from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.probe import Probe, train_probe
-from hma_model.evaluation.recorded_state import EPISODES, Reader, recorded_reader, simulated_reader
+from hma_model.evaluation.recorded_state import EPISODES_NEEDED, Reader, recorded_reader, simulated_reader
 from hma_model.generation.decode import cameras_for
 from hma_model.policies.arenas import Arena, Floats, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy
@@ -240,7 +240,7 @@ def _stated(
         if robot.state is None:
             return None
         return robot, simulated_reader(robot.id, world.tokenizer, robot.stride, settings.seed, tell)
-    if shards.embodiment.state is None or shards.manifest.splits["train"]["episodes"] < EPISODES:
+    if shards.embodiment.state is None or shards.manifest.splits["train"]["episodes"] < EPISODES_NEEDED:
         return None
     reader = recorded_reader(world.tokenizer, shards, tuple(cameras), settings.seed, tell)
     return None if reader is None else (shards.embodiment, reader)
