@@ -1,8 +1,8 @@
 """Convert recordings of any robot to tokenized parquet shards, and read them in training.
 
-Rooms in the road's order: storage, hub, registry, episodes, sources, tokenizers, shards, inspection,
-conversion, loading; beside them lab, bench and cli. A room imports only from rooms before it. The names
-below are imported on use, so that `import hma_data` costs nothing.
+The packages in the order of the road: storage, hub, registry, episodes, sources, tokenizers, shards,
+inspection, conversion, loading; beside them lab, bench and cli. A package imports only from those before it.
+The names below are imported on use, so that `import hma_data` costs nothing.
 """
 
 from collections.abc import Callable, Mapping

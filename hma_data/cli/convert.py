@@ -239,7 +239,7 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
                 "frames_per_second": cost.frames_per_second,
                 "seconds": cost.seconds,
                 "cameras": plan.facts["cameras"],
-                "pictures": cost.pictures,
+                "pictures": cost.frame_sizes,
                 "shards": units,
             }
         )
@@ -251,7 +251,9 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
         f"{uri}: {human_count(plan.episodes, 'episode')}, about {plan.frames:,} recorded frames{kept} into "
         f"{human_count(len(units), 'shard')}, about {human_bytes(cost.bytes)}"
     )
-    _print_cameras(cameras_line(plan.facts["cameras"], robot), cost.pictures, robot, opened.spec.image_size)
+    _print_cameras(
+        cameras_line(plan.facts["cameras"], robot), cost.frame_sizes, robot, opened.spec.image_size
+    )
     _print_left_out(plan.left_out)
     if cost.seconds is None:
         print(f"time unknown, no episode could be read: {cost.fault}")
@@ -310,7 +312,7 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
                 "shards_kept": summary.kept_shards,
                 "seconds": summary.seconds,
                 "cameras": manifest.cameras,
-                "pictures": summary.pictures,
+                "pictures": summary.frame_sizes,
                 "flags": summary.flags,
                 "left_out": summary.left_out,
                 "changed": summary.changed,
@@ -325,7 +327,7 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
         kept = f" ({summary.kept_shards} were there already)" if summary.kept_shards else ""
         print(f"{totals_line(summary.out, manifest)}{kept}, {human_seconds(summary.seconds)}")
         robot, size = manifest.embodiment, manifest.tokenizer.image_size
-        _print_cameras(manifest.cameras_line, summary.pictures, robot, size)
+        _print_cameras(manifest.cameras_line, summary.frame_sizes, robot, size)
         _print_left_out(summary.left_out)
         print(summary.held_out)
         if summary.flags:
@@ -345,12 +347,12 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
         )
 
 
-def _print_cameras(line: str, pictures: dict[str, tuple[int, int]], robot: Any, size: int) -> None:
-    """Print which cameras are stored, and what becomes of their pictures."""
+def _print_cameras(line: str, sizes: dict[str, tuple[int, int]], robot: Any, size: int) -> None:
+    """Print which cameras are stored, and what becomes of their frames."""
     from hma_data.episodes.images import describe_resize
 
     print(f"cameras: {line}")
-    for name, (height, width) in pictures.items():
+    for name, (height, width) in sizes.items():
         print(describe_resize(robot.camera(name), height, width, size))
 
 

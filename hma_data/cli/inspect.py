@@ -89,7 +89,7 @@ def _print_inspection(report: dict[str, Any]) -> None:
 
 
 def _row(key: dict[str, Any]) -> list[Any]:
-    """Return the table row of one key: pictures with their codec, the skew as p50/p95/max."""
+    """Return the table row of one key: cameras with their codec, the skew as p50/p95/max."""
     skew = "/".join(f"{part:.3g}" for part in key["skew_ms"]) if key["skew_ms"] else None
     kind = {"camera": f"{key['dtype']} {key['codec'] or ''}", "text": "text"}.get(key["kind"], key["dtype"])
     bounds = [human_number(key[side]) for side in ("low", "high")]
@@ -117,7 +117,7 @@ def _print_checks(report: dict[str, Any]) -> None:
         said = f"{finding['severity']}: {finding['message']}{remedy}"
         findings.setdefault(finding["check"], []).append(said)
     titles = {**CHECKS, "fits": "the embodiment fits", "usable": "episodes the embodiment can use"}
-    titles["robot"] = "pictures and commands of a robot"
+    titles["robot"] = "frames and actions of a robot"
     done = {check: result for check, result in report["checks"].items() if result != NOT_CHECKED}
     print_lines(
         (titles.get(check, check), line)

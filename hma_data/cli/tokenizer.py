@@ -46,7 +46,7 @@ def _print_list(entries: list[Any]) -> None:
         ]
         for entry in entries
     ]
-    print_table(["name", "kind", "picture", "grid", "here", "weights", "licence", "what it is"], rows)
+    print_table(["name", "kind", "image", "grid", "here", "weights", "licence", "what it is"], rows)
 
 
 @tokenizer_app.command("train")
@@ -90,7 +90,7 @@ def tokenizer_train(
 @tokenizer_app.command("eval")
 def tokenizer_eval(
     tokenizer: Annotated[str, Argument(help="Name of the tokenizer.", autocompletion=tokenizers)],
-    data: Annotated[list[str], Argument(help="Pictures, videos, folders of them, recordings, shard sets.")],
+    data: Annotated[list[str], Argument(help="Images, videos, folders of them, recordings, shard sets.")],
     embodiment: Annotated[str | None, robot_option("DATA are recordings of this robot: id or YAML.")] = None,
     weights: Annotated[str | None, Option(help="Its weights, if not the usual ones.")] = None,
     frames: Annotated[int, Option(min=1, help="Frames of each video or episode, evenly spaced.")] = 64,

@@ -5,7 +5,7 @@ extended plan.
 
 A file that holds several episodes changes when one is added. That does not tell whether the other episodes
 changed; the hash of each episode's content does. A worker notes it before it tokenizes the episode. It covers
-all numbers, times and texts, and three pictures a camera.
+all numbers, times and texts, and three frames a camera.
 """
 
 import hashlib
@@ -165,7 +165,7 @@ def _digest_after(earlier: str, pieces: Iterator[str]) -> str:
 
 
 class Content:
-    """The hash of an episode; the caller adds pictures camera after camera, in their order.
+    """The hash of an episode; the caller adds frames camera after camera, in their order.
 
     Args:
         kept: (N,) frames of the clip that become rows of a camera.
@@ -178,7 +178,7 @@ class Content:
         self._looked_at = looked_at(len(kept))
 
     def add(self, start: int, frames: NDArray[np.uint8]) -> None:
-        """Add the next pictures (n, H, W, 3) of a camera; the first of them is its row `start`."""
+        """Add the next frames (n, H, W, 3) of a camera; the first of them is its row `start`."""
         for row in self._looked_at:
             if start <= row < start + len(frames):
                 self._add(frames[row - start])
@@ -196,7 +196,7 @@ class Content:
 
 
 def looked_at(rows: int) -> list[int]:
-    """Return the rows of a camera whose pictures are hashed: the first, the middle and the last."""
+    """Return the rows of a camera whose frames are hashed: the first, the middle and the last."""
     return sorted({0, rows // 2, rows - 1})
 
 

@@ -195,7 +195,7 @@ class Conversion:
             reasons=reasons,
             flags=flags,
             too_many=manifest.quarantined > self.max_quarantine * (episodes + manifest.quarantined),
-            pictures=run.pictures,
+            frame_sizes=run.frame_sizes,
             left_out=run.whole.left_out,
             changed=run.changed,
             warning=warning,
@@ -245,7 +245,7 @@ class _Run:
         if self._opened is not None:
             self._spec = self._opened.spec
         self.whole, self.uri = plan_conversion(given.embodiment, given.source, self._spec, given.settings)
-        self.pictures: dict[str, tuple[int, int]] = {}
+        self.frame_sizes: dict[str, tuple[int, int]] = {}
         self.changed = ""
 
     def plan(self) -> tuple[Plan, Manifest | None]:
@@ -301,7 +301,7 @@ class _Run:
             kept_shards=len(kept) + (len(base.shards) if base else 0),
             total_episodes=sum(len(unit) for unit in mine),
             total_frames=_encoded(mine, layout),
-            pictures=self.pictures,
+            frame_sizes=self.frame_sizes,
         )
         idle = idle_workers(plan, len(todo), self.workers, tasks, bool(there))
         has_none = bool(plan.units) and not mine  # a share may have no shard at all

@@ -37,7 +37,7 @@ from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.records import BATCH, Records, schema_of, values_of
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 
-FRAMES, TRIED = 64, 5  # of an estimate: pictures tokenized, episodes tried
+FRAMES_TOKENIZED, EPISODES_TRIED = 64, 5  # of an estimate
 SHARDS_A_WORKER = 4  # so that the last shards of a job do not leave most workers waiting
 VAL_FRACTION = 0.05
 HELD_OUT = 5  # episodes of a small set: fewer give a verdict on a model no interval to speak of
@@ -372,14 +372,14 @@ class Estimate:
         frames_per_second: of one worker, decoding included; None when no episode could be read.
         seconds: until the last worker ends; None when no episode could be read.
         fault: why no episode could be read.
-        pictures: camera -> [height, width] of its recorded pictures.
+        frame_sizes: camera -> [height, width] of its recorded frames.
     """
 
     bytes: int
     frames_per_second: float | None
     seconds: float | None
     fault: str = ""
-    pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
+    frame_sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
 def estimate(
@@ -396,18 +396,18 @@ def estimate(
     size = int(rows * bytes_a_row(layout))
     source = open_source(embodiment.source.format)
     fault = ""
-    for _, ref in islice((item for unit in plan.units for item in unit.episodes), TRIED):
+    for _, ref in islice((item for unit in plan.units for item in unit.episodes), EPISODES_TRIED):
         try:
             begun = time.monotonic()
             clip = read_clip(source, as_text(uri), ref.id, embodiment, layout.cameras)
-            kept, pictures = layout.kept(len(clip))[:FRAMES], {}
+            kept, sizes = layout.kept(len(clip))[:FRAMES_TOKENIZED], {}
             for name in layout.cameras:
                 raw, spec = clip.frames_at(name, kept), tokenizer.spec
                 tokenizer.encode(prepare(raw, embodiment.camera(name), spec.image_size, spec.resize_filter))
-                pictures[name] = (raw.shape[1], raw.shape[2])
+                sizes[name] = (raw.shape[1], raw.shape[2])
             rate = len(kept) / (time.monotonic() - begun)
             slowest = longest_work([unit.frames for unit in plan.units], workers, tasks)
-            return Estimate(size, rate, slowest / layout.frame_stride / rate, pictures=pictures)
+            return Estimate(size, rate, slowest / layout.frame_stride / rate, frame_sizes=sizes)
         except HMAError as refused:
             fault = str(refused)
     return Estimate(size, None, None, fault)
@@ -458,8 +458,8 @@ def bytes_a_row(layout: RowLayout) -> float:
     spec = layout.tokenizer
     h, w = spec.grid
     if spec.kind == "discrete":
-        picture = h * w * math.ceil(math.log2(spec.vocab_size or 2)) / 8
+        frame = h * w * math.ceil(math.log2(spec.vocab_size or 2)) / 8
     else:
-        picture = h * w * (spec.channels or 1) * np.dtype(spec.dtype).itemsize
-    picture *= len(layout.cameras)
-    return picture + 4 * (layout.frame_stride * layout.widths["action"] + layout.widths.get("state", 0))
+        frame = h * w * (spec.channels or 1) * np.dtype(spec.dtype).itemsize
+    frame *= len(layout.cameras)
+    return frame + 4 * (layout.frame_stride * layout.widths["action"] + layout.widths.get("state", 0))

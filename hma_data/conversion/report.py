@@ -34,7 +34,7 @@ class Progress:
     total_episodes: int = 0
     total_frames: int = 0
     retries: list[str] = field(default_factory=list)
-    pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
+    frame_sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
     notices: list[str] = field(default_factory=list)
     started: float = field(default_factory=time.monotonic)
 
@@ -47,7 +47,7 @@ class Summary:
         reasons: error type and message (without the ids where there are several) -> number of episodes
             refused for it.
         flags: name -> count over all episodes, such as masked_actions; see docs/format.md.
-        pictures: camera -> (height, width) of its recorded pictures; empty if no shard was made.
+        frame_sizes: camera -> (height, width) of its recorded frames; empty if no shard was made.
         left_out: number of the recording's episodes that `only` and `exclude` leave out.
         too_many: True where more than `max_quarantine` was refused; the command ends with exit code 1.
         changed: what the YAML says now that a finished set did not say yet; empty if nothing.
@@ -64,7 +64,7 @@ class Summary:
     reasons: dict[str, int]
     flags: dict[str, int]
     too_many: bool
-    pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
+    frame_sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
     left_out: int = 0
     changed: str = ""
     warning: str = ""
@@ -99,7 +99,7 @@ class Counter:
 
     def __call__(self, unit: int, event: Tick | Seen | Retry | Notice) -> None:
         if isinstance(event, Seen):
-            self._progress.pictures.setdefault(event.camera, (event.height, event.width))
+            self._progress.frame_sizes.setdefault(event.camera, (event.height, event.width))
             return
         if isinstance(event, Notice):
             self._progress.notices.append(event.text)

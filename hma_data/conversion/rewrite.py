@@ -59,12 +59,15 @@ from hma_data.storage.remote import parquet_input, place
 from hma_data.tokenizers.base import TokenizerSpec
 
 OnProgress = Callable[[int, int], None]
-AGAIN = "run the same hma convert again"
-MARKS = ("synthetic", "inferred_actions")  # of sets that no robot recorded, in `made_by` of their plans
+CONVERT_AGAIN = "run the same hma convert again"
+SYNTHETIC_MARKS = (
+    "synthetic",
+    "inferred_actions",
+)  # of sets that no robot recorded, in `made_by` of their plans
 
 
 @dataclass(frozen=True)
-class _Job:
+class _NewSet:
     """The description of a shard set to make of others, which share embodiment, tokenizer and row layout.
 
     Attributes:
@@ -130,7 +133,7 @@ class _Job:
             return manifest
 
 
-def _make_shard(job: _Job, plan: Plan, out: Path, unit: ShardUnit, refused: Sequence[Refused]) -> None:
+def _make_shard(job: _NewSet, plan: Plan, out: Path, unit: ShardUnit, refused: Sequence[Refused]) -> None:
     readers = [EpisodeReader(shards, shards.columns()) for shards in job.sets]
     layout = replace(job.sets[0].manifest.layout, embodiment=job.embodiment)
     stats = layout.empty_stats()
@@ -208,7 +211,7 @@ def merge(
         _check_alike(first, other)
     episodes, refused = _joined([_rows(shards) for shards in sets], [_refused(shards) for shards in sets])
     made_by: dict[str, Any] = {"merge": [shards.manifest.plan["hash"] for shards in sets]}
-    for mark in MARKS:  # of some of the episodes is of the set
+    for mark in SYNTHETIC_MARKS:  # of some of the episodes is of the set
         if any(shards.manifest.plan.get("made_by", {}).get(mark) for shards in sets):
             made_by[mark] = True
     stateless = any(shards.embodiment.state is None for shards in sets)
@@ -216,7 +219,9 @@ def merge(
     sources = list(dict.fromkeys(shards.manifest.source for shards in sets))
     source = sources[0] if len(sources) == 1 else f"merged of {len(sources)} recordings, first {sources[0]}"
     settings = replace(_settings(first), limit=None, only=(), exclude=())
-    job = _Job(sets, embodiment, settings, episodes, pa.repeat("", len(episodes)), source, refused, made_by)
+    job = _NewSet(
+        sets, embodiment, settings, episodes, pa.repeat("", len(episodes)), source, refused, made_by
+    )
     return job.run(out, workers, on_progress)
 
 
@@ -284,7 +289,7 @@ def split(
     episodes = _with_columns(rows, split=pa.repeat("", len(rows)), set=pa.repeat(0, len(rows)))
     made_by = {} if by == "episode" else {"split_by": by}
     refused, source = _refused(shards), shards.manifest.source
-    job = _Job([shards], shards.embodiment, settings, episodes, together, source, refused, made_by)
+    job = _NewSet([shards], shards.embodiment, settings, episodes, together, source, refused, made_by)
     return job.run(out, workers, on_progress)
 
 
@@ -440,10 +445,12 @@ def _as_found(folder: Path) -> tuple[list[str], dict[str, Any], str, Embodiment]
     # the plan's digest holds unless an episode is in quarantine
     cut = [(name, footer.table["episode_index"].to_pylist()) for name, footer in zip(names, footers)]
     if not gapless or not (plan["shards"] == digest(cut) or _lists(folder, gathered)):
-        raise ShardError(folder, "cannot tell from its files whether all its shards are there", AGAIN)
+        raise ShardError(folder, "cannot tell from its files whether all its shards are there", CONVERT_AGAIN)
     embodiment = stored_embodiment(folder)
     if embodiment.digest != plan["embodiment_hash"]:
-        raise ShardError(folder / EMBODIMENT, "is not the embodiment the shards were made with", AGAIN)
+        raise ShardError(
+            folder / EMBODIMENT, "is not the embodiment the shards were made with", CONVERT_AGAIN
+        )
     return names, plan, gathered.source, embodiment
 
 

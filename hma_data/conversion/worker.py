@@ -84,7 +84,7 @@ class Tick:
 
 @dataclass(frozen=True)
 class Seen:
-    """The size of a camera's recorded pictures in pixels, reported in the first episode of a shard."""
+    """The size of a camera's recorded frames in pixels, reported in the first episode of a shard."""
 
     camera: str
     height: int
@@ -172,10 +172,10 @@ class _Episode:
 
     Attributes:
         content: hash over what was read of it.
-        read: whether all its pictures are in the queue, or encoded.
+        read: whether all its frames are in the queue, or encoded.
         waiting: frames that are in the queue.
         tokens: camera -> tokens of the frames that are encoded.
-        flags: of its grid and its pictures, see `rate_flags` and `picture_flags`.
+        flags: of its grid and its frames, see `rate_flags` and `picture_flags`.
     """
 
     index: int
@@ -189,25 +189,25 @@ class _Episode:
 
 
 @dataclass(frozen=True)
-class _Pictures:
-    """The next pictures (n, S, S, 3) of a camera of the episode that was begun."""
+class _Frames:
+    """The next frames (n, S, S, 3) of a camera of the episode that was begun."""
 
     camera: str
     frames: Frames
 
 
 class _End:
-    """The end of the episode that was begun: all its pictures have come."""
+    """The end of the episode that was begun: all its frames have come."""
 
 
-# An episode is begun by itself, goes on with its pictures, and ends with _End; or it is refused.
-Decoded = _Episode | _Pictures | _End | Refused
+# An episode is begun by itself, goes on with its frames, and ends with _End; or it is refused.
+Decoded = _Episode | _Frames | _End | Refused
 
 
 def _decoded(job: Job, unit: ShardUnit, report: Report, attempt: Attempt) -> Iterator[Decoded]:
     """Read the episodes of a shard, each as the items that `Decoded` names.
 
-    This runs ahead in a thread. An episode may begin again, or be refused, after some of its pictures; its
+    This runs ahead in a thread. An episode may begin again, or be refused, after some of its frames; its
     earlier items are then void.
     """
     source = open_source(job.embodiment.source.format)
@@ -261,7 +261,7 @@ def _episode(
                 frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
                 content.add(start, frames)
                 seen.add(frames)
-                yield _Pictures(name, frames)
+                yield _Frames(name, frames)
         except EpisodeError as fault:
             if len(layout.cameras) == 1:
                 raise
@@ -286,7 +286,7 @@ def _tokenized(
             yield unfinished.popleft()
 
     for item in items:
-        if isinstance(item, _Pictures):
+        if isinstance(item, _Frames):
             assert begun is not None
             report(Tick(frames=batches.add(begun, item.camera, item.frames)))
         elif isinstance(item, _End):

@@ -1,4 +1,4 @@
-"""Show a shard set: in figures, and as pictures decoded from its tokens with the actions drawn as curves.
+"""Show a shard set: in figures, and as images decoded from its tokens with the actions drawn as curves.
 
 `describe` needs the manifest and episodes.parquet alone. T rows of an episode, A values of an action.
 """
@@ -34,13 +34,28 @@ from hma_data.sources.common.choice import chosen_ids
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
-THUMB, GAP, LABEL, STRIPS, FILM = 144, 4, 18, 22, 256  # pixels; STRIPS is the height of a strip in the sheet
-DECODED = 16  # frames decoded at a time
-LINE, CURSOR, ZERO, UNKNOWN = (0, 114, 178), (213, 94, 0), (200, 200, 200), (225, 225, 225)
-MOST = 16  # strips; of further values only the number is shown
-LABELS, NAMES, FOOT = 240, 120, 16  # pixels left of the strips, of the names in them, and below the strips
-BESIDE = 232  # pixels by which the curves of the video are wider than its picture
-SMALL = 0.36  # scale of the text beside the strips
+THUMB_SIDE, GAP, LABEL_HEIGHT, STRIP_HEIGHT, FILM_SIDE = (
+    144,
+    4,
+    18,
+    22,
+    256,
+)  # pixels; STRIP_HEIGHT is the height of a strip in the sheet
+FRAMES_DECODED = 16  # frames decoded at a time
+LINE_COLOUR, CURSOR_COLOUR, ZERO_COLOUR, UNKNOWN_COLOUR = (
+    (0, 114, 178),
+    (213, 94, 0),
+    (200, 200, 200),
+    (225, 225, 225),
+)
+MOST_STRIPS = 16  # strips; of further values only the number is shown
+LABELS_WIDTH, NAMES_WIDTH, FOOT_HEIGHT = (
+    240,
+    120,
+    16,
+)  # pixels left of the strips, of the names in them, and below the strips
+CURVES_WIDER = 232  # pixels by which the curves of the video are wider than its frame
+TEXT_SCALE = 0.36  # scale of the text beside the strips
 
 
 # -- in figures
@@ -126,7 +141,7 @@ class Curves:
         low, high: (A,) range of each value, over the whole set.
         names: A names.
         seconds: time from the first row to the last.
-        width, height: size of the picture in pixels.
+        width, height: size of the image in pixels.
     """
 
     values: NDArray[np.float32]
@@ -141,35 +156,37 @@ class Curves:
     @cached_property
     def panel(self) -> Images:
         """Draw all curves without a cursor; (height, width, 3)."""
-        picture = np.full((self.height, self.width, 3), PAPER, np.uint8)
-        shown = min(self.values.shape[1], MOST)
+        image = np.full((self.height, self.width, 3), PAPER, np.uint8)
+        shown = min(self.values.shape[1], MOST_STRIPS)
         rest = self.values.shape[1] - shown
-        tall = (self.height - FOOT) // max(shown, 1)
+        tall = (self.height - FOOT_HEIGHT) // max(shown, 1)
         for dim in range(shown):
-            self._strip(picture, dim, dim * tall, tall)
+            self._strip(image, dim, dim * tall, tall)
         text = f"0 to {self.seconds:.1f} s" + (f", {rest} more values" if rest else "")
-        write_text(picture, text, (LABELS, self.height - 4), SMALL)
-        return picture
+        write_text(image, text, (LABELS_WIDTH, self.height - 4), TEXT_SCALE)
+        return image
 
     def at(self, row: int) -> Images:
         """Return the panel with a cursor at a row."""
-        picture = self.panel.copy()
+        image = self.panel.copy()
         x = self._x(np.array([row]))[0]
-        picture[: self.height - FOOT, max(x - 1, 0) : x + 1] = CURSOR
-        return picture
+        image[: self.height - FOOT_HEIGHT, max(x - 1, 0) : x + 1] = CURSOR_COLOUR
+        return image
 
     def marked(self, rows: NDArray[np.int64]) -> Images:
         """Return the panel with a tick below each of these rows."""
-        picture = self.panel.copy()
+        image = self.panel.copy()
         for x in self._x(rows):
-            picture[self.height - FOOT - 2 : self.height - FOOT + 3, x - 1 : x + 2] = CURSOR
-        return picture
+            image[self.height - FOOT_HEIGHT - 2 : self.height - FOOT_HEIGHT + 3, x - 1 : x + 2] = (
+                CURSOR_COLOUR
+            )
+        return image
 
     def _x(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         last = max(len(self.values) - 1, 1)
-        return (LABELS + rows / last * (self.width - LABELS - 6)).round().astype(np.int64)
+        return (LABELS_WIDTH + rows / last * (self.width - LABELS_WIDTH - 6)).round().astype(np.int64)
 
-    def _strip(self, picture: Images, dim: int, top: int, tall: int) -> None:
+    def _strip(self, image: Images, dim: int, top: int, tall: int) -> None:
         cv2 = opencv()
         inner = max(tall - 5, 3)
         span = self.high[dim] - self.low[dim]
@@ -182,29 +199,29 @@ class Curves:
         x = self._x(np.arange(len(self.values)))
         if self.known is not None:
             for at in x[~self.known]:
-                picture[top + 2 : top + 3 + inner, max(at - 1, 0) : at + 2] = UNKNOWN
+                image[top + 2 : top + 3 + inner, max(at - 1, 0) : at + 2] = UNKNOWN_COLOUR
         if self.low[dim] <= 0 <= self.high[dim]:
-            picture[y(np.zeros(1))[0], LABELS : self.width - 6] = ZERO
+            image[y(np.zeros(1))[0], LABELS_WIDTH : self.width - 6] = ZERO_COLOUR
         points = np.stack([x, y(self.values[:, dim])], axis=1).astype(np.int32).reshape(-1, 1, 2)
-        cv2.polylines(picture, [points], False, LINE, 1, cv2.LINE_AA)
-        picture[top + 2 : top + 3 + inner, LABELS - 1] = INK
+        cv2.polylines(image, [points], False, LINE_COLOUR, 1, cv2.LINE_AA)
+        image[top + 2 : top + 3 + inner, LABELS_WIDTH - 1] = INK
         if tall >= 10:
             height = top + tall // 2 + 4
             limits = f"{self.low[dim]:.2g} to {self.high[dim]:.2g}"
-            write_text(picture, self._names[dim], (4, height), SMALL)
-            write_text(picture, limits, (LABELS - 6 - text_width(limits, SMALL), height), SMALL)
+            write_text(image, self._names[dim], (4, height), TEXT_SCALE)
+            write_text(image, limits, (LABELS_WIDTH - 6 - text_width(limits, TEXT_SCALE), height), TEXT_SCALE)
 
     @cached_property
     def _names(self) -> list[str]:
-        return fitted_names(self.names[:MOST], NAMES - 8, SMALL)
+        return fitted_names(self.names[:MOST_STRIPS], NAMES_WIDTH - 8, TEXT_SCALE)
 
 
-# -- in pictures
+# -- in images
 
 
 @dataclass(frozen=True)
 class Preview:
-    """The files that were written, the ids of the episodes in them, and what became of the pictures.
+    """The files that were written, the ids of the episodes in them, and what became of the frames.
 
     Attributes:
         resized: a line for each camera whose YAML states its size, see `describe_resize`.
@@ -254,7 +271,7 @@ def preview(
         out: str or path of the folder to write to.
         weights: str or path, as `get_tokenizer` takes them.
         episodes: number of episodes, evenly spaced from the first to the last.
-        columns: number of pictures of each episode in the sheet.
+        columns: number of frames of each episode in the sheet.
         camera: name of the camera; None shows all cameras of the set.
         frames: largest number of frames of each episode in the video.
         tokenizer: tokenizer that decodes; None takes the set's own.
@@ -308,7 +325,7 @@ class _Seen:
         views = {camera: reader.episode(row, camera) for camera in cameras}
         self._tokens = {camera: view[token_column(shards.spec)[0]] for camera, view in views.items()}
         values = views[cameras[0]]
-        self._actions = values["action"][:, : shards.embodiment.action_dim]  # the first command of a chunk
+        self._actions = values["action"][:, : shards.embodiment.action_dim]  # the first action of a chunk
         self._known = values.get("action_known")
         self._seconds = float(values["timestamp"][-1])
         self._length = row["length"]
@@ -317,8 +334,8 @@ class _Seen:
         words = [row["id"], row["split"], length, row["instruction"], success]
         self.label = "   ".join(word for word in words if word)
 
-    def _pictures(self, rows: NDArray[np.int64]) -> dict[str, Images]:
-        """Return camera -> pictures (n, S, S, 3) of some rows."""
+    def _images(self, rows: NDArray[np.int64]) -> dict[str, Images]:
+        """Return camera -> images (n, S, S, 3) of some rows."""
         return {
             camera: self._tokenizer.decode(self._shards.tokens(tokens[rows]))
             for camera, tokens in self._tokens.items()
@@ -332,37 +349,39 @@ class _Seen:
         return Curves(self._actions, known, low, high, names, self._seconds, width, height)
 
     def sheet(self, columns: int) -> Images:
-        """Return (H, W, 3): the label, a row of pictures a camera, and the actions of the whole episode."""
+        """Return (H, W, 3): the label, a row of frames a camera, and the actions of the whole episode."""
         picks = np.unique(np.linspace(0, self._length - 1, columns).astype(int))
-        width = columns * (THUMB + GAP) + GAP
+        width = columns * (THUMB_SIDE + GAP) + GAP
         shown = min(self._actions.shape[1], 16)
-        curves = self._curves(width, 16 + max(shown * STRIPS, 40))
+        curves = self._curves(width, 16 + max(shown * STRIP_HEIGHT, 40))
         strips = []
-        for number, (camera, pictures) in enumerate(self._pictures(picks).items()):
-            strip = np.full((LABEL + THUMB + GAP, width, 3), PAPER, np.uint8)
+        for number, (camera, images) in enumerate(self._images(picks).items()):
+            strip = np.full((LABEL_HEIGHT + THUMB_SIDE + GAP, width, 3), PAPER, np.uint8)
             named = [camera] if len(self._tokens) > 1 else []
             words = "   ".join([*named, *([] if number else [self.label])])
-            write_text(strip, fitted(words, width - 2 * GAP), (GAP, LABEL - 5))
-            for place, picture in enumerate(pictures):
-                left = GAP + place * (THUMB + GAP)
-                strip[LABEL : LABEL + THUMB, left : left + THUMB] = _resized(picture, THUMB)
+            write_text(strip, fitted(words, width - 2 * GAP), (GAP, LABEL_HEIGHT - 5))
+            for place, image in enumerate(images):
+                left = GAP + place * (THUMB_SIDE + GAP)
+                strip[LABEL_HEIGHT : LABEL_HEIGHT + THUMB_SIDE, left : left + THUMB_SIDE] = _resized(
+                    image, THUMB_SIDE
+                )
             strips.append(strip)
         return np.concatenate([*strips, curves.marked(picks), np.full((2, width, 3), INK, np.uint8)])
 
     def film(self, most: int) -> Iterator[Images]:
-        """Yield (H, W, 3) for each frame: the pictures, and the actions with a cursor at its time."""
-        curves = self._curves(FILM + BESIDE, FILM)
-        width = (len(self._tokens) + 1) * FILM + BESIDE
-        for start in range(0, min(self._length, most), DECODED):
-            rows = np.arange(start, min(start + DECODED, self._length, most))
-            for row, *pictures in zip(rows, *self._pictures(rows).values()):
-                bar = np.full((LABEL, width, 3), PAPER, np.uint8)
-                write_text(bar, fitted(self.label, width - 2 * GAP), (GAP, LABEL - 5))
-                parts = [*(_resized(picture, FILM) for picture in pictures), curves.at(int(row))]
+        """Yield (H, W, 3) for each frame: its images, and the actions with a cursor at its time."""
+        curves = self._curves(FILM_SIDE + CURVES_WIDER, FILM_SIDE)
+        width = (len(self._tokens) + 1) * FILM_SIDE + CURVES_WIDER
+        for start in range(0, min(self._length, most), FRAMES_DECODED):
+            rows = np.arange(start, min(start + FRAMES_DECODED, self._length, most))
+            for row, *images in zip(rows, *self._images(rows).values()):
+                bar = np.full((LABEL_HEIGHT, width, 3), PAPER, np.uint8)
+                write_text(bar, fitted(self.label, width - 2 * GAP), (GAP, LABEL_HEIGHT - 5))
+                parts = [*(_resized(image, FILM_SIDE) for image in images), curves.at(int(row))]
                 yield np.concatenate([bar, np.concatenate(parts, axis=1)])
 
 
-def _resized(picture: Images, side: int) -> Images:
+def _resized(image: Images, side: int) -> Images:
     cv2 = opencv()
-    way = cv2.INTER_AREA if picture.shape[0] >= side else cv2.INTER_NEAREST
-    return np.asarray(cv2.resize(picture, (side, side), interpolation=way), np.uint8)
+    way = cv2.INTER_AREA if image.shape[0] >= side else cv2.INTER_NEAREST
+    return np.asarray(cv2.resize(image, (side, side), interpolation=way), np.uint8)

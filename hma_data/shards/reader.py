@@ -33,9 +33,9 @@ from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import AHEAD, RangeFile, RemotePath, parquet_file, place
 
 Ints = NDArray[np.int64]
-LIMIT, DEFAULT_GB = "HMA_CACHE_GB", 20.0
+CACHE_VARIABLE, DEFAULT_GB = "HMA_CACHE_GB", 20.0
 IN_USE_S = 3600.0
-SPARE, SPARE_BYTES = 0.1, 5 * 10**9  # free space to leave: a tenth of the disk, but at most 5 GB
+SPARE_SHARE, SPARE_BYTES = 0.1, 5 * 10**9  # free space to leave: a tenth of the disk, but at most 5 GB
 
 
 @dataclass(frozen=True)
@@ -279,12 +279,12 @@ def _words(column: pa.ChunkedArray) -> tuple[Ints, list[str]]:
 
 def limit_bytes() -> int:
     """Return how many bytes of shards may be kept."""
-    stated = os.environ.get(LIMIT) or DEFAULT_GB
+    stated = os.environ.get(CACHE_VARIABLE) or DEFAULT_GB
     try:
         return int(float(stated) * 1e9)
     except (ValueError, OverflowError) as fault:
         text = f"{stated!r} is no number of gigabytes"
-        raise UsageError(f"${LIMIT}", text, "give for example 20, or 0 for no cache") from fault
+        raise UsageError(f"${CACHE_VARIABLE}", text, "give for example 20, or 0 for no cache") from fault
 
 
 def kept_shard(path: RemotePath, sha256: str, size: int) -> Path | None:
@@ -348,7 +348,7 @@ def _make_room(folder: Path, size: int) -> bool:
             facts = path.stat()
             found.append((facts.st_mtime, facts.st_size, path))
     limit, disk = limit_bytes(), shutil.disk_usage(folder)
-    usable = disk.free - min(int(SPARE * disk.total), SPARE_BYTES)
+    usable = disk.free - min(int(SPARE_SHARE * disk.total), SPARE_BYTES)
     over = max(sum(item[1] for item in found) + size - limit, size - usable)
     old = [item for item in sorted(found) if item[0] < time.time() - IN_USE_S]
     if size > limit or over > sum(item[1] for item in old):

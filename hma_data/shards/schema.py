@@ -295,7 +295,7 @@ class RowLayout:
 
     @property
     def strided(self) -> bool:
-        """Check whether rows leave out recorded steps, and an action holds several commands."""
+        """Check whether rows leave out recorded steps, and an action value holds several recorded actions."""
         return self.frame_stride > 1
 
     @property

@@ -46,7 +46,10 @@ from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import parquet_file, parquet_input, place
 
 REMAKE = "delete it and run the same hma convert again"
-KNOWN = {"action": "action_known", "state": "state_known"}  # bool columns of sets whose values can be missing
+MASK_COLUMNS = {
+    "action": "action_known",
+    "state": "state_known",
+}  # bool columns of sets whose values can be missing
 OnProgress = Callable[[int, int], None]
 
 
@@ -231,7 +234,7 @@ def _row_problems(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Ma
         found.append("column frame_index does not count up from 0 in every episode")
     if (np.diff(columns["timestamp"])[np.diff(columns["frame_index"]) > 0] < 0).any():
         found.append("timestamps go back within an episode")
-    for name, mask in KNOWN.items():
+    for name, mask in MASK_COLUMNS.items():
         if mask in columns and columns[name][~columns[mask]].any():
             found.append(f"column {name} is not 0 where {mask} is false")
     return found
@@ -262,7 +265,7 @@ def _stats_problems(
         if said is None or len(said.mean) != len(own.mean):
             found.append(f"its footer has no statistics of {name}")
         elif manifest.layout.strided:
-            masked = int((~columns[KNOWN[name]]).sum()) if KNOWN[name] in columns else 0
+            masked = int((~columns[MASK_COLUMNS[name]]).sum()) if MASK_COLUMNS[name] in columns else 0
             if not own.count <= said.count <= stride * (own.count + len(footer.episodes) + masked):
                 counted = f"count {said.count} steps, its rows {own.count}"
                 found.append(f"{name} statistics in its footer {counted}")

@@ -3,7 +3,7 @@
 A reader that knows which parts it will need says so (`Blocks.expect`). While it reads such a part, the next
 blocks of expected parts are on their way. Blocks that nobody expects are fetched when they are read.
 
-What a reader will need once more, such as the pictures of an episode of which it looks for the times first,
+What a reader will need once more, such as the frames of an episode of which it looks for the times first,
 it can keep until then. One cache serves all files of a process, so memory does not grow with their number or
 size.
 """
@@ -25,9 +25,9 @@ from hma_data.errors import StorageError
 from hma_data.storage.remote import RemotePath, SeekableFile, fetch_range
 
 BLOCK = 1 << 20  # bytes of a request
-AHEAD = 32  # expected blocks on their way while one is read
-KEPT = 64  # blocks in memory
-PARTS = 256 << 20  # most bytes of parts in memory, such as pictures, that will be read once more
+BLOCKS_AHEAD = 32  # expected blocks on their way while one is read
+BLOCKS_KEPT = 64  # blocks in memory
+PART_BYTES = 256 << 20  # most bytes of parts in memory, such as frames, that will be read once more
 REQUESTS = 16  # at once
 
 Fetch = Callable[[int, int], bytes]  # (start, end) -> the bytes between them
@@ -49,7 +49,7 @@ class _Cache:
         with self._lock:
             self._bytes += len(data) - len(self._parts.pop(key, b""))
             self._parts[key] = data
-            while self._bytes > PARTS:
+            while self._bytes > PART_BYTES:
                 self._bytes -= len(self._parts.popitem(last=False)[1])
 
     def take(self, key: tuple[int, Hashable]) -> bytes | None:
@@ -67,7 +67,7 @@ class _Cache:
             else:
                 self._blocks[key] = self._pool.submit(load)
             found = self._blocks[key]
-            while len(self._blocks) > KEPT:
+            while len(self._blocks) > BLOCKS_KEPT:
                 self._blocks.popitem(last=False)
         return found
 
@@ -124,7 +124,7 @@ class Blocks:
         numbers = range(start // BLOCK, (end - 1) // BLOCK + 1)
         pieces = []
         for number in numbers:
-            self._prefetch(range(number + 1, min(number + 1 + AHEAD, numbers.stop)))
+            self._prefetch(range(number + 1, min(number + 1 + BLOCKS_AHEAD, numbers.stop)))
             pieces.append(memoryview(self.block(number)))
         pieces[-1] = pieces[-1][: end - numbers[-1] * BLOCK]
         pieces[0] = pieces[0][start - numbers[0] * BLOCK :]
@@ -134,7 +134,7 @@ class Blocks:
         """Return a block, and let the expected blocks after it be fetched."""
         found = self._want(number)
         if self.expects(number * BLOCK):
-            self._ahead(int(np.searchsorted(self._expected, number)) + 1, AHEAD)
+            self._ahead(int(np.searchsorted(self._expected, number)) + 1, BLOCKS_AHEAD)
         if found.exception():  # waits for it
             _cache(os.getpid()).forget((self._number, number))
         return found.result()

@@ -48,9 +48,9 @@ def misplaced(path: Path, wanted: str) -> tuple[str, str] | None:
 
 
 def own_layout(files: Iterable[Path]) -> str:
-    """Return the pictures, arrays and tables among the files, such as `60 .png, 2 .csv`.
+    """Return the images, arrays and tables among the files, such as `60 .png, 2 .csv`.
 
-    The result is empty without pictures or arrays: then it is no recording in a layout of somebody's own.
+    The result is empty without images or arrays: then it is no recording in a layout of somebody's own.
     """
     counts = Counter(".zarr" if ".zarr/" in file.as_posix() else file.suffix.lower() for file in files)
     held = [f"{counts[suffix]:,} {suffix}" for suffix in (*_ARRAYS, *_TABLES) if counts[suffix]]

@@ -54,7 +54,7 @@ def evaluate(
         bool,
         Option(
             "--state",
-            help="Measure what the robot does in the pictures, against its recorded or simulated state.",
+            help="Measure what the robot does in the frames, against its recorded or simulated state.",
         ),
     ] = False,
     episodes: Annotated[

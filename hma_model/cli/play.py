@@ -28,7 +28,7 @@ def play(
         list[Path] | None, Argument(help="Shard sets, whose held-out episodes give more scenes.")
     ] = None,
     prompt: Annotated[
-        list[Path] | None, Option(help="A picture to begin from; repeat it for several, in their order.")
+        list[Path] | None, Option(help="An image to begin from; repeat it for several, in their order.")
     ] = None,
     embodiment: Annotated[
         str | None,
@@ -56,8 +56,8 @@ def play(
     from hma_model.worlds.images import read_image
     from hma_model.worlds.scenes import drivable, opening, trained_on
 
-    # what is wrong with it, the data or the pictures is said before torch is imported
-    sets, pictures = list(map(ShardSet, data or ())), list(map(read_image, prompt or ()))
+    # what is wrong with it, the data or the images is said before torch is imported
+    sets, images = list(map(ShardSet, data or ())), list(map(read_image, prompt or ()))
     require_checkpoint(checkpoint)
     opened, device = located(checkpoint)[0], device_name(device)
 
@@ -68,10 +68,10 @@ def play(
         return get_tokenizer(opened.config.tokenizer["name"], device=device)
 
     sets = sets or trained_on(opened)
-    robots = drivable(opened, sets, tokenizer, pictures)
-    first = opening(robots, embodiment, "images" if pictures else "recordings" if sets else None)
-    if len(opened.embodiments) > 1 and pictures and embodiment is None:
-        print("the picture is offered for every robot; -e ROBOT opens the page with yours", file=sys.stderr)
+    robots = drivable(opened, sets, tokenizer, images)
+    first = opening(robots, embodiment, "images" if images else "recordings" if sets else None)
+    if len(opened.embodiments) > 1 and images and embodiment is None:
+        print("the image is offered for every robot; -e ROBOT opens the page with yours", file=sys.stderr)
     from hma_model.play.server import LOOPBACK, serve
 
     listener = _listen(host, port)

@@ -31,7 +31,7 @@ def policy_eval(
         Argument(
             metavar="POLICY…",
             help="scripted, reach, either with :noise=SHARE, random, still, hma:CHECKPOINT, plan:cem, "
-            "lerobot:FOLDER_OR_REPO, or MODULE:NAME of a Python function or class: picture to command.",
+            "lerobot:FOLDER_OR_REPO, or MODULE:NAME of a Python function or class: image to action.",
         ),
     ],
     checkpoint: OfCheckpoint = "embedded",

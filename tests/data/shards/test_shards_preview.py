@@ -9,7 +9,7 @@ import pytest
 
 from hma_data.conversion.plan import Settings
 from hma_data.errors import UsageError
-from hma_data.shards.preview import CURSOR, UNKNOWN, Curves, preview
+from hma_data.shards.preview import CURSOR_COLOUR, UNKNOWN_COLOUR, Curves, preview
 from tests.conftest import BlockTokenizer, toy_shards
 
 
@@ -71,7 +71,7 @@ def test_curves_of_any_size_are_drawn(shape: tuple[int, int]) -> None:
     values = np.random.default_rng(0).normal(size=shape)
     picture = curves(values).at(0)
     assert picture.shape == (200, 400, 3)
-    assert count(picture, CURSOR) >= 100
+    assert count(picture, CURSOR_COLOUR) >= 100
     assert lines(curves(values).panel) > 20 or shape[0] == 1
 
 
@@ -82,5 +82,5 @@ def test_constant_and_huge_values_are_drawn() -> None:
 
 def test_what_is_not_known_is_grey() -> None:
     values = np.sin(np.arange(40.0))[:, None]
-    assert count(curves(values, np.arange(40) % 20 > 5).panel, UNKNOWN) > 1000
-    assert count(curves(values, np.ones(40, bool)).panel, UNKNOWN) < 100
+    assert count(curves(values, np.arange(40) % 20 > 5).panel, UNKNOWN_COLOUR) > 1000
+    assert count(curves(values, np.ones(40, bool)).panel, UNKNOWN_COLOUR) < 100

@@ -138,7 +138,7 @@ def test_blocks_ahead_are_fetched_before_they_are_read() -> None:
     assert file.read(file.size - 9, file.size + 100) == bytes(9)
     for number in range(90, 100):
         file.block(number)
-    assert set(asked) == {3, 4, *range(50, 50 + blocks.AHEAD), *range(90, 101)}
+    assert set(asked) == {3, 4, *range(50, 50 + blocks.BLOCKS_AHEAD), *range(90, 101)}
     assert len(asked) == len(set(asked))  # each block once
 
 

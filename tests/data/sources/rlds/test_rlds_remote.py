@@ -85,7 +85,7 @@ def test_the_next_shard_is_on_its_way_before_this_one_ends_and_no_more(tmp_path,
         open_folder(uri).example(f"train/{i:06d}")
         settled()
         ahead = sum(stop - start for _, start, stop in ranges)
-        assert ahead <= (i + 1) * size / EPISODES + (blocks.AHEAD + 3) * blocks.BLOCK
+        assert ahead <= (i + 1) * size / EPISODES + (blocks.BLOCKS_AHEAD + 3) * blocks.BLOCK
         reached.append(max(number for number, _, _ in ranges))
     assert reached[0] == "00000" and reached[-1] == "00001"
 
