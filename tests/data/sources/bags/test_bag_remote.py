@@ -36,8 +36,8 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small blocks, as the files are small."""
     monkeypatch.setattr(blocks, "BLOCK", 4096)
-    monkeypatch.setattr(blocks, "AHEAD", 2)
-    monkeypatch.setattr(blocks, "KEPT", 16)
+    monkeypatch.setattr(blocks, "BLOCKS_AHEAD", 2)
+    monkeypatch.setattr(blocks, "BLOCKS_KEPT", 16)
 
 
 @pytest.fixture
@@ -159,7 +159,7 @@ def test_a_store_that_stops_answering_is_not_the_bag_s_fault(small, tmp_path, mo
     uri = put(path, tmp_path.name)
     episode = SOURCE.read(uri, SOURCE.index(uri, GAP)[0].id, GAP)
     monkeypatch.setattr(remote, "WAITS_S", (0.0,))
-    monkeypatch.setattr(blocks, "PARTS", 0)
+    monkeypatch.setattr(blocks, "PART_BYTES", 0)
     blocks._cache(os.getpid()).keep((-1, ""), b"")  # drops what was kept
     plain = MemoryFileSystem.cat_file
 

@@ -21,7 +21,7 @@ EPISODES, LENGTH = 6, 8  # of each shard; steps
 def ranges(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int, int]]:
     """The ranges of bytes of record files that were read, with the files' numbers; blocks are small."""
     monkeypatch.setattr(blocks, "BLOCK", 1024)
-    monkeypatch.setattr(blocks, "AHEAD", 4)
+    monkeypatch.setattr(blocks, "BLOCKS_AHEAD", 4)
     monkeypatch.setattr(records, "READ_AHEAD", 64)
     found: list[tuple[str, int, int]] = []
     plain = MemoryFileSystem.cat_file
