@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (700, 4_100, 7),
+    "hma_data": (880, 5_400, 8),
     "hma_data/cli": (1_470, 10_400, 8),
     "hma_data/conversion": (3_320, 24_000, 12),
     "hma_data/episodes": (1_310, 11_500, 7),
