@@ -11,13 +11,12 @@ from typing import Any
 
 from hma_data.storage.paths import REPOSITORY
 from hma_data.storage.yaml_io import write_yaml
-from hma_data.tables import Table, fill
+from hma_data.tables import fill
 from hma_data.tokenizers.catalog import other_weights
 from hma_model.config import token_words
 
 _TAGS = ("robotics", "world-model", "video-prediction", "hma")
 _DATASET = re.compile(rf"hf://datasets/({REPOSITORY.pattern})")
-_HEADINGS = ["embodiment", "robot", "action dims", "Hz", "stride", "data", "metrics", "licence"]
 
 # The identifiers that the hub accepts in a card's front matter; it refuses any other.
 LICENCES = frozenset((
@@ -73,7 +72,7 @@ def render(
         grid="×".join(str(side) for side in model.get("grid", ())),
         weights=line(other_weights(tokenizer)),
         trunk=line(config.get("trunk_sha256")),
-        table=_table(cards),
+        rows=[_row(name, card) for name, card in sorted(cards.items())],
         loss_unit=token_words(merge if isinstance(merge, int) else 1) if says_baseline else "",
         pictures=pictures,
         name=repo or ".",
@@ -87,22 +86,17 @@ def render(
     return (text + "\n").encode()
 
 
-def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the table of embodiments; empty without any."""
-    rows = [
-        [
-            f"`{name}`",
-            line(card.get("robot") or card.get("description")),
-            f"{line(card.get('action_dim'))} ({line(card.get('action_space'))})",
-            number(card.get("effective_hz")),
-            line(card.get("stride")),
-            _pairs(card.get("data")),
-            _pairs(card.get("metrics")),
-            line(card.get("license")) or "not stated",
-        ]
-        for name, card in sorted(cards.items())
+def _row(name: str, card: Mapping[str, Any]) -> list[str]:
+    return [
+        f"`{name}`",
+        line(card.get("robot") or card.get("description")),
+        f"{line(card.get('action_dim'))} ({line(card.get('action_space'))})",
+        number(card.get("effective_hz")),
+        line(card.get("stride")),
+        _pairs(card.get("data")),
+        _pairs(card.get("metrics")),
+        line(card.get("license")) or "not stated",
     ]
-    return Table(_HEADINGS, rows).markdown() if rows else ""
 
 
 def _origins(cards: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

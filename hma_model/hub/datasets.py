@@ -22,7 +22,7 @@ from hma_data.shards.manifest import (
 from hma_data.storage.files import file_sha256, write_atomic
 from hma_data.storage.paths import REPOSITORY, StrPath, as_address, as_path
 from hma_data.storage.yaml_io import write_yaml
-from hma_data.tables import Table, fill
+from hma_data.tables import fill
 from hma_data.tokenizers.catalog import other_weights
 from hma_model.checkpoint.model_card import licence, line, number
 from hma_model.hub.stores import Store, open_store
@@ -172,7 +172,7 @@ def _page(manifest: Manifest, repo: str | None) -> bytes:
             "licence": line(robot.license) or "not stated",
             "quarantined episodes": str(manifest.quarantined),
         },
-        table=_table(manifest),
+        rows=_rows(manifest),
         name=repo or ".",
         place=f'"{repo}"' if repo else "str(Path.cwd())",
         split=_SPLITS[(_present(manifest) or ["train"])[0]],
@@ -206,10 +206,10 @@ def _front(manifest: Manifest) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _table(manifest: Manifest) -> str:
+def _rows(manifest: Manifest) -> list[list[str]]:
     rows = []
     for split, counts in manifest.splits.items():
         size = sum(shard.bytes for shard in manifest.shards if shard.split == split) / 1e6
         counted = [f"{counts[key]:,}" for key in ("episodes", "frames", "shards")]
         rows.append([line(split), *counted, f"{size:,.1f}"])
-    return Table(["split", "episodes", "frames", "shards", "MB"], rows).markdown()
+    return rows
