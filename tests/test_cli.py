@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import pytest
 
+from hma_data.errors import UsageError
 from hma_data.lab import record
 from tests.command import ROOT, fails, hma, hma_process
 from tests.conftest import ARM_YAML, write_toy
@@ -65,7 +66,7 @@ def test_help_shows_brackets_and_the_version() -> None:
     def shown(*verb: str) -> str:
         return " ".join(hma(*verb, "--help").stdout.replace("│", " ").split())
 
-    assert 'Example: hma train discrete_tiny "data=[shards/my_arm]" --out' in shown("train")
+    assert "Example: hma train discrete_tiny shards/my_arm steps=500 --out" in shown("train")
     assert "org/name[@revision]" in shown("evaluate")
     assert hma("--version").stdout.startswith("hma 0.")
 
@@ -334,3 +335,51 @@ def test_a_warning_is_one_line_without_its_place_in_the_code() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stderr == "warning: two lines\n"
+
+
+def test_a_recording_is_named_first_or_by_source_but_once(arm: Path, tmp_path: Path) -> None:
+    words = ["-e", str(arm), "--out", str(tmp_path / "o"), "--tokenizer", "fsq-8", "--dry-run", "--json"]
+    recording = str(tmp_path / "toy.hdf5")
+    first, named = hma("convert", recording, *words), hma("convert", "--source", recording, *words)
+    assert first.returncode == named.returncode == 0, first.stderr + named.stderr
+    assert json.loads(first.stdout)["shards"] == json.loads(named.stdout)["shards"]
+    fails(hma("convert", recording, "--source", recording, *words), 2, "name the recording once")
+
+
+def test_progress_names_the_robot_not_its_file(arm: Path, tmp_path: Path) -> None:
+    renamed = arm.rename(tmp_path / "embodiment.yaml")
+    words = ["-e", str(renamed), "--out", str(tmp_path / "o"), "--tokenizer", "fsq-8"]
+    done = hma("convert", str(tmp_path / "toy.hdf5"), *words)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.startswith("convert toy_arm: ")
+
+
+@pytest.mark.parametrize("verb", ["train discrete_tiny nowhere", "finetune nowhere --from embedded"])
+def test_a_key_written_as_an_option_is_answered_by_how_to_write_it(verb: str) -> None:
+    fails(hma(*verb.split(), "--steps", "10"), 2, "write steps=10")
+    fails(hma(*verb.split(), "--batch-size=4"), 2, "write batch_size=4")
+    fails(hma(*verb.split(), "--nonsense", "1"), 2, "--help")
+
+
+def test_train_and_finetune_take_shard_sets_as_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[list[str]] = []
+
+    def looked_at(folders: list[str]) -> None:
+        read.append(list(folders))
+        raise UsageError("enough", "seen")
+
+    monkeypatch.setattr("hma_model.cli.train.refuse_early", looked_at)
+    for words in ("train discrete_tiny a b steps=3", "finetune a b steps=3 --from embedded"):
+        fails(hma(*words.split()), 2, "seen")
+    fails(hma("finetune", "--from", "embedded", "--data", "a", "b"), 2, "seen")
+    assert read == [["a", "b"]] * 3
+    fails(hma("finetune", "--from", "embedded", "steps=3"), 2, "names no shard set")
+
+
+def test_recipes_are_listed_and_shown() -> None:
+    listed = json.loads(hma("recipe", "list", "--json").stdout)
+    assert {"discrete_tiny", "finetune_tiny"} <= {one["recipe"] for one in listed}
+    assert all(one["about"] for one in listed)
+    shown = hma("recipe", "show", "discrete_tiny")
+    assert "\nbatch_size: 2\n" in shown.stdout and "steps=10" in shown.stdout
+    fails(hma("recipe", "show", "nowhere"), 1, "no such recipe")

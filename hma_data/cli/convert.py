@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from typer import Option
+from typer import Argument, Option
 
 from hma_data.cli.options import Json, choice_option, robot_option, tokenizers
 from hma_data.console import (
@@ -38,11 +38,13 @@ _chosen = partial(choice_option, metavar="ID|GLOB|@FILE", rich_help_panel="What 
 
 
 def convert(
+    *,
+    data: Annotated[
+        str | None, Argument(help="Recording: file, folder or URI; default: source.uri of the YAML.")
+    ] = None,
     embodiment: Annotated[str, robot_option("The robot: an id of the registry, or a YAML file.")],
     out: Annotated[Path, Option(help="Folder of the shard set.")],
-    source: Annotated[
-        str | None, Option(help="Recording: file, folder or URI; default: source.uri of the YAML.")
-    ] = None,
+    source: Annotated[str | None, Option(help="The same as DATA.")] = None,
     tokenizer: Annotated[
         str, Option(help="Name of the tokenizer; see hma tokenizer list.", autocompletion=tokenizers)
     ] = "fsq-16",
@@ -103,11 +105,14 @@ def convert(
 ) -> None:
     """Convert recordings to tokenized shards; run it again to continue.
 
-    Example: hma convert -e my_arm.yaml --source ./demo.hdf5 --out shards/my_arm
+    Example: hma convert ./demo.hdf5 -e my_arm.yaml --out shards/my_arm
     """
     from hma_data.conversion.output import Share
     from hma_data.conversion.plan import Settings
 
+    if data is not None and source is not None:
+        raise UsageError("--source", f"says {source}, DATA says {data}", "name the recording once")
+    source = data if source is None else source
     if extend and overwrite:
         raise UsageError("hma convert", "--extend keeps what --overwrite deletes", "give one of them")
     settings = Settings(
@@ -152,7 +157,7 @@ def convert(
     if dry_run:
         _print_plan(conversion, share, json)
         return
-    with interruptible(lambda: _kept(conversion)), _shown(Path(embodiment).stem) as on_progress:
+    with interruptible(lambda: _kept(conversion)), _shown(robot.id) as on_progress:
         if share:
             done = conversion.run_share(share, on_progress)
         else:

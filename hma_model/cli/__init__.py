@@ -41,6 +41,7 @@ from hma_model.cli.options import (
 )
 from hma_model.cli.play import play
 from hma_model.cli.policy import augment, label_actions, policy_eval
+from hma_model.cli.recipe import recipe_app
 from hma_model.cli.train import MODELS
 from hma_model.cli.view import view
 
@@ -127,6 +128,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not fault.format_message().strip() or type(fault).__name__ == "NoArgsIsHelpError":
             return 2  # the help has been shown
         hint = f" — see {context.command_path} --help" if context else ""
+        if context and context.info_name in ("train", "finetune"):
+            key = cli_train.unknown_option(getattr(fault, "option_name", "") or "", words)
+            hint = f" — {key}" if key else hint
         said = fault.format_message().replace("Value error, ", "").replace("Input should be", "must be")
         return fail(said + hint, 2)
     except (KeyboardInterrupt, typer.Abort):
@@ -232,4 +236,5 @@ def _opened(checkpoint: str, data: Path, device: str) -> tuple[Any, Any, Any]:
 app.command("policy-eval", rich_help_panel=MODELS)(policy_eval)
 app.command(rich_help_panel=MODELS)(augment)
 app.command("label-actions", rich_help_panel=MODELS)(label_actions)
+app.add_typer(recipe_app, name="recipe", rich_help_panel=MODELS)
 app.add_typer(hub_app, name="hub", rich_help_panel=MODELS)

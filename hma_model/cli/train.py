@@ -1,6 +1,7 @@
 """Define the commands `hma train` and `hma finetune`."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,11 +11,15 @@ from typer import Argument, Option
 from hma_data.cli.options import Json, recipes
 from hma_data.cli.shards import refuse_early
 from hma_data.console import human_seconds, interruptible, print_json
+from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
     from hma_model.training.loop import TrainResult
 
-Overrides = Annotated[list[str] | None, Argument(metavar="KEY=VALUE", help="Dotted overrides of the recipe.")]
+Words = Annotated[
+    list[str] | None,
+    Argument(metavar="DATA|KEY=VALUE", help="Shard sets; keys of the recipe, with dots: model.layers=4."),
+]
 Out = Annotated[Path | None, Option("--out", help="The run's folder.")]
 Force = Annotated[bool, Option("--force", help="Resume although the recipe or the shards changed.")]
 MODELS = "Models"  # the panel of `hma --help`
@@ -29,7 +34,7 @@ def mount(app: typer.Typer) -> None:
 
 def train(
     recipe: Annotated[str, Argument(help="A recipe: name or YAML file.", autocompletion=recipes)],
-    overrides: Overrides = None,
+    words: Words = None,
     out: Out = None,
     force: Force = False,
     json: Json = False,
@@ -38,18 +43,45 @@ def train(
 
     On several GPUs: torchrun --nproc-per-node N --no-python hma train …
 
-    Example: hma train discrete_tiny "data=[shards/my_arm]" --out runs/first
+    Example: hma train discrete_tiny shards/my_arm steps=500 --out runs/first
     """
-    words = overrides or []
-    _refuse_early(recipe, words)
+    folders, overrides = _parted(words)
+    if folders:
+        overrides.insert(0, _data(folders))
+    _refuse_early(recipe, overrides)
     with interruptible(lambda: STOPPED):
         from hma_model.training.loop import train as run
         from hma_model.training.parallel import report_once
         from hma_model.training.recipe import load_recipe
 
         with report_once():
-            result = run(load_recipe(recipe, words), out=out, force=force)
+            result = run(load_recipe(recipe, overrides), out=out, force=force)
     _tell(result, json)
+
+
+def _parted(words: list[str] | None) -> tuple[list[str], list[str]]:
+    """Divide words into shard sets and KEY=VALUE; a folder here may have an equals sign in its name."""
+    folders = [word for word in words or () if "=" not in word or Path(word).expanduser().is_dir()]
+    return folders, [word for word in words or () if word not in folders]
+
+
+def _data(folders: list[str]) -> str:
+    return f"data={folders}"  # as YAML has a list of texts
+
+
+def unknown_option(option: str, words: Sequence[str]) -> str:
+    """Return how to write an option that is a key of recipes, such as `steps=10`; empty if it is none."""
+    from hma_model.training.recipe import Recipe
+
+    name, _, value = option.lstrip("-").partition("=")
+    key = name.replace("-", "_")
+    if key.partition(".")[0] not in Recipe.model_fields:
+        return ""
+    given = next((word.partition("=")[2] for word in words if word.startswith(f"{option}=")), value)
+    if not given and option in words:
+        after = words[words.index(option) + 1 :]
+        given = after[0] if after else ""
+    return f"write {key}={given or 'VALUE'}"
 
 
 def _refuse_early(recipe: str, overrides: list[str]) -> None:
@@ -68,10 +100,9 @@ def finetune(
     source: Annotated[
         str, Option("--from", help="A checkpoint, a run's folder, a URI, or ORG/NAME[@REVISION].")
     ],
-    data: Annotated[list[Path], Option(help="A shard set; more may follow it, or repeat --data.")],
-    overrides: Annotated[
-        list[str] | None,
-        Argument(metavar="SHARDS|KEY=VALUE", help="More shard sets; overrides of the recipe."),
+    words: Words = None,
+    data: Annotated[
+        list[str] | None, Option(help="The same as DATA, of which it takes one; repeat it for more.")
     ] = None,
     freeze_trunk: Annotated[
         bool, Option("--freeze-trunk", help="Train stems and heads; keep the trunk as it is.")
@@ -85,20 +116,22 @@ def finetune(
 ) -> None:
     """Train a new stem and head on a trained trunk; run it again to resume.
 
-    Example: hma finetune --from team/model --data shards/my_arm --freeze-trunk --out runs/my_arm
+    Example: hma finetune shards/my_arm --from team/model --freeze-trunk --out runs/my_arm
     """
-    words = [word for word in overrides or [] if "=" in word]
-    folders = [*data, *(Path(word) for word in overrides or [] if "=" not in word)]
+    named, overrides = _parted(words)
+    folders = [*(data or ()), *named]
+    if not folders:
+        raise UsageError("hma finetune", "names no shard set", "write hma finetune DATA… --from CHECKPOINT")
     options: dict[str, Any] = {"out": out, "freeze_trunk": freeze_trunk, "recipe": recipe, "force": force}
     from hma_model.training.recipe import recipe_for
 
-    _refuse_early(recipe or recipe_for(source), [f"data={[str(folder) for folder in folders]}", *words])
+    _refuse_early(recipe or recipe_for(source), [_data(folders), *overrides])
     with interruptible(lambda: STOPPED):
         from hma_model.training.loop import finetune as run
         from hma_model.training.parallel import report_once
 
         with report_once():
-            result = run(source, folders, overrides=words, **options)
+            result = run(source, folders, overrides=overrides, **options)
     _tell(result, json)
 
 

@@ -29,10 +29,10 @@ OWN_DATA = """
 hma inspect DATA                                          # what is in the recording
 hma registry infer DATA --id my_arm --out my_arm.yaml     # its YAML; answer the TODOs in it
 hma registry validate my_arm.yaml
-hma convert -e my_arm.yaml --source DATA --tokenizer {tokenizer} --out shards/my_arm
+hma convert DATA -e my_arm.yaml --tokenizer {tokenizer} --out shards/my_arm
 hma shards verify shards/my_arm
 hma shards preview shards/my_arm                          # sheet.png and preview.mp4 from the tokens
-hma finetune --from embedded --data shards/my_arm --out runs/my_arm
+hma finetune shards/my_arm --from embedded --out runs/my_arm
 hma evaluate runs/my_arm shards/my_arm
 hma generate runs/my_arm shards/my_arm --out rollout.mp4
 hma hub push runs/my_arm ./my-hub/team/model --embodiment my_arm

@@ -171,7 +171,7 @@ def described(model: "Network", embodiment: str) -> Embodiment | None:
     """
     if embodiment not in model.embodiments:
         there = ", ".join(model.embodiments) or "none"
-        remedy = "choose one of them, or add yours: hma finetune --from CHECKPOINT --data SHARDS --out RUN"
+        remedy = "choose one of them, or add yours: hma finetune SHARDS --from CHECKPOINT --out RUN"
         raise HMAError(embodiment, f"is not in the model, which has: {there}", remedy)
     kept = _checkpoint(model, embodiment)
     if kept is not None:

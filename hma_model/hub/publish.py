@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 Content = Path | bytes
 MAX_NAMED = 50  # ids that an error lists
 _ADD_ONE = (
-    f"Add one: hma finetune --from {EMBEDDED_NAME} --data SHARDS --out RUN, "
+    f"Add one: hma finetune SHARDS --from {EMBEDDED_NAME} --out RUN, "
     "with shards of hma convert --tokenizer {name}"
 )
 

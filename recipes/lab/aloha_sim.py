@@ -11,7 +11,7 @@
 """Record gym-aloha's AlohaTransferCube to a LeRobotDataset: one arm hands a cube to the other, at 50 Hz.
 
     uv run recipes/lab/aloha_sim.py build/lab --episodes 40
-    hma convert -e aloha_sim --source build/lab/aloha_sim --out build/lab/shards/aloha_sim
+    hma convert build/lab/aloha_sim -e aloha_sim --out build/lab/shards/aloha_sim
 
 The physics, the look and the success are the environment's, but its shadows are coarser, which halves the
 time of a picture. Commands are joint positions. The expert plans them when an episode begins: both hands

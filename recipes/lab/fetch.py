@@ -15,7 +15,7 @@
 """Record gymnasium-robotics' FetchPickAndPlace to HDF5: a Fetch arm carries a block to a goal, at 25 Hz.
 
     uv run recipes/lab/fetch.py build/lab --episodes 40
-    hma convert -e fetch --source build/lab/fetch.hdf5 --out build/lab/shards/fetch
+    hma convert build/lab/fetch.hdf5 -e fetch --out build/lab/shards/fetch
 
 The physics, the look and the success are the environment's; the camera is nearer. The goal is the red ball.
 """

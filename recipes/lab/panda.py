@@ -17,7 +17,7 @@
 """Record robosuite's Lift and Stack to RLDS: a Panda lifts a cube or stacks it on another one, at 20 Hz.
 
     uv run recipes/lab/panda.py build/lab --episodes 40
-    hma convert -e panda --source build/lab/panda --out build/lab/shards/panda
+    hma convert build/lab/panda -e panda --out build/lab/shards/panda
 
 The physics, the look and the success are robosuite's, and so is the controller OSC_POSE, which moves the hand
 by steps. The tasks take turns.

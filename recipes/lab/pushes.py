@@ -1,10 +1,10 @@
 """Record pushes of a T by good and by bad drivers, for a world model in which policies are scored.
 
     python recipes/lab/pushes.py build/pushes
-    for part in planned noisy; do hma convert -e pusht_fast --source build/pushes/$part/pusht_fast.hdf5 \\
+    for part in planned noisy; do hma convert build/pushes/$part/pusht_fast.hdf5 -e pusht_fast \\
         --tokenizer fsq-lab --frames strided --val-fraction 0.05 --out build/pushes/shards/$part; done
     hma shards merge build/pushes/shards/planned build/pushes/shards/noisy --out build/pushes/shards/all
-    hma finetune --from embedded --data build/pushes/shards/all --out runs/pushes \\
+    hma finetune build/pushes/shards/all --from embedded --out runs/pushes \\
         batch_size=4 cpu_seconds=3250 steps=100000 ema=0.995 self_forward=0.15 self_forward_from=0
     hma policy-eval pusht_fast scripted scripted:noise=0.1 scripted:noise=0.25 scripted:noise=0.5 random \\
         still --checkpoint runs/pushes --judge placed --frames 20 --out policies

@@ -1,10 +1,10 @@
 """Record a task that a policy can learn, and let a world model make more of it: the paper's Table 6, small.
 
     python recipes/lab/reaching.py build/reach             # mover_04 goes to the nearest block; and it plays
-    for n in 100 500 1000; do hma convert -e build/reach/mover_04.yaml --source build/reach/reach.hdf5 \\
+    for n in 100 500 1000; do hma convert build/reach/reach.hdf5 -e build/reach/mover_04.yaml \\
         --limit $n --tokenizer fsq-lab --frames strided --val-fraction 0.01 \\
         --out build/reach/shards/real_$n; done
-    hma convert -e build/reach/mover_04.yaml --source build/reach/mover_04.hdf5 --tokenizer fsq-lab \\
+    hma convert build/reach/mover_04.hdf5 -e build/reach/mover_04.yaml --tokenizer fsq-lab \\
         --frames strided --out build/reach/shards/play
     hma augment mover_04 build/reach/shards/made --from build/reach/shards/play --episodes 400 \\
         --commands reach --judge reached --keep 1 --frames 20

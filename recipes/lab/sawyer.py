@@ -15,7 +15,7 @@
 """Record six tasks of Meta-World to MCAP: a Sawyer pushes, places, opens and presses things, at 20 Hz.
 
     uv run recipes/lab/sawyer.py build/lab --episodes 40
-    hma convert -e sawyer --source build/lab/sawyer --out build/lab/shards/sawyer
+    hma convert build/lab/sawyer -e sawyer --out build/lab/shards/sawyer
 
 The physics, the look, the success and the scripted experts are Meta-World's, but its shadows are coarser,
 which takes a third off the time of a picture. The camera is corner2, moved nearer; as there, it hangs upside

@@ -52,7 +52,7 @@ def test_a_demo_that_was_cut_goes_on_by_the_same_command(
         assert f'alt="{robot}: recorded"' in page and f"<h2>{robot}: " in page
     for title in ("The robots", "What the tokens keep", "Sizes and timings", "on your own data"):
         assert title in page
-    assert "hma finetune --from embedded --data shards/my_arm" in page
+    assert "hma finetune shards/my_arm --from embedded" in page
 
 
 def test_a_folder_that_holds_something_else_is_refused(tmp_path: Path) -> None:

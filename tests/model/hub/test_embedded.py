@@ -32,7 +32,7 @@ def test_for_a_robot_that_it_lacks_the_command_that_adds_one_is_named(
     assert main(["evaluate", "embedded", str(shards)]) == 1
     said = capsys.readouterr().err
     assert "embedded: has no embodiment 'my_arm'" in said and "it has: " in said and "arm2_02" in said
-    assert "hma finetune --from embedded --data SHARDS --out RUN" in said
+    assert "hma finetune SHARDS --from embedded --out RUN" in said
     assert f"hma convert --tokenizer {HMA.from_pretrained('embedded', []).config.tokenizer['name']}" in said
 
 
