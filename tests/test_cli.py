@@ -30,6 +30,8 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
     verbs = [
         "demo",
         "play",
+        "try",
+        "recipe",
         "view",
         "registry",
         "inspect",

@@ -1,0 +1,171 @@
+"""Define the verb `hma try`: from a recording to a film of its robot in the model, by the other verbs.
+
+Every step is one command of `hma`, printed and run in a process of its own. What a step has finished is kept,
+so the same command continues.
+"""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Argument, Option
+
+from hma_data.cli.options import robot_option
+from hma_data.cpu import usable_cores
+from hma_data.errors import Interrupted, RegistryError, UsageError
+from hma_model.cli.options import embedded_robots
+
+BUNDLED = "embedded"  # the model to begin with
+TOKENIZER = "fsq-lab"  # the one that it was trained on
+PROMPT, LONGEST_FILM = 2, 24  # frames that are given, and that are predicted at most
+UNLIMITED_STEPS = 1_000_000  # the time ends the training
+
+
+def try_recording(
+    data: Annotated[str, Argument(help="A recording of your robot: file, folder or URI.")],
+    embodiment: Annotated[
+        str | None, robot_option("The robot, if its YAML is there: a registry id, or a file.")
+    ] = None,
+    answer: Annotated[
+        list[str] | None,
+        Option(metavar="KEY=VALUE", help="Answer a question of the robot's YAML; repeat it for more."),
+    ] = None,
+    minutes: Annotated[float, Option(min=0.1, help="Minutes of training.")] = 5.0,
+    out: Annotated[Path | None, Option(help="Folder for everything; default: hma-try-NAME.")] = None,
+) -> None:
+    """Show your robot in the model: inspect, infer, convert, finetune, evaluate, and a film with a page.
+
+    What a recording cannot say is asked in a terminal; elsewhere --answer says it. Run it again to continue.
+
+    Example: hma try ./demo.hdf5 --minutes 5 --answer action.space=joint_delta
+    """
+    from hma_data.sources.detect import require_there
+
+    require_there(data)
+    name = re.sub(r"[^a-z0-9_.-]+", "_", Path(data).stem.lower()).strip("_.-") or "my_robot"
+    folder = out or Path(f"hma-try-{name}")
+    if name in embedded_robots(""):  # the bundled model has another robot of this id
+        name = f"my_{name}"
+    folder.mkdir(parents=True, exist_ok=True)
+    shards, run, film = folder / "shards", folder / "run", folder / "film.mp4"
+    cpu_seconds = round(60 * minutes * usable_cores())
+    done: list[list[str]] = []
+
+    def step(*words: object) -> None:
+        done.append([str(word) for word in words])
+        _run(done[-1])
+
+    if embodiment is None:
+        yaml = folder / "robot.yaml"
+        step("inspect", data, "--fail-on", "never")
+        if not yaml.is_file():
+            step("registry", "infer", data, "--id", name, "--out", yaml)
+        _answer(yaml, answer or [])
+        embodiment = str(yaml)
+    step("convert", data, "-e", embodiment, "--tokenizer", TOKENIZER, "--out", shards)
+    time_limit = (f"cpu_seconds={cpu_seconds}", f"steps={UNLIMITED_STEPS}")
+    step("finetune", shards, "--from", BUNDLED, *time_limit, "--out", run)
+    step("evaluate", run, shards, "--windows", 24, "--out", folder / "evaluation")
+    if not film.is_file():
+        frames = ("--prompt", PROMPT, "--frames", _film_frames(shards))
+        step("generate", run, shards, *frames, "--unmask-steps", 8, "--out", film)
+    print(f"open {_write_page(folder, film, done)}")
+
+
+def _run(words: list[str]) -> None:
+    """Print a command and run it; end with its exit code if it fails."""
+    print(f"$ {shlex.join(['hma', *words])}", flush=True)
+    try:
+        code = subprocess.run([sys.executable, "-m", "hma_model.cli", *words], check=False).returncode
+    except KeyboardInterrupt:  # the step has got the same Ctrl-C, and says what it keeps
+        raise Interrupted("", "interrupted: run the same command again to continue") from None
+    if code:
+        raise SystemExit(code)
+
+
+def _film_frames(folder: Path) -> int:
+    """Return how many frames the longest held-out episode has to predict."""
+    from hma_data.shards.reader import ShardSet
+
+    shards = ShardSet(folder)
+    longest = int(shards.index("val").length.max(initial=0)) // shards.row_stride
+    return max(1, min(LONGEST_FILM, longest - PROMPT))
+
+
+def _answer(path: Path, given: list[str]) -> None:
+    """Replace the TODOs of a YAML by the answers that are given, or asked for in a terminal."""
+    from hma_data.registry.embodiment import todos
+    from hma_data.storage.files import write_atomic
+    from hma_data.storage.yaml_io import parse_yaml, read_yaml, write_yaml
+
+    values = read_yaml(path)
+    for word in given:
+        key, equals, text = word.partition("=")
+        if not equals:
+            raise UsageError("--answer", f"{word!r} is not KEY=VALUE", "write for example kind=real")
+        _set(values, key, parse_yaml(text, word, UsageError))
+    open_questions = []
+    for key, question in todos(values):
+        if key == "robot" or key.startswith("provenance"):
+            _set(values, key, "not stated")  # a text for people, which changes nothing
+        elif sys.stdin.isatty():
+            _set(values, key, parse_yaml(input(f"{key}: {question} "), key, UsageError))
+        else:
+            open_questions.append((key, question))
+    if open_questions:
+        asked = "; ".join(f"{key}: {question}" for key, question in open_questions)
+        flags = " ".join(f"--answer {key}=…" for key, _ in open_questions)
+        raise RegistryError(path, f"has open questions: {asked}", f"answer by {flags}, or in the file")
+    write_atomic(path, write_yaml(values))
+
+
+def _set(values: Any, key: str, value: Any) -> None:
+    """Set the value at a path such as `cameras[0].color`."""
+    *parents, last = _parts(key)
+    try:
+        for part in parents:
+            values = values[part]
+        values[last] = value
+    except (KeyError, IndexError, TypeError) as fault:
+        raise UsageError("--answer", f"{key} is not a key of the YAML", "the file has them") from fault
+
+
+def _parts(key: str) -> Iterator[str | int]:
+    for word, number in re.findall(r"([^.\[\]]+)|\[(\d+)\]", key):
+        yield word or int(number)
+
+
+def _write_page(folder: Path, film: Path, done: list[list[str]]) -> Path:
+    """Write the page with the film, what was measured, and the commands."""
+    from hma_data.episodes.sheets import webp_bytes
+    from hma_data.storage.files import write_atomic
+    from hma_model.evaluation.pages import Page
+    from hma_model.evaluation.verdict import verdict
+
+    [found] = json.loads((folder / "evaluation" / "results.json").read_bytes())["results"]
+    page = Page("Your robot in the model", f"The model {verdict(found)}.")
+    frames, fps = _frames(film)
+    caption = "Recorded frames; predicted from the recorded actions; predicted from other actions."
+    page.picture(webp_bytes(frames, fps), "webp", caption)
+    page.section("Files", f"{film.name} is this film. evaluation/report.html has all figures and charts.")
+    page.section("Commands")
+    page.commands("\n".join(shlex.join(["hma", *words]) for words in done))
+    path = folder / "index.html"
+    write_atomic(path, page.html())
+    return path
+
+
+def _frames(film: Path) -> tuple[Any, float]:
+    import av
+    import numpy as np
+
+    with av.open(os.fspath(film)) as file:
+        stream = file.streams.video[0]
+        frames = np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(stream)])
+        return frames, float(stream.average_rate or 1)

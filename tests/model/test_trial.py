@@ -1,0 +1,61 @@
+"""hma try: from a recording to a film of its robot in the model, each step a command of its own."""
+
+import shutil
+from pathlib import Path
+
+import av
+import pytest
+
+from hma_data.lab import record
+from hma_data.registry.embodiment import Embodiment
+from hma_model.cli import trial
+from tests.command import fails, hma, hma_process
+
+ANSWER = ("--answer", "action.space=joint_delta")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded")
+    return shutil.move(record("mover_04", folder, 12, 0), folder / "My Arm.hdf5")
+
+
+def test_what_the_recording_cannot_say_is_asked_and_answered_by_flags(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, ran = trial._run, []
+
+    def only_light_steps(words: list[str]) -> None:
+        ran.append(words)
+        if words[0] == "convert":
+            raise SystemExit(3)
+        run(words)
+
+    monkeypatch.setattr(trial, "_run", only_light_steps)
+    monkeypatch.setattr("sys.stdin.isatty", lambda: False)
+    out = tmp_path / "out"
+    asked = hma("try", str(recording), "--out", str(out))
+    assert asked.returncode == 1 and "answer by --answer action.space=…" in asked.stderr
+    fails(hma("try", str(recording), "--out", str(out), "--answer", "no.such=1"), 2, "no.such is not a key")
+    assert hma("try", str(recording), "--out", str(out), *ANSWER).returncode == 3
+    robot = Embodiment.load(out / "robot.yaml")
+    assert (robot.id, robot.action.space) == ("my_arm", "joint_delta")
+    assert [words[0] for words in ran].count("registry") == 1, "what was inferred is kept"
+    fails(hma("try", "nowhere.hdf5"), 1, "does not exist")
+
+
+@pytest.mark.slow
+def test_one_command_ends_with_a_film_and_a_page_and_continues(recording: Path, tmp_path: Path) -> None:
+    words = ("try", str(recording), "--minutes", "0.1", "--out", str(tmp_path / "out"), *ANSWER)
+    done = hma_process(*words)
+    assert done.returncode == 0, done.stderr
+    commands = [line.removeprefix("$ hma ") for line in done.stdout.splitlines() if line.startswith("$ hma ")]
+    verbs = [line.split()[0] for line in commands]
+    assert verbs == ["inspect", "registry", "convert", "finetune", "evaluate", "generate"]
+    with av.open(str(tmp_path / "out" / "film.mp4")) as film:
+        assert sum(1 for _ in film.decode(video=0)) > 10
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "its actions" in page and "data:image/webp" in page and "hma finetune" in page
+    again = hma_process(*words)
+    assert again.returncode == 0, again.stderr
+    assert "$ hma generate" not in again.stdout and "$ hma registry infer" not in again.stdout
