@@ -15,20 +15,20 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (880, 5_400, 8),
     "hma_data/cli": (1_470, 10_400, 8),
-    "hma_data/conversion": (3_320, 24_000, 12),
+    "hma_data/conversion": (3_280, 23_800, 12),
     "hma_data/episodes": (1_310, 11_500, 7),
     "hma_data/hub": (520, 3_800, 3),
-    "hma_data/inspection": (2_030, 18_900, 9),
+    "hma_data/inspection": (2_040, 19_000, 9),
     "hma_data/lab": (3_910, 35_300, 18),
     "hma_data/loading": (1_370, 11_600, 6),
     "hma_data/registry": (1_270, 8_100, 6),
-    "hma_data/shards": (2_720, 21_500, 10),
+    "hma_data/shards": (2_630, 20_500, 10),
     "hma_data/sources": (11_800, 99_000, 55),
-    "hma_data/storage": (1_860, 12_700, 10),
+    "hma_data/storage": (1_660, 10_900, 11),
     "hma_data/tokenizers": (3_260, 23_700, 17),
     "hma_model": (480, 2_800, 3),
     "hma_model/checkpoint": (860, 6_300, 5),
-    "hma_model/cli": (1_400, 8_800, 9),
+    "hma_model/cli": (1_500, 9_300, 11),
     "hma_model/demo": (480, 3_900, 4),
     "hma_model/evaluation": (4_030, 32_100, 23),
     "hma_model/generation": (1_720, 14_300, 12),
@@ -42,7 +42,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_510, 11_600, 7),
 }
 PRODUCT_LINES, PRODUCT_NODES = 61_900, 494_000
-TEST_LINES = 45_300
+TEST_LINES = 45_500
 DOC_WORDS = 42_000
 
 
