@@ -27,8 +27,10 @@ Schema = Mapping[str, Any]
 
 def table(heads: list[str], rows: list[list[str]]) -> str:
     """Return a table in Markdown."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    head, *body = [
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (heads, *rows)
+    ]
+    return "\n".join([head, "|" + "---|" * len(heads), *body])
 
 
 # -- the command line
@@ -50,7 +52,7 @@ def cli_page() -> str:
 _EXIT_CODES = """## Exit codes
 
 | code | when |
-| --- | --- |
+|---|---|
 | 0 | done; for `hma inspect` and `hma doctor`: no error was found (warnings do not count) |
 | 1 | failed, or problems found. `hma inspect` and `hma doctor` take `--fail-on warn` (or `info`, `never`) |
 | 2 | wrong usage |
