@@ -1,7 +1,6 @@
 """docs/adding-a-robot.md, walked: three robots of three formats, by a YAML alone, from recording to hub."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -44,9 +43,7 @@ def lerobot_dataset(folder: Path) -> Path:
 @pytest.mark.parametrize(
     "make", [hdf5_arm, *(pytest.param(make, marks=pytest.mark.slow) for make in (ros2_bags, lerobot_dataset))]
 )
-def test_a_robot_goes_from_a_recording_to_the_hub_by_its_yaml_alone(
-    make: Callable[[Path], Path], tmp_path: Path
-) -> None:
+def test_a_robot_goes_from_a_recording_to_the_hub_by_its_yaml_alone(make, tmp_path) -> None:
     def run(*words: str | Path) -> str:
         done = hma(*map(str, words), cwd=tmp_path)
         assert done.returncode == 0, f"hma {' '.join(map(str, words))}\n{done.stdout}{done.stderr}"

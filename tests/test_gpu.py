@@ -189,9 +189,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 
 @pytest.mark.parametrize("optimizer", ["adamw", "muon"])
-def test_a_run_has_the_curve_of_a_cpu_and_its_checkpoint_loads_there(
-    shards: list[str], optimizer: str, tmp_path: Path
-) -> None:
+def test_a_run_has_the_curve_of_a_cpu_and_its_checkpoint_loads_there(shards, optimizer, tmp_path) -> None:
     given = {**TINY, "data": shards, "optimizer": optimizer, "ema": 0.5, "self_forward": 0.5}
     given["model"] = {"layers": 1, "width": 16, "heads": 2, "corrupt_max": 0.0}  # a GPU draws its own digits
     runs = [
@@ -228,9 +226,7 @@ def test_a_run_goes_on_where_it_was(shards: list[str], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "options", [{"precision": "bf16"}, {"compile": True}, {"checkpointing": True}], ids=str
 )
-def test_a_run_in_another_way_has_nearly_the_same_curve(
-    shards: list[str], options: dict[str, Any], tmp_path: Path
-) -> None:
+def test_a_run_in_another_way_has_nearly_the_same_curve(shards, options, tmp_path) -> None:
     given = {**TINY, "data": shards, "device": GPU}
     usual, other = (
         train(make_recipe({**given, **more}), out=tmp_path / name, show=False)
@@ -255,9 +251,7 @@ def test_shards_made_on_a_gpu_hold_the_tokens_of_a_cpu(sliders: dict[str, Path])
     assert torch.equal(mine.actions, theirs.actions)
 
 
-def test_the_embedded_model_is_evaluated_and_generates_on_a_gpu(
-    sliders: dict[str, Path], tmp_path: Path
-) -> None:
+def test_the_embedded_model_is_evaluated_and_generates_on_a_gpu(sliders, tmp_path) -> None:
     shards, found = str(sliders["cpu"]), []
     for device in ("cpu", GPU):
         words = ["embedded", shards, "--split", "train", "--windows", "8", "--device", device]

@@ -114,9 +114,7 @@ def test_what_no_package_adds_is_an_error_that_lists_what_is_known(episodes: Pat
         get_tokenizer("grey-8")
 
 
-def test_a_judgement_of_the_registry_changes_when_a_package_is_installed(
-    request: pytest.FixtureRequest, episodes: Path
-) -> None:
+def test_a_judgement_of_the_registry_changes_when_a_package_is_installed(request, episodes) -> None:
     words = ("registry", "validate", "npz_arm.yaml")
     assert hma(*words, cwd=episodes).returncode == 1
     request.getfixturevalue("toy_robot")
@@ -133,9 +131,7 @@ def test_a_judgement_of_the_registry_changes_when_a_package_is_installed(
         ("def open():\n    raise OSError('no disk')", r"open\(\) failed: OSError: no disk"),
     ],
 )
-def test_a_broken_source_is_one_error_that_names_its_package(
-    module: str, said: str, install: Install, tmp_path: Path
-) -> None:
+def test_a_broken_source_is_one_error_that_names_its_package(module, said, install, tmp_path) -> None:
     install("bad-robot", {"bad_source.py": module}, {"hma_data.sources": {"npz": "bad_source"}})
     with pytest.raises(PluginError, match=f"^bad-robot 0.1, entry point 'npz' of hma_data.sources: {said}"):
         open_source("npz")
@@ -171,9 +167,7 @@ def test_a_broken_source_is_told_only_where_no_other_knows_the_recording(
         (DULL.replace("Spec(name", "Spec('grey-9'"), "its spec is named 'grey-9', not 'dull'"),
     ],
 )
-def test_a_broken_tokenizer_is_one_error_that_names_its_package(
-    module: str, said: str, install: Install
-) -> None:
+def test_a_broken_tokenizer_is_one_error_that_names_its_package(module, said, install) -> None:
     points = {"hma_data.tokenizers": {"dull": "bad_tokenizer:ENTRY"}}
     install("bad-robot", {"bad_tokenizer.py": module}, points)
     where = "bad-robot 0.1, entry point 'dull' of hma_data.tokenizers"

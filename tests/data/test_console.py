@@ -9,9 +9,7 @@ from hma_data import console
 from hma_data.errors import Interrupted, SourceError, UsageError
 
 
-def test_progress_tells_elapsed_from_remaining_time(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_progress_tells_elapsed_from_remaining_time(monkeypatch, capsys) -> None:
     clock = [0.0]
     monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
     with console.progress("convert arm", unit="frames") as update:
@@ -24,9 +22,7 @@ def test_progress_tells_elapsed_from_remaining_time(
     assert capsys.readouterr().err == ""  # what has been shown is not shown again at the end
 
 
-def test_preparation_does_not_slow_the_rate(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_preparation_does_not_slow_the_rate(monkeypatch, capsys) -> None:
     clock = [0.0]
     monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
     with console.progress("episodes") as update:
@@ -39,9 +35,7 @@ def test_preparation_does_not_slow_the_rate(
     assert capsys.readouterr().err == "episodes: 100/400 frames, 8.3/s, 1 min 02 s so far, 36 s left\n"
 
 
-def test_bytes_have_their_own_unit_and_an_unknown_total_is_left_out(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_bytes_have_their_own_unit_and_an_unknown_total_is_left_out(capsys) -> None:
     with console.progress("verify", unit="bytes") as update:
         update(0, total=45_400)
         update(45_400, total=45_400)
@@ -58,9 +52,7 @@ def test_brackets_in_tables_are_text(capsys: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.parametrize("width", [80, 100])
-def test_a_table_too_wide_for_a_terminal_is_cut_into_several(
-    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_too_wide_for_a_terminal_is_cut_into_several(width, monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     figures = [f"figure {i}" for i in range(14)]
@@ -117,9 +109,7 @@ def test_a_duration_never_has_sixty_seconds(seconds: float, text: str) -> None:
     assert console.human_seconds(seconds) == text
 
 
-def test_a_row_of_words_too_wide_for_a_terminal_becomes_a_paragraph(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_row_of_words_too_wide_for_a_terminal_becomes_a_paragraph(monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "60")
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     name = "a_robot_with_a_name_that_alone_is_wider_than_the_terminal_is"

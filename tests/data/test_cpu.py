@@ -26,9 +26,7 @@ def test_a_command_begun_under_real_time_priority_takes_the_ordinary_one() -> No
 
 
 @pytest.mark.parametrize(("name", "value"), [("OMP_WAIT_POLICY", "ACTIVE"), ("GOMP_SPINCOUNT", "7")])
-def test_how_threads_wait_is_left_to_the_environment(
-    name: str, value: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_how_threads_wait_is_left_to_the_environment(name, value, monkeypatch) -> None:
     for other in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
         monkeypatch.delenv(other, raising=False)
     monkeypatch.setenv(name, value)

@@ -45,9 +45,7 @@ def test_a_generated_set_has_as_many_frames_as_asked(tmp_path: Path, frames: int
     assert splits["train"]["frames"] >= frames
 
 
-def test_a_peer_must_give_our_windows_and_a_missing_one_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_peer_must_give_our_windows_and_a_missing_one_is_named(tmp_path, monkeypatch) -> None:
     settings = SMALL | {"frames": 1_500, "peer_windows": 8}
     folder = loader.make_set(tmp_path / "set", 0, settings)
 

@@ -23,9 +23,7 @@ def frames(episode: int, start: int, count: int) -> NDArray[np.uint8]:
     st.integers(1, 7),
     st.sets(st.integers(0, 7)),
 )
-def test_batches_are_full_and_tokens_come_back_to_their_frames(
-    pieces: list[list[int]], size: int, dropped: set[int]
-) -> None:
+def test_batches_are_full_and_tokens_come_back_to_their_frames(pieces, size, dropped) -> None:
     seen: list[int] = []
 
     def encode(batch: NDArray[np.uint8]) -> NDArray[Any]:

@@ -22,7 +22,6 @@ from hma_data.shards.preview import preview
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import read_footer
 from hma_data.shards.verify import verify
-from hma_data.tokenizers.base import Tokenizer
 from tests.command import hma
 from tests.conftest import BlockTokenizer, write_toy
 from tests.data.cameras import LENGTHS, SIZES, arm, write_dataset, write_hdf5
@@ -51,9 +50,7 @@ def made(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_each_camera_is_a_column_of_what_it_would_be_alone(
-    made: Path, recording: Path, tmp_path: Path
-) -> None:
+def test_each_camera_is_a_column_of_what_it_would_be_alone(made, recording, tmp_path) -> None:
     assert verify(made) == []
     shards = ShardSet(made)
     assert shards.manifest.cameras == list(SIZES)
@@ -116,9 +113,7 @@ def test_an_unknown_camera_is_refused(recording: Path, tmp_path: Path) -> None:
         convert(arm(), recording, BlockTokenizer(), tmp_path / "x", settings=Settings(cameras=("nose",)))
 
 
-def test_merged_split_and_extended_sets_keep_every_camera(
-    made: Path, recording: Path, tmp_path: Path
-) -> None:
+def test_merged_split_and_extended_sets_keep_every_camera(made, recording, tmp_path) -> None:
     merge([made, made], tmp_path / "twice")
     split(tmp_path / "twice", tmp_path / "again", val_fraction=0.5)
     for limit in (2, None):
@@ -154,9 +149,7 @@ def test_preview_and_export_show_the_cameras(made: Path, tmp_path: Path) -> None
     assert json.loads((tmp_path / "flat/metadata.json").read_text())["camera"] == "wrist"
 
 
-def test_a_set_of_one_camera_has_the_rows_that_it_had(
-    toy_arm, block_tokenizer: Tokenizer, tmp_path: Path
-) -> None:
+def test_a_set_of_one_camera_has_the_rows_that_it_had(toy_arm, block_tokenizer, tmp_path) -> None:
     write_toy(tmp_path / "toy.hdf5", [9, 11, 10])
     out = tmp_path / "set"
     convert(toy_arm, tmp_path / "toy.hdf5", block_tokenizer, out, settings=Settings(val_fraction=0.3))

@@ -116,9 +116,7 @@ def test_another_embodiment_or_tokenizer_is_refused_and_nothing_touched(
 
 
 @pytest.mark.parametrize(("limit", "empty"), [(2, True), (3, False), (1, False)])
-def test_a_limit_that_leaves_val_empty_is_told(
-    limit: int, empty: bool, toy_arm, tmp_path, block_tokenizer
-) -> None:
+def test_a_limit_that_leaves_val_empty_is_told(limit, empty, toy_arm, tmp_path, block_tokenizer) -> None:
     path = tmp_path / "split.hdf5"
     write_toy(path, [20, 20, 20])
     with h5py.File(path, "a") as file:  # robomimic's masks are a split of the recording's own

@@ -110,9 +110,7 @@ def test_a_worker_that_no_node_of_this_machine_can_hold_is_one_error(
 
 
 @on_a_cluster
-def test_a_cluster_that_was_named_is_waited_for_and_the_user_hears_of_it(
-    cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cluster_that_was_named_is_waited_for_and_the_user_hears_of_it(cluster, monkeypatch) -> None:
     from hma_data.conversion.engines import ray as engine
 
     said: list[str] = []
@@ -128,9 +126,7 @@ def test_a_cluster_that_was_named_is_waited_for_and_the_user_hears_of_it(
 
 
 @on_a_cluster
-def test_workers_that_cannot_be_made_are_one_error(
-    cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_workers_that_cannot_be_made_are_one_error(cluster, tmp_path, monkeypatch) -> None:
     from hma_data.conversion.engines import ray as engine
 
     monkeypatch.setattr(engine, "LOST_STARTS", 1)
@@ -187,9 +183,7 @@ def whole(toy_arm, toy_recording, tmp_path: Path) -> dict[str, bytes]:
 
 
 @on_a_cluster
-def test_the_bytes_are_those_of_the_local_engine(
-    cluster, toy_arm, toy_recording, tmp_path: Path, whole: dict[str, bytes]
-) -> None:
+def test_the_bytes_are_those_of_the_local_engine(cluster, toy_arm, toy_recording, tmp_path, whole) -> None:
     convert(toy_arm, str(toy_recording), "raw", tmp_path / "out", settings=SETTINGS, workers=2, engine="ray")
     assert contents(tmp_path / "out") == whole
 
@@ -215,9 +209,7 @@ conversion.convert(
 
 
 @on_a_cluster
-def test_a_storm_of_kills_ends_with_the_same_bytes(
-    cluster, toy_recording, tmp_path: Path, whole: dict[str, bytes], request
-) -> None:
+def test_a_storm_of_kills_ends_with_the_same_bytes(cluster, toy_recording, tmp_path, whole, request) -> None:
     """Of actors, of the processes that work for them, and twice of the driver, which is run again."""
     draws = random.Random(0)
     script, out, killed = tmp_path / "driver.py", tmp_path / "out", 0
@@ -272,9 +264,7 @@ def actors_of(pid: int) -> list[int]:
         ("127.0.0.1:1", "the Ray cluster at 127.0.0.1:1: cannot be joined: [Errno 111] Connection refused"),
     ],
 )
-def test_a_cluster_that_does_not_answer_is_one_error(
-    address: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_cluster_that_does_not_answer_is_one_error(address, said, monkeypatch, tmp_path) -> None:
     from hma_data.conversion.engines import ray as engine
 
     class NoRay:
@@ -306,9 +296,7 @@ def test_actors_take_their_nodes_environment_unless_the_user_says_otherwise(
     assert done.stdout.strip() == seen, done.stderr
 
 
-def test_without_ray_the_error_says_how_to_install_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_ray_the_error_says_how_to_install_it(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingDependencyError, match="uv sync --inexact --extra ray"):
         do(PLAIN, tmp_path)

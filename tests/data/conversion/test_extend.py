@@ -62,9 +62,7 @@ def check_extended(
     assert run(robot, recording, out).made_shards == 0
 
 
-def test_demos_added_to_a_file_extend_the_set_again_and_again(
-    toy_arm: Embodiment, recording: Path, tmp_path: Path
-) -> None:
+def test_demos_added_to_a_file_extend_the_set_again_and_again(toy_arm, recording, tmp_path) -> None:
     out = tmp_path / "out"
     run(toy_arm, recording, out)
     for begun, lengths in ((3, [23, 24]), (5, [25])):
@@ -75,9 +73,7 @@ def test_demos_added_to_a_file_extend_the_set_again_and_again(
         check_extended(toy_arm, recording, out, before, begun + len(lengths))
 
 
-def test_strided_rows_of_two_cameras_are_recognised(
-    toy_arm: Embodiment, recording: Path, tmp_path: Path
-) -> None:
+def test_strided_rows_of_two_cameras_are_recognised(toy_arm, recording, tmp_path) -> None:
     settings = Settings(frames="strided", cameras=tuple(c.name for c in toy_arm.cameras), shard_frames=60)
     run(toy_arm, recording, tmp_path / "out", settings)
     grow(recording, [23], 3)
@@ -106,9 +102,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("what", CHANGES)
-def test_a_known_episode_that_changed_is_refused_by_its_name(
-    what: str, toy_arm: Embodiment, recording: Path, tmp_path: Path
-) -> None:
+def test_a_known_episode_that_changed_is_refused_by_its_name(what, toy_arm, recording, tmp_path) -> None:
     out = tmp_path / "out"
     run(toy_arm, recording, out)
     before = shards(out)
@@ -151,9 +145,7 @@ def test_what_follows_from_the_shards_is_written_anew_or_told_before_it_is_exten
     assert (out / name).read_bytes() == before and shards(out) == shards_before and verify(out) == []
 
 
-def test_a_shard_that_is_missing_is_told_before_the_set_is_extended(
-    toy_arm: Embodiment, recording: Path, tmp_path: Path
-) -> None:
+def test_a_shard_that_is_missing_is_told_before_the_set_is_extended(toy_arm, recording, tmp_path) -> None:
     out = tmp_path / "out"
     run(toy_arm, recording, out)
     whole = shards(out)
@@ -173,18 +165,14 @@ def test_a_shard_that_is_missing_is_told_before_the_set_is_extended(
             run(toy_arm, recording, out, extend=extend)
 
 
-def test_doctor_tells_a_set_that_is_not_finished_from_a_recording(
-    toy_arm: Embodiment, recording: Path, tmp_path: Path
-) -> None:
+def test_doctor_tells_a_set_that_is_not_finished_from_a_recording(toy_arm, recording, tmp_path) -> None:
     run(toy_arm, recording, tmp_path / "out")
     (tmp_path / "out" / "manifest.json").unlink()
     (found,) = examine(str(tmp_path / "out"))
     assert found.check == "integrity" and "its conversion has not finished" in found.message
 
 
-def test_what_a_worker_notes_is_what_is_found_later(
-    toy_arm: Embodiment, recording: Path, tmp_path: Path
-) -> None:
+def test_what_a_worker_notes_is_what_is_found_later(toy_arm, recording, tmp_path) -> None:
     run(toy_arm, recording, tmp_path / "out")
     facts = Manifest.load(tmp_path / "out").plan
     rows = pq.read_table(tmp_path / "out" / EPISODES).to_pylist()
@@ -194,9 +182,7 @@ def test_what_a_worker_notes_is_what_is_found_later(
 
 
 @pytest.mark.parametrize(("make", "robot"), [(make_v3, lerobot_robot), (toy, rlds_robot)])
-def test_episodes_added_to_a_lerobot_datasets_videos_or_a_split_of_rlds(
-    make: Callable[..., Path], robot: Callable[[], Embodiment], tmp_path: Path
-) -> None:
+def test_episodes_added_to_a_lerobot_datasets_videos_or_a_split_of_rlds(make, robot, tmp_path) -> None:
     folder, out = tmp_path / "set", tmp_path / "out"
     make(folder, (12, 9, 15))
     run(robot(), folder, out)
@@ -259,9 +245,7 @@ def test_a_published_set_is_a_set_to_extend(tmp_path: Path, toy_arm: Embodiment)
 
 
 @pytest.mark.parametrize("options", [{}, {"extend": True}, {"overwrite": True}])
-def test_a_foreign_file_in_a_set_is_named_and_kept(
-    options: dict[str, bool], tmp_path: Path, toy_arm: Embodiment
-) -> None:
+def test_a_foreign_file_in_a_set_is_named_and_kept(options, tmp_path, toy_arm) -> None:
     recording, out = tmp_path / "toy.hdf5", tmp_path / "out"
     write_toy(recording, [20, 21])
     convert(toy_arm, recording, BlockTokenizer(), out)

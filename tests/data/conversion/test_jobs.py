@@ -47,9 +47,7 @@ def test_only_who_tokenizes_opens_the_tokenizer(
     assert opened == devices
 
 
-def test_a_device_that_workers_lack_is_one_error(
-    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path
-) -> None:
+def test_a_device_that_workers_lack_is_one_error(toy_arm, toy_recording, tmp_path) -> None:
     with pytest.raises(HMAError, match="cannot run on device 'no such'"):
         convert(toy_arm, toy_recording, "fsq-8", tmp_path / "out", device="no such", workers=1)
     assert not contents(tmp_path / "out")
@@ -59,9 +57,7 @@ def test_a_device_that_workers_lack_is_one_error(
 
 
 @pytest.mark.slow
-def test_workers_without_a_shard_are_told_before_the_work_and_by_a_dry_run(
-    toy_arm: Embodiment, tmp_path: Path
-) -> None:
+def test_workers_without_a_shard_are_told_before_the_work_and_by_a_dry_run(toy_arm, tmp_path) -> None:
     (tmp_path / "toy_arm.yaml").write_text(toy_arm.to_yaml())
     write_toy(tmp_path / "toy.hdf5", [20] * 8)
     words = ["convert", "-e", tmp_path / "toy_arm.yaml", "--source", tmp_path / "toy.hdf5"]
@@ -139,9 +135,7 @@ def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(
     assert not out.exists()
 
 
-def test_a_lock_left_by_a_killed_job_is_no_lock(
-    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
-) -> None:
+def test_a_lock_left_by_a_killed_job_is_no_lock(toy_arm, toy_recording, tmp_path, whole) -> None:
     out = tmp_path / "out"
     out.mkdir()
     (out / LOCK).touch()
@@ -277,8 +271,6 @@ def test_an_episode_that_breaks_off_in_the_middle_leaves_nothing_of_itself(
     assert summary.manifest.splits["train"]["episodes"] + summary.manifest.splits["val"]["episodes"] == 11
 
 
-def test_limits_are_kept_apart_from_errors_of_the_job(
-    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path
-) -> None:
+def test_limits_are_kept_apart_from_errors_of_the_job(toy_arm, toy_recording, tmp_path) -> None:
     with pytest.raises(HMAError, match="tokenizer"):
         convert(toy_arm, str(toy_recording), "no-such", tmp_path / "o", workers=1, limits=Limits(quiet_s=1))

@@ -125,16 +125,12 @@ def test_episodes_cut_from_one_recording_share_a_split() -> None:
         ([], 4, 1, 0),
     ],
 )
-def test_a_job_takes_as_long_as_its_busiest_worker(
-    frames: list[int], workers: int, tasks: int, longest: int
-) -> None:
+def test_a_job_takes_as_long_as_its_busiest_worker(frames, workers, tasks, longest) -> None:
     assert longest_work(frames, workers, tasks) == longest
 
 
 @pytest.mark.parametrize(("workers", "tasks"), [(64, 1), (4, 16), (10, 1), (3, 64)])
-def test_workers_without_a_shard_are_told_with_the_size_that_gives_them_one(
-    workers: int, tasks: int, toy_arm: Embodiment
-) -> None:
+def test_workers_without_a_shard_are_told_with_the_size_that_gives_them_one(workers, tasks, toy_arm) -> None:
     episodes = refs(*[50] * 400)
     few = plan(episodes, toy_arm)
     todo = len(few.units[::tasks])

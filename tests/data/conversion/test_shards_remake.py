@@ -67,9 +67,7 @@ def test_split_is_what_converting_with_that_seed_gives(made: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_split_gives_the_same_bytes_for_any_number_of_workers(
-    made: Path, tmp_path: Path, workers: int
-) -> None:
+def test_split_gives_the_same_bytes_for_any_number_of_workers(made, tmp_path, workers) -> None:
     split(made, tmp_path / "a", seed=5)
     split(made, tmp_path / "b", seed=5, workers=workers)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")

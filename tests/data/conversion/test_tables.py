@@ -106,9 +106,7 @@ def together_by_hand(rows: Sequence[EpisodeRow], by: str) -> list[str]:
     st.none() | st.integers(1, 900),
     st.none() | st.integers(1, 30),
 )
-def test_a_plan_is_that_of_plain_loops(
-    refs: list[EpisodeRef], fraction: float, seed: int, size: int | None, limit: int | None
-) -> None:
+def test_a_plan_is_that_of_plain_loops(refs, fraction, seed, size, limit) -> None:
     chosen = Settings(val_fraction=fraction, seed=seed, shard_frames=size, limit=limit)
     plan = make_plan(refs, ARM, BlockTokenizer.spec, chosen, "toy")
     refs = refs[:limit]

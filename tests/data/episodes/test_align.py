@@ -61,9 +61,7 @@ def test_hold_is_the_last_at_or_before(source: np.ndarray, targets: np.ndarray) 
 
 @QUICK
 @given(source=times(), targets=times(), late=st.integers(0, 50))
-def test_hold_with_a_tolerance_is_the_last_at_most_so_late(
-    source: np.ndarray, targets: np.ndarray, late: int
-) -> None:
+def test_hold_with_a_tolerance_is_the_last_at_most_so_late(source, targets, late) -> None:
     index, skew_ms = hold(source, targets, late * TICK)
     np.testing.assert_array_equal(index, [one_held(source, t + late * TICK) for t in targets])
     trimmed = targets + late * TICK < source[0]
@@ -224,9 +222,7 @@ def test_frames_before_the_first_command_are_left_out_and_counted() -> None:
 
 @QUICK
 @given(limit=st.floats(1, 80), gap=st.integers(1, 12))
-def test_an_episode_is_refused_exactly_when_a_stream_is_further_off_than_allowed(
-    limit: float, gap: int
-) -> None:
+def test_an_episode_is_refused_exactly_when_a_stream_is_further_off_than_allowed(limit, gap) -> None:
     wrist = np.concatenate([FAST[:100], FAST[100 + gap :]])
     middle = episode(FAST[:180], wrist, FAST, FAST, FAST)
     worst = max(min(abs(w - t) for w in wrist) for t in FAST[:180]) * 1e3
@@ -308,9 +304,7 @@ def ticks(draw: st.DrawFn) -> np.ndarray:
     epoch=st.sampled_from([0.0, 3_600.0, 86_400.5, 1_700_000_000.0, 1_763_740_800.123456]),
     added=st.booleans(),
 )
-def test_hold_and_nearest_are_those_of_exact_times(
-    source: np.ndarray, targets: np.ndarray, epoch: float, added: bool
-) -> None:
+def test_hold_and_nearest_are_those_of_exact_times(source, targets, epoch, added) -> None:
     floats = epoch + source / 300
     if added and epoch < 1e6:  # near 1.7e9 each sum loses 0.1 µs, and times drift apart in earnest
         floats = np.cumsum([epoch + source[0] / 300, *(np.diff(source) * (1 / 300))])

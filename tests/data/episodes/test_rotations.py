@@ -49,9 +49,7 @@ def turning(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
 
 @QUICK
 @given(turning(), st.lists(st.sampled_from([-1.0, 1.0]), min_size=6, max_size=6), st.booleans())
-def test_quaternions_turn_along_the_shorter_arc_whatever_their_signs(
-    turn: tuple[np.ndarray, np.ndarray], signs: list[float], w_first: bool
-) -> None:
+def test_quaternions_turn_along_the_shorter_arc_whatever_their_signs(turn, signs, w_first) -> None:
     axis, angles = turn
     values = about(axis, angles) * np.array(signs)[:, None]
     name = "quaternion_wxyz" if w_first else "quaternion_xyzw"
@@ -67,9 +65,7 @@ def test_quaternions_turn_along_the_shorter_arc_whatever_their_signs(
 
 @QUICK
 @given(turning())
-def test_axis_angle_turns_along_the_shorter_arc_and_keeps_its_samples(
-    turn: tuple[np.ndarray, np.ndarray],
-) -> None:
+def test_axis_angle_turns_along_the_shorter_arc_and_keeps_its_samples(turn) -> None:
     axis, angles = turn
     wrapped = (angles + np.pi) % (2 * np.pi) - np.pi  # of length 0 to pi, jumping to the other end
     values = (axis * wrapped[:, None]).astype(np.float32)
@@ -83,9 +79,7 @@ def test_axis_angle_turns_along_the_shorter_arc_and_keeps_its_samples(
 
 @QUICK
 @given(turning(), st.sampled_from([(-np.pi, "rad"), (0.0, "rad"), (-180.0, "deg"), (0.0, None)]))
-def test_angles_go_over_the_seam_and_stay_in_their_range(
-    turn: tuple[np.ndarray, np.ndarray], convention: tuple[float, str | None]
-) -> None:
+def test_angles_go_over_the_seam_and_stay_in_their_range(turn, convention) -> None:
     low, unit = convention
     period = 360.0 if unit == "deg" else 2 * np.pi
     angles = turn[1][:, None] * np.array([1, -0.5, 0.3]) * period / (2 * np.pi)

@@ -72,9 +72,7 @@ def test_a_sound_recording_has_no_finding(tmp_path: Path) -> None:
         (set_all("actions", lambda actions: np.full_like(actions, np.nan)), "usable", "error"),
     ],
 )
-def test_a_defect_is_found_by_its_check(
-    tmp_path: Path, damage: Callable[[h5py.File], None], check: str, severity: str
-) -> None:
+def test_a_defect_is_found_by_its_check(tmp_path, damage, check, severity) -> None:
     found = examined(tmp_path, damage)
     assert (check, severity) in {(finding.check, finding.severity) for finding in found}
 
@@ -87,17 +85,13 @@ def test_a_defect_is_found_by_its_check(
         ("target_hz: 5", "target_hz: 1", "length"),
     ],
 )
-def test_what_the_yaml_states_is_held_against_the_episodes(
-    tmp_path: Path, old: str, new: str, check: str
-) -> None:
+def test_what_the_yaml_states_is_held_against_the_episodes(tmp_path, old, new, check) -> None:
     assert check in {
         finding.check for finding in examined(tmp_path, lambda file: None, ARM_YAML.replace(old, new))
     }
 
 
-def test_without_a_yaml_black_pictures_are_a_warning_only_where_no_other_camera_is_left(
-    tmp_path: Path,
-) -> None:
+def test_without_a_yaml_black_pictures_are_a_warning_only_where_no_other_camera_is_left(tmp_path) -> None:
     path = tmp_path / "toy.hdf5"
     with h5py.File(path, "w") as file:
         sound(file)

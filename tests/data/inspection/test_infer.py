@@ -337,9 +337,7 @@ def test_colours_of_other_numbers_than_bytes_are_cameras_with_their_range(
         ({}, np.arange(T) * 0.1, 10),
     ],
 )
-def test_rates_of_attributes_and_of_times_in_any_unit(
-    tmp_path: Path, attributes: dict[str, Any], times: np.ndarray | None, hz: int | None
-) -> None:
+def test_rates_of_attributes_and_of_times_in_any_unit(tmp_path, attributes, times, hz) -> None:
     path = tmp_path / "run.hdf5"
     with h5py.File(path, "w") as file:
         for name, value in attributes.items():
@@ -465,9 +463,7 @@ def test_real_g1(real_data: Path) -> None:
         ("ros1/foxglove/fixtures/no-messages.bag", ("no bag holds a message",)),
     ],
 )
-def test_real_recordings_of_no_use_say_what_is_there(
-    real_data: Path, name: str, words: tuple[str, ...]
-) -> None:
+def test_real_recordings_of_no_use_say_what_is_there(real_data, name, words) -> None:
     with pytest.raises(SourceError) as caught:
         infer(str(real_data / name), "mine")
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 900
@@ -569,9 +565,7 @@ def test_grey_cameras_are_taken_with_a_question_where_there_is_no_colour() -> No
         (30, (), 2),
     ],
 )
-def test_short_episodes_get_a_rate_at_which_a_model_sees_enough_of_them(
-    hz: float, lengths: tuple[int, ...], rate: float
-) -> None:
+def test_short_episodes_get_a_rate_at_which_a_model_sees_enough_of_them(hz, lengths, rate) -> None:
     keys = KeyInfo("image", "camera", (64, 64, 3), "uint8"), KeyInfo("action", "vector", (3,), "float32")
     found = Inspection("hdf5", "d", max(len(lengths), 1), keys, lengths=lengths, hz=hz)
     values = parse_yaml(from_inspection(found, "mine"), "d")

@@ -221,9 +221,7 @@ def test_a_rate_measured_in_one_episode_is_not_called_stated(tmp_path: Path) -> 
         ("meta/episode_ends", [10, 20, 30], 3),  # as diffusion policy's arrays
     ],
 )
-def test_episodes_end_to_end_in_one_file_are_told(
-    tmp_path: Path, key: str, values: list, count: int | None
-) -> None:
+def test_episodes_end_to_end_in_one_file_are_told(tmp_path, key, values, count) -> None:
     with h5py.File(tmp_path / "flat.hdf5", "w") as file:
         file["images"] = np.random.default_rng(0).integers(0, 256, (30, 16, 16, 3), np.uint8)
         file["actions"], file[key] = np.random.default_rng(0).normal(size=(30, 3)), values

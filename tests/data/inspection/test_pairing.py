@@ -117,9 +117,7 @@ def yaml_of(tmp_path: Path, bag: Path, **sync: Any) -> Path:
         ("around, with jitter", {}, "get the action of the frame before them"),
     ],
 )
-def test_doctor_says_when_the_yaml_pairs_commands_with_other_pictures(
-    tmp_path: Path, name: str, sync: dict[str, Any], said: str
-) -> None:
+def test_doctor_says_when_the_yaml_pairs_commands_with_other_pictures(tmp_path, name, sync, said) -> None:
     bag = FORMS["mcap"](tmp_path, recording(CASES[name]))
     found = [one for one in examine(bag, yaml_of(tmp_path, bag, **sync)) if one.check == "offset"]
     assert [one.severity for one in found] == ["warn"] * bool(said)

@@ -144,9 +144,7 @@ def test_shards_without_a_window_are_an_error(tmp_path: Path, toy_arm: Embodimen
 
 
 @pytest.mark.parametrize(("length", "short"), [(23, True), (24, False)])
-def test_doctor_counts_the_rows_of_a_window_as_the_loader_does(
-    length: int, short: bool, tmp_path: Path, toy_arm: Embodiment
-) -> None:
+def test_doctor_counts_the_rows_of_a_window_as_the_loader_does(length, short, tmp_path, toy_arm) -> None:
     write_toy(tmp_path / "toy.hdf5", [length] * 3)
     (tmp_path / "arm.yaml").write_text(toy_arm.to_yaml())
     found = [one for one in examine(tmp_path / "toy.hdf5", tmp_path / "arm.yaml") if one.check == "length"]

@@ -100,9 +100,7 @@ def test_unknown_actions_are_a_gap(arm: Path, tmp_path: Path, monkeypatch: pytes
     assert np.isnan(values[:4]).all() and np.isfinite(values[4:]).all()
 
 
-def test_what_cannot_be_shown_says_what_to_do(
-    arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_shown_says_what_to_do(arm, tmp_path, monkeypatch) -> None:
     recording = tmp_path / "toy.hdf5"
     fails(hma("view", recording), 2, "add -e ROBOT")
     fails(hma("view", recording, "-e", arm, "--episode", 3), 2, "3 episodes")

@@ -141,9 +141,7 @@ def test_most_robots_push_a_block_in_some_of_their_episodes() -> None:
 
 
 @pytest.mark.parametrize(("robot", "hold", "release"), [("arm2_07", 0.0, 1.0), ("crane_01", 1.0, 0.0)])
-def test_what_is_held_moves_with_the_tip_until_it_is_released(
-    robot: str, hold: float, release: float
-) -> None:
+def test_what_is_held_moves_with_the_tip_until_it_is_released(robot, hold, release) -> None:
     world, _ = start(Body.of(robot), SEED, 1)
     world.blocks[0] = world.body.mechanism.tip(world.pose)[0]
     begun = world.blocks[0].copy()

@@ -17,7 +17,6 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
 from hma_data.sources.detect import detect
-from tests.conftest import BlockTokenizer
 
 EPISODES, SEED = 2, 3
 
@@ -76,9 +75,7 @@ def test_the_episodes_are_those_of_the_recording_in_hdf5(recorded: Path, tmp_pat
         assert 10 * np.log10(255**2 / np.square(shown - drawn).mean()) > 30  # the video is lossy
 
 
-def test_it_is_found_to_be_lerobots_and_converts(
-    recorded: Path, block_tokenizer: BlockTokenizer, tmp_path: Path
-) -> None:
+def test_it_is_found_to_be_lerobots_and_converts(recorded, block_tokenizer, tmp_path) -> None:
     robot = find("planar_arm_lerobot")
     assert detect(str(recorded)) == robot.source.format == "lerobot"
     convert(robot, str(recorded), block_tokenizer, tmp_path / "shards")
@@ -89,9 +86,7 @@ def test_it_is_found_to_be_lerobots_and_converts(
         np.testing.assert_array_equal(values, episode.actions[0].values)
 
 
-def test_without_lerobot_one_line_says_how_to_install_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_lerobot_one_line_says_how_to_install_it(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "lerobot.datasets.lerobot_dataset", None)
     with pytest.raises(MissingDependencyError, match=r"lerobot: .*uv sync") as found:
         record("planar_arm_lerobot", tmp_path, 1)

@@ -18,7 +18,6 @@ from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
-from tests.conftest import BlockTokenizer
 
 EPISODES, SEED = 4, 3
 ROBOTS = ("pendulum", "planar_arm")
@@ -80,13 +79,7 @@ def test_recording_reads_as_the_registry_describes(robot: str, recordings: dict[
 
 
 @pytest.mark.parametrize(("robot", "stride"), [("pendulum", 2), ("planar_arm", 3)])
-def test_recording_converts(
-    robot: str,
-    stride: int,
-    recordings: dict[str, Recorded],
-    block_tokenizer: BlockTokenizer,
-    tmp_path: Path,
-) -> None:
+def test_recording_converts(robot, stride, recordings, block_tokenizer, tmp_path) -> None:
     recorded = recordings[robot]
     assert recorded.robot.stride == stride
     convert(recorded.robot, str(recorded.path), block_tokenizer, tmp_path / "shards")
@@ -117,9 +110,7 @@ def test_other_actions_make_other_pictures(robot: str, recordings: dict[str, Rec
     ("robot", "module"),
     [("pendulum", "gymnasium.envs.classic_control.pendulum"), ("planar_arm", "pymunk")],
 )
-def test_missing_simulator_says_how_to_install_it(
-    robot: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_simulator_says_how_to_install_it(robot, module, tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingDependencyError, match="uv sync"):
         record(robot, tmp_path, 1)

@@ -114,9 +114,7 @@ def flipped(path: Path) -> None:
 
 @pytest.mark.parametrize("damage", [missing, truncated])
 @pytest.mark.parametrize("workers", [0, 1])
-def test_a_shard_that_goes_while_training_stops_it_with_its_name(
-    sets: list[Path], damage: Callable[[Path], None], workers: int
-) -> None:
+def test_a_shard_that_goes_while_training_stops_it_with_its_name(sets, damage, workers) -> None:
     data = MixtureDataset(sets, 16, 6, pool=1, memory_mib=1)
     batches = data.batches(workers)
     taken = len(list(islice(batches, 2)))

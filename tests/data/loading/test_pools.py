@@ -50,9 +50,7 @@ def rows_of(stream: WindowSequence, start: int, count: int) -> list[float]:
     st.integers(0, 2**31),
 )
 @settings(max_examples=100, deadline=None)
-def test_windows_that_share_a_row_are_further_apart_than_promised(
-    runs: list[int], span: int, seed: int
-) -> None:
+def test_windows_that_share_a_row_are_further_apart_than_promised(runs, span, seed) -> None:
     rows = np.concatenate([np.arange(n) + 100 * i for i, n in enumerate(runs)]).astype(np.int64)
     order, apart = spread(rows, span, np.random.default_rng(seed))
     assert sorted(order.tolist()) == list(range(len(rows)))

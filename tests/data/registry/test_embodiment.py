@@ -330,9 +330,7 @@ LAYOUT_VALUES = [
 
 
 @pytest.mark.parametrize(("name", "layout", "valid"), LAYOUT_VALUES)
-def test_the_schema_and_the_registry_judge_a_layout_alike(
-    name: str, layout: dict[str, Any], valid: bool
-) -> None:
+def test_the_schema_and_the_registry_judge_a_layout_alike(name, layout, valid) -> None:
     values = BASE | {"source": {"format": name, "layout": layout}}
     told = pytest.importorskip("jsonschema").Draft202012Validator(schema()).is_valid(values)
     assert (not problems(values), told) == (valid, valid)

@@ -100,9 +100,7 @@ def test_a_file_that_its_id_does_not_find_is_named(folder: Path) -> None:
     assert "does not find its file arm.yaml" in own(folder)["arm"][0]
 
 
-def test_the_first_folder_wins_over_later_ones(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_first_folder_wins_over_later_ones(folder, tmp_path, monkeypatch) -> None:
     later = tmp_path / "later"
     later.mkdir()
     put(folder, "arm", hz=10)

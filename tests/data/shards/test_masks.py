@@ -63,9 +63,7 @@ def lacking(times_ns: np.ndarray) -> list[int]:
     return [i for i, age in enumerate(ages) if age > 60_000_000]
 
 
-def test_an_episode_is_refused_or_its_old_commands_are_masked(
-    bag: Path, shards: Path, tmp_path: Path, block_tokenizer
-) -> None:
+def test_an_episode_is_refused_or_its_old_commands_are_masked(bag, shards, tmp_path, block_tokenizer) -> None:
     with pytest.raises(SourceError, match="ms off at 1"):
         convert(robot("refuse"), str(bag), block_tokenizer, tmp_path / "out")
     rows = ShardSet(shards).episode_rows(0, ["action", "state", "action_known", "state_known"])
@@ -158,9 +156,7 @@ def test_statistics_without_a_known_state_are_zeros(tmp_path: Path, block_tokeni
         (12, True, 0.0, "action statistics in its footer are not those of its rows"),
     ],
 )
-def test_marks_that_are_not_those_of_the_values_are_found(
-    shards: Path, tmp_path: Path, row: int, known: bool, value: float, fault: str
-) -> None:
+def test_marks_that_are_not_those_of_the_values_are_found(shards, tmp_path, row, known, value, fault) -> None:
     manifest = ShardSet(shards).manifest
     (shard,) = manifest.shards
     table = pq.read_table(shards / shard.path)

@@ -41,9 +41,7 @@ def test_info_in_figures(made: Path) -> None:
         assert word in said
 
 
-def test_info_counts_episodes_with_an_instruction_and_different_ones_apart(
-    made: Path, tmp_path: Path
-) -> None:
+def test_info_counts_episodes_with_an_instruction_and_different_ones_apart(made, tmp_path) -> None:
     path = Path(shutil.copytree(made, tmp_path / "set")) / "episodes.parquet"
     table = pq.read_table(path)
     place = table.column_names.index("instruction")
@@ -85,9 +83,7 @@ def test_every_verb_that_makes_a_set_makes_a_sound_one(made: Path, tmp_path: Pat
         ["preview", "nowhere", "--out", "x"],
     ],
 )
-def test_a_folder_that_is_not_there_is_one_error(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_is_not_there_is_one_error(words, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(shards_app, words)
     assert isinstance(done.exception, HMAError)

@@ -65,9 +65,7 @@ def test_a_pause_as_long_as_a_step_divides_an_episode_into_pieces() -> None:
 
 @given(LENGTHS, st.integers(1, 4), st.integers(1, 3), st.data())
 @settings(max_examples=60, deadline=None)
-def test_the_pieces_of_one_episode_are_those_of_the_window_index(
-    lengths: list[int], stride: int, frame_stride: int, data: st.DataObject
-) -> None:
+def test_the_pieces_of_one_episode_are_those_of_the_window_index(lengths, stride, frame_stride, data) -> None:
     rates = st.dictionaries(st.integers(0, 95), st.integers(1, 9), max_size=4)
     paused = [data.draw(rates) for _ in lengths]
     made = fake(lengths)
@@ -88,9 +86,7 @@ def test_the_pieces_of_one_episode_are_those_of_the_window_index(
 
 @given(LENGTHS, st.integers(1, 6), st.integers(1, 3))
 @settings(max_examples=60, deadline=None)
-def test_a_row_group_reaches_as_far_as_its_windows_and_no_further(
-    lengths: list[int], frames: int, stride: int
-) -> None:
+def test_a_row_group_reaches_as_far_as_its_windows_and_no_further(lengths, frames, stride) -> None:
     index = WindowIndex.of(fake(lengths, stride), "train", frames)
     for group in index.units():
         last = index.first_rows(np.array([index.unit_first[group + 1] - 1]))[0] + index.span - 1
@@ -100,9 +96,7 @@ def test_a_row_group_reaches_as_far_as_its_windows_and_no_further(
 
 @given(LENGTHS, st.integers(2, 6), st.integers(1, 3))
 @settings(max_examples=60, deadline=None)
-def test_a_padded_episode_gives_one_window_from_its_first_row(
-    lengths: list[int], frames: int, stride: int
-) -> None:
+def test_a_padded_episode_gives_one_window_from_its_first_row(lengths, frames, stride) -> None:
     index = WindowIndex.of(fake(lengths, stride), "train", frames, short="pad")
     ends = np.cumsum(lengths)
     expected = []

@@ -25,9 +25,7 @@ REFS = st.lists(
 
 @settings(max_examples=25, deadline=None)
 @given(REFS, st.integers(-10, 10), st.integers(-10, 10), st.sampled_from([None, 1, 2, -1]))
-def test_a_sequence_of_records_is_the_list_it_was_made_of(
-    items: list[EpisodeRef], start: int, stop: int, step: int | None
-) -> None:
+def test_a_sequence_of_records_is_the_list_it_was_made_of(items, start, stop, step) -> None:
     records = Records.of(EpisodeRef, items)
     assert list(records) == items and len(records) == len(items)
     assert list(records[start:stop:step]) == items[start:stop:step]

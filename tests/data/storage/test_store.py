@@ -105,9 +105,7 @@ def test_any_read_of_a_range_file_gives_the_bytes_that_are_there(bucket: RemoteP
     assert file_sha256(bucket / "x") == hashlib.sha256(data).hexdigest()
 
 
-def test_reading_is_tried_again_and_ends_in_one_error(
-    bucket: RemotePath, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reading_is_tried_again_and_ends_in_one_error(bucket, monkeypatch) -> None:
     put_bytes(b"some bytes", bucket / "x")
     real, left = MemoryFileSystem.cat_file, [2]
 
@@ -178,9 +176,7 @@ def test_a_copy_with_other_bytes_than_the_manifest_says_is_refused(both: tuple[P
     assert not list((shard_cache.cache_folder() / "shards").iterdir())
 
 
-def test_the_cache_keeps_to_its_bound_and_drops_what_was_not_used_for_longest(
-    both: tuple[Path, RemotePath], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_cache_keeps_to_its_bound_and_drops_what_was_not_used_for_longest(both, monkeypatch) -> None:
     shards = ShardSet(both[1])
     total = sum(shard.bytes for shard in shards.manifest.shards)
     folder = shard_cache.cache_folder() / "shards"
@@ -205,18 +201,14 @@ def test_the_cache_keeps_to_its_bound_and_drops_what_was_not_used_for_longest(
         (10**9, 10 * 10**9, False),
     ],
 )
-def test_some_of_the_disk_is_left_free(
-    both: tuple[Path, RemotePath], monkeypatch: pytest.MonkeyPatch, free: int, total: int, kept: bool
-) -> None:
+def test_some_of_the_disk_is_left_free(both, monkeypatch, free, total, kept) -> None:
     a_disk_with(monkeypatch, free, total)
     shards = ShardSet(both[1])
     shards.read(shards.manifest.shards[0].path, [0], ["action"])
     assert bool(list((shard_cache.cache_folder() / "shards").glob("*.parquet"))) == kept
 
 
-def test_a_set_larger_than_the_cache_or_with_none_is_read_by_ranges(
-    both: tuple[Path, RemotePath], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_set_larger_than_the_cache_or_with_none_is_read_by_ranges(both, monkeypatch) -> None:
     for stated in ("0", "0.000001"):
         monkeypatch.setenv("HMA_CACHE_GB", stated)
         shards = ShardSet(both[1])

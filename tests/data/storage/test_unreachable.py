@@ -69,9 +69,7 @@ def test_a_recording_on_a_silent_web_server_may_exist() -> None:
         existing_path("http://127.0.0.1:9/run.mcap")
 
 
-def test_a_store_at_a_closed_port_is_tried_four_times(
-    closed: str, requests: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_at_a_closed_port_is_tried_four_times(closed, requests, monkeypatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", closed)
     said = (
         rf"s3://bucket/set: cannot be read: .*{closed}.* — check the network, and the address .AWS_ENDPOINT"

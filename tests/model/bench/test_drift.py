@@ -1,7 +1,6 @@
 """`hma bench drift`: its figures on rollouts whose errors are known, its settings, and one run of it."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -115,9 +114,7 @@ def test_ways_of_sampling_are_told_apart_by_the_words_that_differ() -> None:
 
 
 @pytest.mark.slow
-def test_rollouts_are_measured_and_drawn_and_repeat_themselves(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rollouts_are_measured_and_drawn_and_repeat_themselves(tmp_path, monkeypatch) -> None:
     embedded.embedded(tmp_path / "made", monkeypatch)
     robot = next(iter(drift_robots()))
     changes = {"robots": robot, "frames": 12, "rollouts": 2, "sampling": "unmask_steps=1/temperature=1.0"}

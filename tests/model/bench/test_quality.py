@@ -36,9 +36,7 @@ def test_the_same_code_is_inside_its_bands(shards: Path, tmp_path: Path) -> None
         assert row["other than the bands'"] is None
 
 
-def test_a_figure_outside_its_band_makes_the_command_fail(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_figure_outside_its_band_makes_the_command_fail(tmp_path, monkeypatch) -> None:
     losses = iter((3.0, 3.1, 3.05, 3.6, 2.4))
     monkeypatch.setattr(quality, "measure", lambda *given: {"loss": next(losses)})
     monkeypatch.setattr(quality, "digest_of", lambda data: "d")

@@ -20,9 +20,7 @@ from tests.model.embedded import embedded
 
 
 @pytest.mark.slow
-def test_a_demo_that_was_cut_goes_on_by_the_same_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_demo_that_was_cut_goes_on_by_the_same_command(tmp_path, monkeypatch) -> None:
     def cut(made: Demo) -> None:
         raise KeyboardInterrupt
 
@@ -61,9 +59,7 @@ def test_a_folder_that_holds_something_else_is_refused(tmp_path: Path) -> None:
         demos.demo(tmp_path)
 
 
-def test_other_settings_than_the_folder_was_begun_with_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_settings_than_the_folder_was_begun_with_are_refused(tmp_path, monkeypatch) -> None:
     def begun(*given: Any) -> None:
         raise KeyboardInterrupt
 

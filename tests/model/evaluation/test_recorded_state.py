@@ -102,9 +102,7 @@ def exact(*_: Any, **__: Any) -> Reader:
     return Reader(torch.nn.Module(), one, one, one, one, 0 * one, one)
 
 
-def test_a_prediction_that_is_not_finite_has_no_error(
-    disc: ShardSet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_prediction_that_is_not_finite_has_no_error(disc, monkeypatch) -> None:
     monkeypatch.setattr(recorded_state, "learn", exact)
     monkeypatch.setattr(Reader, "errors", lambda self, pictures, states: 0 * states)
     batches = list(windows(disc, "val", 8, 12))
@@ -117,9 +115,7 @@ def test_a_prediction_that_is_not_finite_has_no_error(
     assert found["true"]["error_sd_last"] is None and found["true"]["error_sd_by_frame"][0] == 0
 
 
-def test_a_set_whose_states_are_all_unknown_in_part_has_no_reader(
-    disc: ShardSet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_set_whose_states_are_all_unknown_in_part_has_no_reader(disc, monkeypatch) -> None:
     unknown = np.array([0.0, np.nan, 0.0, 0.0])
     monkeypatch.setattr(
         recorded_state._States, "of", lambda _, batch, frames: np.full((len(batch), frames, 4), unknown)
@@ -134,9 +130,7 @@ def test_a_set_whose_states_are_all_unknown_in_part_has_no_reader(
     assert np.isnan(last).all()
 
 
-def test_what_cannot_be_read_off_the_windows_own_pictures_is_left_out(
-    disc: ShardSet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_read_off_the_windows_own_pictures_is_left_out(disc, monkeypatch) -> None:
     monkeypatch.setattr(recorded_state, "learn", exact)
     monkeypatch.setattr(Reader, "errors", lambda self, pictures, states: 0 * states + [0.1, 0.6, 0.7, 0.8])
     batches = list(windows(disc, "val", 8, 12))

@@ -15,9 +15,7 @@ class OnGPU(torch.Tensor):
 
 
 @pytest.mark.parametrize("name", ["fsq-8", "vae-8"])
-def test_frames_on_a_gpu_are_decoded_there_to_the_same_pictures(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_on_a_gpu_are_decoded_there_to_the_same_pictures(name, monkeypatch) -> None:
     tokenizer = get_tokenizer(name)
     cells = tokenizer.spec.image_size // 16
     small = np.random.default_rng(0).integers(0, 256, (6, cells, cells, 3), np.uint8)

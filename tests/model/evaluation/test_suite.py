@@ -99,9 +99,7 @@ def test_what_holds_for_every_part_is_said_of_all_and_the_rest_of_its_own(made: 
     assert {text: name for name, text in absences(parts[:1])}["of each"] == "arm"
 
 
-def test_a_model_of_squares_is_compared_by_the_loss_of_a_stored_token(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_model_of_squares_is_compared_by_the_loss_of_a_stored_token(tmp_path, capsys) -> None:
     spec = replace(SPEC, grid=(2, 4))
     make_shards(tmp_path / "arm", "arm", held_out=2, spec=spec)
     for name, merge in (("single", 1), ("square", 2)):  # neither knows anything
@@ -124,9 +122,7 @@ def test_a_model_of_squares_is_compared_by_the_loss_of_a_stored_token(
     assert "loss, perplexity and accuracy are of squares of 2×2 tokens" in said and "nats/token" in said
 
 
-def test_parts_that_are_done_are_not_computed_again(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parts_that_are_done_are_not_computed_again(made, tmp_path, monkeypatch) -> None:
     calls: list[str] = []
     real = suite.measure
 
@@ -208,9 +204,7 @@ def test_the_difference_is_black_where_pictures_are_equal() -> None:
         (["{made}/edited", "{made}/arm"], "edited/trunk.safetensors: missing "),
     ],
 )
-def test_wrong_input_is_one_line(
-    made: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
-) -> None:
+def test_wrong_input_is_one_line(made, capsys, words, message) -> None:
     if not (made / "narrow").exists():
         save(made / "narrow", {"arm": 2})
         other = CONFIG.replace(tokenizer={**SPEC.to_json(), "version": 2})

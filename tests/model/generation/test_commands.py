@@ -1,10 +1,8 @@
 """Commands outside the range seen in training: told once, of each embodiment, by `HMA.generate`."""
 
 import warnings
-from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from hma_model.generation import commands
@@ -25,9 +23,7 @@ def told(model: HMA, actions: torch.Tensor, known: torch.Tensor | None = None) -
     return [str(one.message) for one in caught]
 
 
-def test_actions_outside_the_range_are_told_once_of_each_embodiment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_actions_outside_the_range_are_told_once_of_each_embodiment(tmp_path, monkeypatch) -> None:
     save(tmp_path, NAMES)
     model = HMA.from_pretrained(tmp_path).eval()
     ends = {"arm": np.array([[-1, -1], [1, 1]]), "crane": np.array([[-9, -9, -9], [9, 9, 9]])}

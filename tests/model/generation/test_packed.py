@@ -76,9 +76,7 @@ def test_a_packed_trunk_shares_everything_but_its_maps_and_leaves_the_model_alon
 
 
 @pytest.mark.parametrize("digits", ["together", "chain"])
-def test_a_rollout_on_packed_maps_makes_the_frames_of_the_plain_ones(
-    digits: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rollout_on_packed_maps_makes_the_frames_of_the_plain_ones(digits, monkeypatch) -> None:
     model = small_model(digit_order=digits, told_noise=True)
     how = {"temperature": 0.5, "noise_level": 0.2}
     quick = _frames(model, **how)
@@ -109,9 +107,7 @@ def test_products_of_fewer_bits_keep_the_features_near(precision: str, near: flo
         ("bf16", "no products of bfloat16 — use float32"),
     ],
 )
-def test_a_precision_that_is_not_there_is_refused(
-    precision: str, message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_precision_that_is_not_there_is_refused(precision, message, monkeypatch) -> None:
     monkeypatch.setattr(engine, "has_bfloat16", lambda: False)
     with pytest.raises(HMAError, match=message):
         Rollout(small_model(), "arm", precision=precision)

@@ -79,9 +79,7 @@ def test_a_row_has_the_spread_that_it_has_alone() -> None:
     torch.testing.assert_close(*found)
 
 
-def test_the_spread_is_the_standard_deviation_of_the_draws_in_the_tokenizers_units(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_spread_is_the_standard_deviation_of_the_draws_in_the_tokenizers_units(monkeypatch) -> None:
     model = small_model(kind="continuous", latent_scale=0.5, grid=(32, 32))
 
     def draw(conditions: Tensor, steps: Any, temperature: Any, generators: Any) -> Tensor:

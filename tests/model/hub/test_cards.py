@@ -45,9 +45,7 @@ def test_the_hubs_filters_find_a_model_by_its_data_and_its_base(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("tokenizer", "views"), [("fsq-lab", 1), ("fsq-lab", 2), pytest.param("vae-8", 1, marks=pytest.mark.slow)]
 )
-def test_the_cards_code_runs_as_pasted(
-    tokenizer: str, views: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_cards_code_runs_as_pasted(tokenizer, views, tmp_path, monkeypatch) -> None:
     spec = get_tokenizer(tokenizer).spec
     numbers = {"factored": spec.factored} if spec.kind == "discrete" else {"channels": spec.channels}
     config = HMAConfig(

@@ -25,9 +25,7 @@ def test_it_is_loaded_by_its_name(checkpoint: Path) -> None:
     assert sorted(model.embodiments) == sorted(path.name for path in (checkpoint / "embodiments").iterdir())
 
 
-def test_for_a_robot_that_it_lacks_the_command_that_adds_one_is_named(
-    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_for_a_robot_that_it_lacks_the_command_that_adds_one_is_named(checkpoint, tmp_path, capsys) -> None:
     shards = make_shards(tmp_path / "shards", "my_arm")
     assert main(["evaluate", "embedded", str(shards)]) == 1
     said = capsys.readouterr().err
@@ -37,9 +35,7 @@ def test_for_a_robot_that_it_lacks_the_command_that_adds_one_is_named(
 
 
 @pytest.mark.parametrize("part", ["trunk.safetensors", "embodiments/arm2_02/stem.safetensors"])
-def test_weights_with_a_flipped_byte_are_refused(
-    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
-) -> None:
+def test_weights_with_a_flipped_byte_are_refused(checkpoint, tmp_path, monkeypatch, part) -> None:
     copy = use(Path(shutil.copytree(checkpoint, tmp_path / "copy")), monkeypatch)
     content = bytearray((copy / part).read_bytes())
     content[-1] ^= 1

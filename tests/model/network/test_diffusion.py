@@ -34,9 +34,7 @@ class _Gaussian(DiffusionHead):
 @TARGETS
 @pytest.mark.parametrize("temperature", [0.0, 1.0])
 @pytest.mark.parametrize(("steps", "tolerance"), [(1000, 0.03), (100, 0.05), (20, 0.15)])
-def test_sampling_gives_the_distribution_back(
-    steps: int, tolerance: float, temperature: float, target: str
-) -> None:
+def test_sampling_gives_the_distribution_back(steps, tolerance, temperature, target) -> None:
     head = _Gaussian(mean=0.7, spread=0.5, target=target)
     generator = torch.Generator().manual_seed(0)
     samples = head.sample(torch.zeros(4000, 32), steps, temperature, generator)

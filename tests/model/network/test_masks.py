@@ -72,9 +72,7 @@ def test_no_loss_depends_on_what_stands_in_unknown_chunks(model: HMA, batch: Bat
 
 
 @pytest.mark.parametrize("objective", ["forward", "policy", "inverse", "full"])
-def test_a_batch_of_which_nothing_is_known_trains_without_nan(
-    model: HMA, batch: Batch, objective: str
-) -> None:
+def test_a_batch_of_which_nothing_is_known_trains_without_nan(model, batch, objective) -> None:
     model.train()
     blind = replace(batch, action_mask=torch.zeros_like(batch.action_mask))
     out = model(blind, objective, torch.Generator().manual_seed(0))

@@ -208,9 +208,7 @@ def test_action_loss_is_the_mean_over_present_chunks(target: str) -> None:
     [{}, {"digit_order": "chain"}, {"copy_previous": True}, {"merge": 2, "factored": (6, 4)}],
     ids=str,
 )
-def test_the_scores_of_one_frame_of_each_window_are_those_of_all_at_these_frames(
-    changes: dict[str, Any],
-) -> None:
+def test_the_scores_of_one_frame_of_each_window_are_those_of_all_at_these_frames(changes) -> None:
     model = small_model(**changes)
     batch = small_batch(model.config, ["arm", "hand.v1", "arm"])
     frame = torch.tensor([4, 1, 0])

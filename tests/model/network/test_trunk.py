@@ -134,9 +134,7 @@ def test_the_fast_rotation_equals_the_plain_one() -> None:
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_attention_over_the_cache_is_the_same_when_compiled(
-    frames: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_attention_over_the_cache_is_the_same_when_compiled(frames, monkeypatch) -> None:
     attention = TemporalAttention(small_model().config)
     heads, size, slots = attention.heads, 32 // attention.heads, 5
     q, cache = torch.randn(2, frames, 6, heads, size), torch.randn(2, slots, 2, 6, heads, size)
@@ -244,9 +242,7 @@ def test_checkpointed_blocks_give_the_same_gradients() -> None:
 
 
 @pytest.mark.parametrize("mask", [None, (5, 5), (1, 1, 5, 5), (7, 1, 5, 5)], ids=str)
-def test_many_sequences_are_attended_part_by_part(
-    mask: tuple[int, ...] | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_sequences_are_attended_part_by_part(mask, monkeypatch) -> None:
     q, k, v = torch.randn(3, 7, 2, 5, 4)
     allowed = None if mask is None else torch.ones(mask, dtype=torch.bool).tril(1)
     whole = transformer.attend(q, k, v, allowed, 0.5, causal=mask is None)

@@ -219,9 +219,7 @@ def test_the_mouse_steers_by_dragging_on_the_image(page: "Page", stepper: Steppe
     assert session.held.tolist() == [0, 0]
 
 
-def test_touch_sets_the_target_of_a_robot_that_follows_one(
-    browser: "Browser", address: str, stepper: Stepper
-) -> None:
+def test_touch_sets_the_target_of_a_robot_that_follows_one(browser, address, stepper) -> None:
     context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
     page = opened(context.new_page(), address, "mover_02")
     page.wait_for_timeout(200)
@@ -299,9 +297,7 @@ def test_replay_follows_the_recorder_until_a_person_takes_over(page: "Page", ste
     assert not session.replays
 
 
-def test_two_pages_drive_robots_of_their_own(
-    page: "Page", browser: "Browser", address: str, stepper: Stepper
-) -> None:
+def test_two_pages_drive_robots_of_their_own(page, browser, address, stepper) -> None:
     context = browser.new_context()
     other = opened(context.new_page(), address, "arm4_04")
     other.wait_for_selector("#dim-4")
@@ -337,9 +333,7 @@ def test_a_drive_is_downloaded(page: "Page") -> None:
     assert download.value.suggested_filename == "mover_04-scene-0.mp4"
 
 
-def test_a_file_that_is_prepared_says_how_far_it_is_and_the_page_goes_on(
-    page: "Page", monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_is_prepared_says_how_far_it_is_and_the_page_goes_on(page, monkeypatch) -> None:
     go_on = threading.Event()
 
     def write(kind: str, robot: Any, shown: Any, tell: Any) -> bytes:
@@ -361,9 +355,7 @@ def test_a_file_that_is_prepared_says_how_far_it_is_and_the_page_goes_on(
     page.wait_for_selector("#note:has-text('Saved mover_04-scene-0.zip')")
 
 
-def test_a_recording_has_readable_names_and_its_end_offers_no_pause(
-    browser: "Browser", recorded: Stepper
-) -> None:
+def test_a_recording_has_readable_names_and_its_end_offers_no_pause(browser, recorded) -> None:
     with serving(recorded) as port:
         context = browser.new_context(viewport={"width": 1280, "height": 800})
         page = opened(context.new_page(), f"http://127.0.0.1:{port}/", "toy_arm:recordings")
@@ -441,9 +433,7 @@ def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", st
     page.wait_for_selector("#sync:not(.call)")
 
 
-def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(
-    page: "Page", stepper: Stepper
-) -> None:
+def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(page, stepper) -> None:
     session = session_of(stepper, page)
     stepper.call(lambda: stepper._world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
     page.locator("input[value=fast]").check(force=True)
@@ -476,9 +466,7 @@ def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(
     assert page.evaluate(bright)
 
 
-def test_a_page_whose_server_stopped_says_so_and_goes_on_when_it_is_back(
-    browser: "Browser", stepper: Stepper
-) -> None:
+def test_a_page_whose_server_stopped_says_so_and_goes_on_when_it_is_back(browser, stepper) -> None:
     page = browser.new_context().new_page()
     with serving(stepper) as port:
         opened(page, f"http://127.0.0.1:{port}/")
@@ -513,9 +501,7 @@ def test_the_images_and_the_run_button_fit_on_the_screen_side_by_side(
     context.close()
 
 
-def test_the_question_mark_explains_the_page_and_the_keys_rest_meanwhile(
-    page: "Page", stepper: Stepper
-) -> None:
+def test_the_question_mark_explains_the_page_and_the_keys_rest_meanwhile(page, stepper) -> None:
     page.keyboard.press("?")
     page.wait_for_selector("#about:has-text('A neural network predicts every image')")
     page.keyboard.press("ArrowRight")

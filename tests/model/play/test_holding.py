@@ -2,7 +2,6 @@
 
 import json
 from importlib.resources import files
-from pathlib import Path
 
 import pytest
 
@@ -31,9 +30,7 @@ def test_the_bundled_models_robots_were_measured() -> None:
         ("", None),
     ],
 )
-def test_of_other_checkpoints_the_verdict_of_evaluate_counts(
-    verdict: str, follows: bool | None, tmp_path: Path
-) -> None:
+def test_of_other_checkpoints_the_verdict_of_evaluate_counts(verdict, follows, tmp_path) -> None:
     save(tmp_path / "model", {"arm": 2})
     checkpoint = Checkpoint.open(tmp_path / "model")
     if verdict:

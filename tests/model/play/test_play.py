@@ -38,18 +38,14 @@ def image(tmp_path: Path) -> str:
 
 
 @pytest.mark.parametrize("address", [REPO, f"{REPO}@main", f"hf://{REPO}"])
-def test_a_published_checkpoint_is_fetched(
-    published: Hub, served: list[Any], image: str, address: str
-) -> None:
+def test_a_published_checkpoint_is_fetched(published, served, image, address) -> None:
     assert main(["play", address, "--prompt", image, "--no-browser"]) == 0
     ((checkpoint, name, robots, *_),) = served
     assert name == address and set(robots) == {f"{robot}:images" for robot in ROBOTS}
     assert set(Checkpoint.open(checkpoint.folder).embodiments) == set(ROBOTS)
 
 
-def test_a_damaged_trunk_is_refused(
-    tmp_path: Path, served: list[Any], image: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_trunk_is_refused(tmp_path, served, image, capsys) -> None:
     save(tmp_path / "model", {"arm": 2})
     trunk = tmp_path / "model/trunk.safetensors"
     data = bytearray(trunk.read_bytes())
@@ -93,9 +89,7 @@ def test_the_page_opens_with_the_robot_that_was_named_or_the_image_that_was_give
     assert "there is no robot 'nobody' to drive" in capsys.readouterr().err
 
 
-def test_the_device_and_precision_reach_the_world(
-    tmp_path: Path, served: list[Any], image: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_device_and_precision_reach_the_world(tmp_path, served, image, monkeypatch) -> None:
     monkeypatch.setattr("hma_model.training.runtime.choose_device", lambda name: name)
     save(tmp_path / "model", {"arm": 2})
     words = ["play", str(tmp_path / "model"), "--prompt", image, "--no-browser"]

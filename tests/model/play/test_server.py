@@ -147,9 +147,7 @@ def test_a_reload_goes_on_where_it_was(client: TestClient) -> None:
         assert "has ended" in page.message("gone")["text"]
 
 
-def test_a_page_that_reads_nothing_skips_frames_and_gets_the_latest(
-    client: TestClient, stepper: Stepper
-) -> None:
+def test_a_page_that_reads_nothing_skips_frames_and_gets_the_latest(client, stepper) -> None:
     with client.websocket_connect(DRIVE) as socket:
         page = PageViewer(socket)
         session, seen = stepper.sessions[page.open()["session"]], []
@@ -192,9 +190,7 @@ def test_a_malformed_message_closes_its_connection_alone(client: TestClient, tex
         PageViewer(good).works()
 
 
-def test_a_flood_and_bytes_close_their_connections_alone(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_flood_and_bytes_close_their_connections_alone(client, monkeypatch) -> None:
     monkeypatch.setattr(server, "MESSAGES_PER_S", 0.0)  # time restores no credit
     with client.websocket_connect(DRIVE) as good:
         PageViewer(good).open()
@@ -211,9 +207,7 @@ def test_a_flood_and_bytes_close_their_connections_alone(
 
 
 @pytest.mark.parametrize("do", ["open", "scene", "sync"])
-def test_a_page_cannot_begin_scenes_so_often_that_the_others_wait(
-    client: TestClient, stepper: Stepper, monkeypatch: pytest.MonkeyPatch, do: str
-) -> None:
+def test_a_page_cannot_begin_scenes_so_often_that_the_others_wait(client, stepper, monkeypatch, do) -> None:
     monkeypatch.setattr(server, "MESSAGES_PER_S", 0.0)  # time restores no credit
     values = {"open": {"robot": "mover_04"}, "scene": {"number": 1}, "sync": {}}[do]
     world = stepper._world

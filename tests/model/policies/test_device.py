@@ -25,9 +25,7 @@ class Asked(Exception):
         (labels, ["label-actions", "film", "--checkpoint", "run", "-e", "rails_03", "--out", "made"], []),
     ],
 )
-def test_device_and_precision_reach_the_world(
-    module: Any, words: list[str], options: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_device_and_precision_reach_the_world(module, words, options, monkeypatch, tmp_path) -> None:
     def load(checkpoint: str, **given: Any) -> World:
         raise Asked(given["device"], given.get("precision"), given.get("compile"))
 
@@ -46,9 +44,7 @@ def test_a_device_that_is_not_here_is_refused(capsys: pytest.CaptureFixture[str]
     assert "--device" in capsys.readouterr().err and not (tmp_path / "made").exists()
 
 
-def test_a_model_that_acts_is_on_the_device_of_its_world(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_that_acts_is_on_the_device_of_its_world(world, monkeypatch) -> None:
     asked: list[str] = []
 
     def load(checkpoint: str, **given: Any) -> World:

@@ -242,9 +242,7 @@ def test_policies_that_cannot_be_told_apart_are_named(judge: StateJudge) -> None
 
 
 @pytest.mark.slow
-def test_a_policy_that_was_edited_is_scored_again(
-    world: World, judge: StateJudge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_policy_that_was_edited_is_scored_again(world, judge, tmp_path, monkeypatch) -> None:
     begun = list[str]()
 
     def score(name: str, **given: Any) -> dict[str, Any]:

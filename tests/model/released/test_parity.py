@@ -61,9 +61,7 @@ def test_conditions_equal_the_released_code(imported: dict[str, Path], real_data
         assert (z - io[f"{embodiment}.z"].permute(0, 2, 3, 4, 1)).abs().max() < 1e-4
 
 
-def test_embodiments_of_one_released_model_may_share_a_batch(
-    imported: dict[str, Path], real_data: Path
-) -> None:
+def test_embodiments_of_one_released_model_may_share_a_batch(imported, real_data) -> None:
     io, embodiments = _io(real_data / "parity" / "discrete")
     model = HMA.from_pretrained(str(imported["discrete"]))
     widest = max(io[f"{e}.actions"].shape[-1] for e in embodiments)
@@ -84,9 +82,7 @@ def test_embodiments_of_one_released_model_may_share_a_batch(
 
 
 @pytest.mark.parametrize("name", ["discrete", "discrete_mup", "continuous"])
-def test_an_imported_checkpoint_exports_to_the_same_tensors(
-    imported: dict[str, Path], real_data: Path, tmp_path: Path, name: str
-) -> None:
+def test_an_imported_checkpoint_exports_to_the_same_tensors(imported, real_data, tmp_path, name) -> None:
     hub.export_released(imported[name], tmp_path / "out")
     before = load_file(real_data / "parity" / name / "model.safetensors")
     after = load_file(tmp_path / "out" / "model.safetensors")

@@ -82,18 +82,14 @@ def test_replayed_episodes_hold_the_recorders_actions_and_say_that_they_are_synt
         np.testing.assert_array_equal(columns["tokens"][:known].reshape(stored.shape), stored)
 
 
-def test_the_plan_names_a_precision_that_changes_tokens(
-    world: World, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_plan_names_a_precision_that_changes_tokens(world, monkeypatch, tmp_path) -> None:
     assert augment(tmp_path / "whole", asked(), world=world).plan["made_by"]["precision"] == "float32"
     monkeypatch.setattr(world, "precision", "bf16")
     assert augment(tmp_path / "half", asked(), world=world).plan["made_by"]["precision"] == "bf16"
 
 
 @pytest.mark.slow
-def test_synthetic_episodes_merge_with_recorded_ones_and_the_whole_says_so(
-    world: World, tmp_path: Path
-) -> None:
+def test_synthetic_episodes_merge_with_recorded_ones_and_the_whole_says_so(world, tmp_path) -> None:
     recording, robot = record(ROBOT, tmp_path, 2), family.embodiment(ROBOT)
     for frames in ("strided", "all"):
         convert(robot, recording, world.tokenizer, tmp_path / frames, settings=Settings(frames=frames))
@@ -124,9 +120,7 @@ def test_perturbed_actions_lie_around_the_recorded_ones(world: World, tmp_path: 
 
 
 @pytest.mark.parametrize("kind", ["world", "latents"])
-def test_a_stopped_run_continues_and_gives_the_same_bytes(
-    kind: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
+def test_a_stopped_run_continues_and_gives_the_same_bytes(kind, request, tmp_path) -> None:
     world = request.getfixturevalue(kind)
     whole = augment(tmp_path / "whole", asked(), world=world)
 
@@ -149,9 +143,7 @@ def test_a_stopped_run_continues_and_gives_the_same_bytes(
         augment(tmp_path / "cut", asked(seed=1), world=world)
 
 
-def test_the_first_frames_of_latents_are_the_simulators_at_their_own_size(
-    latents: World, tmp_path: Path
-) -> None:
+def test_the_first_frames_of_latents_are_the_simulators_at_their_own_size(latents, tmp_path) -> None:
     augment(tmp_path / "out", asked(episodes=2), world=latents)
     assert verify(tmp_path / "out") == []
     true, shards = TrueArena(Scenes.of(latents, ROBOT, 2, 0), 64), ShardSet(tmp_path / "out")
@@ -234,9 +226,7 @@ def real(world: World, tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_episodes_of_the_same_beginning_differ(
-    world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_episodes_of_the_same_beginning_differ(world, real, tmp_path, monkeypatch) -> None:
     long_enough = augment_module._Maker._long_enough
 
     def one_beginning(maker: Any, shards: ShardSet) -> list[dict[str, Any]]:
@@ -249,9 +239,7 @@ def test_episodes_of_the_same_beginning_differ(
 
 
 @pytest.mark.slow
-def test_windows_with_unknown_actions_are_left_out(
-    world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_windows_with_unknown_actions_are_left_out(world, real, tmp_path, monkeypatch) -> None:
     read, unknown = augment_module.shard_window, [True]
 
     def gaps(*given: Any) -> Prompt:
@@ -300,9 +288,7 @@ def test_other_shards_of_the_same_name_are_not_the_same_job(world: World, real: 
         augment(tmp_path / "out", settings, world=world, shards=tmp_path / "other" / "real")
 
 
-def test_episodes_of_several_cameras_hold_each_in_its_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_episodes_of_several_cameras_hold_each_in_its_place(tmp_path, monkeypatch) -> None:
     recording, tokenizer = three.write_hdf5(tmp_path / "three.hdf5"), BlockTokenizer()
     taken = Settings(cameras=("all",))
     convert(three.arm(), recording, tokenizer, tmp_path / "real", settings=taken)
@@ -470,9 +456,7 @@ def one_sided(block_tokenizer: BlockTokenizer, tmp_path: Path) -> tuple[World, S
 
 
 @pytest.mark.parametrize("commands", ["random", "perturb=3"])
-def test_actions_stay_in_the_range_seen_in_training(
-    commands: str, one_sided: tuple[World, ShardSet], tmp_path: Path
-) -> None:
+def test_actions_stay_in_the_range_seen_in_training(commands, one_sided, tmp_path) -> None:
     world, shards = one_sided
     settings = Augmentation("a_strangers_arm", "real", episodes=4, frames=2, keep=1.0, commands=commands)
     augment(tmp_path / "out", settings, world=world, shards=shards.folder)
@@ -500,9 +484,7 @@ def test_a_robot_without_simulator_needs_shards(tmp_path: Path) -> None:
         augment(tmp_path / "out", Augmentation("arm"), world=world)
 
 
-def test_a_policy_that_plans_gets_the_judge(
-    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_policy_that_plans_gets_the_judge(world, tmp_path, monkeypatch) -> None:
     class Planning(Still):
         def judged(self, judge: Any) -> None:
             self.judge = judge

@@ -70,9 +70,7 @@ def oracle(world: World, real: Path, share: float) -> Oracle:
 
 
 @pytest.mark.slow
-def test_labelled_shards_verify_and_say_what_they_are(
-    world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_labelled_shards_verify_and_say_what_they_are(world, real, tmp_path, monkeypatch) -> None:
     knows = oracle(world, real, 0.5)
     monkeypatch.setattr(labels, "infer", knows)
     out = tmp_path / "a folder"
@@ -181,9 +179,7 @@ def test_video_files_are_taken_at_the_rate_of_the_model(world: World, tmp_path: 
 
 
 @pytest.mark.slow
-def test_film_that_cannot_be_read_goes_to_quarantine(
-    world: World, real: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_film_that_cannot_be_read_goes_to_quarantine(world, real, tmp_path, monkeypatch) -> None:
     places = tmp_path / "film of a day"
     places.mkdir()
     film(places)
@@ -270,9 +266,7 @@ def three(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         (["side", "top"], ["side", "top"]),
     ],
 )
-def test_film_shows_the_cameras_that_the_model_was_trained_on(
-    three: ShardSet, views: Any, seen: list[str], tmp_path: Path
-) -> None:
+def test_film_shows_the_cameras_that_the_model_was_trained_on(three, views, seen, tmp_path) -> None:
     world = trained_on(views, three, tmp_path / "model")
     film = ShardFilm(world, three, three.row_stride)
     stored = film.stored(1)
@@ -314,9 +308,7 @@ def test_films_of_one_camera_are_refused_by_a_model_of_several(three: ShardSet, 
 
 
 @pytest.mark.parametrize("views", ["nose", ["nose"]])
-def test_film_of_the_robot_without_the_models_camera_is_refused(
-    three: ShardSet, views: Any, tmp_path: Path
-) -> None:
+def test_film_of_the_robot_without_the_models_camera_is_refused(three, views, tmp_path) -> None:
     world = trained_on(views, three, tmp_path / "model")
     with pytest.raises(UsageError, match="three_hdf5 has the cameras top, wrist, side in .* not nose"):
         ShardFilm(world, three, three.row_stride)

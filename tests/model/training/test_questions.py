@@ -43,9 +43,7 @@ def test_intervals_are_those_of_students_t(tmp_path: Path) -> None:
     assert questions.table(lines).splitlines()[-1] == f"| one | 3 | {mean:.2f} ± {half:.2f} |"
 
 
-def test_runs_of_several_budgets_are_not_averaged(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runs_of_several_budgets_are_not_averaged(tmp_path, capsys, monkeypatch) -> None:
     gains = iter([1.0, 3.0])
     monkeypatch.setattr(
         questions, "measure",

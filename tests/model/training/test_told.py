@@ -1,7 +1,5 @@
 """What `hma train` says at its end."""
 
-from pathlib import Path
-
 import pytest
 
 from hma_model.cli.train import _print
@@ -10,9 +8,7 @@ from tests.model.robots import CONFIG, make_model, save
 
 
 @pytest.mark.parametrize(("merge", "unit"), [(1, "token"), (2, "square of 2×2 tokens")])
-def test_the_held_out_loss_names_what_it_is_of(
-    merge: int, unit: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_held_out_loss_names_what_it_is_of(merge, unit, tmp_path, capsys) -> None:
     config = CONFIG.replace(grid=(2, 4), merge=merge, tokenizer={**CONFIG.tokenizer, "grid": [2, 4]})
     save(tmp_path / "made", {"arm": 2}, model=make_model({"arm": 2}, config=config))
     _print(

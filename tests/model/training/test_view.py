@@ -67,9 +67,7 @@ def test_a_window_that_is_not_there_is_refused(run: Path) -> None:
         module.view_run(run, 999)
 
 
-def test_the_command_refuses_what_does_not_belong_to_the_place(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_refuses_what_does_not_belong_to_the_place(run, tmp_path, capsys) -> None:
     out = ["--out", str(tmp_path / "x.rrd")]
     for words, said in (
         ([str(tmp_path / "arm"), "--tokenizer", "fsq-8"], "--tokenizer: is for a recording"),

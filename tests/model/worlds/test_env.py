@@ -107,9 +107,7 @@ def test_a_judge_sees_the_episode_and_ends_it(world: World, window: tuple[Any, A
 @pytest.mark.parametrize(
     "mode", [AutoresetMode.NEXT_STEP, pytest.param(AutoresetMode.SAME_STEP, marks=pytest.mark.slow)]
 )
-def test_a_vector_steps_as_gymnasium_steps_environments_one_by_one(
-    model: HMA, window: tuple[Any, Any], mode: AutoresetMode
-) -> None:
+def test_a_vector_steps_as_gymnasium_steps_environments_one_by_one(model, window, mode) -> None:
     def judge(images: np.ndarray, actions: np.ndarray) -> tuple[float, bool]:
         return float(images[-1].mean()), bool(actions[-1, 0, 0] > 300)  # episodes end at different steps
 
@@ -134,9 +132,7 @@ def test_a_vector_steps_as_gymnasium_steps_environments_one_by_one(
     assert 3 < ends < 24
 
 
-def test_a_vector_without_autoreset_starts_those_that_are_asked_for(
-    world: World, window: tuple[Any, Any]
-) -> None:
+def test_a_vector_without_autoreset_starts_those_that_are_asked_for(world, window) -> None:
     env = WorldModelVectorEnv(
         2, embodiment=PUSH, world=world, prompt=prompt(window), control="chunk", horizon=2,
         autoreset_mode="Disabled",
@@ -181,9 +177,7 @@ def test_a_policy_of_gym_pusht_runs_unchanged(world: World) -> None:
     assert min(moved) > 0.1 and np.abs(images[0][0].astype(int) - images[1][0]).mean() < 12
 
 
-def test_gymnasium_records_a_film_of_the_images(
-    world: World, window: tuple[Any, Any], tmp_path: Path
-) -> None:
+def test_gymnasium_records_a_film_of_the_images(world, window, tmp_path) -> None:
     env: Any = WorldModelEnv(
         embodiment=PUSH,
         world=world,
@@ -202,9 +196,7 @@ def test_gymnasium_records_a_film_of_the_images(
     assert np.abs(np.stack(frames[1:]) - np.stack(images).astype(float)).mean() < 6
 
 
-def test_actions_outside_the_training_range_warn_once_and_are_clipped_only_if_asked(
-    world: World, window: tuple[Any, Any]
-) -> None:
+def test_actions_outside_the_training_range_warn_once_and_are_clipped_only_if_asked(world, window) -> None:
     how: dict[str, Any] = {"embodiment": PUSH, "world": world, "prompt": prompt(window), "control": "chunk"}
     wild, edge = np.full((4, 2), 700.0), np.tile(world.action_spec(PUSH).seen[1], (4, 1))  # type: ignore[index]
     free, clipped, at_edge = (WorldModelEnv(**how, clip=clip) for clip in (False, True, False))
@@ -237,9 +229,7 @@ def test_an_unknown_action_is_nan(world: World, window: tuple[Any, Any]) -> None
         (np.array([np.inf, 1.0]), "not finite"),
     ],
 )
-def test_bad_actions_are_refused_and_the_episode_goes_on(
-    world: World, window: tuple[Any, Any], action: np.ndarray, message: str
-) -> None:
+def test_bad_actions_are_refused_and_the_episode_goes_on(world, window, action, message) -> None:
     env = WorldModelEnv(embodiment=PUSH, world=world, prompt=prompt(window))
     with pytest.raises(HMAError, match=re.escape("call reset() first")):
         env.step(np.zeros(2))

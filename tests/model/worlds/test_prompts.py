@@ -85,9 +85,7 @@ def test_frames_at_the_control_rate_become_chunks_that_end_at_the_last_frame(mod
 
 
 @pytest.mark.slow
-def test_a_lerobot_episode_is_a_prompt_of_the_same_robot_recorded_elsewhere(
-    model: HMA, tmp_path: Path
-) -> None:
+def test_a_lerobot_episode_is_a_prompt_of_the_same_robot_recorded_elsewhere(model, tmp_path) -> None:
     dataset = record("planar_arm_lerobot", tmp_path, 2)
     images, chunks = starting_window(model, ARM)
     frames, found = read_prompt(model, ARM, dataset)

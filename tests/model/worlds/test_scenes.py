@@ -165,9 +165,7 @@ def shards(
     return ShardSet(tmp_path / "shards")
 
 
-def test_a_recordings_truth_is_known_for_its_own_actions(
-    shards: ShardSet, block_tokenizer: BlockTokenizer
-) -> None:
+def test_a_recordings_truth_is_known_for_its_own_actions(shards, block_tokenizer) -> None:
     robot = RecordedRobot(shards, lambda: block_tokenizer, shards.manifest.stats, "first")
     one, other = robot.scene(0), robot.scene(1)
     assert not np.array_equal(one.prompt.frames, other.prompt.frames)
@@ -208,9 +206,7 @@ def test_new_scenes_come_to_every_window_once_before_any_comes_again() -> None:
         assert count < 16 or 0.35 < apart(count) / count < 0.65  # neighbours in number lie apart
 
 
-def test_a_robot_without_simulator_and_shards_of_another_model_are_refused(
-    shards: ShardSet,
-) -> None:
+def test_a_robot_without_simulator_and_shards_of_another_model_are_refused(shards) -> None:
     with pytest.raises(UsageError, match="does not know the robot toy_arm"):
         drivable(Checkpoint.open(EMBEDDED), [shards], pytest.fail)
 
@@ -237,9 +233,7 @@ def test_a_robot_without_simulator_begins_from_its_sample_or_from_images(tmp_pat
     assert np.array_equal(begun.frames, images[:2]) and np.isnan(begun.chunks).all()
 
 
-def test_a_saved_dataset_names_the_cameras_that_the_model_shows(
-    block_tokenizer: BlockTokenizer, tmp_path: Path
-) -> None:
+def test_a_saved_dataset_names_the_cameras_that_the_model_shows(block_tokenizer, tmp_path) -> None:
     arm, settings = three.arm(), Settings(val_fraction=0, cameras=("all",))
     convert(
         arm, three.write_hdf5(tmp_path / "three.hdf5"), block_tokenizer, tmp_path / "set", settings=settings

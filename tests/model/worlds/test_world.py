@@ -91,9 +91,7 @@ def test_a_snapshot_brings_a_session_back(model: HMA, windows: dict[str, Any]) -
     assert world.sessions == {first: ARM, second: ARM}
 
 
-def test_a_reset_gives_the_same_images_again_and_settings_count_at_once(
-    model: HMA, windows: dict[str, Any]
-) -> None:
+def test_a_reset_gives_the_same_images_again_and_settings_count_at_once(model, windows) -> None:
     world = make(model)
     session = world.open(ARM, *windows[ARM], seed=5)
     (chunk,) = drawn(model, ARM, 1)
@@ -143,9 +141,7 @@ def test_images_of_another_size_are_resized_as_in_a_conversion(model: HMA, windo
         (np.array([[0, np.nan]] * 4), "not finite"),
     ],
 )
-def test_actions_that_do_not_fit_are_refused(
-    model: HMA, windows: dict[str, Any], actions: np.ndarray, message: str
-) -> None:
+def test_actions_that_do_not_fit_are_refused(model, windows, actions, message) -> None:
     world = make(model)
     session, other = (world.open(PUSH, *windows[PUSH]) for _ in range(2))
     with pytest.raises(HMAError, match=message):

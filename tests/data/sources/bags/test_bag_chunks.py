@@ -57,9 +57,7 @@ def test_squares_made_one_by_one_are_those_of_whole_batches(tmp_path: Path, kind
 
 
 @pytest.mark.parametrize("codec", ["ros1-lz4", "ros1-bz2", "mcap-lz4", "mcap-zstd"])
-def test_without_room_chunks_are_unpacked_again_to_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codec: str
-) -> None:
+def test_without_room_chunks_are_unpacked_again_to_the_same(tmp_path, monkeypatch, codec) -> None:
     run = bag_parts.make_run(40, side=32, pause_after=(20,))
     kind, _, packing = codec.partition("-")
     if kind == "ros1":

@@ -30,9 +30,7 @@ def shifted(tmp_path: Path, shift_s: np.ndarray) -> Path:
         (np.full(FRAMES, -1e9), "simulated time"),
     ],
 )
-def test_clocks_that_are_apart_are_measured_named_and_asked_about(
-    tmp_path: Path, shift_s: np.ndarray, says: str
-) -> None:
+def test_clocks_that_are_apart_are_measured_named_and_asked_about(tmp_path, shift_s, says) -> None:
     path = shifted(tmp_path, shift_s)
     with pytest.raises(EpisodeError, match=says) as fault:
         read(path, arm())

@@ -75,9 +75,7 @@ IN_ORDER = [(i, i) for i in range(FRAMES)]
 
 @pytest.mark.parametrize("name", STREAMS)
 @pytest.mark.parametrize("stamped_as_shown", [False, True])
-def test_video_is_in_the_order_in_which_it_is_shown(
-    name: str, stamped_as_shown: bool, tmp_path: Path
-) -> None:
+def test_video_is_in_the_order_in_which_it_is_shown(name, stamped_as_shown, tmp_path) -> None:
     path = bag(tmp_path / "run", name, foxglove, stamped_as_shown)
     assert pairs(path, robot(sync=", stamp: receive")) == IN_ORDER
     if not stamped_as_shown:

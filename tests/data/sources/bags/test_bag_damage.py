@@ -44,9 +44,7 @@ def single(bags: dict[str, Path], kind: str) -> bytes:
 @pytest.mark.parametrize("kind", SINGLE)
 @PATIENT
 @given(share=st.floats(0, 1, exclude_max=True))
-def test_a_bag_cut_off_anywhere_is_refused(
-    kind: str, share: float, bags: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_bag_cut_off_anywhere_is_refused(kind, share, bags, tmp_path) -> None:
     whole = single(bags, kind)
     path = tmp_path / "cut.bag"
     path.write_bytes(whole[: int(len(whole) * share)])
@@ -58,9 +56,7 @@ def test_a_bag_cut_off_anywhere_is_refused(
 @pytest.mark.parametrize("kind", SINGLE)
 @PATIENT
 @given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7), fill=st.booleans())
-def test_a_flipped_bit_gives_an_answer_or_our_error(
-    kind: str, share: float, bit: int, fill: bool, bags: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_flipped_bit_gives_an_answer_or_our_error(kind, share, bit, fill, bags, tmp_path) -> None:
     data = bytearray(single(bags, kind))
     at = int(len(data) * share)
     if fill:
@@ -75,9 +71,7 @@ def test_a_flipped_bit_gives_an_answer_or_our_error(
         assert "\n" not in str(fault)
 
 
-def test_a_bag_that_holds_less_than_its_index_counts_is_refused(
-    bags: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_bag_that_holds_less_than_its_index_counts_is_refused(bags, tmp_path) -> None:
     zipped = tmp_path / "zipped"
     shutil.copytree(bags["ros2-sqlite3-file-zstd"], zipped)
     metadata = zipped / "metadata.yaml"
@@ -86,9 +80,7 @@ def test_a_bag_that_holds_less_than_its_index_counts_is_refused(
         read(zipped, arm())
 
 
-def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(
-    bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(bags, tmp_path, monkeypatch) -> None:
     from hma_data.sources.bags import container
 
     monkeypatch.setattr(container, "MAX_CHUNK", 4000)
@@ -180,9 +172,7 @@ def touch_every_part(path: Path) -> None:
 @pytest.mark.parametrize("kind", PARTED)
 @PATIENT
 @given(share=st.floats(0, 1, exclude_max=True))
-def test_a_bag_of_episodes_cut_off_anywhere_is_refused(
-    kind: str, share: float, parted_bags: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_a_bag_of_episodes_cut_off_anywhere_is_refused(kind, share, parted_bags, tmp_path) -> None:
     path = tmp_path / "cut.bag"
     path.write_bytes(parted_bags[kind][: int(len(parted_bags[kind]) * share)])
     if kind == "ros1-without-index":  # without an index nothing tells that a whole chunk is missing

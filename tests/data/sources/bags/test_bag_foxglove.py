@@ -195,9 +195,7 @@ def test_a_bag_that_a_killed_recorder_left_is_refused_with_what_mends_it(tmp_pat
         SOURCE.read(str(tmp_path), "run.bag", robot)
 
 
-def test_inspect_doctor_and_eval_look_at_the_embodiments_episodes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_inspect_doctor_and_eval_look_at_the_embodiments_episodes(tmp_path, monkeypatch) -> None:
     path = bag_parts.mcap(tmp_path, bag_parts.make_run(60, pause_after=(20, 40)))
     robot = bag_parts.parted("{gap_s: 1}")
     where = tmp_path / "robot.yaml"

@@ -82,9 +82,7 @@ IN_ORDER = [(i, i) for i in range(FRAMES)]
         (lambda i: 5 * SECOND_NS + i * PERIOD_NS // 2, r"/cam are not of the recorder's clock"),
     ],
 )  # fmt: skip
-def test_clocks_that_differ_are_named_and_a_choice_is_asked(
-    header: Callable[[int], int], says: str, tmp_path: Path
-) -> None:
+def test_clocks_that_differ_are_named_and_a_choice_is_asked(header, says, tmp_path) -> None:
     path = bag(tmp_path / "run", header)
     with pytest.raises(EpisodeError, match=says) as error:
         pairs(path, robot())
@@ -131,9 +129,7 @@ def set_back(i: int) -> int:
 @pytest.mark.parametrize("received", [swapped, burst, set_back])
 @pytest.mark.parametrize("mcap", [False, True])
 @pytest.mark.parametrize("sorted_file", [False, True])
-def test_even_headers_win_over_arrival(
-    received: Callable[[int], int], mcap: bool, sorted_file: bool, tmp_path: Path
-) -> None:
+def test_even_headers_win_over_arrival(received, mcap, sorted_file, tmp_path) -> None:
     """Neither a network that swaps messages nor a recorder whose clock is set back changes the order."""
     order = sorted(range(FRAMES), key=received) if sorted_file else range(FRAMES)
     path = bag(tmp_path / "run", at, received, stamped=True, order=order, mcap=mcap)

@@ -286,9 +286,7 @@ AV1 = {"g": "10", "preset": "12", "svtav1-params": "pred-struct=1:lookahead=0"}
     ("codec", "name", "options"),
     [("libx264", "h264", LOW_DELAY), ("libvpx-vp9", "vp9", VP9), ("libsvtav1", "av1", AV1)],
 )
-def test_key_frames_of_every_codec_are_told(
-    tmp_path: Path, codec: str, name: str, options: dict[str, str]
-) -> None:
+def test_key_frames_of_every_codec_are_told(tmp_path, codec, name, options) -> None:
     from hma_data.sources.bags.bag import Bag
     from hma_data.sources.bags.container import RecordFilter
     from hma_data.sources.bags.images import is_keyframe, payload

@@ -88,9 +88,7 @@ def test_start_and_stop_are_the_moments_at_which_a_value_becomes_theirs(tmp_path
         ("{gap_s: 10}", [60], 0),
     ],
 )
-def test_markers_and_pauses_part_as_their_description_says(
-    segments: str, expected: list[int], left_out: int, tmp_path: Path
-) -> None:
+def test_markers_and_pauses_part_as_their_description_says(segments, expected, left_out, tmp_path) -> None:
     said = [Said(TASK, 0.99, "wait"), Said(TASK, 2.99, "go")]
     path = ros1(tmp_path, make_run(60, pause_after=(45,), said=said))
     refs = SOURCE.index(str(path), parted(segments))

@@ -35,9 +35,7 @@ from tests.data.hub_cache import as_snapshot
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_of_bag_gives_what_was_written(
-    kind: str, bags: dict[str, Path], recording: Recording
-) -> None:
+def test_every_kind_of_bag_gives_what_was_written(kind, bags, recording) -> None:
     episode = read(bags[kind], arm())
     stream = episode.streams["front"]
     np.testing.assert_array_equal(stream.frames(range(len(recording.pictures))), recording.pictures)
@@ -53,9 +51,7 @@ def test_every_kind_of_bag_gives_what_was_written(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_is_recognised_and_counted_without_decoding(
-    kind: str, bags: dict[str, Path], recording: Recording
-) -> None:
+def test_every_kind_is_recognised_and_counted_without_decoding(kind, bags, recording) -> None:
     if "file" not in kind:
         assert detect(str(bags[kind])) == "rosbag"
     (ref,) = SOURCE.index(str(bags[kind]), arm())
@@ -82,9 +78,7 @@ def test_stamp_receive_takes_log_times(bags: dict[str, Path], recording: Recordi
 
 
 @pytest.mark.parametrize("stamps", ["zero", "never moving"])
-def test_stamps_that_are_no_clock_give_way_to_log_times(
-    tmp_path: Path, recording: Recording, stamps: str
-) -> None:
+def test_stamps_that_are_no_clock_give_way_to_log_times(tmp_path, recording, stamps) -> None:
     shift = {"zero": -recording.picture_ns, "never moving": recording.picture_ns[4] - recording.picture_ns}
     path = write_ros1(tmp_path / "bag.bag", replace(recording, stamp_shift_ns=shift[stamps]))
     episode = read(path, arm())
@@ -93,18 +87,14 @@ def test_stamps_that_are_no_clock_give_way_to_log_times(
     assert episode.metadata["clocks"] == {CAMERA: "receive", COMMAND: "receive", STATE: "header"}
 
 
-def test_a_clip_of_a_bag_pairs_each_picture_with_the_command_in_force(
-    bags: dict[str, Path], recording: Recording
-) -> None:
+def test_a_clip_of_a_bag_pairs_each_picture_with_the_command_in_force(bags, recording) -> None:
     clip = to_clip(read(bags["ros2-mcap"], arm()), arm())
     in_force = [np.flatnonzero(recording.command_ns <= t)[-1] for t in recording.picture_ns[: len(clip)]]
     np.testing.assert_array_equal(clip.actions[:, :2], recording.commands[in_force].astype(np.float32))
     np.testing.assert_array_equal(clip.frames_at("front", np.arange(3)), recording.pictures[:3])
 
 
-def test_a_bag_without_index_is_read_to_its_end(
-    bags: dict[str, Path], recording: Recording, tmp_path: Path
-) -> None:
+def test_a_bag_without_index_is_read_to_its_end(bags, recording, tmp_path) -> None:
     data = bytearray(bags["ros1-lz4"].read_bytes())
     at = data.index(b"index_pos=") + len(b"index_pos=")
     data = data[: int.from_bytes(data[at : at + 8], "little")]  # a recorder that was killed
@@ -233,9 +223,7 @@ def test_a_second_publisher_of_joints_keeps_its_own_times(numbers_bag: Path) -> 
         ("/cmd.angular[x]", 1, "", "is not a path"),
     ],
 )
-def test_a_wrong_key_is_told_with_what_there_is(
-    numbers_bag: Path, key: str, dims: int, more: str, says: str
-) -> None:
+def test_a_wrong_key_is_told_with_what_there_is(numbers_bag, key, dims, more, says) -> None:
     with pytest.raises(EpisodeError) as fault:
         read(numbers_bag, keyed(key, dims, more))
     assert re.search(says, str(fault.value)), fault.value
@@ -290,9 +278,7 @@ def test_a_link_out_of_the_folder_is_refused(bags: dict[str, Path], tmp_path: Pa
 
 
 @pytest.mark.parametrize("kind", ["ros1", "ros2-mcap", "ros2-sqlite3", "ros2-sqlite3-file-zstd"])
-def test_links_of_the_hub_cache_are_followed(
-    bags: dict[str, Path], recording: Recording, kind: str, tmp_path: Path
-) -> None:
+def test_links_of_the_hub_cache_are_followed(bags, recording, kind, tmp_path) -> None:
     place = tmp_path / "set" / bags[kind].name
     place.parent.mkdir()
     (shutil.copytree if bags[kind].is_dir() else shutil.copy)(bags[kind], place)

@@ -49,9 +49,7 @@ def said(found: Inspection) -> dict[str, str]:
 
 
 @each_format
-def test_a_linked_folder_that_holds_all_there_is_is_named_in_the_error(
-    name: str, elsewhere: Path, root: Path
-) -> None:
+def test_a_linked_folder_that_holds_all_there_is_is_named_in_the_error(name, elsewhere, root) -> None:
     (root / "day1").symlink_to(elsewhere)
     wanted = f"day1 is a link to a folder outside {root}, not followed — give the path of that folder"
     for look in (detect, open_source(name).episode_ids):
@@ -60,9 +58,7 @@ def test_a_linked_folder_that_holds_all_there_is_is_named_in_the_error(
 
 
 @each_format
-def test_inspect_tells_of_linked_folders_and_of_links_to_nothing(
-    name: str, elsewhere: Path, root: Path, tmp_path: Path
-) -> None:
+def test_inspect_tells_of_linked_folders_and_of_links_to_nothing(name, elsewhere, root, tmp_path) -> None:
     shutil.copytree(elsewhere, root / "day0")
     source = open_source(name)
     assert said(source.inspect(str(root))) == {}

@@ -3,7 +3,6 @@
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -153,9 +152,7 @@ def test_a_playlist_named_mp4_opens_nothing_else(tmp_path: Path, video: Path) ->
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_a_cut_or_flipped_file_gives_right_frames_or_our_error(
-    video: Path, tmp_path: Path, data: st.DataObject
-) -> None:
+def test_a_cut_or_flipped_file_gives_right_frames_or_our_error(video, tmp_path, data) -> None:
     whole = bytearray(video.read_bytes())
     at = data.draw(st.integers(0, len(whole) - 1))
     if cut := data.draw(st.booleans()):
@@ -216,9 +213,7 @@ def test_pictures_survive_their_codec(video: Path) -> None:
         ({"crop": [2, 1, 4, 4]}, lambda p: p[1:5, 2:6]),
     ],
 )
-def test_pictures_are_turned_and_cropped_as_the_yaml_says(
-    changes: dict[str, Any], expected: Callable[[np.ndarray], np.ndarray]
-) -> None:
+def test_pictures_are_turned_and_cropped_as_the_yaml_says(changes, expected) -> None:
     picture = np.random.default_rng(1).integers(0, 256, (8, 8, 3), np.uint8)
     camera = Camera.model_validate({"name": "c", "key": "k", **changes})
     wanted = expected(picture)

@@ -133,9 +133,7 @@ def test_an_edit_list_hides_the_frames_before_it(tmp_path: Path) -> None:
     assert shown == list(range(shown[0], shown[0] + 18)) and shown[0] >= 5
 
 
-def test_a_lying_container_that_gives_fewer_frames_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lying_container_that_gives_fewer_frames_is_refused(tmp_path, monkeypatch) -> None:
     path = without(b"ctts")(tmp_path)
     table = frame_table(path)
     longer = type(table)(**{**vars(table), "times": np.append(table.times, 99.0)})
@@ -149,9 +147,7 @@ def test_frames_that_were_never_reordered_are_not_counted(tmp_path: Path) -> Non
     assert not table.counted and (np.arange(N) - table.keys).max() == 1
 
 
-def test_a_group_is_decoded_no_further_back_than_its_keyframe(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_group_is_decoded_no_further_back_than_its_keyframe(tmp_path, monkeypatch) -> None:
     file, seen = VideoFile(make(tmp_path / "v.mp4", *AV1, gop=2)), []
     inner = VideoFile._index_of
     monkeypatch.setattr(VideoFile, "_index_of", lambda self, frame: seen.append(1) or inner(self, frame))

@@ -114,9 +114,7 @@ def test_a_reason_of_one_episode_alone_names_it(toy_arm: Embodiment, tmp_path: P
 
 
 @pytest.mark.parametrize("out", ["s3://", "s3:", "hf://", "gs:///"])
-def test_a_store_without_a_bucket_is_no_folder_of_this_machine(
-    out: str, toy_arm: Embodiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_without_a_bucket_is_no_folder_of_this_machine(out, toy_arm, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_toy(tmp_path / "toy.hdf5", [5])
     with pytest.raises(StorageError, match="names no bucket"):

@@ -144,9 +144,7 @@ def test_a_folder_without_videos_is_refused(tmp_path: Path) -> None:
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_any_cut_or_changed_byte_ends_in_an_error_of_ours_or_a_reading(
-    folder: Path, clip: Path, data
-) -> None:
+def test_any_cut_or_changed_byte_ends_in_an_error_of_ours_or_a_reading(folder, clip, data) -> None:
     name, labels = data.draw(
         st.sampled_from(
             [

@@ -140,9 +140,7 @@ def test_a_cut_of_the_same_size_is_the_picture_and_beyond_its_edge_black() -> No
 
 @settings(max_examples=30, deadline=None)
 @given(st.floats(-3.1, 3.1), st.floats(-50, 50), st.floats(0.5, 3))
-def test_where_a_hand_is_looked_for_turns_moves_and_grows_with_it(
-    angle: float, moved: float, grown: float
-) -> None:
+def test_where_a_hand_is_looked_for_turns_moves_and_grows_with_it(angle, moved, grown) -> None:
     points = np.random.default_rng(1).random((21, 2)) * 100
     points[[0, 5, 9, 13]] = [[50, 100], [40, 40], [50, 35], [60, 40]]  # a hand that points up
     cos, sin = np.cos(angle), np.sin(angle)
@@ -181,9 +179,7 @@ def test_there_is_at_most_one_hand_a_side(p_right: list[float], sides: list[str 
 
 
 @pytest.mark.real
-def test_raised_hands_are_found_on_their_side_with_the_wrist_below(
-    real_data: Path, finder: MediaPipeHands
-) -> None:
+def test_raised_hands_are_found_on_their_side_with_the_wrist_below(real_data, finder) -> None:
     for name, side in RAISED.items():
         finder.reset()
         hands = {
@@ -207,9 +203,7 @@ def test_most_pictures_give_a_hand(real_data: Path, finder: MediaPipeHands) -> N
 
 
 @pytest.mark.real
-def test_a_mirrored_picture_gives_the_same_points_of_the_other_hand(
-    real_data: Path, finder: MediaPipeHands, models: Path
-) -> None:
+def test_a_mirrored_picture_gives_the_same_points_of_the_other_hand(real_data, finder, models) -> None:
     picture = picture_of(real_data / "hands/images/four_249c5023.jpg")
     mirrored = np.ascontiguousarray(picture[:, ::-1])
     finder.reset()
@@ -243,9 +237,7 @@ def robot(models: Path, **layout: str) -> Embodiment:
 
 
 @pytest.mark.real
-def test_a_folder_of_videos_becomes_episodes_whose_hands_are_the_tables(
-    short: Path, models: Path, tmp_path: Path
-) -> None:
+def test_a_folder_of_videos_becomes_episodes_whose_hands_are_the_tables(short, models, tmp_path) -> None:
     source, own = open_source("hands"), robot(models)
     (ref,) = source.index(str(short), own)
     assert (ref.id, ref.frames) == ("clip.mp4", 24)
@@ -332,9 +324,7 @@ def test_videos_without_hands_and_cut_off_ones_are_refused(short: Path, models: 
 
 
 @pytest.mark.real
-def test_inspection_tells_the_share_of_frames_with_hands(
-    short: Path, models: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_inspection_tells_the_share_of_frames_with_hands(short, models, monkeypatch) -> None:
     monkeypatch.setenv("HMA_HAND_MODELS", str(models))
     facts = open_source("hands").inspect(str(short)).facts
     assert facts["frames with left hand"] == facts["frames with both"] == "100% of 12 looked at"
@@ -358,9 +348,7 @@ def test_missing_models_say_where_they_are_looked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-def test_a_bundle_gives_the_same_hands_as_the_files_in_it(
-    real_data: Path, models: Path, finder: MediaPipeHands, tmp_path: Path
-) -> None:
+def test_a_bundle_gives_the_same_hands_as_the_files_in_it(real_data, models, finder, tmp_path) -> None:
     with zipfile.ZipFile(tmp_path / "hand_landmarker.task", "w") as bundle:
         bundle.write(models / "palm_detection_full.tflite", "hand_detector.tflite")
         bundle.write(models / "hand_landmark_full.tflite", "hand_landmarks_detector.tflite")

@@ -147,9 +147,7 @@ def test_a_masked_conversion_stores_marks_and_zeros_and_counts_known_values_only
     assert verify(tmp_path / "out") == []
 
 
-def test_a_chunk_of_a_batch_is_known_when_all_its_steps_are(
-    folder: Path, tmp_path: Path, block_tokenizer
-) -> None:
+def test_a_chunk_of_a_batch_is_known_when_all_its_steps_are(folder, tmp_path, block_tokenizer) -> None:
     robot = made.hand_video("landmarks", missing="mask")
     assert robot.stride == 5
     for frames in ("all", "strided"):
@@ -171,9 +169,7 @@ def test_a_chunk_of_a_batch_is_known_when_all_its_steps_are(
         assert verify(tmp_path / frames) == []
 
 
-def test_sets_that_cannot_mask_have_no_marks_and_all_is_known(
-    folder: Path, tmp_path: Path, block_tokenizer
-) -> None:
+def test_sets_that_cannot_mask_have_no_marks_and_all_is_known(folder, tmp_path, block_tokenizer) -> None:
     robot = made.hand_video("landmarks", missing="hold")
     done = convert(robot, str(folder), block_tokenizer, tmp_path / "out")
     assert done.flags == {"held_frames": 3, "dropped_frames": 1}

@@ -104,9 +104,7 @@ def test_as_many_observations_as_actions_need_nothing_dropped(tmp_path: Path) ->
         ("u2", "0-65535", 257),
     ],
 )
-def test_other_numbers_become_bytes_by_the_range_named(
-    tmp_path: Path, dtype: str, pixels: str, factor: float
-) -> None:
+def test_other_numbers_become_bytes_by_the_range_named(tmp_path, dtype, pixels, factor) -> None:
     path = one(tmp_path, data=(pictures().astype(float) * factor).astype(dtype))
     np.testing.assert_array_equal(shown(path, [5, 2, 7], pixels=pixels), pictures()[[5, 2, 7]])
 
@@ -209,9 +207,7 @@ def test_states_without_pictures_say_that_they_must_be_rendered(tmp_path: Path) 
         ({"train": [0, 1], "valid": []}, ["train", "train", None]),
     ],
 )
-def test_masks_by_their_names(
-    tmp_path: Path, masks: dict[str, list[int]], expected: list[str | None]
-) -> None:
+def test_masks_by_their_names(tmp_path, masks, expected) -> None:
     path = tmp_path / "demos.hdf5"
     with h5py.File(path, "w") as file:
         for i in range(3):
@@ -228,9 +224,7 @@ def test_masks_by_their_names(
 
 
 @pytest.mark.parametrize("chunks", [(T, H, W, 3), (4, H, W, 3), (5, 5, 7, 1), (1, H, W, 3), None])
-def test_batches_in_any_order_are_the_frames_whatever_the_chunks(
-    tmp_path: Path, chunks: tuple[int, ...] | None
-) -> None:
+def test_batches_in_any_order_are_the_frames_whatever_the_chunks(tmp_path, chunks) -> None:
     options = {"chunks": chunks, "compression": "gzip", "shuffle": True} if chunks else {}
     path = one(tmp_path, data=pictures(), **options)
     stream = open_source("hdf5").read(str(path), "demo_0", embodiment()).streams["front"]
@@ -238,9 +232,7 @@ def test_batches_in_any_order_are_the_frames_whatever_the_chunks(
         np.testing.assert_array_equal(stream.frames(batch), pictures()[batch])
 
 
-def test_a_chunk_larger_than_the_usual_cache_is_read_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_chunk_larger_than_the_usual_cache_is_read_once(tmp_path, monkeypatch) -> None:
     from hma_data.sources.hdf5 import file as hdf5_file
 
     monkeypatch.setattr(hdf5_file, "CHUNK_CACHE", 1000)
@@ -404,9 +396,7 @@ def test_numbered_parts_with_pictures_and_numbers_are_one_episode(tmp_path: Path
     ],
     ids=["below", "at the top", "days", "tasks"],
 )
-def test_what_is_short_beside_numbered_episodes_is_none(
-    tmp_path: Path, names: list[str], ids: list[str]
-) -> None:
+def test_what_is_short_beside_numbered_episodes_is_none(tmp_path, names, ids) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name in names:
             fill(file.create_group(name))

@@ -74,9 +74,7 @@ def test_a_link_within_the_file_is_an_episode(tmp_path: Path) -> None:
     ],
     ids=["external", "dangling"],
 )
-def test_a_link_out_of_the_file_or_to_nothing_is_an_episode_that_is_refused(
-    tmp_path: Path, link: Any, said: str
-) -> None:
+def test_a_link_out_of_the_file_or_to_nothing_is_an_episode_that_is_refused(tmp_path, link, said) -> None:
     path, source = linked(tmp_path, link), open_source("hdf5")
     assert [ref.id for ref in source.index(str(path), robot())] == ["demo_0", "demo_1", "demo_2"]
     with pytest.raises(EpisodeError, match=f"{said}, which is not in this file"):
@@ -95,9 +93,7 @@ def test_a_mask_that_names_an_absent_demo_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("actions", "images"), [(40, 40), (40, 41), (ROWS, 40)], ids=["all", "more", "images"]
 )
-def test_rows_of_buffers_that_were_never_recorded_are_left_out(
-    tmp_path: Path, stated: str, actions: int, images: int
-) -> None:
+def test_rows_of_buffers_that_were_never_recorded_are_left_out(tmp_path, stated, actions, images) -> None:
     path, source = tmp_path / "demo.hdf5", open_source("hdf5")
     with h5py.File(path, "w") as file:
         fill(file.create_group("data/demo_0"), 5, actions, images)

@@ -183,9 +183,7 @@ def test_pictures_named_by_path_are_read(copy: Callable[[str], Path]) -> None:
         open_source("lerobot").read(str(folder), "episode_000000", embodiment()).streams["still"].frames([0])
 
 
-def test_a_dataset_of_the_hub_is_read_from_its_cache(
-    originals: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dataset_of_the_hub_is_read_from_its_cache(originals, tmp_path, monkeypatch) -> None:
     from huggingface_hub import constants
 
     home, commit = tmp_path / "datasets--team--arm", "a" * 40
@@ -261,9 +259,7 @@ def test_rows_that_metadata_does_not_count_are_refused(copy: Callable[[str], Pat
         open_source("lerobot").read(str(folder), "episode_000000", embodiment())
 
 
-def test_a_run_of_more_rows_than_any_recording_is_refused(
-    copy: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_of_more_rows_than_any_recording_is_refused(copy, monkeypatch) -> None:
     folder = copy("v2")
     monkeypatch.setattr("hma_data.sources.lerobot.rows.MAX_VALUES", 1000)
     path = folder / "data/chunk-000/episode_000000.parquet"
@@ -317,9 +313,7 @@ def test_actions_that_are_none_are_refused(copy: Callable[[str], Path], column: 
         ({"features": {"action": {"dtype": "float32"}}}, r"lacks features\.action\.shape"),
     ],
 )
-def test_metadata_out_of_bounds_is_one_clear_line(
-    copy: Callable[[str], Path], change: dict[str, Any], said: str
-) -> None:
+def test_metadata_out_of_bounds_is_one_clear_line(copy, change, said) -> None:
     folder = copy("v2")
     change_info(folder, **change)
     with pytest.raises(SourceError, match=said) as found:
@@ -345,9 +339,7 @@ def test_metadata_out_of_bounds_is_one_clear_line(
         ("tasks.jsonl", "3", r"tasks\.jsonl: holds 3, not an object"),
     ],
 )
-def test_damaged_metadata_is_one_clear_line(
-    copy: Callable[[str], Path], name: str, text: str | None, said: str
-) -> None:
+def test_damaged_metadata_is_one_clear_line(copy, name, text, said) -> None:
     folder = copy("v2")
     path = folder / "meta" / name
     path.unlink() if text is None else path.write_text(text)
@@ -375,9 +367,7 @@ def test_a_template_that_leaves_the_folder_is_refused(copy: Callable[[str], Path
         open_source("lerobot").read(str(folder), "episode_000000", embodiment())
 
 
-def test_a_snapshot_in_the_hubs_cache_is_read_where_it_lies(
-    originals: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_snapshot_in_the_hubs_cache_is_read_where_it_lies(originals, tmp_path) -> None:
     folders = (originals["v3"], as_snapshot(originals["v3"], tmp_path))
     plain, cached = (open_source("lerobot").read(str(f), "episode_000001", embodiment()) for f in folders)
     assert np.array_equal(cached.actions[0].values, plain.actions[0].values)
@@ -397,9 +387,7 @@ def test_a_folder_that_is_none_says_so(tmp_path: Path) -> None:
 @pytest.mark.slow
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_a_cut_or_flipped_file_gives_only_our_errors(
-    originals: dict[str, Path], tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
+def test_a_cut_or_flipped_file_gives_only_our_errors(originals, tmp_path_factory, data) -> None:
     folder = tmp_path_factory.mktemp("bad") / "set"
     shutil.copytree(originals[data.draw(st.sampled_from(["v2", "v3"]))], folder)
     files = sorted(path for path in folder.rglob("*.*") if path.is_file())

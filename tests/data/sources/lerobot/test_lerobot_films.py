@@ -109,9 +109,7 @@ def test_an_offset_that_was_never_reset_for_a_new_video_does_no_harm(tmp_path: P
     ],
     ids=["twice", "four times", "first twice", "last twice", "one missing", "end missing"],
 )
-def test_one_frame_too_many_or_too_few_refuses_every_episode_of_the_video(
-    shared: Path, shown: list[int], said: str
-) -> None:
+def test_one_frame_too_many_or_too_few_refuses_every_episode_of_the_video(shared, shown, said) -> None:
     film(shared, shown)
     assert all(said in text for text in outcome(shared))
     problems = open_source("lerobot").inspect(str(shared)).problems

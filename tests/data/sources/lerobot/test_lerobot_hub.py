@@ -102,9 +102,7 @@ def test_what_the_hub_does_not_have_is_one_line(hub: Hub, uri: str) -> None:
     assert ("no such revision" if "@" in uri else "no such repository, or no access") in str(found.value)
 
 
-def test_a_file_the_hub_lacks_is_one_refused_episode(
-    hub: Hub, folders: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_file_the_hub_lacks_is_one_refused_episode(hub, folders, tmp_path) -> None:
     import shutil
 
     copy = Path(shutil.copytree(folders["v2"], tmp_path / "copy"))
