@@ -252,6 +252,12 @@ class HMAConfig:
         return any(OBJECTIVES[name].sees_actions for name, weight in self.objectives.items() if weight)
 
     @property
+    def trained_readouts(self) -> tuple[Readout, ...]:
+        """Return the readouts of actions that an objective of the training trains."""
+        chosen = [OBJECTIVES[name].readout for name, weight in self.objectives.items() if weight]
+        return tuple(readout for readout in chosen if readout is not None)
+
+    @property
     def vocab_size(self) -> int:
         """Return the number of ids of a stored token; this number is also the id that means masked."""
         return math.prod(self.factored)

@@ -278,7 +278,11 @@ class Rollout:
 
         Returns:
             (n, K) float32 raw; those of narrower embodiments are padded with zeros.
+
+        Raises:
+            HMAError: no objective of the training trained the policy.
         """
+        self.model.require_readout(POLICY)
         own = self._begun(rows)
         if self.config.action_alignment == "current":
             self.state.put_chunk(own, 1, None, None)  # it is the one that is asked for

@@ -190,17 +190,19 @@ class HMA(Network):
             actions: (B, T, K) raw chunks that are known; none by default.
             action_mask: (B, T) bool, True where a chunk is known; by default all are.
             readout: "policy": chunk k from frames up to k; "inverse": chunk k from frames up to k+1. No frame
-                follows the last chunk, so "inverse" takes it from the policy.
+                follows the last chunk, so "inverse" takes it from the policy if that was trained too, else
+                it is NaN.
             generator: the generator of the noise of a diffusion head.
 
         Returns:
             (B, T, K) float32 raw; narrower embodiments of a mixed batch are padded with zeros.
 
         Raises:
-            HMAError: the readout is unknown.
+            HMAError: the readout is unknown, or no objective of the training trained it.
         """
         if readout not in READOUTS:
             raise HMAError("readout", f"{readout!r} is unknown", "give one of " + ", ".join(READOUTS))
+        self.require_readout(READOUTS[readout])
         groups, count = Groups.of(embodiment, len(frames)), frames.shape[1]
         times = self.time_positions(count)
         given = None

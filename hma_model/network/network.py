@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_model.checkpoint.folder import Checkpoint
-from hma_model.config import POLICY, ActionSpace, HMAConfig, Readout
+from hma_model.config import OBJECTIVES, POLICY, ActionSpace, HMAConfig, Readout
 from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
 from hma_model.network.head import ActionHead, Generators, LatentReadout, TokenReadout
 from hma_model.network.states import check_fit, module_key
@@ -226,6 +226,16 @@ class Network(nn.Module):
             return features[:, :, -self.config.action_tokens :].mean(2)
         return features.mean(2)
 
+    def require_readout(self, readout: Readout) -> None:
+        """Raise HMAError unless an objective of the training trained a readout: else it returns noise."""
+        if readout in self.config.trained_readouts:
+            return
+        where = self.source.name if self.source else "the model"
+        objectives = ", ".join(name for name, weight in self.config.objectives.items() if weight)
+        wanted = " or ".join(name for name, one in OBJECTIVES.items() if one.readout == readout)
+        fault = f"was not trained to predict actions by {readout.name!r}, but for {objectives}"
+        raise HMAError(where, fault, f"train one with the objective {wanted}")
+
     def read_chunks(self, pooled: Tensor, groups: Groups, readout: Readout, generator: Generators) -> Tensor:
         """Read chunks (B, T, K) in the batch's order off action features (B, T, D) sorted by embodiment.
 
@@ -246,6 +256,8 @@ class Network(nn.Module):
     def _predict(self, pooled: Tensor, embodiment: str, readout: Readout, generator: Generators) -> Tensor:
         head = self.head(embodiment)
         chunks = head.predict(pooled.flatten(0, 1), POLICY, generator).unflatten(0, pooled.shape[:2])
+        if readout != POLICY and POLICY not in self.config.trained_readouts:
+            chunks = torch.full_like(chunks, torch.nan)  # rather than numbers that nothing trained
         if lag := readout.lag:
             after = head.predict(pooled[:, lag:].flatten(0, 1), readout, generator)
             chunks = torch.cat([after.unflatten(0, (len(pooled), -1)), chunks[:, -lag:]], dim=1)

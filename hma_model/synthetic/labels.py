@@ -27,7 +27,7 @@ from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.config import INVERSE, OBJECTIVES
+from hma_model.config import INVERSE
 from hma_model.generation.commands import Commands, Floats, card, described
 from hma_model.policies.fingerprints import device_facts, world_digests
 from hma_model.synthetic.film import FilmEpisode, ShardFilm, find_film, read_film
@@ -117,8 +117,7 @@ def label_actions(
         raise OutputError(folder, "is a file", "name a folder")
     world = world or load_world(checkpoint, device=device)
     model = world.model
-    trained = [OBJECTIVES[name].readout for name, weight in model.config.objectives.items() if weight]
-    if INVERSE not in trained:
+    if INVERSE not in model.config.trained_readouts:
         fault = f"was not trained to infer actions, but for {', '.join(model.config.objectives)}"
         raise HMAError(checkpoint, fault, "train one with objectives={inverse: 1.0}")
     spec = world.action_spec(embodiment)

@@ -23,7 +23,7 @@ from hma_data.errors import HMAError
 from hma_data.storage.paths import StrPath
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.config import OBJECTIVES, POLICY
+from hma_model.config import POLICY
 from hma_model.generation.commands import Commands, described
 from hma_model.generation.decode import decode
 from hma_model.generation.engine import products_in
@@ -332,9 +332,9 @@ class World:
 
 def require_actor(config: "HMAConfig", where: str) -> None:
     """Check that a model was trained to act; an HMAError says how that is done."""
-    trained = [OBJECTIVES[name] for name, weight in config.objectives.items() if weight > 0]
-    if not any(one.readout == POLICY for one in trained):
-        fault = f"was not trained to act, but for {', '.join(one.name for one in trained)}"
+    if POLICY not in config.trained_readouts:
+        objectives = ", ".join(name for name, weight in config.objectives.items() if weight)
+        fault = f"was not trained to act, but for {objectives}"
         raise HMAError(where, fault, "train one with objectives={policy: 1.0} or {full: 1.0}")
 
 

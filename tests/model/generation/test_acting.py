@@ -1,5 +1,7 @@
 """A rollout that acts commands what `predict_actions` says of the whole history, also of its own video."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -8,6 +10,7 @@ from hma_model.network.model import HMA
 from tests.model.generation.test_generate import LAYOUTS
 from tests.model.network_parts import ARM, HAND, small_batch, small_model
 
+ACTS: dict[str, Any] = {"objectives": {"forward": 1.0, "policy": 1.0}}
 NAMES, TOTAL, PROMPTS = ["arm", "hand.v1"], 9, (3, 1)
 
 
@@ -26,7 +29,7 @@ def wanted(
     ("layout", "kind"), [(name, "discrete") for name in LAYOUTS] + [("rotary", "continuous")]
 )
 def test_the_cached_chunk_is_that_of_the_whole_history(layout: str, kind: str, cache: bool) -> None:
-    model = small_model(kind=kind, **LAYOUTS[layout])
+    model = small_model(kind=kind, **LAYOUTS[layout] | ACTS)
     batch = small_batch(model.config, NAMES, frames=TOTAL)
     frames, chunks = batch.tokens if kind == "discrete" else batch.latents, batch.actions
     known = torch.rand(2, TOTAL, generator=torch.Generator().manual_seed(1)) < 0.7
@@ -51,7 +54,7 @@ def test_the_cached_chunk_is_that_of_the_whole_history(layout: str, kind: str, c
 
 @pytest.mark.parametrize("layout", ["rotary", "learned", "released", "cross"])
 def test_video_and_actions_roll_out_together_with_and_without_a_cache(layout: str) -> None:
-    model = small_model(**LAYOUTS[layout])
+    model = small_model(**LAYOUTS[layout] | ACTS)
     batch = small_batch(model.config, NAMES, frames=2)
     runs = []
     for cache in (True, False):
@@ -65,7 +68,7 @@ def test_video_and_actions_roll_out_together_with_and_without_a_cache(layout: st
 
 
 def test_acting_leaves_no_trace_in_the_video() -> None:
-    model = small_model()
+    model = small_model(**ACTS)
     batch = small_batch(model.config, NAMES, frames=8)
     runs = []
     for acts in (True, False):
@@ -79,7 +82,7 @@ def test_acting_leaves_no_trace_in_the_video() -> None:
 
 
 def test_a_diffusion_head_draws_each_rows_own_noise() -> None:
-    model = small_model(action_loss="diffusion", diffusion_clip=1.0)
+    model = small_model(action_loss="diffusion", diffusion_clip=1.0, **ACTS)
     batch = small_batch(model.config, NAMES, frames=3)
     both = Rollout(model, NAMES[::-1], 2)
     both.reset([1, 0], batch.tokens, batch.actions, None, [5, 6], NAMES)

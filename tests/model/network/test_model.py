@@ -180,7 +180,9 @@ def test_every_combination_of_conditionings_is_causal(conditioning: tuple[str, .
 
 @pytest.mark.parametrize("target", ["normalized", "raw"])
 def test_action_loss_is_the_mean_over_present_chunks(target: str) -> None:
-    model = small_model(corrupt_max=0.0, action_target=target)
+    model = small_model(
+        corrupt_max=0.0, action_target=target, objectives={"forward": 1, "policy": 1, "inverse": 1}
+    )
     batch = small_batch(model.config, ["arm", "hand.v1", "arm"])
     batch.action_mask[0, 1] = batch.action_mask[1, 3:] = False
     out = model(batch, "policy", seeded(5))
@@ -221,7 +223,7 @@ def test_the_scores_of_one_frame_of_each_window_are_those_of_all_at_these_frames
 
 
 def test_predicted_actions_are_raw_and_padded() -> None:
-    model = small_model()
+    model = small_model(objectives={"forward": 1, "policy": 1, "inverse": 1})
     batch = small_batch(model.config, ["arm", "hand.v1"])
     chunks = model.predict_actions(batch.tokens, batch.embodiment)
     assert chunks.shape == (2, 5, ARM.chunk_dim)
@@ -231,8 +233,32 @@ def test_predicted_actions_are_raw_and_padded() -> None:
     assert torch.allclose(chunks[1:, :, :2], alone, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("objectives", "readout", "says"),
+    [
+        ({"forward": 1.0}, "policy", "'policy', but for forward.*objective policy or full"),
+        ({"passive": 1.0, "policy": 0.0}, "policy", "'policy', but for passive"),
+        ({"policy": 1.0}, "inverse", "'inverse', but for policy.*objective inverse"),
+        ({"full": 1.0}, "inverse", "'inverse', but for full"),
+        ({"inverse": 1.0}, "policy", "'policy', but for inverse"),
+    ],
+)
+def test_readouts_that_nothing_trained_are_refused(
+    objectives: dict[str, float], readout: str, says: str
+) -> None:
+    model = small_model(objectives=objectives)
+    with pytest.raises(HMAError, match=says):
+        model.predict_actions(small_batch(model.config, ["arm"]).tokens, "arm", readout=readout)
+
+
+def test_the_chunk_after_the_last_frame_is_unknown_to_a_model_that_only_infers() -> None:
+    model = small_model(objectives={"inverse": 1.0})
+    chunks = model.predict_actions(small_batch(model.config, ["arm"]).tokens, "arm", readout="inverse")
+    assert chunks[:, :-1].isfinite().all() and chunks[:, -1].isnan().all()
+
+
 def test_inverse_reads_the_frame_after_and_policy_does_not() -> None:
-    model = small_model()
+    model = small_model(objectives={"forward": 1, "policy": 1, "inverse": 1})
     batch = small_batch(model.config, ["arm"])
     changed = batch.tokens.clone()
     changed[:, 3] = (changed[:, 3] + 1) % 24

@@ -171,7 +171,9 @@ def test_absent_actions_can_skip_conditioning_altogether() -> None:
 
 
 def test_without_actions_only_learned_tokens_may_stand_for_them() -> None:
-    model = small_model(conditioning=("modulation",), absent_action="tokens", action_tokens=3)
+    model = small_model(
+        conditioning=("modulation",), absent_action="tokens", action_tokens=3, objectives={"policy": 1.0}
+    )
     batch = small_batch(model.config, ["arm"])
     with torch.no_grad():
         one = model.video_logits(batch.tokens, None, "arm")

@@ -87,13 +87,15 @@ def _outputs(model: HMA) -> list[torch.Tensor]:
             with torch.no_grad():
                 if model.config.kind == "discrete":
                     outputs.append(model.video_logits(batch.tokens, actions, name))
-                    outputs.append(model.predict_actions(batch.tokens, name, actions))
+                    if model.config.trained_readouts:
+                        outputs.append(model.predict_actions(batch.tokens, name, actions))
                 else:
                     mask = torch.rand(2, model.config.frames, 8, 8, generator=torch.Generator()) < 0.3
                     outputs.append(model.video_conditions(batch.latents, mask, actions, name))
                     generator = torch.Generator().manual_seed(1)
-                    chunks = model.predict_actions(batch.latents, name, actions, generator=generator)
-                    outputs.append(chunks)
+                    if model.config.trained_readouts:
+                        chunks = model.predict_actions(batch.latents, name, actions, generator=generator)
+                        outputs.append(chunks)
     return outputs
 
 
