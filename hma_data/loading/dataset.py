@@ -217,7 +217,17 @@ class MixtureDataset(IterableDataset[Batch]):
             for name, shards in self.sets.items()
         }
         for decoder in self._decoders.values():
-            _check_windows(decoder, frames)
+            index = decoder.index
+            if index.count:
+                continue
+            episodes, remedy = "0 episodes", "leave this embodiment out"
+            if index.short_episodes:
+                episodes = f"{index.short_episodes} episodes, all shorter"
+                remedy = "raise target_hz in its YAML and run hma convert again, or use fewer frames"
+            fault = (
+                f"has no window of {frames} frames, {index.row_stride} rows apart, in {split} ({episodes})"
+            )
+            raise ShardError(decoder.shards.folder, fault, remedy)
         counts = {name: decoder.index.count for name, decoder in self._decoders.items()}
         self.mixture = Mixture.of(
             counts,
@@ -248,6 +258,7 @@ class MixtureDataset(IterableDataset[Batch]):
         while True:
             lane, draws = self._step % self.lanes, self._draws(self._step)
             mine = (self._step - (self._origin or 0)) % workers == worker
+            # Batches of a lane are cut ahead only where the lane stays with this worker.
             batch = self._batch(self._step, self._taken[lane], self.lanes % workers == 0) if mine else None
             self._step, self._taken = self._step + 1, _counted(self._taken, lane, draws)
             if batch is not None:
@@ -313,14 +324,13 @@ class MixtureDataset(IterableDataset[Batch]):
         if step not in self._drawn:
             if len(self._drawn) > 4 * AHEAD * self.lanes:
                 self._drawn.clear()
-            self._drawn[step] = self._drawn_now(step)
+            size = self.batch_size
+            if self.mixture.draw == "per_batch":
+                self._drawn[step] = self.mixture.batch(step * self.world + self.rank, size)
+            else:  # every rank draws for all, and takes its part
+                whole = self.mixture.batch(step, size * self.world)
+                self._drawn[step] = whole[self.rank * size : (self.rank + 1) * size]
         return self._drawn[step]
-
-    def _drawn_now(self, step: int) -> Ints:
-        if self.mixture.draw == "per_batch":
-            return self.mixture.batch(step * self.world + self.rank, self.batch_size)
-        whole = self.mixture.batch(step, self.batch_size * self.world)
-        return whole[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]
 
     @cached_property
     def _some(self) -> int:
@@ -367,12 +377,8 @@ class MixtureDataset(IterableDataset[Batch]):
         return self._sequences[lane, which]
 
     def __getstate__(self) -> dict[str, Any]:
-        fresh: dict[str, Any] = {
-            "_sequences": {},
-            "_assignments": {},
-            "_ahead": {},
-        }  # a worker makes these anew
-        return self.__dict__ | fresh
+        # A worker makes these anew: decoded rows are large, and iterators cannot be sent.
+        return {**self.__dict__, "_sequences": {}, "_assignments": {}, "_ahead": {}}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position of the stream after the last batch taken, as plain values of a few kB."""
@@ -419,6 +425,7 @@ class MixtureDataset(IterableDataset[Batch]):
                     "continue with the same settings and data, or start a new run",
                 )
         step, taken = int(state["step"]), np.asarray(state["taken"], np.int64)
+        # Lanes of another rank took windows of other sets. What this rank had taken follows from its draws.
         if state.get("rank") != self.rank:
             taken = np.zeros_like(taken)
             for before in range(step):
@@ -426,19 +433,6 @@ class MixtureDataset(IterableDataset[Batch]):
         self._step, self._taken = step, taken
         self._ahead.clear()  # cut after other windows
         self._origin = state.get("origin") if get_worker_info() else None
-
-
-def _check_windows(decoder: Decoder, frames: int) -> None:
-    index = decoder.index
-    if not index.count:
-        short = index.short_episodes
-        remedy = "raise target_hz in its YAML and run hma convert again, or use fewer frames"
-        raise ShardError(
-            decoder.shards.folder,
-            f"has no window of {frames} frames, {index.row_stride} rows apart, in {decoder.split} "
-            f"({short} episodes{', all shorter' if short else ''})",
-            remedy if short else "leave this embodiment out",
-        )
 
 
 def _counted(taken: Ints, lane: int, draws: Ints) -> Ints:

@@ -8,7 +8,7 @@ E embodiments, B samples a batch.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -110,9 +110,15 @@ class Mixture:
         """
         weights, groups, caps = weights or {}, groups or {}, caps or {}
         group = {name: groups.get(name, name) for name in counts}
-        _check_names("groups", groups, counts)
-        _check_factors("weights", weights, [*counts, *(group.values() if groups else [])])
-        _check_factors("caps", caps, counts)
+        labels = set(group.values()) if groups else set()
+        allowed = {"groups": counts.keys(), "weights": counts.keys() | labels, "caps": counts.keys()}
+        for what, named in (("groups", groups), ("weights", weights), ("caps", caps)):
+            if unknown := sorted(named.keys() - allowed[what]):
+                fault = f"name {', '.join(unknown)}, which the mixture does not have"
+                raise UsageError(f"mixture {what}", fault)
+        for what, factors in (("weights", weights), ("caps", caps)):
+            if not all(0 <= factor < math.inf for factor in factors.values()):
+                raise UsageError(f"mixture {what}", f"must be numbers of at least 0, not {dict(factors)}")
         if seed < 0:
             raise UsageError("mixture seed", f"must be at least 0, not {seed}")
         share = _shares(list(counts.values()), temperature)
@@ -180,19 +186,6 @@ def _shares(counts: Sequence[int], temperature: float) -> Floats:
     present = n > 0
     share[present] = np.exp((np.log(n[present]) - np.log(n.max())) / temperature)
     return share
-
-
-def _check_factors(what: str, factors: Mapping[str, float], known: Iterable[str]) -> None:
-    _check_names(what, factors, known)
-    if not all(0 <= factor < math.inf for factor in factors.values()):
-        raise UsageError(f"mixture {what}", f"must be numbers of at least 0, not {dict(factors)}")
-
-
-def _check_names(what: str, named: Mapping[str, object], known: Iterable[str]) -> None:
-    unknown = set(named) - set(known)
-    if unknown:
-        fault = f"name {', '.join(sorted(unknown))}, which the mixture does not have"
-        raise UsageError(f"mixture {what}", fault)
 
 
 def plot_mixture(mixture: Mixture, temperature: float, path: StrPath) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -80,10 +81,13 @@ class Rows:
         return found
 
     def _spans(self, span: int) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
-        """Return the actions and marks of every run of `span` rows, see `_spans`; they are made once."""
+        """Return the actions (N - span + 1, span * A) and marks of every run of `span` rows; made once."""
         if self._of_span is None or self._of_span[0] != span:
-            known = None if self.known is None else _spans(self.known[:, None], span)
-            self._of_span = span, _spans(self.actions, span), known
+            # Rows lie one after the other in memory, so a run of rows is a run of numbers: every window is a
+            # view, and all windows of a pool share one copy of the actions.
+            flat, width = self.actions.ravel(), self.actions.shape[1]
+            known = None if self.known is None else sliding_window_view(self.known, span)
+            self._of_span = span, sliding_window_view(flat, span * width)[::width], known
         return self._of_span[1:]
 
     def _frames(self, rows: Ints, view: Ints | None) -> NDArray[Any]:
@@ -104,18 +108,6 @@ class Rows:
             "known": np.all(known.reshape(len(first), index.frames, -1), axis=2),
             "inside": inside[:, :: index.row_stride],
         }
-
-
-def _spans(values: NDArray[Any], span: int) -> NDArray[Any]:
-    """Return every run of `span` rows, without a copy: (N, A) -> (N - span + 1, span * A)."""
-    rows, width = values.shape
-    size = values.itemsize
-    return np.ndarray(
-        (max(0, rows - span + 1), span * width),
-        values.dtype,
-        buffer=np.ascontiguousarray(values),
-        strides=(width * size, size),
-    )
 
 
 class Decoder:
@@ -146,7 +138,11 @@ class Decoder:
             raise UsageError("frames", f"a window must have at least 1, not {frames}")
         self.shards, self.split = shards, split
         self.views = Views.of(shards, cameras)
-        _check_stride(shards)
+        recorded, kept = shards.embodiment.stride, shards.manifest.frame_stride
+        if kept < 1 or recorded % kept:
+            fault = f"keeps one of every {kept} recorded frames, but the stride is {recorded}"
+            remedy = f"convert again with --frames all, or set a stride that is a multiple of {kept}"
+            raise ShardError(shards.folder, fault, remedy)
         self.index = WindowIndex.of(shards, split, frames, stride, short)
         width = token_column(shards.spec)[1] * len(self.views.columns)
         robot = shards.embodiment
@@ -230,16 +226,6 @@ class Decoder:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _lock=threading.Lock())
-
-
-def _check_stride(shards: ShardSet) -> None:
-    stride, kept = shards.embodiment.stride, shards.manifest.frame_stride
-    if kept < 1 or stride % kept:
-        raise ShardError(
-            shards.folder,
-            f"keeps one of every {kept} recorded frames, but the stride is {stride}",
-            f"convert again with --frames all, or set a stride that is a multiple of {kept}",
-        )
 
 
 @dataclass

@@ -27,7 +27,7 @@ from hma_model.config import POLICY
 from hma_model.generation.chunks import prompt_chunks, step_chunk
 from hma_model.generation.engine import Engine
 from hma_model.generation.passes import Passes
-from hma_model.generation.state import Pass, RowState, Snapshot
+from hma_model.generation.state import RowState, Snapshot
 from hma_model.generation.unmask import (
     Decoding,
     PatchFrame,
@@ -309,28 +309,27 @@ class Rollout:
             self.state.grow(rows)
 
     def _frame(self, rows: list[int]) -> Tensor:
-        """Return the next frame (n, S) of rows, unmasked."""
+        """Return the next frame (n, S) of rows: begin with a masked one, and unmask it step by step."""
         frame, passes = self._blank(rows), self.passes.begin(rows)
         left = tokens = self.config.tokens_per_frame
         for step in range(self.decoding.steps):
             count = left - masked_after(step, self.decoding.steps, tokens)
-            if count > 0:
-                self._unmask(frame, passes, count, first=left == tokens)
-                left -= count
+            if count <= 0:
+                continue
+            first = left == tokens
+            if self.engine.whole is not None and isinstance(frame, TokenFrame) and not self.decoding.measure:
+                # One graph for the pass and the choice of tokens; all draws are made before, outside of it.
+                (part,) = passes
+                seen = frame.laid_out(part.lay_out, self.model.token_readout, count)
+                made = self.engine.whole(seen, count, *self.passes.inputs(frame, part, first)).clone()
+                frame.values = made if part.lanes is None else made[part.lanes]
+            else:
+                features, position = self.passes.features(frame, passes, first)
+                own = features[:, :tokens]
+                frame.unmask(self.engine.readout, own, position, count)  # type: ignore[arg-type]
+            left -= count
         self.uncertainty = frame.uncertainty / self.config.latent_scale
         return frame.values
-
-    def _unmask(self, frame: TokenFrame | PatchFrame, passes: list[Pass], count: int, first: bool) -> None:
-        """Predict and keep `count` more tokens of a frame."""
-        if self.engine.whole is not None and isinstance(frame, TokenFrame) and not self.decoding.measure:
-            (part,) = passes
-            seen = frame.laid_out(part.lay_out, self.model.token_readout, count)
-            made = self.engine.whole(seen, count, *self.passes.inputs(frame, part, first)).clone()
-            frame.values = made if part.lanes is None else made[part.lanes]
-            return
-        features, position = self.passes.features(frame, passes, first)
-        own = features[:, : self.config.tokens_per_frame]
-        frame.unmask(self.engine.readout, own, position, count)  # type: ignore[arg-type]
 
     # -- actions ------------------------------------------------------------------------------------------
 

@@ -277,12 +277,15 @@ class RowState:
         """Return the times of a pass over T frames of each row, from the times `begin` on."""
         positions = self.tensor(begin).unsqueeze(1) + torch.arange(frames, device=self.model.device)
         newest, batch = positions[:, -1:], len(self.times)
+        # Slot r holds the newest time t with t mod R = r. A negative one is a slot that nothing has filled.
         held = newest - (newest - torch.arange(self.slots, device=newest.device)) % self.slots  # (n, R) times
         age = positions.unsqueeze(2) - held.unsqueeze(1)
         allowed = (held >= 0).unsqueeze(1) & (age >= 0) & (age < self.config.frames)
         places = positions % self.slots * batch + self.tensor(rows).unsqueeze(1)
-        whole = len(rows) == batch and list(rows) == list(range(batch))
-        chosen = None if whole else _span(rows, self.tensor(rows))
+        chosen: slice | Tensor | None = self.tensor(rows)
+        if list(rows) == list(range(rows[0], rows[0] + len(rows))):
+            # A slice of the cache is a view; an index would copy it in every layer.
+            chosen = None if len(rows) == batch else slice(rows[0], rows[0] + len(rows))
         return TimePositions(
             positions, allowed, rotary_angles(self.config, positions), slots=places, rows=chosen
         )
@@ -312,9 +315,3 @@ class RowState:
             if state is not None:
                 generator = self.generators[row] = self._seeded(0)
                 generator.set_state(state)
-
-
-def _span(rows: Sequence[int], index: Tensor) -> slice | Tensor:
-    """Return rows as a slice, which needs no copy, if they are in order."""
-    inside = list(rows) == list(range(rows[0], rows[0] + len(rows)))
-    return slice(rows[0], rows[0] + len(rows)) if inside else index

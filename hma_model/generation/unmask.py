@@ -196,18 +196,14 @@ class PatchFrame:
 
         patches = draw(self.generators)
         if way.measure:  # half the squared difference of two draws is their variance
-            other = draw([_copy(one) for one in self.generators])
+            copies = [torch.Generator(one.device) for one in self.generators]
+            for own, copied in zip(self.generators, copies, strict=True):
+                copied.set_state(own.get_state())  # measuring takes none of the rollout's numbers
+            other = draw(copies)
             variance = (patches - other).square().mean(-1).sum(1) / 2
             self.variance = self.variance + variance
         self.values = self.values.scatter(1, chosen.unsqueeze(-1).expand_as(patches), patches)
         self.masked = self.masked.scatter(1, chosen, False)
-
-
-def _copy(generator: torch.Generator) -> torch.Generator:
-    """Return a generator that draws the numbers which this one will draw next."""
-    made = torch.Generator(generator.device)
-    made.set_state(generator.get_state())
-    return made
 
 
 def _ranks(values: Tensor, generators: Sequence[torch.Generator]) -> Tensor:

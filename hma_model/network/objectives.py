@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.config import OBJECTIVES, HMAConfig, Objective, Readout
-from hma_model.network.conditioning import ActionConditioning, Groups, align
+from hma_model.network.conditioning import Groups, align
 from hma_model.network.copying import frames_before
 from hma_model.network.head import randn, uniform
 from hma_model.network.masking import (
@@ -115,8 +115,14 @@ def compute(
     layout = Layout.of(model, batch.actions.shape[1], chosen)
 
     video = _hide_tokens(config, batch, chosen, layout, generator)
-    dropped = _hide_chunks(batch, chosen.readout, generator)
-    given = _shown_chunks(model, batch, chosen, dropped, layout, generator)
+    dropped = torch.zeros_like(batch.action_mask)  # what the model must predict, and so does not see
+    if chosen.readout is not None:
+        read = dropped.shape[1] - chosen.readout.lag  # the chunks after these have no frame to be read from
+        dropped[:, :read] = drop_chunks(batch.action_mask[:, :read], generator)
+    given = None
+    if chosen.sees_actions:
+        given = align(config, batch.actions, batch.action_mask & ~dropped, dropped.shape[1])
+        given = given.frames(layout.frames) if layout.paired else given
     conditioning = model.condition(given, groups, layout.times.positions)
     x, shown = _embed(model, batch, frames, video, layout, groups, generator)
     features = model.trunk(x, conditioning, layout.times)
@@ -213,31 +219,6 @@ def _hide_tokens(
     if not objective.predicts_video:
         video.masked = torch.zeros_like(video.masked)
     return video
-
-
-def _hide_chunks(batch: "Batch", readout: Readout | None, generator: torch.Generator | None) -> Tensor:
-    """Draw the chunks that the model does not see because it must predict them, (B, T) bool."""
-    dropped = torch.zeros_like(batch.action_mask)
-    if readout is not None:
-        read = dropped.shape[1] - readout.lag  # the chunks after these have no frame to be read from
-        dropped[:, :read] = drop_chunks(batch.action_mask[:, :read], generator)
-    return dropped
-
-
-def _shown_chunks(
-    model: Network,
-    batch: "Batch",
-    objective: Objective,
-    dropped: Tensor,
-    layout: Layout,
-    generator: torch.Generator | None,
-) -> ActionConditioning | None:
-    """Return the chunks that the frames of a pass see; None for no actions at all."""
-    if not objective.sees_actions:
-        return None
-    config, known = model.config, batch.action_mask & ~dropped
-    given = align(config, batch.actions, known, known.shape[1])
-    return given.frames(layout.frames) if layout.paired else given
 
 
 def _embed(

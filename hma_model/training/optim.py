@@ -25,13 +25,14 @@ _MOMENTS = ("exp_avg", "exp_avg_sq", "step")
 MUON_MOMENTUM = 0.95
 
 
-class BlocksByMuon(torch.optim.AdamW):
+class AdamWAndMuon(torch.optim.AdamW):
     """AdamW, but for the groups marked `muon`, whose matrices take steps of Muon."""
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:  # type: ignore[override]
         """Take one step; `closure` is not called."""
         every = self.param_groups
+        # AdamW steps all groups of `param_groups`, so those of Muon are out of its sight meanwhile.
         self.param_groups = [group for group in every if not group["muon"]]
         try:
             super().step()
@@ -42,35 +43,12 @@ class BlocksByMuon(torch.optim.AdamW):
                 muon_step(group["params"], self.state, group["lr"], MUON_MOMENTUM, group["weight_decay"])
 
 
-def make_optimizer(model: "HMA", recipe: "Recipe") -> torch.optim.AdamW:
-    """Return AdamW for the trained parameters; each group has its `base_lr` and its parameters' `names`.
-
-    With `optimizer: muon`, the matrices of the blocks are in groups of their own, marked `muon`.
-    """
-    lr = learning_rate(recipe)
-    groups = parameter_groups(model, lr, recipe.weight_decay)
+def make_optimizer(model: "HMA", recipe: "Recipe") -> AdamWAndMuon:
+    """Return the optimizer of the trained parameters."""
     fused = model.device.type == "cuda"
-    if recipe.optimizer == "adamw":
-        return torch.optim.AdamW(groups, lr=lr, betas=recipe.betas, eps=recipe.eps, fused=fused)
-    parted = [part for group in groups for part in _parted(group, recipe.muon_lr)]
-    return BlocksByMuon(parted, lr=lr, betas=recipe.betas, eps=recipe.eps, fused=fused)
-
-
-def _parted(group: dict[str, Any], muon_lr: float) -> list[dict[str, Any]]:
-    """Return a group of AdamW as two, of which the second holds the blocks' matrices, for Muon."""
-    parts: list[dict[str, Any]] = []
-    for muon in (False, True):
-        chosen = [
-            (name, parameter)
-            for name, parameter in zip(group["names"], group["params"], strict=True)
-            if (name.startswith("trunk.blocks.") and parameter.ndim == 2) == muon
-        ]
-        if chosen:
-            names, parameters = map(list, zip(*chosen, strict=True))
-            rate = muon_lr if muon else group["base_lr"]
-            own = {"params": parameters, "names": names, "lr": rate, "base_lr": rate, "muon": muon}
-            parts.append({**group, **own})
-    return parts
+    lr, muon_lr = learning_rate(recipe), recipe.muon_lr if recipe.optimizer == "muon" else None
+    groups = parameter_groups(model, lr, recipe.weight_decay, muon_lr)
+    return AdamWAndMuon(groups, lr=lr, betas=recipe.betas, eps=recipe.eps, fused=fused)
 
 
 def learning_rate(recipe: "Recipe") -> float:
@@ -97,23 +75,32 @@ def set_lr(optimizer: torch.optim.Optimizer, scale: float) -> float:
     """Set the lr of every group to `base_lr` times the scale, and return the largest, Muon's left out."""
     for group in optimizer.param_groups:
         group["lr"] = group["base_lr"] * scale
-    return max(group["lr"] for group in optimizer.param_groups if not group.get("muon"))
+    return max(group["lr"] for group in optimizer.param_groups if not group["muon"])
 
 
-def parameter_groups(model: "HMA", lr: float, weight_decay: float) -> list[dict[str, Any]]:
-    """Return the groups of AdamW, by weight decay, muP's scaling and sharding."""
+def parameter_groups(
+    model: "HMA", lr: float, weight_decay: float, muon_lr: float | None = None
+) -> list[dict[str, Any]]:
+    """Return the groups of parameters, by weight decay, muP's scaling, sharding and optimizer.
+
+    Each has its `base_lr`, its parameters' `names`, and whether Muon steps them: with `muon_lr`, the matrices
+    of the blocks.
+    """
     multiplier = model.config.width / model.config.base_width if model.config.mup else 1.0
     matrices = _growing_matrices(model) if multiplier != 1.0 else set()
     plain = _undecayed(model)
-    groups: dict[tuple[bool, bool, bool], dict[str, Any]] = {}
+    groups: dict[tuple[bool, bool, bool, bool], dict[str, Any]] = {}
     for name, parameter in model.named_parameters():
         if not parameter.requires_grad:
             continue
         decays, scaled, sharded = name not in plain, name in matrices, isinstance(parameter, DTensor)
         factor = multiplier if scaled else 1.0
-        base_lr, decay = lr / factor, weight_decay * factor if decays else 0.0
-        fresh = {"params": [], "names": [], "lr": base_lr, "base_lr": base_lr, "weight_decay": decay}
-        group = groups.setdefault((decays, scaled, sharded), fresh)
+        rate, decay = lr / factor, weight_decay * factor if decays else 0.0
+        muon = muon_lr is not None and name.startswith("trunk.blocks.") and parameter.ndim == 2
+        if muon_lr is not None and muon:
+            rate = muon_lr
+        fresh = {"params": [], "names": [], "lr": rate, "base_lr": rate, "weight_decay": decay, "muon": muon}
+        group = groups.setdefault((decays, scaled, sharded, muon), fresh)
         group["params"].append(parameter)
         group["names"].append(name)
     return list(groups.values())
@@ -159,7 +146,7 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, T
     """Restore a result of `optimizer_state`; a parameter that it does not name begins without moments."""
     for group in optimizer.param_groups:
         for name, parameter in zip(group["names"], group["params"]):
-            if f"{name}/exp_avg" in state and group.get("muon"):
+            if f"{name}/exp_avg" in state and group["muon"]:
                 optimizer.state[parameter] = {"exp_avg": like(state[f"{name}/exp_avg"].clone(), parameter)}
             elif f"{name}/step" in state:
                 moments = {key: like(state[f"{name}/{key}"].clone(), parameter) for key in _MOMENTS[:2]}

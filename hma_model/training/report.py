@@ -98,16 +98,12 @@ def _curves(page: Page, out: Path, recipe: dict[str, Any], steps: Lines, evaluat
                     curves[-1].setdefault(name, []).append((line["step"], loss))
     video = any(OBJECTIVES[name].predicts_video for name in recipe["objectives"])
     discrete = any("perplexity" in line for line in evaluations)
-    label = f"loss, nats a {_unit(out)}" if video and discrete else "loss"
+    label, kept = "loss", training_checkpoints(out)
+    if video and discrete:
+        label = f"loss, nats a {token_words(Checkpoint.open(kept[-1]).config.merge) if kept else 'token'}"
     page.section("Losses")
     plot = loss_curves(curves[0], curves[1], label)
     page.picture(plot, "svg+xml", "Training (lines) and held-out (markers) loss by robot")
-
-
-def _unit(out: Path) -> str:
-    """Return what the losses of a run are of, as its newest checkpoint says."""
-    kept = training_checkpoints(out)
-    return token_words(Checkpoint.open(kept[-1]).config.merge) if kept else "token"
 
 
 def _samples(page: Page, out: Path) -> None:
