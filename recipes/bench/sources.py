@@ -245,7 +245,7 @@ def _mcap(folder: Path, episodes: int, length: int, seed: int) -> Path:
         messages = []
         pictures = _encoded(scene(*VGA, length, seed + episode), "jpeg")
         for i, (data, values) in enumerate(zip(pictures, actions(length, episode), strict=True)):
-            at = START_NS + i * 10**9 // HZ
+            at = START_NS + episode * 60 * 10**9 + i * 10**9 // HZ  # a minute apart: no parts of one bag
             picture = {"format": "jpeg", "data": np.frombuffer(data, np.uint8)}
             joints = {"name": names, "position": values.astype(np.float64), "velocity": none, "effort": none}
             messages += [

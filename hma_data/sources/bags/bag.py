@@ -331,6 +331,7 @@ SPLIT_PART = re.compile(
     r"(?P<stem>.+?)(_\d{4}(-\d\d){5})?_(?P<number>\d+)(?P<suffix>\.(bag|mcap|db3)(\.zstd)?)"
 )
 MAX_PAUSE_NS = 10**9  # between two parts of one recording; episodes that are recorded apart pause longer
+MAX_OVERLAP_NS = 10**8
 
 
 def _part_number(path: Path) -> int | None:
@@ -372,7 +373,8 @@ def _continues(path: Path, following: Path) -> bool:
         first_ns = _span(following, Bag(following).state())[0]
     except EpisodeError:  # reading it raises its error
         return False
-    return abs(first_ns - last_ns) <= MAX_PAUSE_NS
+    # Messages may change places where a recorder splits, but what overlaps by more is another recording.
+    return -MAX_OVERLAP_NS <= first_ns - last_ns <= MAX_PAUSE_NS
 
 
 @lru_cache(maxsize=4096)
