@@ -38,7 +38,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_040, 14_500, 12),
     "hma_model/released": (860, 7_500, 4),
     "hma_model/synthetic": (1_210, 8_900, 5),
-    "hma_model/training": (3_350, 27_600, 16),
+    "hma_model/training": (3_400, 27_900, 17),
     "hma_model/worlds": (1_540, 11_500, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 59_300, 469_000

@@ -29,6 +29,7 @@ from hma_model.evaluation.rollout_video import newest_sheets, write_sheets
 from hma_model.network.model import HMA
 from hma_model.training import guards, new_stem, optim
 from hma_model.training.data import TrainData
+from hma_model.training.memory import require_memory
 from hma_model.training.parallel import ParallelModel, World, gathered, require_shardable
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import (
@@ -42,7 +43,7 @@ from hma_model.training.resume import (
     seed_for,
     write_state,
 )
-from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment, require_memory
+from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment
 from hma_model.training.scheduled_sampling import forwarded, share_at
 from hma_model.training.start import Start
 
@@ -78,6 +79,8 @@ class Run:
         if self.start:
             self.digests["the checkpoint it starts from"] = self.start.checkpoint.trunk_sha256[:16]
             self.stats = {name: self.start.stats(shards) for name, shards in self.sets.items()}
+        with torch.device("meta"):  # shapes alone
+            require_memory(self._network(), recipe, device, self.world.size)
         torch.manual_seed(seed_for(recipe.seed, "init"))
         self.model = self._fresh_model()
         splits = (
@@ -101,10 +104,7 @@ class Run:
         return self.recipe.network(next(iter(self.sets.values())).spec)
 
     def _network(self) -> HMA:
-        config = self._config()
-        parts = self.world.size if self.recipe.parallel == "fsdp" else 1
-        require_memory(config, self.device, parts, bool(self.start and self.start.frozen))
-        model = HMA(config)
+        model = HMA(self._config())
         for name, shards in self.sets.items():
             space = ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name))
             waves = self.start.waves(shards.embodiment, self.recipe) if self.start else None

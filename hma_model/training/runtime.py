@@ -1,4 +1,4 @@
-"""Manage a run's folder, device, memory limits and signals, and describe its environment."""
+"""Manage a run's folder, device and signals, and describe its environment."""
 
 import fcntl
 import os
@@ -14,15 +14,12 @@ from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 import hma_data
 from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
-
-if TYPE_CHECKING:
-    from hma_model.config import HMAConfig
 
 RECIPE, ENVIRONMENT = "recipe.json", "environment.json"
 LOCK, START = ".lock", ".start"  # START: the checkpoint that the run starts from
@@ -130,28 +127,6 @@ def run_errors(out: Path) -> Iterator[None]:
         told = f"there is not enough for this model and batch: {text}"
         remedy = "lower batch_size (accumulate makes up for it), frames or width, or set checkpointing=true"
         raise TrainingError("memory", told, remedy) from fault
-
-
-def require_memory(config: "HMAConfig", device: torch.device, parts: int, frozen: bool) -> None:
-    """Refuse a network that is too large for the memory, with its gradients and moments (none if `frozen`).
-
-    `parts` is the number of ranks over which the network is sharded.
-
-    Raises:
-        RecipeError: the smallest estimate is above the memory of the device.
-    """
-    values = config.layers * config.width**2 * (8 + 2 * config.mlp_ratio)
-    if config.kind == "continuous":
-        values += config.diffusion_depth * config.diffusion_width**2
-    needed = values * (4 if frozen else 16) / parts
-    if device.type == "cuda":
-        there = float(torch.cuda.get_device_properties(device).total_memory)
-    else:
-        there = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    if needed > there:
-        needs = f"{values / 1e9:,.1f} billion weights take {needed / 2**30:,.0f} GiB in training"
-        fault = f"{needs}, this device has {there / 2**30:,.0f} GiB"
-        raise RecipeError("recipe: model", fault, "lower model.width or model.layers")
 
 
 @contextmanager

@@ -1,0 +1,118 @@
+"""Estimate the memory that training needs, before its first step, and refuse what does not fit.
+
+A process that needs more than there is ends without a word: the system kills it. The estimate adds up the
+weights with their gradients and moments, what a forward pass keeps for the backward pass, and the process
+itself. Its factors were fitted to measured peaks on a CPU (`tests/model/training/test_memory.py`).
+On a GPU only the weights count: what does not fit there ends in an error that names what to lower.
+
+B windows a pass, T frames of a pass, S tokens of a frame, D width.
+"""
+
+import os
+from contextlib import suppress
+from itertools import product
+from pathlib import Path
+
+import torch
+
+from hma_data.errors import RecipeError
+from hma_model.config import OBJECTIVES, HMAConfig
+from hma_model.network.network import Network
+from hma_model.training.data import share
+from hma_model.training.recipe import Recipe
+
+GIB = 2**30
+PROCESS = 0.4 * GIB  # what a process gains before its first pass: kernels, threads, decoded rows
+# A block keeps so many values for each value of its input, besides those of the MLP's hidden layer.
+BLOCK_VALUES = 21.0
+CHECKPOINT_VALUES = 9.0  # of a block that is recomputed
+PASS_VALUES = 23.0  # of the embedding and of the backward pass through one block
+BF16_SHARE = 0.7  # of float32's bytes: norms and sums stay float32
+HIDDEN_SHARE = 0.8  # of the tokens are masked and predicted, at most, as a rule
+SCORE_COPIES = 3  # scores, their softmax, and their gradient
+DIFFUSION_VALUES = 13.0  # of a layer of the diffusion head, for each of its width
+
+
+def activation_bytes(config: HMAConfig, recipe: Recipe, windows: int) -> float:
+    """Return the bytes that a pass over B windows keeps for its backward pass."""
+    predicts_video = any(OBJECTIVES[name].predicts_video for name in recipe.objectives)
+    predicted = config.frames - 1 if predicts_video else 0
+    frames = config.frames
+    if config.training_pass == "pairs" and predicts_video:
+        frames += predicted  # a masked copy of each frame from the second on
+    values = windows * frames * (config.tokens_per_frame + config.appended_tokens) * config.width
+    block = BLOCK_VALUES + config.mlp_ratio
+    if recipe.precision == "bf16":
+        block *= BF16_SHARE
+    kept = CHECKPOINT_VALUES * config.layers + block if recipe.checkpointing else block * config.layers
+    hidden = windows * predicted * config.tokens_per_frame * HIDDEN_SHARE
+    if config.kind == "discrete":
+        read = SCORE_COPIES * sum(config.digits)
+        if config.digit_order == "chain":
+            read += SCORE_COPIES * len(config.digits) * config.width
+    else:
+        layers = config.diffusion_depth * config.diffusion_repeats
+        read = int(DIFFUSION_VALUES * layers * config.diffusion_width)
+    return 4.0 * (values * (kept + PASS_VALUES) + hidden * read)
+
+
+def needed_bytes(model: Network, recipe: Recipe, device: torch.device, ranks: int = 1) -> float:
+    """Return the estimated bytes of one rank's training; the model may be on the device `meta`."""
+    weights = sum(parameter.numel() for parameter in model.parameters())
+    trained = weights
+    if recipe.freeze == "trunk":
+        trained = sum(p.numel() for module in (model.stems, model.heads) for p in module.parameters())
+    values = weights + 3 * trained  # a gradient and two moments each
+    if recipe.ema:
+        values += trained + weights  # the averages, and the model that evaluates them
+    of_weights = 4.0 * values / (ranks if recipe.parallel == "fsdp" else 1)
+    if device.type == "cuda":
+        return of_weights
+    return PROCESS + of_weights + activation_bytes(model.config, recipe, share(recipe, ranks)[1])
+
+
+def free_bytes(device: torch.device) -> float:
+    """Return the memory that a process can still get: of a GPU all of it, else what the system has free."""
+    if device.type == "cuda":
+        return float(torch.cuda.get_device_properties(device).total_memory)
+    free = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    with suppress(OSError, ValueError, StopIteration):  # elsewhere than on Linux
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        free = 1024.0 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1])
+    with suppress(OSError, ValueError):  # a container's limit; "max" is none
+        free = min(free, float(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return free
+
+
+def require_memory(model: Network, recipe: Recipe, device: torch.device, ranks: int = 1) -> None:
+    """Refuse a training that needs more memory than there is, and say which keys would make it fit.
+
+    Args:
+        model: the network, which may be on the device `meta`.
+        recipe: its training.
+        device: where it will be.
+        ranks: of the run; those of this machine share its memory.
+
+    Raises:
+        RecipeError: the estimate is above the memory that is free.
+    """
+    there = free_bytes(device)
+    if device.type != "cuda":
+        there /= int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    needed = needed_bytes(model, recipe, device, ranks)
+    if needed <= there:
+        return
+    remedy = "use a smaller network, as in model.layers=4 model.width=128 model.heads=4"
+    sizes = [recipe.batch_size >> halvings for halvings in range(recipe.batch_size.bit_length())]
+    for checkpointing, size in product(dict.fromkeys((recipe.checkpointing, True)), sizes):
+        keys = {"batch_size": size, "accumulate": -(-recipe.windows_per_step // size)}
+        if checkpointing:
+            keys["checkpointing"] = True
+        even = size * keys["accumulate"] % ranks == 0
+        if even and needed_bytes(model, recipe.model_copy(update=keys), device, ranks) <= there:
+            remedy = "set " + " ".join(f"{key}={str(value).lower()}" for key, value in keys.items())
+            break
+    weights = sum(parameter.numel() for parameter in model.parameters())
+    what = f"{weights / 1e6:,.0f} million weights and passes of {share(recipe, ranks)[1]} windows"
+    fault = f"needs about {needed / GIB:,.1f} GiB ({what}), and {there / GIB:,.1f} GiB are free"
+    raise RecipeError("recipe: memory", fault, remedy)

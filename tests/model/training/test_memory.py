@@ -1,0 +1,117 @@
+"""The estimate of a training's memory: near what is measured, and refused with keys that make it fit."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from hma_data.errors import RecipeError
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.config import OBJECTIVES, ActionSpace
+from hma_model.network.model import HMA
+from hma_model.training import memory
+from hma_model.training.loop import train
+from hma_model.training.memory import needed_bytes, require_memory
+from hma_model.training.recipe import Recipe, load_recipe, make_recipe, parse_overrides
+from tests.model.shards import make_shards
+
+CPU = torch.device("cpu")
+TOKENS = TokenizerSpec("fsq-16", 1, "discrete", 256, (16, 16), vocab_size=64**2, factored=(64, 64))
+LAB = TokenizerSpec("fsq-lab", 1, "discrete", 128, (16, 16), vocab_size=8**5, factored=(8,) * 5)
+LATENTS = TokenizerSpec("vae-8", 1, "continuous", 256, (32, 32), channels=4, dtype="float16")
+MEASURE = """
+import json, sys, torch
+from hma_data.loading.rows import Batch
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.training.recipe import make_recipe
+from tests.model.training.test_memory import network
+recipe, spec = make_recipe(json.loads(sys.argv[1])), TokenizerSpec.from_json(json.loads(sys.argv[2]))
+def peak():  # getrusage would begin with the peak of the process that started this one
+    with open("/proc/self/status") as file:
+        return 1024 * next(int(line.split()[1]) for line in file if line.startswith("VmHWM"))
+before = peak()
+model = network(recipe, spec, "cpu").train()
+model.trunk.checkpointing = recipe.checkpointing
+optimizer, (objective,) = torch.optim.AdamW(model.parameters()), recipe.objectives
+b, t = recipe.batch_size, recipe.frames
+shape = (b, t, *model.config.frame_shape)
+frames = {"tokens": torch.zeros(shape, dtype=torch.int64)}
+if spec.kind == "continuous":
+    frames = {"latents": torch.zeros(shape)}
+batch = Batch(["arm"] * b, torch.zeros(b, t, 7), torch.ones(b, t, dtype=torch.bool), **frames)
+for _ in range(2):
+    with torch.autocast("cpu", torch.bfloat16, enabled=recipe.precision == "bf16"):
+        loss = model(batch, objective, torch.Generator().manual_seed(0)).loss
+    loss.backward()
+    optimizer.step()
+    optimizer.zero_grad(set_to_none=True)
+print(peak() - before)
+"""
+
+
+def network(recipe: Recipe, spec: TokenizerSpec, device: str = "meta") -> HMA:
+    with torch.device(device):
+        model = HMA(recipe.network(spec))
+        model.add_embodiment(ActionSpace("arm", 7, 1, (0.0,) * 7, (1.0,) * 7, (True,) * 7))
+    return model
+
+
+SMALL, WIDE = {"model": {"layers": 4, "width": 192}}, {"model": {"layers": 8, "width": 256}}
+PAIRS = {"model": {"layers": 6, "width": 192, "training_pass": "pairs"}}
+DIFFUSION = {"model": {"layers": 4, "width": 128, "diffusion_width": 512}, "batch_size": 8}
+SLOW = [
+    (TOKENS, WIDE),
+    (TOKENS, {**WIDE, "objectives": {"policy": 1}}),
+    (TOKENS, {**WIDE, "checkpointing": True}),
+    (TOKENS, {**WIDE, "precision": "bf16"}),
+    (TOKENS, PAIRS),
+    (LATENTS, DIFFUSION),
+]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="peaks are read from /proc")
+@pytest.mark.parametrize(
+    ("spec", "changes"),
+    [(TOKENS, SMALL), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
+)
+def test_the_estimate_is_near_the_measured_peak(spec, changes):
+    recipe = {"frames": 12, "batch_size": 3, "objectives": {"forward": 1}, **changes}
+    words = [sys.executable, "-c", MEASURE, json.dumps(recipe), json.dumps(spec.to_json())]
+    made = subprocess.run(words, capture_output=True, text=True, check=True)
+    asked = make_recipe(recipe)
+    estimate, measured = needed_bytes(network(asked, spec), asked, CPU), float(made.stdout.split()[-1])
+    assert 0.7 < estimate / measured < 1.5, (estimate / memory.GIB, measured / memory.GIB)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+@pytest.mark.parametrize(
+    ("name", "spec"), [("discrete_tiny", LAB), ("discrete_tiny", TOKENS), ("continuous_tiny", LATENTS)]
+)
+def test_recipes_for_laptops_run_on_laptops(name, spec, objective):
+    recipe = load_recipe(name, [f"objectives={{{objective}: 1}}"])
+    assert needed_bytes(network(recipe, spec), recipe, CPU) < 2 * memory.GIB
+
+
+@pytest.mark.parametrize("name", ["discrete_base", "continuous_base"])
+@pytest.mark.parametrize("free", [8, 16, 64])
+def test_what_does_not_fit_is_refused_with_keys_that_make_it_fit(name, free, monkeypatch):
+    spec = TOKENS if name.startswith("discrete") else LATENTS
+    monkeypatch.setattr(memory, "free_bytes", lambda device: free * memory.GIB)
+    recipe = load_recipe(name)
+    with pytest.raises(RecipeError, match=r"needs about [\d,.]+ GiB .* are free — set ") as refused:
+        require_memory(network(recipe, spec), recipe, CPU)
+    keys = refused.value.remedy.removeprefix("set ").split()
+    smaller = make_recipe({**recipe.values(), **parse_overrides(keys)})
+    assert smaller.windows_per_step == recipe.windows_per_step
+    require_memory(network(smaller, spec), smaller, CPU)
+
+
+def test_a_network_that_no_batch_makes_fit_is_refused_before_anything_is_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "free_bytes", lambda device: memory.GIB)
+    shards = make_shards(tmp_path / "arm", "arm")
+    recipe = load_recipe("discrete_xl", [f"data=[{shards}]", "device=cpu", "batch_size=1", "workers=0"])
+    with pytest.raises(RecipeError, match="recipe: memory: needs about .* use a smaller network"):
+        train(recipe, out=tmp_path / "run", show=False)
+    assert not (tmp_path / "run").exists()
