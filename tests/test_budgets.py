@@ -16,13 +16,13 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data": (880, 5_400, 8),
     "hma_data/cli": (1_480, 10_500, 8),
     "hma_data/conversion": (3_310, 24_100, 12),
-    "hma_data/episodes": (1_320, 11_700, 7),
+    "hma_data/episodes": (1_530, 13_400, 8),
     "hma_data/hub": (520, 3_800, 3),
-    "hma_data/inspection": (2_050, 19_200, 8),
+    "hma_data/inspection": (2_140, 19_900, 9),
     "hma_data/lab": (3_350, 31_600, 16),
     "hma_data/loading": (1_330, 11_200, 6),
     "hma_data/registry": (1_280, 8_200, 6),
-    "hma_data/shards": (2_650, 20_700, 10),
+    "hma_data/shards": (2_690, 21_000, 11),
     "hma_data/sources": (12_880, 108_900, 53),
     "hma_data/storage": (1_680, 11_000, 11),
     "hma_data/tokenizers": (3_280, 23_900, 17),
@@ -41,7 +41,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_400, 27_900, 17),
     "hma_model/worlds": (1_540, 11_500, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 59_300, 469_000
+PRODUCT_LINES, PRODUCT_NODES = 59_600, 471_500
 TEST_LINES = 45_300
 DOC_WORDS = 38_000
 

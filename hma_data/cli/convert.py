@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hma_data.conversion.output import Share
     from hma_data.conversion.report import Progress, Shared, Summary
     from hma_data.registry.embodiment import Embodiment
+    from hma_data.sources.common.checks import Finding
 
 REASONS_PRINTED = 20  # of quarantine, the most frequent first
 # Options that few people need stand in panels of their own below the others in --help.
@@ -165,7 +166,11 @@ def convert(
     if share:
         _report_share(done, share, json)
         return
-    _report(summary, max_quarantine, json)
+    from hma_data.inspection.kept import kept_findings
+    from hma_data.shards.reader import ShardSet
+
+    lasting = list(kept_findings(ShardSet(summary.out), weights, device)) if summary.made_shards else []
+    _report(summary, lasting, max_quarantine, json)
     raise typer.Exit(1 if summary.too_many else 0)
 
 
@@ -301,7 +306,7 @@ def _report_share(done: "Shared", share: "Share", json: bool) -> None:
     _print_changes(done)
 
 
-def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
+def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float, json: bool) -> None:
     from hma_data.cli.shards import totals_line
     from hma_data.shards.schema import flag_words
 
@@ -324,6 +329,7 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
                 "warning": summary.warning,
                 "held_out": summary.held_out,
                 "notes": list(summary.notes),
+                "kept": [finding.to_json() for finding in lasting],
                 "reasons": summary.reasons,
                 "too_many_quarantined": summary.too_many,
             }
@@ -341,6 +347,9 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
         _print_changes(summary)
         for note in summary.notes:
             typer.echo(f"warning: {note}", err=True)
+        for finding in lasting:
+            warns = finding.severity == "warn"
+            typer.echo(f"{'warning: ' * warns}{finding}", err=warns)
     for reason, count in sorted(summary.reasons.items(), key=lambda item: -item[1])[:REASONS_PRINTED]:
         typer.echo(f"quarantine: {count:,} × {reason}", err=True)
     if summary.too_many:

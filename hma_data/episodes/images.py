@@ -87,6 +87,17 @@ class FrameToRGB:
         )
 
 
+def upright(frames: Images, camera: Camera) -> Images:
+    """Return raw frames (N, H, W, 3) of a camera in RGB, flipped and rotated as its YAML says."""
+    if camera.color == "bgr":
+        frames = frames[..., ::-1]
+    if camera.flip:
+        frames = np.flip(frames, axis=1 if camera.flip == "vertical" else 2)
+    if camera.rotate:
+        frames = np.rot90(frames, k=-camera.rotate // 90, axes=(1, 2))
+    return frames
+
+
 def prepare(
     frames: Images, camera: Camera, size: int, resize_filter: Filter = "area", out: Images | None = None
 ) -> Images:
@@ -97,12 +108,7 @@ def prepare(
     Args:
         out: (N, size, size, 3) to write the result to; new memory by default.
     """
-    if camera.color == "bgr":
-        frames = frames[..., ::-1]
-    if camera.flip:
-        frames = np.flip(frames, axis=1 if camera.flip == "vertical" else 2)
-    if camera.rotate:
-        frames = np.rot90(frames, k=-camera.rotate // 90, axes=(1, 2))
+    frames = upright(frames, camera)
     if camera.crop:
         x, y, width, height = camera.crop
         if y + height > frames.shape[1] or x + width > frames.shape[2]:

@@ -16,6 +16,7 @@ from typing import Any, get_args
 
 import yaml
 
+from hma_data.episodes.movement import Framing, framing
 from hma_data.episodes.offset import Offset
 from hma_data.errors import SourceError, UsageError
 from hma_data.inspection import infer_topics
@@ -36,7 +37,7 @@ from hma_data.inspection.infer_choices import (
     vectors,
 )
 from hma_data.registry.catalog import entries
-from hma_data.registry.components import Space
+from hma_data.registry.components import Camera, Space
 from hma_data.registry.embodiment import ID_PATTERN, ONE_INDEX, TODO, Embodiment, find
 from hma_data.sources.base import Inspection, KeyInfo, open_source
 from hma_data.sources.common.checks import Finding
@@ -315,6 +316,7 @@ class _Draft:
                 "key": key.key,
                 "size": list(map(int, key.shape[:2])),
                 **_levels(key),
+                **(framed.keys if (framed := _framing(key)) else {}),
                 **(asked if doubtful and not is_video(key.key) else {}),
             }
             for name, key in zip(camera_names(self.seen.keys), self.seen.keys, strict=True)
@@ -364,6 +366,11 @@ class _Draft:
         if self.seen.question or self.looks:
             asked = [f"{TODO}: {self.seen.question}"] if self.seen.question else []
             said["cameras"] = "; ".join([*asked, *self.looks])
+        framed = [(key.key, found) for key in self.seen.keys if (found := _framing(key))]
+        if told := [
+            f"{key}: {found.fault}; does {found.words} hold all that matters?" for key, found in framed
+        ]:
+            said["crop"] = f"{TODO}: {' '.join(told)}"
         if levels := [key.key for key in self.seen.keys if key.encoding == "mono16"]:
             said["levels"] = f"from 0 to the largest value of as many bits as {shown(levels)} uses"
         if self.bag:
@@ -424,6 +431,11 @@ def _showing(seen: Choice, findings: Iterable[Finding]) -> tuple[Choice, list[st
     out = never if never < keys else set()
     notes = [one.message + (", and is left out" if one.key in out else "") for one in found]
     return replace(seen, keys=tuple(key for key in seen.keys if key.key not in out)), notes
+
+
+def _framing(key: KeyInfo) -> Framing | None:
+    """Return what of the image the YAML should show a tokenizer, where that is not the middle square."""
+    return framing(Camera(name="camera", key=key.key), key.moves_in, *key.shape[:2])
 
 
 def _levels(key: KeyInfo) -> dict[str, Any]:

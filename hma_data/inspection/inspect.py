@@ -25,6 +25,7 @@ from hma_data.episodes.align import (
 )
 from hma_data.episodes.episode import Clip, Floats
 from hma_data.episodes.images import describe_resize
+from hma_data.episodes.movement import framing
 from hma_data.episodes.offset import Offset, measure
 from hma_data.errors import HMAError, SourceError
 from hma_data.inspection.infer import action_offsets, held_actions, lacking
@@ -325,6 +326,10 @@ def _for_robot(inspection: Inspection, robot: Embodiment) -> Iterator[Finding]:
             size, stated = list(info.shape[:2]), list(camera.size)
             said = f"camera {camera.name} is {size} pixels, its YAML says {stated}"
             yield Finding("size", "info", said, key=camera.key)
+        upright = camera and not camera.flip and not camera.rotate
+        if camera and upright and (framed := framing(camera, info.moves_in, *info.shape[:2])):
+            said = f"camera {camera.name}: {framed.fault}"
+            yield Finding("crop", "warn", said, f"set {framed.words} in the YAML", camera.key)
         if camera and camera.color == "bgr" and info.swapped == "no":
             said = f"camera {camera.name} is stored with red first, its YAML says bgr"
             yield Finding("colour", "warn", said, "set color: rgb", camera.key)
@@ -412,6 +417,7 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
 
 
 def _shard_set(folder: Path) -> Iterator[Finding]:
+    from hma_data.inspection.kept import kept_findings
     from hma_data.inspection.shard_flags import pause_finding, picture_findings, rate_finding, window_finding
     from hma_data.shards.reader import ShardSet
     from hma_data.shards.verify import verify
@@ -441,3 +447,4 @@ def _shard_set(folder: Path) -> Iterator[Finding]:
     if paused := pause_finding(shards):
         yield paused
     yield from picture_findings(shards)
+    yield from kept_findings(shards)

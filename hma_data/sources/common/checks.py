@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.align import nearest
 from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import BLANK_LEVELS, Images, PictureCheck
+from hma_data.episodes.movement import MovingPart
 
 Severity = Literal["error", "warn", "info"]
 SEVERITIES: tuple[Severity, ...] = ("info", "warn", "error")
@@ -279,6 +280,7 @@ class Look:
         neighbours, same: pairs of neighbouring images compared, and equal ones among them.
         blank, episodes: episodes in which the camera shows one colour; all episodes looked at.
         colours: some of the colours met.
+        moving: where images change.
     """
 
     lossless: bool = True
@@ -290,6 +292,7 @@ class Look:
     blank: int = 0
     episodes: int = 0
     colours: list[NDArray[np.uint8]] = field(default_factory=list)
+    moving: MovingPart = field(default_factory=MovingPart)
     _check: PictureCheck | None = None
     _size: tuple[int, int] = (0, 0)
 
@@ -301,6 +304,7 @@ class Look:
         if not again:
             self.episodes, self.blank, self._check = self.episodes + 1, self.blank + 1, PictureCheck()
         self.images += len(frames)
+        self.moving.add(frames)
         size = (int(frames.shape[1]), int(frames.shape[2]))
         self.changes += again and size != self._size
         self._size = size
@@ -359,7 +363,7 @@ def ycbcr_share(colours: NDArray[np.uint8]) -> float | None:
 
 
 def choose(length: int, pairs: int, starts: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-    """Choose frames (n,) of an episode, in runs of neighbours over its length.
+    """Choose frames (n,) of an episode, in runs of neighbours over its length; a single run in its middle.
 
     Args:
         length: of the episode.
@@ -368,6 +372,8 @@ def choose(length: int, pairs: int, starts: NDArray[np.int64] | None = None) -> 
             and have three frames: where every other frame is a keyframe, encoders often repeat it between.
     """
     firsts = np.unique(np.linspace(0, max(length - 2, 0), max(pairs, 1)).astype(np.int64))
+    if pairs <= 1:
+        firsts = np.array([max(length - 2, 0) // 2])  # at its begin, a robot is where it always begins
     run = 2
     if starts is not None:
         firsts, run = np.unique(np.maximum(starts[firsts], 0)), 3

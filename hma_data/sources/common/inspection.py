@@ -67,6 +67,8 @@ class KeyInfo:
         low, high: smallest and largest finite number in the sampled episodes; of images in mono16, their
             values before they are scaled.
         swapped: whether red and blue are swapped in the images: sure, no; None where it is unknown.
+        moves_in: the box [x, y, width, height] that holds what moves in the sampled images; None where
+            nothing is known to move.
         skew_ms: p50, p95 and max distance from the first camera's frames, for a stream with its own clock.
         encoding: of a bag's images, as their messages state it: rgb8, mono8, mono16.
     """
@@ -87,6 +89,7 @@ class KeyInfo:
     high: float | None = None
     skew_ms: tuple[float, float, float] | None = None
     swapped: str | None = None
+    moves_in: tuple[int, int, int, int] | None = None
     encoding: str | None = None
 
 

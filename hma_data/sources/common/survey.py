@@ -219,8 +219,11 @@ class Survey:
                 jitter_ms=float(np.median(jitters)) if jitters else info.jitter_ms,
                 skew_ms=times.skew,
             )
-        if look is not None and look.swapped()[0]:
-            info = replace(info, swapped=look.swapped()[0])
+        if look is not None:
+            alike = list(look.sizes) == [info.shape[:2]]  # a box is of images of one size
+            info = replace(
+                info, swapped=look.swapped()[0] or None, moves_in=look.moving.box if alike else None
+            )
         return info
 
     def findings(self, keys: Sequence[KeyInfo]) -> tuple[Finding, ...]:

@@ -24,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hma_data.episodes.movement import moving
 from hma_data.episodes.sheets import grid, write_png
 from hma_data.errors import MissingDependencyError, TokenizerError
 from hma_data.storage.files import write_atomic
@@ -35,7 +36,6 @@ Perceptual = Callable[[Frames, Frames], NDArray[np.float64]]
 Results = dict[str, dict[str, Any]]
 BATCH_FRAMES = 32
 GREY = (0.299, 0.587, 0.114)
-MOVING_THRESHOLD = 24  # of 255: by more a channel of a moving pixel differs from the frame before or after
 BACKBONE = "alexnet-owt-7be5be79.pth"  # torchvision's file of AlexNet, 233 MB
 
 
@@ -75,15 +75,6 @@ def ssim(true: Frames, made: Frames) -> NDArray[np.float64]:
     weights = torch.tensor(GREY, dtype=torch.float64) / 255
     first, second = ((torch.from_numpy(frames).double() @ weights)[:, None] for frames in (true, made))
     return ssim_map(first, second).mean(dim=(1, 2, 3)).numpy()
-
-
-def moving(film: Frames) -> NDArray[np.bool_]:
-    """Return which pixels of (n, S, S, 3) frames move, (n, S, S): unlike the frame before or after."""
-    masks = np.zeros(film.shape[:3], np.bool_)
-    changed = np.abs(np.diff(film.astype(np.int16), axis=0)).max(axis=-1) > MOVING_THRESHOLD
-    masks[1:] |= changed
-    masks[:-1] |= changed
-    return masks
 
 
 def open_lpips(*, download: bool, device: str = "cpu") -> Perceptual:
