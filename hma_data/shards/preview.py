@@ -26,11 +26,13 @@ from hma_data.episodes.sheets import (
     write_png,
     write_text,
 )
-from hma_data.errors import ShardError, TokenizerError
+from hma_data.errors import HMAError, ShardError, TokenizerError
 from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.recorded import Recorded
 from hma_data.shards.schema import flag_totals, token_column
 from hma_data.shards.windows import WINDOW, WindowIndex
 from hma_data.sources.common.choice import chosen_ids
+from hma_data.sources.common.survey import sampled
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
@@ -264,13 +266,15 @@ def preview(
     exclude: Sequence[str] = (),
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Preview:
-    """Write `sheet.png` and `preview.mp4` for episodes spread evenly over a shard set.
+    """Write `sheet.png` and `preview.mp4` for episodes spread evenly over a shard set, held-out ones too.
+
+    Recorded frames stand beside those decoded from the tokens where the recording is at hand.
 
     Args:
         folder: str or path of the set, or its URI.
         out: str or path of the folder to write to.
         weights: str or path, as `get_tokenizer` takes them.
-        episodes: number of episodes, evenly spaced from the first to the last.
+        episodes: number of episodes, evenly spaced from the first to the last; of several, one is held out.
         columns: number of frames of each episode in the sheet.
         camera: name of the camera; None shows all cameras of the set.
         frames: largest number of frames of each episode in the video.
@@ -290,8 +294,11 @@ def preview(
     ids = shards.episodes["id"].to_pylist()
     kept = set(chosen_ids(ids, only, exclude))
     places = np.flatnonzero([name in kept for name in ids])
-    picks = np.unique(np.linspace(0, len(places) - 1, episodes).round().astype(int))
-    rows = shards.episodes.take(places[picks]).to_pylist()
+    picks = places[sampled(len(places), episodes)]
+    held_out = places[[shards.episodes["split"][int(i)].as_py() == "val" for i in places]]
+    if len(held_out) and len(picks) > 1 and not np.isin(held_out, picks).any():
+        picks[-1] = held_out[0]
+    rows = shards.episodes.take(picks).to_pylist()
     seen = [_Seen(shards, opened, row, cameras) for row in rows]
     sheet, video = out / "sheet.png", out / "preview.mp4"
     write_png(sheet, np.concatenate([one.sheet(columns) for one in seen]))
@@ -332,14 +339,22 @@ class _Seen:
         success = {True: "success", False: "failure", None: ""}[row["success"]]
         length = f"{row['length']} frames, {self._seconds:.1f} s"
         words = [row["id"], row["split"], length, row["instruction"], success]
+        self._recorded: Recorded | None = None
+        try:
+            self._recorded = Recorded(shards, row)
+        except (HMAError, OSError, ImportError):
+            words.insert(0, "recording not at hand")
         self.label = "   ".join(word for word in words if word)
 
     def _images(self, rows: NDArray[np.int64]) -> dict[str, Images]:
-        """Return camera -> images (n, S, S, 3) of some rows."""
-        return {
-            camera: self._tokenizer.decode(self._shards.tokens(tokens[rows]))
-            for camera, tokens in self._tokens.items()
-        }
+        """Return what is shown -> images (n, S, S, 3) of some rows, each camera recorded and decoded."""
+        found: dict[str, Images] = {}
+        for camera, tokens in self._tokens.items():
+            named = f"{camera}, " if len(self._tokens) > 1 else ""
+            if self._recorded:
+                found[f"{named}recorded"] = self._recorded.frames(camera, rows)
+            found[f"{named}decoded"] = self._tokenizer.decode(self._shards.tokens(tokens[rows]))
+        return found
 
     def _curves(self, width: int, height: int) -> Curves:
         stats = self._shards.manifest.stats["action"]
@@ -349,16 +364,15 @@ class _Seen:
         return Curves(self._actions, known, low, high, names, self._seconds, width, height)
 
     def sheet(self, columns: int) -> Images:
-        """Return (H, W, 3): the label, a row of frames a camera, and the actions of the whole episode."""
+        """Return (H, W, 3): the label, two rows of frames a camera, and the actions of the whole episode."""
         picks = np.unique(np.linspace(0, self._length - 1, columns).astype(int))
         width = columns * (THUMB_SIDE + GAP) + GAP
         shown = min(self._actions.shape[1], 16)
         curves = self._curves(width, 16 + max(shown * STRIP_HEIGHT, 40))
         strips = []
-        for number, (camera, images) in enumerate(self._images(picks).items()):
+        for number, (name, images) in enumerate(self._images(picks).items()):
             strip = np.full((LABEL_HEIGHT + THUMB_SIDE + GAP, width, 3), PAPER, np.uint8)
-            named = [camera] if len(self._tokens) > 1 else []
-            words = "   ".join([*named, *([] if number else [self.label])])
+            words = "   ".join([name, *([] if number else [self.label])])
             write_text(strip, fitted(words, width - 2 * GAP), (GAP, LABEL_HEIGHT - 5))
             for place, image in enumerate(images):
                 left = GAP + place * (THUMB_SIDE + GAP)
@@ -371,14 +385,21 @@ class _Seen:
     def film(self, most: int) -> Iterator[Images]:
         """Yield (H, W, 3) for each frame: its images, and the actions with a cursor at its time."""
         curves = self._curves(FILM_SIDE + CURVES_WIDER, FILM_SIDE)
-        width = (len(self._tokens) + 1) * FILM_SIDE + CURVES_WIDER
         for start in range(0, min(self._length, most), FRAMES_DECODED):
             rows = np.arange(start, min(start + FRAMES_DECODED, self._length, most))
-            for row, *images in zip(rows, *self._images(rows).values()):
-                bar = np.full((LABEL_HEIGHT, width, 3), PAPER, np.uint8)
-                write_text(bar, fitted(self.label, width - 2 * GAP), (GAP, LABEL_HEIGHT - 5))
+            shown = self._images(rows)
+            for row, *images in zip(rows, *shown.values()):
                 parts = [*(_resized(image, FILM_SIDE) for image in images), curves.at(int(row))]
-                yield np.concatenate([bar, np.concatenate(parts, axis=1)])
+                film = np.concatenate(parts, axis=1)
+                bar = np.full((2 * LABEL_HEIGHT, film.shape[1], 3), PAPER, np.uint8)
+                write_text(bar, fitted(self.label, film.shape[1] - 2 * GAP), (GAP, LABEL_HEIGHT - 5))
+                for place, name in enumerate(shown):
+                    write_text(
+                        bar,
+                        fitted(name, FILM_SIDE - 2 * GAP),
+                        (GAP + place * FILM_SIDE, 2 * LABEL_HEIGHT - 5),
+                    )
+                yield np.concatenate([bar, film])
 
 
 def _resized(image: Images, side: int) -> Images:

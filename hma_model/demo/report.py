@@ -10,12 +10,10 @@ import numpy as np
 
 from hma_data.console import human_bytes, human_seconds
 from hma_data.cpu import usable_cores
-from hma_data.episodes.align import to_clip
-from hma_data.episodes.images import prepare
 from hma_data.episodes.sheets import webp_bytes
 from hma_data.registry.embodiment import find
 from hma_data.shards.preview import tokenizer_of
-from hma_data.sources.base import open_source
+from hma_data.shards.recorded import Recorded
 from hma_data.storage.files import write_atomic
 from hma_model.demo.results import Demo
 from hma_model.evaluation.pages import Page
@@ -120,19 +118,15 @@ def _kept_by_tokens(page: Page, made: Demo) -> None:
     about = "Recorded frames, and the same decoded from their tokens. The model predicts tokens only."
     page.section("What the tokens keep", about)
     for robot, shards in made.sets.items():
-        own, spec = find(robot), shards.spec
-        source, camera = open_source(own.source.format), own.primary_camera
         row = next(row for row in shards.episodes.to_pylist() if row["split"] == "val")
         picks = np.linspace(0, row["length"] - 1, KEPT_FRAMES).astype(int)
         tokens = shards.tokens(shards.episode_rows(row["episode_index"], ["tokens"])["tokens"])
-        clip = to_clip(source.read(str(made.recordings[robot]), row["id"], own), own)
-        seen = clip.frames_at(camera.name, picks * shards.manifest.frame_stride)
-        as_tokenized = prepare(seen, camera, spec.image_size, spec.resize_filter)
+        recorded = Recorded(shards, row).frames(shards.manifest.cameras[0], picks)
         decoded = tokenizer_of(shards).decode(tokens[picks])
         numbers = np.arange(len(picks))
         strips = [
             (name, strip(frames, numbers, len(picks)))
-            for name, frames in (("recorded", as_tokenized), ("from its tokens", decoded))
+            for name, frames in (("recorded", recorded), ("from its tokens", decoded))
         ]
         page.strips(robot, f"held-out episode {row['id']}", strips)
 

@@ -11,13 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hma_data.episodes.align import to_clip
-from hma_data.episodes.images import prepare
 from hma_data.errors import HMAError
 from hma_data.loading.dataset import Batch
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
-from hma_data.sources.base import open_source
+from hma_data.shards.recorded import Recorded
 from hma_model.evaluation.losses import windows
 from hma_model.generation.decode import decode
 
@@ -91,13 +89,8 @@ def recorded_frames(shards: ShardSet, batch: Batch, row: int) -> Images:
         HMAError: the recording is not where the shard set says, or cannot be read.
     """
     assert batch.episode is not None and batch.frame is not None
-    robot, spec, manifest = shards.embodiment, shards.spec, shards.manifest
     seen = 0 if batch.camera is None else int(batch.camera[row])
-    camera = robot.primary_camera if len(manifest.cameras) == 1 else robot.camera(manifest.cameras[seen])
     number = int(batch.episode[row])
     (episode,) = (one for one in shards.episodes.to_pylist() if one["episode_index"] == number)
-    uri = episode.get("source") or manifest.source
-    clip = to_clip(open_source(robot.source.format).read(str(uri), episode["id"], robot), robot)
-    begin, length = int(batch.frame[row]) * manifest.frame_stride, batch.actions.shape[1]
-    rows = begin + np.arange(length) * robot.stride
-    return prepare(clip.frames_at(camera.name, rows), camera, spec.image_size, spec.resize_filter)
+    rows = int(batch.frame[row]) + np.arange(batch.actions.shape[1]) * shards.row_stride
+    return Recorded(shards, episode).frames(shards.manifest.cameras[seen], rows)
