@@ -151,7 +151,7 @@ def _write_page(folder: Path, film: Path, done: list[list[str]]) -> Path:
     [found] = json.loads((folder / "evaluation" / "results.json").read_bytes())["results"]
     page = Page("Your robot in the model", f"The model {verdict(found)}.")
     frames, fps = _frames(film)
-    caption = "Recorded frames; predicted from the recorded actions; predicted from other actions."
+    caption = "Recorded frames, decoded from tokens; predicted from the recorded actions; from other actions."
     page.picture(webp_bytes(frames, fps), "webp", caption)
     page.section("Files", f"{film.name} is this film. evaluation/report.html has all figures and charts.")
     page.section("Commands")

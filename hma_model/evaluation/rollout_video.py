@@ -195,7 +195,7 @@ def _column(
         if given == len(film):
             about = "recorded, decoded from tokens"
         else:
-            about = "prompt: true frames" if t < given else "predicted"
+            about = "prompt: recorded, decoded" if t < given else "predicted"
         write_text(sheet, name, (8, 17), 0.5)
         write_text(sheet, about, (8, 34), 0.4)
     return padded
@@ -282,7 +282,7 @@ def write_sheets(
         true = rollout(model, tokenizer, batch, seed=seed)
         other = rollout(model, tokenizer, shuffled(batch, true.prompt - 1, seed), seed=seed, truth=true.truth)
         films = {
-            "truth": true.truth,
+            "recorded, decoded from tokens": true.truth,
             f"predicted from frame {true.prompt}": true.predicted,
             "with other actions": other.predicted,
         }

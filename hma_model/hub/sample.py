@@ -82,7 +82,10 @@ def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
     batch = windows.batch([middle])
     true = rollout(model, tokenizer, batch)
     picks = np.unique(np.linspace(0, true.truth.shape[1] - 1, COLUMNS).astype(int))
-    rows = {"truth": true.truth[0], f"predicted from frame {true.prompt} on": true.predicted[0]}
+    rows = {
+        "recorded, decoded from tokens": true.truth[0],
+        f"predicted from frame {true.prompt} on": true.predicted[0],
+    }
     # Small frames are enlarged, large ones subsampled, to about SIDE pixels.
     side = true.truth.shape[2]
     scale, every = max(1, -(-SIDE // side)), max(1, side // SIDE)

@@ -49,12 +49,13 @@ def film(
     hz = robot.embodiment.effective_hz
     if all(frame.true is None for frame in frames[1:]):
         frames = [replace(frames[0], true=None), *frames[1:]]
+    truth = "truth, decoded" if robot.source == "recordings" else "truth"
     if kind == "gif":
-        return gif_bytes(_counted(frames[-GIF_FRAMES:], GIF_SIDE, on_progress), hz)
+        return gif_bytes(_counted(frames[-GIF_FRAMES:], GIF_SIDE, truth, on_progress), hz)
     with TemporaryDirectory(prefix="hma-play-") as folder:
         if kind == "mp4":
             path = Path(folder) / "film.mp4"
-            write_mp4(path, _counted(frames, SIDE, on_progress), hz)
+            write_mp4(path, _counted(frames, SIDE, truth, on_progress), hz)
             return path.read_bytes()
         home = Path(folder) / robot.embodiment.id
         episode, embodiment = lerobot_episode(robot, frames)
@@ -85,19 +86,19 @@ def told_by(session: Session, kind: str) -> Told:
     return tell
 
 
-def _counted(frames: Sequence[Frame], side: int, on_progress: Told) -> Iterator[Image]:
-    for done, panel in enumerate(panels(frames, side), 1):
+def _counted(frames: Sequence[Frame], side: int, truth: str, on_progress: Told) -> Iterator[Image]:
+    for done, panel in enumerate(panels(frames, side, truth), 1):
         yield panel
         on_progress("writing frames" if done < len(frames) else "encoding the film", done, len(frames))
 
 
-def panels(frames: Sequence[Frame], side: int) -> Iterator[Image]:
-    """Return the model's images with titles, and the true ones beside them; an unknown one is white."""
+def panels(frames: Sequence[Frame], side: int, truth: str) -> Iterator[Image]:
+    """Return the model's images, and the true ones beside them, with titles; an unknown one is white."""
     wide = any(frame.true is not None for frame in frames)
     for frame in frames:
         shown = [_panel("world model", frame.model, side)]
         if wide:
-            text = "truth" if frame.psnr is None else f"truth: {frame.psnr:.1f} dB"
+            text = truth if frame.psnr is None else f"{truth}: {frame.psnr:.1f} dB"
             true = np.full_like(shown[0], 255) if frame.true is None else _panel(text, frame.true, side)
             shown += [np.full((side + HEAD, GAP, 3), 255, np.uint8), true]
         yield np.concatenate(shown, axis=1)

@@ -141,7 +141,7 @@ def test_preview_and_export_show_the_cameras(made: Path, tmp_path: Path) -> None
     shown = preview(made, tmp_path / "seen", episodes=1, columns=3, tokenizer=BlockTokenizer())
     assert shown.resized[2].startswith("side: 96×64 → 64×64, 33 %")
     sheet = cv2.imread(str(shown.sheet))[..., ::-1].astype(int)
-    reds = [sheet[18 + row * 166 + 72, 4 + 72, 0] for row in range(3)]
+    reds = [sheet[18 + row * 166 + 72, 4 + 72, 0] for row in range(1, 6, 2)]  # decoded, below the recorded
     assert reds == [17, 17 * 5, 17 * 9]
     export(made, tmp_path / "flat", camera="wrist", split="train")
     video = np.fromfile(tmp_path / "flat/video.bin", np.uint32)
