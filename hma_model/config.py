@@ -78,7 +78,8 @@ OBJECTIVES: Mapping[str, Objective] = {
 CONDITIONINGS = ("modulation", "concat", "add", "cross_attention")
 _CHOICES = {
     "kind": ("discrete", "continuous"),
-    "trunk": ("transformer",),
+    "trunk": ("transformer", "unet"),
+    "video_loss": ("diffusion", "regression"),
     "training_pass": ("window", "pairs"),
     "masked_input": ("learned", "previous"),
     "digit_order": ("together", "chain"),
@@ -118,8 +119,13 @@ class HMAConfig:
 
     kind: str = "discrete"  # discrete: VQ tokens, cross-entropy; continuous: latents, diffusion head
     trunk: str = "transformer"  # see `hma_model.network.trunks`
-    layers: int = 32
+    layers: int = 32  # of a U-Net: blocks at each resolution, down and up
     width: int = 256
+    levels: tuple[int, ...] = (
+        48,
+        96,
+        192,
+    )  # of a U-Net: channels at each resolution, each half the one before
     heads: int = 8
     mlp_ratio: float = 4.0
     frames: int = 12  # T, the window; in a longer rollout, temporal attention sees this many frames
@@ -190,6 +196,10 @@ class HMAConfig:
     # of each value that stays.
     copy_previous: bool = False
 
+    # continuous: "diffusion", the head below; "regression": the change since the frame before, by squared and
+    # absolute error, of which what moves weighs up to 1 + motion_weight
+    video_loss: str = "diffusion"
+    motion_weight: float = 6.0
     diffusion_target: str = "velocity"  # what the head predicts: defined at full noise too; "noise" (paper)
     diffusion_depth: int = 3
     diffusion_width: int = 1024
@@ -204,7 +214,7 @@ class HMAConfig:
     def __post_init__(self) -> None:
         if isinstance(self.conditioning, str):
             object.__setattr__(self, "conditioning", self.conditioning.split("+"))
-        for name in ("grid", "factored", "conditioning"):
+        for name in ("grid", "factored", "conditioning", "levels"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for name in ("objectives", "tokenizer"):
             object.__setattr__(self, name, dict(getattr(self, name)))
@@ -273,6 +283,16 @@ class HMAConfig:
         return math.prod(self.digits)
 
     @property
+    def whole_frames(self) -> bool:
+        """Return whether training masks only whole frames, so that a frame is made in one pass."""
+        return self.training_pass == "pairs" and self.whole_share == 1.0
+
+    @property
+    def pixels(self) -> bool:
+        """Return whether latents are pixels, stored as whole numbers from 0 to 255."""
+        return self.tokenizer.get("dtype") == "uint8"
+
+    @property
     def patch_dim(self) -> int:
         """Return the number of values in one patch of latents."""
         return self.channels * self.patch**2
@@ -326,6 +346,8 @@ def _check_scalars(config: HMAConfig) -> None:
             raise _refuse(name, getattr(config, name), "a share from 0 to 1")
     if not (math.isfinite(config.latent_noise) and config.latent_noise >= 0):
         raise _refuse("latent_noise", config.latent_noise, "a number of at least 0")
+    if not (math.isfinite(config.motion_weight) and config.motion_weight >= 0):
+        raise _refuse("motion_weight", config.motion_weight, "a number of at least 0")
     for name in ("latent_scale", "rotary_base", "diffusion_clip"):
         if not (math.isfinite(value := getattr(config, name)) and value > 0):
             raise _refuse(name, value, "a positive number")
@@ -364,8 +386,34 @@ def _check_sets(config: HMAConfig) -> None:
         raise _refuse("objectives", config.objectives, "weights of at least 0 that do not all vanish")
     if config.norms == "qk" and not config.qk_norm:
         raise _refuse("norms", "qk", "before, as qk_norm is off")
+    if config.video_loss == "regression" and config.kind == "discrete":
+        raise _refuse("video_loss", "regression", "diffusion, or a continuous tokenizer")
+    if config.video_loss == "regression" and not config.copy_previous:
+        raise _refuse("copy_previous", False, "true: regression predicts the change since the frame before")
+    if config.trunk == "unet":
+        _check_unet(config)
     if config.shared_modulation and config.modulation_out == "embodiment":
         raise _refuse("modulation_out", "embodiment", "trunk, as shared_modulation is on")
+
+
+def _check_unet(config: HMAConfig) -> None:
+    if config.kind == "discrete":
+        raise _refuse("trunk", "unet", "transformer, or a continuous tokenizer")
+    for name, value in (
+        ("conditioning", ("modulation",)),
+        ("shared_modulation", True),
+        ("time_position", "rotary"),
+        ("absent_action", "embedding"),
+    ):
+        if getattr(config, name) != value:
+            raise _refuse(name, getattr(config, name), f"{value!r}, as the trunk is a unet")
+    if not config.levels or min(config.levels) < 1:
+        raise _refuse("levels", config.levels, "at least one width, all at least 1")
+    side = 2 ** (len(config.levels) - 1)
+    if any(size % side for size in (config.token_grid[0] // config.views, config.token_grid[1])):
+        raise _refuse(
+            "levels", config.levels, f"fewer: tokens lie on {config.token_grid}, not multiples of {side}"
+        )
 
 
 @dataclass(frozen=True)

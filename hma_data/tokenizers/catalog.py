@@ -175,6 +175,16 @@ _ROWS = (
         "pixels as they are, for baselines and for models with a tokenizer of their own",
         "none", "hma_data.tokenizers.raw", imports=(),
     ),
+    Entry(
+        "raw-128", "continuous", 128, (128, 128),
+        "small pixels as they are: what moves loses nothing, and nothing is decoded",
+        "none", "hma_data.tokenizers.raw", {"image_size": 128}, imports=(),
+    ),
+    Entry(
+        "raw-64", "continuous", 64, (64, 64),
+        "the same at 64 pixels, four times cheaper to train on",
+        "none", "hma_data.tokenizers.raw", {"image_size": 64}, imports=(),
+    ),
 )  # fmt: skip
 
 CATALOG: dict[str, Entry] = {entry.name: entry for entry in _ROWS}

@@ -33,7 +33,8 @@ def decode(tokenizer: "Tokenizer", stored: Tensor) -> NDArray[np.uint8]:
         pictures = torch.cat([tokenizer.pictures(view) for view in kept.split(rows, -2)], 2).numpy(force=True)
     else:
         dtype = np.uint32 if tokenizer.spec.kind == "discrete" else np.dtype(tokenizer.spec.dtype)
-        cameras = np.split(views.cpu().numpy().astype(dtype), views.shape[-2] // rows, axis=-2)
+        kept = views.round().clamp(0, 255) if dtype == np.uint8 else views  # a cast would wrap around
+        cameras = np.split(kept.cpu().numpy().astype(dtype), views.shape[-2] // rows, axis=-2)
         pictures = np.concatenate([tokenizer.decode(view) for view in cameras], axis=2)
     return pictures.reshape(*stored.shape[:2], *pictures.shape[1:])
 

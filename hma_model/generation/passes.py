@@ -110,6 +110,7 @@ class Passes:
         last = self.config.frames - 1 if self.config.time_position == "learned" else max(self.state.times)
         begin = [max(min(self.state.times[row], last) - 1, 0) for row in rows]  # of idle rows any will do
         times = self.state.cached_times(rows, begin, 2)
+        times.wanted = 1
         before = times.positions[:, :1]
         past, levels = self.state.past(rows, before), self._levels(rows, before)
         return Pass(past, levels, times, self._condition(rows, times.positions))

@@ -312,8 +312,9 @@ class Rollout:
         """Return the next frame (n, S) of rows: begin with a masked one, and unmask it step by step."""
         frame, passes = self._blank(rows), self.passes.begin(rows)
         left = tokens = self.config.tokens_per_frame
-        for step in range(self.decoding.steps):
-            count = left - masked_after(step, self.decoding.steps, tokens)
+        steps = 1 if self.config.whole_frames else self.decoding.steps
+        for step in range(steps):
+            count = left - masked_after(step, steps, tokens)
             if count <= 0:
                 continue
             first = left == tokens
@@ -370,7 +371,8 @@ class Rollout:
         if config.kind == "discrete":
             return split_tokens(values, config.merge, config.vocab_size, config.token_grid)
         latents = unpatchify(values.unsqueeze(1), config.patch, config.token_grid)
-        return latents.squeeze(1) / config.latent_scale
+        shown = latents.squeeze(1) / config.latent_scale
+        return shown.round() if config.pixels else shown  # the scale is not exact in float32
 
 
 def generate(

@@ -21,6 +21,8 @@ from hma_model.network.copying import CopyGain, Copying, PatchCopy
 from hma_model.network.linear import Linear
 from hma_model.network.trunks.contract import rows_at
 
+ABSOLUTE_SHARE = 0.2  # of the absolute error beside the squared one: edges stay sharper
+MOTION_SLOPE = 3.0  # a change of a third of a unit has most of the weight of motion
 _LEVEL_VALUES = 256  # sinusoids that describe a noise level
 
 
@@ -235,7 +237,13 @@ class LatentReadout(nn.Module):
             before = features.new_zeros(*features.shape[:-1], self.diffusion.values)
         return torch.cat([conditions, self.copy(features, before)], dim=-1)
 
-    def loss(self, patches: Tensor, conditions: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def loss(
+        self,
+        patches: Tensor,
+        conditions: Tensor,
+        generator: torch.Generator | None = None,
+        before: Tensor | None = None,
+    ) -> Tensor:
         """Return the diffusion head's loss (M,) float32 of patches (M, C) under conditions (M, …)."""
         conditions, kept = self._parts(conditions)
         return self.diffusion.loss(patches if kept is None else patches - kept, conditions, generator)
@@ -258,6 +266,66 @@ class LatentReadout(nn.Module):
             return conditions, None
         own, kept = conditions.split([self.diffusion.condition.in_features, self.diffusion.values], dim=-1)
         return own.to(self.position.dtype), kept.float()
+
+
+class RegressionReadout(nn.Module):
+    """The readout of a continuous model that predicts each value's change since the frame before.
+
+    It draws nothing. Pixels are rounded to whole numbers as they are stored, so that what does not move stays
+    exactly what it was, for any number of frames.
+    """
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        self.width, self.channels, self.motion = config.width, config.channels, config.motion_weight
+        self.scale = config.latent_scale if config.pixels else 0.0
+        self.unit = 0.5 if config.pixels else 1.0  # so that errors of pixels are as large as those of latents
+        self.proj = Linear(config.width, config.patch_dim)
+        nn.init.zeros_(self.proj.weight)
+        nn.init.zeros_(self.proj.bias)
+
+    def forward(self, features: Tensor, positions: Tensor, before: Tensor | None = None) -> Tensor:
+        """Return features (B, T, S, D), followed by the patches `before` (B, T, S, C); zeros by default."""
+        if before is None:
+            before = features.new_zeros(*features.shape[:-1], self.proj.out_features)
+        return torch.cat([features.float(), before.float()], dim=-1)
+
+    def loss(
+        self,
+        patches: Tensor,
+        conditions: Tensor,
+        generator: torch.Generator | None = None,
+        before: Tensor | None = None,
+    ) -> Tensor:
+        """Return the weighted error (M,) float32 of patches (M, C) under conditions (M, D + C).
+
+        `before` (M, C) are the true patches of the frame before: what differs from them moves.
+        """
+        error = (self._predict(conditions) - patches.float()) / self.unit
+        errors = error.square() + ABSOLUTE_SHARE * error.abs()
+        if before is not None and self.motion:
+            change = ((patches - before).float() / self.unit).unflatten(-1, (self.channels, -1))
+            moves = torch.tanh(MOTION_SLOPE * change.abs().amax(-2, keepdim=True))
+            errors = errors * (1 + self.motion * moves).expand_as(change).flatten(-2)
+        return errors.mean(-1)
+
+    @torch.no_grad()
+    def sample(
+        self,
+        conditions: Tensor,
+        steps: int | None = None,
+        temperature: float = 0.0,
+        generator: Generators = None,
+    ) -> Tensor:
+        """Return the predicted patches (M, C) float32 under conditions (M, D + C)."""
+        made = self._predict(conditions)
+        if self.scale:
+            return (made / self.scale).round().clamp(0, 255) * self.scale
+        return made
+
+    def _predict(self, conditions: Tensor) -> Tensor:
+        features, before = conditions.split([self.width, self.proj.out_features], dim=-1)
+        return before + self.unit * self.proj(features.to(self.proj.weight.dtype)).float()
 
 
 class ActionHead(nn.Module):

@@ -16,13 +16,21 @@ from hma_data.errors import CheckpointError, HMAError
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.config import OBJECTIVES, POLICY, ActionSpace, HMAConfig, Readout
 from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
-from hma_model.network.head import ActionHead, Generators, LatentReadout, TokenReadout
+from hma_model.network.head import (
+    ActionHead,
+    Generators,
+    LatentReadout,
+    RegressionReadout,
+    TokenReadout,
+)
 from hma_model.network.states import check_fit, module_key
 from hma_model.network.stem import Stem, merge_tokens, patchify, space_of_stem, waves_of_stem
 from hma_model.network.trunks.contract import Conditioning, TimePositions, window_times
 from hma_model.network.trunks.transformer import Transformer
+from hma_model.network.trunks.unet import UNet
 
-TRUNKS = {"transformer": Transformer}  # by `HMAConfig.trunk`
+# by `HMAConfig.trunk`
+TRUNKS: dict[str, type[Transformer] | type[UNet]] = {"transformer": Transformer, "unet": UNet}
 
 
 class Network(nn.Module):
@@ -41,9 +49,12 @@ class Network(nn.Module):
         self.config = config
         self.embodiments: dict[str, ActionSpace] = {}
         self.source: Checkpoint | None = None
-        self.trunk = TRUNKS[config.trunk](config)
-        continuous = config.kind == "continuous"
-        self.readout: nn.Module = LatentReadout(config) if continuous else TokenReadout(config)
+        self.trunk: Transformer | UNet = TRUNKS[config.trunk](config)
+        if config.kind == "discrete":
+            self.readout: nn.Module = TokenReadout(config)
+        else:
+            diffuses = config.video_loss == "diffusion"
+            self.readout = LatentReadout(config) if diffuses else RegressionReadout(config)
         self.stems = nn.ModuleDict()
         self.heads = nn.ModuleDict()
 
@@ -64,9 +75,9 @@ class Network(nn.Module):
         return self.readout
 
     @property
-    def latent_readout(self) -> LatentReadout:
+    def latent_readout(self) -> LatentReadout | RegressionReadout:
         """Return the readout of a continuous model."""
-        assert isinstance(self.readout, LatentReadout)
+        assert isinstance(self.readout, LatentReadout | RegressionReadout)
         return self.readout
 
     # -- embodiments ------------------------------------------------------------------------------------

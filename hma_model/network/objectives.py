@@ -79,7 +79,11 @@ class Layout:
             order = list(range(count))
             return cls(order, [t - 1 for t in order], count, model.time_positions(count))
         # the last true frame is there only to be read
-        return cls.pairs(model, count, past=count if objective.readout else count - 1)
+        if objective.readout:
+            return cls.pairs(model, count, past=count)
+        layout = cls.pairs(model, count, past=count - 1)
+        layout.times.wanted = 0 if model.config.kind == "discrete" else count - 1
+        return layout
 
     @classmethod
     def pairs(cls, model: Network, count: int, past: int) -> Self:
@@ -137,6 +141,9 @@ def compute(
         masked = masked[:, layout.predicted]
         own, before = _readout_inputs(model, features, shown, video, layout, groups)
         targets = frames[:, 1:] if layout.paired else frames
+        if config.video_loss == "regression":  # the motion that weighs is that of the true frames
+            before = frames[:, :-1] if layout.paired else torch.cat([frames[:, :1], frames[:, :-1]], dim=1)
+            before = groups.sort(before)
         video_loss, per_sample = _video_loss(model, own, targets, before, masked, groups, generator)
         if layout.paired:  # no copy is of the first frame
             masked = F.pad(masked, (0, 0, 1, 0))
@@ -264,18 +271,19 @@ def _video_loss(
 ) -> tuple[Tensor, Tensor]:
     """Return the mean loss over masked tokens, and each sample's (B,), in the batch's order.
 
-    `before` (B, T, S, F) are the digits of the frames before, sorted by embodiment as the features.
+    `before` (B, T, S, F or C), sorted by embodiment as the features, are the digits of the frames before, or
+    their patches if what moves weighs more.
     """
     masked = groups.sort(masked)
     rows = masked.flatten().nonzero().squeeze(1)  # on the generator's device, so no wait for an accelerator
     sample = (rows // masked[0].numel()).to(features.device)
     rows = rows.to(features.device)
     chosen, targets = features.flatten(0, 2)[rows], groups.sort(frames).flatten(0, 2)[rows]
+    near = None if before is None else before.flatten(0, 2)[rows]
     if model.config.kind == "discrete":
-        near = None if before is None else before.flatten(0, 2)[rows]
         losses = model.token_readout.loss(chosen, to_digits(targets, model.config.digits), near)
     else:
-        losses = model.latent_readout.loss(targets, chosen, generator)
+        losses = model.latent_readout.loss(targets, chosen, generator, near)
     return losses.sum() / max(len(rows), 1), groups.unsort(_means(losses, sample, len(frames)))
 
 

@@ -98,6 +98,7 @@ class _Settings(BaseModel):
 
 _WORDS = Annotated[Any, AfterValidator(_words)]
 _TYPES: dict[Any, Any] = {int: Count, float: Number, bool: StrictBool, str: str, tuple[str, ...]: _WORDS}
+_TYPES[tuple[int, ...]] = tuple[Count, ...]
 _NETWORK: dict[str, Any] = {
     name: (_TYPES[kind], None) for name, kind in get_type_hints(HMAConfig).items() if name not in _DERIVED
 }

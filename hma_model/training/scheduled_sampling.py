@@ -15,8 +15,10 @@ import torch
 from torch import Tensor
 
 from hma_data.loading.dataset import Batch
-from hma_model.network.conditioning import Groups
+from hma_model.config import OBJECTIVES
+from hma_model.network.conditioning import Groups, align
 from hma_model.network.head import uniform
+from hma_model.network.objectives import Layout
 from hma_model.network.stem import from_digits, split_tokens, unpatchify
 from hma_model.network.trunks.contract import Conditioning, TimePositions
 
@@ -70,13 +72,49 @@ def forwarded(
     groups, times = Groups.of(names, len(rows)), model.time_positions(frames)
     actions = batch.actions[chosen] if model.config.sees_actions else None
     conditioning = model.condition_window(actions, batch.action_mask[chosen], groups, times)
-    for offset in range(depth):
-        at = first[chosen] + offset
-        context[rows, at] = _predicted(model, context, at, (conditioning, groups, times), generator)
+    if model.config.whole_frames and model.config.kind == "continuous":
+        known = torch.arange(frames, device=true.device) < first[chosen].unsqueeze(1)
+        for _ in range(depth):
+            made = _all_predicted(model, context, (actions, batch.action_mask[chosen], groups), generator)
+            context = torch.where(known.view(*known.shape, 1, 1, 1), context, made.to(context.dtype))
+    else:
+        for offset in range(depth):
+            at = first[chosen] + offset
+            context[rows, at] = _predicted(model, context, at, (conditioning, groups, times), generator)
     model.train(training)
     seen = true.clone()
     seen[chosen] = context
     return replace(batch, context=seen)
+
+
+def _all_predicted(
+    model: "HMA",
+    context: Tensor,
+    under: tuple[Tensor | None, Tensor, Groups],
+    generator: torch.Generator | None,
+) -> Tensor:
+    """Predict every frame from the frames before it in one pass; the first stays.
+
+    Each pass makes one more frame of a window what a rollout from its true frames would have.
+    """
+    config, (actions, known, groups) = model.config, under
+    layout = Layout.of(model, context.shape[1], OBJECTIVES["forward" if config.sees_actions else "passive"])
+    given = None
+    if actions is not None:
+        given = align(config, actions, known, context.shape[1]).frames(layout.frames)
+    frames = model.frame_values(context)
+    values = torch.cat([frames[:, : layout.past], frames[:, 1:]], dim=1)
+    masked = torch.zeros_like(values[..., :1], dtype=torch.bool)
+    masked[:, layout.past :] = True
+    x = model.embed(groups.sort(values), masked, layout.previous)
+    features = model.trunk(x, model.condition(given, groups, layout.times.positions), layout.times)
+    conditions = model.latent_readout(
+        features[:, layout.predicted], layout.times.positions[layout.predicted], groups.sort(frames[:, :-1])
+    )
+    patches = model.latent_readout.sample(conditions.flatten(0, 2), SAMPLE_STEPS, generator=generator)
+    whole = groups.unsort(patches.view(*conditions.shape[:3], config.patch_dim))
+    latents = unpatchify(whole, config.patch, config.token_grid) / config.latent_scale
+    return torch.cat([context[:, :1].to(latents.dtype), latents], dim=1)
 
 
 def _predicted(

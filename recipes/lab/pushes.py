@@ -19,9 +19,15 @@ import argparse
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from hma_data.console import run_script
 from hma_data.lab import pusht
+from hma_data.lab.pusher import Planned, Wandering
+from hma_data.lab.tee_table import TICK_S
+from hma_data.lab.writers import Demo
 from hma_data.storage.files import part_of
 
 NOISE = (0.1, 0.25, 0.5, 0.75, 1.0)  # shares of random targets
@@ -47,6 +53,48 @@ def record_play(part: Path, episodes: Iterable[int], seed: int) -> None:
     pusht.write_fast(part, demos, PLAY_LOOK)
 
 
+CONTACT_STEPS = 100
+AIM_STEPS = (25, 60)  # between two goals
+
+
+def contact_demo(seed: int, episode: int) -> Demo:
+    """Simulate pushes towards goals that are drawn anew all the time: contact of every kind, everywhere.
+
+    Of five episodes three aim, one of these with random targets in between, and one wanders.
+    """
+    rng = np.random.default_rng((seed, 3, episode))
+    arena = pusht.Arena(pusht.FAST_LOOK, ("near", "far", "far")[episode % 3], rng)
+    wanders, strays = episode % 5 == 4, episode % 5 == 3
+
+    def aimed() -> pusht.Targets:
+        if wanders:
+            return pusht.Targets(Wandering(arena.agent, False, rng), arena.agent)
+        goal = np.array([*rng.uniform(110, 400, 2), rng.uniform(-np.pi, np.pi)])
+        speed = pusht.SPEED * rng.uniform(0.7, 1.3)
+        return pusht.Targets(Planned(arena.tee, goal, arena.agent, speed, False, rng), arena.agent)
+
+    targets, until, stray = aimed(), 0, None
+    rows: list[tuple[Any, ...]] = []
+    for step in range(CONTACT_STEPS):
+        if step == until:
+            targets, until = aimed(), step + int(rng.integers(*AIM_STEPS))
+        if strays and step % pusht.HELD == 0:
+            stray = rng.uniform(15, 497, 2).astype(np.float32) if rng.random() < 0.3 else None
+        action = targets.next(arena.pose, arena.agent)
+        action = action if stray is None else stray
+        seen = arena.picture(), arena.agent, arena.state
+        arena.advance(action.astype(np.float64), round(pusht.FAST_PERIOD_S / TICK_S))
+        rows.append((*seen, action, arena.reward))
+    images, positions, states, actions, rewards = map(np.stack, zip(*rows, strict=True))
+    observations = {"image": images, "agent_pos": positions}
+    return Demo(actions, observations, states, rewards, arena.success, {"start": "contact", "seed": seed})
+
+
+def record_contact(part: Path, episodes: Iterable[int], seed: int) -> None:
+    """Record `contact_demo`."""
+    pusht.write_fast(part, (contact_demo(seed, episode) for episode in episodes))
+
+
 def main() -> None:
     """Record the parts; a part that is there is kept."""
     parser = argparse.ArgumentParser(description="Record pushes of good and of bad drivers")
@@ -54,6 +102,9 @@ def main() -> None:
     parser.add_argument("--planned", type=int, default=1200, help="episodes of the recorder's own driver")
     parser.add_argument("--noisy", type=int, default=900, help="episodes with random commands among its own")
     parser.add_argument("--play", type=int, default=0, help="episodes at 96 px, most of which wander")
+    parser.add_argument(
+        "--contact", type=int, default=0, help="episodes that push towards one goal after another"
+    )
     parser.add_argument("--seed", type=int, default=7)
     given = parser.parse_args()
     planned = partial(pusht.record, robot="pusht_fast")
@@ -61,6 +112,7 @@ def main() -> None:
         ("planned", planned, given.planned, given.seed),
         ("noisy", record_noisy, given.noisy, given.seed + 4),
         ("play", record_play, given.play, given.seed + 8),
+        ("contact", record_contact, given.contact, given.seed + 12),
     ):
         file = given.out / name / "pusht_fast.hdf5"
         if count and not file.exists():

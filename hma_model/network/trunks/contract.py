@@ -65,6 +65,7 @@ class TimePositions:
         slots: (B, T) int64, slot · rows + row, the places where the frames of the pass are carried; None
             where nothing is carried.
         rows: the samples' rows of what is carried; None for all.
+        wanted: the first frame whose features are read; a trunk may leave out those before it.
         shared: what `once` keeps.
     """
 
@@ -74,6 +75,7 @@ class TimePositions:
     causal: bool = False
     slots: Tensor | None = None
     rows: slice | Tensor | None = None
+    wanted: int = 0
     shared: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
     def once(self, name: str, make: Callable[[], Tensor]) -> Tensor:

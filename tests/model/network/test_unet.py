@@ -1,0 +1,151 @@
+"""The U-Net trunk: the same frames with and without a carried past, and pixels that stay what they are."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from hma_data.errors import RecipeError
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model import HMA
+from hma_model.config import HMAConfig
+from hma_model.network.trunks.contract import Conditioning, TimePositions, paired_times
+from hma_model.training.scheduled_sampling import forwarded
+from tests.model.network_parts import ARM, HAND, small_batch
+
+SPEC = TokenizerSpec.continuous("raw-16", 1, 16, 1, 3, latent_scale=1 / 255, dtype="uint8")
+PIXELS: dict[str, Any] = {
+    "kind": "continuous", "trunk": "unet", "layers": 1, "levels": (8, 16), "width": 16, "heads": 2,
+    "frames": 4, "grid": (16, 16), "channels": 3, "patch": 4, "latent_scale": 1 / 255,
+    "shared_modulation": True,
+    "training_pass": "pairs", "whole_share": 1.0, "video_loss": "regression", "copy_previous": True,
+    "told_noise": True, "latent_noise": 0.1, "corrupt_max": 1.0, "action_waves": 2,
+    "tokenizer": SPEC.to_json(),
+}  # fmt: skip
+LATENTS = {**PIXELS, "grid": (8, 8), "channels": 4, "patch": 2, "latent_scale": 0.5, "tokenizer": {}}
+
+
+def unet(moving: bool = True, **changes: Any) -> HMA:
+    """Return a model of two robots; `moving` leaves the state in which every frame repeats the one before."""
+    torch.manual_seed(0)
+    model = HMA(HMAConfig(**{**PIXELS, **changes}))
+    model.add_embodiment(ARM)
+    model.add_embodiment(HAND)
+    if moving:
+        for name, parameter in model.named_parameters():
+            if name.endswith(("conv2.weight", "proj.weight")):
+                torch.nn.init.normal_(parameter, std=0.1)
+    return model.eval()
+
+
+def stored(model: HMA, batch: int, frames: int, seed: int = 0) -> Tensor:
+    draws = torch.Generator().manual_seed(seed)
+    shape = batch, frames, *model.config.frame_shape
+    if model.config.pixels:
+        return torch.randint(0, 256, shape, generator=draws).float()
+    return torch.randn(shape, generator=draws)
+
+
+@pytest.mark.parametrize("changes", [{}, LATENTS, {"views": 2}, {"levels": (8,)}])
+@pytest.mark.parametrize("prompt", [1, 3, 6])
+def test_a_rollout_makes_the_frames_of_a_model_that_computes_everything_anew(
+    changes: dict[str, Any], prompt: int
+) -> None:
+    model = unet(**changes)
+    frames, names = stored(model, 2, prompt), ["arm", "hand.v1"]
+    actions = torch.randn(2, prompt + 7, 6, generator=torch.Generator().manual_seed(1))
+    made, anew = (model.generate(frames, actions, names, 7, cache=cache) for cache in (True, False))
+    torch.testing.assert_close(made, anew, rtol=0, atol=1.0 if model.config.pixels else 1e-4)
+    assert (made[:, -1] - frames[:, -1]).abs().mean() > 0.05  # it moves
+
+
+def test_a_frame_is_that_of_the_training_pass() -> None:
+    model = unet(**LATENTS)
+    frames, actions = stored(model, 1, 4), torch.randn(1, 4, 6)
+    made = model.generate(frames[:, :3], actions, "arm", 1)
+    times = paired_times(model.config, 3, 4, model.device)
+    values = model.frame_values(frames)
+    passed = torch.cat([values[:, :3], values[:, 1:]], dim=1)
+    masked = torch.zeros_like(passed[..., :1], dtype=torch.bool)
+    masked[:, 3:] = True
+    order = [0, 1, 2, 1, 2, 3]
+    chunk = torch.cat([torch.zeros(1, 1, 6), actions[:, :3]], dim=1)[:, order]
+    embedding = model.stem("arm")(chunk)
+    embedding[:, 0] = model.trunk.absent[0]
+    features = model.trunk(model.embed(passed, masked, order), Conditioning(embedding), times)
+    conditions = model.latent_readout(features[:, -1:], times.positions[-1:], values[:, 2:3])
+    expected = model.latent_readout.sample(conditions.flatten(0, 2)) / model.config.latent_scale
+    got = model.frame_values(made) / model.config.latent_scale
+    torch.testing.assert_close(got.flatten(0, 2), expected, rtol=0, atol=1e-4)
+
+
+def test_what_is_not_wanted_is_not_computed_and_changes_nothing() -> None:
+    model = unet()
+    x = torch.randn(2, 6, 16, 16)
+    under = Conditioning(torch.randn(2, 6, 16))
+    every, last = (paired_times(model.config, 3, 4, model.device) for _ in range(2))
+    last.wanted = 3
+    features = model.trunk(x, under, every), model.trunk(x, under, last)
+    torch.testing.assert_close(features[0][:, 3:], features[1][:, 3:])
+    assert not features[1][:, :3].any()
+
+
+def test_pixels_of_an_untrained_model_stay_for_any_number_of_frames() -> None:
+    model = unet(moving=False)
+    frames = stored(model, 1, 2)
+    made = model.generate(frames, torch.randn(1, 42, 6), "arm", 40)
+    assert torch.equal(made, frames[:, -1:].expand_as(made))
+
+
+def test_what_moves_weighs_more() -> None:
+    still, heavy = unet(motion_weight=0.0), unet(motion_weight=6.0)
+    batch = small_batch(still.config, ["arm", "hand.v1"])
+    batch.latents = stored(still, 2, still.config.frames)
+    assert heavy(batch).loss > 1.5 * still(batch).loss
+    batch.latents = batch.latents[:, :1].expand_as(batch.latents).clone()
+    draws = (torch.Generator().manual_seed(3) for _ in range(2))
+    torch.testing.assert_close(
+        heavy(batch, generator=next(draws)).loss, still(batch, generator=next(draws)).loss
+    )
+
+
+def test_each_pass_makes_one_more_frame_of_the_past_that_of_a_rollout() -> None:
+    model = unet(**{**LATENTS, "frames": 6})
+    batch = small_batch(model.config, ["arm"])
+    batch.tokens, batch.latents = None, stored(model, 1, 6)
+    seen = forwarded(model, batch, 1.0, 3, torch.Generator().manual_seed(0)).context
+    assert seen is not None
+    replaced = (seen != batch.latents).flatten(2).any(-1)[0].nonzero().flatten().tolist()
+    first = replaced[0]
+    rolled = model.generate(batch.latents[:, :first], batch.actions, "arm", 3)
+    torch.testing.assert_close(seen[:, first : first + 3], rolled[:, : 6 - first], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"kind": "discrete", "video_loss": "diffusion"}, "trunk"),
+        ({"levels": (8, 16, 32, 64)}, "levels"),
+        ({"shared_modulation": False}, "shared_modulation"),
+        ({"conditioning": ("concat",)}, "conditioning"),
+        ({"time_position": "learned"}, "time_position"),
+        ({"copy_previous": False}, "copy_previous"),
+        ({"motion_weight": -1.0}, "motion_weight"),
+    ],
+)
+def test_a_configuration_that_does_not_fit_is_refused(changes: dict[str, Any], named: str) -> None:
+    with pytest.raises(RecipeError, match=f"model.{named}"):
+        HMAConfig(**{**PIXELS, **changes})
+
+
+def test_times_have_no_future() -> None:
+    """A frame's features do not change with frames after it."""
+    model = unet()
+    x, actions = torch.randn(1, 4, 16, 16), torch.randn(1, 4, 16)
+    times: TimePositions = model.time_positions(4)
+    before = model.trunk(x, Conditioning(actions), times)
+    x[:, 3], actions[:, 3] = 9.0, 9.0
+    after = model.trunk(x, Conditioning(actions), times)
+    torch.testing.assert_close(before[:, :3], after[:, :3])
+    assert not torch.allclose(before[:, 3], after[:, 3])
