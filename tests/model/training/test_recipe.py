@@ -264,8 +264,8 @@ def test_every_shipped_recipe_validates_and_makes_a_network(name):
             name="svd-vae", version=1, kind="continuous", image_size=256, grid=(32, 32), channels=4,
             dtype="float16", latent_scale=0.18215,
         )  # fmt: skip
-    elif name == "world":
-        spec = get_tokenizer("fsq-lab").spec
+    elif name in ("world", "unet_tiny"):
+        spec = get_tokenizer("fsq-lab" if name == "world" else "raw-128").spec
     config = recipe.network(spec)
     assert config.kind == spec.kind and config.frames == recipe.frames
 
