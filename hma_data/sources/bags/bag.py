@@ -7,7 +7,6 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from itertools import groupby
 from operator import itemgetter
@@ -38,7 +37,6 @@ from hma_data.storage.yaml_io import read_yaml
 SUFFIXES = (".bag", ".mcap", ".db3")
 MAX_EXPANSION = 200  # most times its packed size that a file may have unpacked, against decompression bombs
 Container = McapFile | Ros1File | SqliteFile
-PART_NAME = re.compile(r"(?P<begin>.*_)(?P<number>\d+)(?P<end>\.\w+(?:\.zstd)?)")
 BagPlace = tuple[int, int, int]  # of a message: the file of the bag, and two numbers for the place in it
 log = logging.getLogger(__name__)
 
@@ -113,8 +111,6 @@ class Bag:
 
     def records(self, wanted: RecordFilter = ALL) -> Iterator[tuple[BagPlace, Record]]:
         """Yield the wanted messages, file by file; a time range costs about its own bytes."""
-        if self._message_packed:
-            wanted = replace(wanted, heads=frozenset())
         for number, file in enumerate(self.files()):
             for record in file.records(wanted):
                 yield (number, *record.place), self._plain_record(record)

@@ -4,7 +4,7 @@ A container is one file. It yields the messages of wanted topics in the file's o
 it counts the messages without reading them. It finds a message again by its place, so for images only
 places are kept in memory. No container holds an open file between calls.
 
-A piece is a run of a file's records: one chunk, or messages outside of chunks. Its topics and its times of
+A piece is a run of a file's records: one chunk, or messages outside of chunks. Its channels and its times of
 receipt are known, so a time range is read without the rest. A file has some thousands of pieces.
 """
 
@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -31,7 +31,6 @@ CACHED_BYTES = 64 << 20  # of unpacked chunks that a bag keeps
 MAX_CHUNK = 512 << 20  # most bytes of an unpacked chunk, against decompression bombs and errors
 FOREVER = 2**64
 KEPT_FROM = 2048  # bytes of a message of a remote file that is kept in memory for `payloads`
-HEAD = 64  # bytes: the stamp of a message is within them
 FAULTS = (
     struct.error, ValueError, LookupError, OverflowError, RecursionError, EOFError, OSError, RuntimeError,
     MemoryError, sqlite3.Error, McapError,
@@ -76,14 +75,12 @@ class RecordFilter:
     Attributes:
         topics: None for all.
         first_ns, last_ns: range of the time of receipt, both ends included.
-        heads: topics for which the first HEAD bytes of a message are enough; more may be returned.
         again: whether `payloads` of these messages will be asked for.
     """
 
     topics: frozenset[str] | None = None
     first_ns: int = 0
     last_ns: int = FOREVER
-    heads: frozenset[str] = frozenset()
     again: bool = False
 
     def topic(self, name: str) -> bool:
@@ -131,18 +128,32 @@ class Piece(NamedTuple):
 
     Attributes:
         first_ns, last_ns: earliest and latest receipt of its messages.
-        topics: of its messages.
+        channels: the numbers of the channels of its messages.
     """
 
     at: int
     end: int
-    first_ns: int
-    last_ns: int
-    topics: frozenset[str]
+    first_ns: int = FOREVER
+    last_ns: int = -1
+    channels: frozenset[int] = frozenset()
 
-    def holds(self, topics: frozenset[str] | None) -> bool:
-        """Check whether it can hold a message of those topics."""
-        return topics is None or not self.topics.isdisjoint(topics)
+    def including(self, message: "Entry") -> "Piece":
+        """Return the piece with the time and channel of one message more."""
+        return self._replace(
+            first_ns=min(self.first_ns, message.log_ns),
+            last_ns=max(self.last_ns, message.log_ns),
+            channels=self.channels | {message.number},
+        )
+
+
+class Entry(NamedTuple):
+    """A message among the records of a piece: it lies at `at`, its data from `start` to `end`."""
+
+    number: int  # of its channel
+    log_ns: int
+    at: int
+    start: int
+    end: int
 
 
 @dataclass
@@ -150,13 +161,13 @@ class FileIndex:
     """The channels of a file by number, its pieces in their order, and what else a walk over it shows.
 
     Attributes:
-        counts: messages of each channel, where the walk counts them.
+        counts: messages by channel number; None where the file does not state them.
         notes: entries of MCAP's metadata records.
     """
 
     channels: dict[int, Channel] = field(default_factory=dict)
     pieces: list[Piece] = field(default_factory=list)
-    counts: Counter[Channel] = field(default_factory=Counter)
+    counts: Counter[int] | None = None
     notes: dict[str, str] = field(default_factory=dict)
 
     def channel(self, number: int) -> Channel:
@@ -168,6 +179,10 @@ class FileIndex:
         if number not in self.channels:
             raise ValueError(f"a message is on channel {number}, which is not declared")
         return self.channels[number]
+
+    def holds(self, piece: Piece, topics: frozenset[str] | None) -> bool:
+        """Check whether a piece holds a message of those topics."""
+        return topics is None or any(self.channel(number).topic in topics for number in piece.channels)
 
 
 class IndexedFile(ABC):
@@ -182,64 +197,60 @@ class IndexedFile(ABC):
         self._file = LargeFile(path)
         self._indexed: FileIndex | None = None
 
+    def counts(self) -> Counter[Channel]:
+        """Count the messages of each channel, from the index if there is one; also of empty channels."""
+        with self._opened() as (_, index):
+            channels, counts = index.channels, index.counts
+        if counts is None or not counts.keys() <= channels.keys():
+            return Counter(record.channel for record in self.records(ALL))
+        total: Counter[Channel] = Counter()
+        for number, channel in channels.items():
+            total[channel] += counts[number]
+        return total
+
     def records(self, wanted: RecordFilter) -> Iterator[Record]:
         """Yield the wanted messages, in the file's order; pieces without one are not read."""
-        with reading(self.path), self._file.open() as file:
-            index = self._index(file)
+        with self._opened() as (file, index):
             pieces = [
                 piece
                 for piece in index.pieces
                 if piece.first_ns <= wanted.last_ns
                 and piece.last_ns >= wanted.first_ns
-                and piece.holds(wanted.topics)
+                and index.holds(piece, wanted.topics)
             ]
             expect(file, ((piece.at, piece.end) for piece in pieces))
-            if not wanted.again or not isinstance(file, BlockFile):
-                for piece in pieces:
-                    yield from self._in_piece(file, index, piece, wanted)
-                return
-            whole = replace(wanted, heads=frozenset())
             for piece in pieces:
-                for record in self._in_piece(file, index, piece, whole):
-                    if len(record.data) >= KEPT_FROM:  # so that images are not fetched again
+                for record in self._in_piece(file, index, piece, wanted):
+                    # Images of a remote file are not fetched again.
+                    if wanted.again and isinstance(file, BlockFile) and len(record.data) >= KEPT_FROM:
                         file.blocks.keep(record.place, bytes(record.data))
                     yield record
 
     def span(self) -> tuple[int, int]:
         """Return the earliest and latest time of receipt; (FOREVER, -1) without messages."""
-        with reading(self.path), self._file.open() as file:
-            pieces = self._index(file).pieces
+        with self._opened() as (_, index):
+            pieces = index.pieces
         first_ns = min((piece.first_ns for piece in pieces), default=FOREVER)
         return first_ns, max((piece.last_ns for piece in pieces), default=-1)
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
         """Return each topic's last message before a time; topics without one are left out."""
         found: dict[str, Record] = {}
-        with reading(self.path), self._file.open() as file:
-            index = self._index(file)
-            earlier = (piece for piece in index.pieces if piece.first_ns < log_ns and piece.holds(topics))
+        with self._opened() as (file, index):
+            earlier = (piece for piece in index.pieces if piece.first_ns < log_ns)
             for piece in sorted(earlier, key=lambda piece: piece.last_ns, reverse=True):
                 newest = min(piece.last_ns, log_ns - 1)
                 missing = frozenset(t for t in topics if t not in found or found[t].log_ns < newest)
                 if not missing:
                     break
-                if piece.holds(missing):
+                if index.holds(piece, missing):
                     wanted = RecordFilter(missing, last_ns=log_ns - 1)
                     take_last(found, self._in_piece(file, index, piece, wanted))
         return found
 
-    def _index(self, file: BinaryIO) -> FileIndex:
-        if self._indexed is None:
-            self._indexed = self._make_index(file)
-        return self._indexed
-
-    @abstractmethod
-    def counts(self) -> Counter[Channel]:
-        """Count the messages of each channel, from the index if there is one; also of empty channels."""
-
     def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
         """Yield the data of the messages at those places."""
-        with reading(self.path), self._file.open() as file:
+        with self._opened() as (file, index):
             last = -1
             for offset, at in places:
                 kept = file.blocks.take((offset, at)) if isinstance(file, BlockFile) else None
@@ -248,26 +259,46 @@ class IndexedFile(ABC):
                     continue
                 if offset != last:
                     last, view = offset, self._view(file, offset)
-                start, end = self._content(view, at)
-                yield view[start:end]
+                message = next(self._messages(index, view, at))
+                yield view[message.start : message.end]
+
+    @contextmanager
+    def _opened(self) -> Iterator[tuple[BinaryIO, FileIndex]]:
+        with reading(self.path), self._file.open() as file:
+            if self._indexed is None:
+                self._indexed = self._make_index(file)
+            yield file, self._indexed
+
+    def _in_piece(
+        self, file: BinaryIO, index: FileIndex, piece: Piece, wanted: RecordFilter
+    ) -> Iterator[Record]:
+        view = self._view(file, piece.at, piece.end)
+        for number, log_ns, at, start, end in self._messages(index, view):
+            channel = index.channel(number)
+            if wanted.topic(channel.topic) and wanted.time(log_ns):
+                yield Record(channel, log_ns, view[start:end], (piece.at, at))
+
+    def _look_into(self, file: BinaryIO, index: FileIndex, at: int, end: int) -> Counter[int]:
+        """Add a piece that no index describes, by reading it; return its messages by channel."""
+        counts: Counter[int] = Counter()
+        piece = Piece(at, end)
+        for message in self._messages(index, self._view(file, at, end)):
+            counts[message.number] += 1
+            piece = piece.including(message)
+        index.pieces.append(piece)
+        return counts
 
     @abstractmethod
     def _make_index(self, file: BinaryIO) -> FileIndex:
         """Return the pieces of the file, and its channels."""
 
     @abstractmethod
-    def _view(self, file: BinaryIO, at: int) -> "View":
-        """Return the records of the piece at an offset, read lazily where they lie unpacked in the file."""
+    def _view(self, file: BinaryIO, at: int, end: int | None = None) -> "View":
+        """Return the records of the piece at an offset: unpacked, or read lazily outside of chunks."""
 
     @abstractmethod
-    def _content(self, view: "View", at: int) -> tuple[int, int]:
-        """Return where the data of the message at `at` begins and ends."""
-
-    @abstractmethod
-    def _in_piece(
-        self, file: BinaryIO, index: FileIndex, piece: Piece, wanted: RecordFilter
-    ) -> Iterator[Record]:
-        """Yield the wanted messages of a piece."""
+    def _messages(self, index: FileIndex, view: "View", at: int = 0) -> Iterator[Entry]:
+        """Yield the messages of a piece from an offset on; add the channels met to the index."""
 
 
 def take_last(found: dict[str, Record], records: Iterable[Record]) -> None:

@@ -7,7 +7,6 @@ used, and then those of the newest release. A message of any encoding is read th
 
 import dataclasses
 import json
-import struct
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from importlib import import_module
@@ -21,8 +20,6 @@ from hma_data.sources.bags.container import Channel, Data
 Decode = Callable[[Data], Any]
 IDL_SEPARATOR = "=" * 80 + "\n"
 TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
-TIME = "builtin_interfaces/msg/Time"
-HEADER = "std_msgs/msg/Header"
 WELL_KNOWN = "google/protobuf/"
 STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))
 
@@ -43,38 +40,6 @@ def decode(channel: Channel, data: Data, where: str) -> Any:
     except Exception as fault:
         kind = channel.type or channel.encoding
         raise EpisodeError(where, f"a message on {channel.topic} is not a {kind}: {_line(fault)}") from fault
-
-
-@lru_cache(maxsize=256)
-def head_stamp(channel: Channel) -> Callable[[Data], int] | None:
-    """Return a function that reads a ROS message's own time, in nanoseconds, from its first HEAD bytes.
-
-    None where the time has no fixed place there, or the definition cannot be read; then `decode` is needed.
-    """
-    if channel.encoding not in ("ros1", "cdr"):
-        return None
-    try:
-        store, kind = ros_store(channel)
-        fields = [(name, spec[1]) for name, spec in store.fielddefs[kind][1]]
-        headed = bool(fields) and fields[0] == ("header", HEADER)
-        if headed:
-            fields = [(name, spec[1]) for name, spec in store.fielddefs[HEADER][1]]
-    except Exception:  # `decode` raises it again
-        return None
-    at = 0 if channel.encoding == "ros1" else 4  # CDR begins with four bytes that state its encoding
-    if headed and fields[0][0] == "seq":
-        fields, at = fields[1:], at + 4
-    elif not headed and {name for name, _ in fields[1:]} & {"header", "timestamp"}:
-        return None
-    if not fields or fields[0] not in (("stamp", TIME), ("timestamp", TIME)):
-        return None
-    return partial(_time_at, at, channel.encoding == "cdr")
-
-
-def _time_at(at: int, cdr: bool, data: Data) -> int:
-    big = cdr and not data[1] & 1
-    seconds, nanoseconds = struct.unpack_from(">iI" if big else "<iI", data, at)
-    return int(seconds * 10**9 + nanoseconds)
 
 
 def _line(fault: BaseException) -> str:

@@ -17,11 +17,10 @@ from typing import Any, BinaryIO
 from urllib.parse import quote
 
 from hma_data.sources.bags.container import (
-    ALL,
     FOREVER,
-    HEAD,
     Channel,
     Data,
+    Entry,
     FileIndex,
     FilePlace,
     FileView,
@@ -50,27 +49,28 @@ LATEST = 2**63 - 1  # largest sqlite3 integer
 class Ros1File(IndexedFile):
     """A ROS 1 bag."""
 
-    def counts(self) -> Counter[Channel]:
+    def _view(self, file: BinaryIO, at: int, end: int | None = None) -> View:
         """See IndexedFile."""
-        with reading(self.path), self._file.open() as file:
-            return self._index(file).counts.copy()
-
-    def _content(self, view: View, at: int) -> tuple[int, int]:
-        _, start, end = _record(view, at)
-        return start, end
-
-    def _view(self, file: BinaryIO, at: int) -> View:
         header, start, end = _record(_whole(file), at)
         if _number(header, "op") != CHUNK:
             raise ValueError(f"there is no chunk at {at:,}, where the index says one is")
-        codec = header["compression"].decode()
-        if codec == "none":
-            return FileView(file, start, end)
 
         def unpacked() -> bytes:
-            return decompress(codec, FileView(file, start, end)[0 : end - start], _number(header, "size"))
+            data = FileView(file, start, end)[0 : end - start]
+            return decompress(header["compression"].decode(), data, _number(header, "size"))
 
         return self._chunks.get(self.path, at, unpacked)
+
+    def _messages(self, index: FileIndex, view: View, at: int = 0) -> Iterator[Entry]:
+        """See IndexedFile."""
+        while at < len(view):
+            place = at
+            header, start, at = _record(view, place)
+            kind = _number(header, "op")
+            if kind == CONNECTION:
+                _learn(index, header, view[start:at])
+            elif kind == MESSAGE:
+                yield Entry(_number(header, "conn"), _time(header, "time"), place, start, at)
 
     def _make_index(self, file: BinaryIO) -> FileIndex:
         magic = file.read(len(ROS1_MAGIC))
@@ -87,39 +87,17 @@ class Ros1File(IndexedFile):
 
     def _index_of_chunks(self, file: BinaryIO) -> FileIndex:
         """Index a bag whose recorder was killed; every chunk is unpacked for it."""
-        index, at, view = FileIndex(), len(ROS1_MAGIC), _whole(file)
+        index, at, view = FileIndex(counts=Counter()), len(ROS1_MAGIC), _whole(file)
         without_index(self.path, file, len(view))
         while at < len(view):
-            header, start, end = _record(view, at)
-            kind = _number(header, "op")
-            if kind == CONNECTION:
-                _learn(index, header, view[start:end])
-            elif kind == CHUNK:
-                piece = Piece(at, end, FOREVER, -1, frozenset())
-                counts: Counter[Channel] = Counter()
-                for record in self._in_piece(file, index, piece, ALL):
-                    first_ns, last_ns = min(piece.first_ns, record.log_ns), max(piece.last_ns, record.log_ns)
-                    piece = piece._replace(first_ns=first_ns, last_ns=last_ns)
-                    counts[record.channel] += 1
-                _add(index, piece, counts)
-            at = end
-        return index
-
-    def _in_piece(
-        self, file: BinaryIO, index: FileIndex, piece: Piece, wanted: RecordFilter
-    ) -> Iterator[Record]:
-        view, at = self._view(file, piece.at), 0
-        while at < len(view):
-            place = (piece.at, at)
-            header, start, at = _record(view, at)
+            place = at
+            header, start, at = _record(view, place)
             kind = _number(header, "op")
             if kind == CONNECTION:
                 _learn(index, header, view[start:at])
-            elif kind == MESSAGE:
-                channel, log_ns = index.channel(_number(header, "conn")), _time(header, "time")
-                if wanted.topic(channel.topic) and wanted.time(log_ns):
-                    end = min(at, start + HEAD) if channel.topic in wanted.heads else at
-                    yield Record(channel, log_ns, view[start:end], place)
+            elif kind == CHUNK and index.counts is not None:
+                index.counts.update(self._look_into(file, index, place, at))
+        return index
 
 
 def _whole(file: BinaryIO) -> FileView:
@@ -172,14 +150,9 @@ def _learn(index: FileIndex, header: Header, content: Data) -> None:
     )
 
 
-def _add(index: FileIndex, piece: Piece, counts: Counter[Channel]) -> None:
-    index.counts.update(counts)
-    index.pieces.append(piece._replace(topics=frozenset(channel.topic for channel in counts)))
-
-
 def _stated_index(file: BinaryIO, at: int, count: int) -> FileIndex:
     """Return the index that lies at the file's end as `count` records."""
-    index, chunks, view = FileIndex(), list[tuple[Header, bytes]](), _whole(file)
+    index, total, view = FileIndex(), Counter[int](), _whole(file)
     index_at = at
     expect(file, [(at, len(view))])
     for _ in range(count):
@@ -188,19 +161,19 @@ def _stated_index(file: BinaryIO, at: int, count: int) -> FileIndex:
         if kind == CONNECTION:
             _learn(index, header, view[start:at])
         elif kind == CHUNK_INFO:
-            chunks.append((header, view[start:at]))
+            counts = dict(COUNTS.iter_unpack(view[start:at]))
+            total.update(counts)
+            first_ns, last_ns = _time(header, "start_time"), _time(header, "end_time")
+            index.pieces.append(
+                Piece(_number(header, "chunk_pos"), index_at, first_ns, last_ns, frozenset(counts))
+            )
         else:
             raise ValueError(f"the index holds a record of kind {kind}")
-    index.counts.update(dict.fromkeys(index.channels.values(), 0))
-    chunks.sort(key=lambda chunk: _number(chunk[0], "chunk_pos"))
-    ends = [_number(header, "chunk_pos") for header, _ in chunks[1:]] + [index_at]
-    for (header, content), end in zip(chunks, ends, strict=False):  # without chunks, there is one end
-        counts: Counter[Channel] = Counter()
-        for number, messages in COUNTS.iter_unpack(content):
-            counts[index.channel(number)] += messages
-        start = _number(header, "chunk_pos")
-        first_ns, last_ns = _time(header, "start_time"), _time(header, "end_time")
-        _add(index, Piece(start, end, first_ns, last_ns, frozenset()), counts)
+    index.pieces.sort()
+    # A chunk ends where the next one begins.
+    for i, following in enumerate(index.pieces[1:]):
+        index.pieces[i] = index.pieces[i]._replace(end=following.at)
+    index.counts = total
     return index
 
 
@@ -237,13 +210,7 @@ class SqliteFile:
             for row_id, topic_id, log_ns in base.execute(query.format(" AND ".join(conditions)), values):
                 if not isinstance(log_ns, int):
                     raise ValueError(f"message {row_id} has no time")
-                channel = index.channel(topic_id)
-                if channel.topic in wanted.heads:
-                    with base.blobopen("messages", "data", row_id, readonly=True) as blob:
-                        data = blob.read(HEAD)
-                else:
-                    data = _payload(base, row_id)
-                yield Record(channel, log_ns, data, (0, row_id))
+                yield Record(index.channel(topic_id), log_ns, _payload(base, row_id), (0, row_id))
 
     def span(self) -> tuple[int, int]:
         """See IndexedFile."""

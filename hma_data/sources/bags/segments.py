@@ -2,8 +2,8 @@
 
 One pass over the primary camera's stamps and the markers' topics makes a table. The last bags and their
 tables are cached for the other episodes of the same bag, while no file changes; an episode is then read by
-its own time range. Tables of remote bags are also kept in this machine's cache folder. F frames of the
-primary camera in order of receipt; an episode is a run of them.
+its own time range. Tables are also kept in this machine's cache folder. F frames of the primary camera in
+order of receipt; an episode is a run of them.
 
 A marker is a message that begins or ends an episode: `source.segments.start` and `stop`. It counts when it
 arrives, or when a field of it becomes a value.
@@ -12,7 +12,7 @@ arrives, or when a field of it becomes a value.
 import hashlib
 import json
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass, field
 from itertools import pairwise
@@ -28,11 +28,10 @@ from hma_data.registry.components import Marker, Segments
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace
 from hma_data.sources.bags.container import Record, RecordFilter
-from hma_data.sources.bags.images import RAW, STILL, VIDEO, content_kind, image_kind
-from hma_data.sources.bags.messages import decode, head_stamp
+from hma_data.sources.bags.images import STILL, VIDEO, image_kind
+from hma_data.sources.bags.messages import decode
 from hma_data.sources.bags.topic_track import TopicTrack, missing_topic, parse_key
 from hma_data.storage.files import cache_folder, write_atomic
-from hma_data.storage.remote import is_remote
 
 SECOND_NS = 10**9
 SHOWN = 8  # values of a marker in an error
@@ -104,15 +103,12 @@ def parted(path: Path, root: Path, embodiment: Embodiment, segments: Segments) -
     bag = _cached(_bags.setdefault(os.getpid(), {}), (path, root, state), lambda: opened, KEPT_BAGS)
     cameras = tuple((camera.key, camera.stamp) for camera in embodiment.cameras)
     key = (path, state, segments, cameras, embodiment.primary_camera.name, embodiment.sync.stamp)
-
-    def make() -> Table:
-        return part(bag, embodiment, segments)
-
-    return bag, _cached(_tables, key, lambda: _stored(key, make) if is_remote(path) else make(), KEPT_TABLES)
+    table = _cached(_tables, key, lambda: _stored(key, lambda: part(bag, embodiment, segments)), KEPT_TABLES)
+    return bag, table
 
 
 def _stored(key: Any, make: Callable[[], Table]) -> Table:
-    """Return the table of a remote bag from this machine's cache, so that its workers read the bag once."""
+    """Return the table of a bag from this machine's cache, so that its workers read the bag once."""
     kept = cache_folder() / "bags" / f"{hashlib.sha256(repr((TABLE, key)).encode()).hexdigest()[:32]}.json"
     with suppress(OSError, ValueError, KeyError, TypeError):
         values = json.loads(kept.read_bytes())
@@ -139,25 +135,6 @@ def _cached[V](cache: dict[Any, V], key: Any, make: Callable[[], V], limit: int)
     return value
 
 
-def heads(bag: Bag, topics: Collection[str]) -> frozenset[str]:
-    """Return those of the topics that hold still images whose time is in the first bytes of a message.
-
-    Only the content of a message tells a still image from a frame of a video.
-    """
-    channels = [channel for channel in bag.counts() if channel.topic in topics]
-    found = {c.topic for c in channels if image_kind(c.type) in (RAW, STILL)}
-    found = {topic for topic in found if all(head_stamp(c) for c in channels if c.topic == topic)}
-    return frozenset(topic for topic in found if not _begins_as_video(bag, topic))
-
-
-def _begins_as_video(bag: Bag, topic: str) -> bool:
-    first = next(bag.records(RecordFilter(frozenset({topic}))), None)
-    if first is None or image_kind(first[1].channel.type) == RAW:
-        return False
-    message = decode(first[1].channel, first[1].data, str(bag.path))
-    return content_kind(message, STILL) == VIDEO
-
-
 def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
     """Return the table of a bag.
 
@@ -170,13 +147,21 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
     if camera.key not in topics:
         raise missing_topic(camera.key, topics, where)
     cameras = {camera.key for camera in embodiment.cameras}
-    headed = heads(bag, cameras)
-    images = {channel.topic for channel in channels if image_kind(channel.type)}
-    videos = {key for key in cameras & images if key not in headed}  # still images may be among them
+    # Only the messages tell whether compressed images are frames of a video.
+    videos = {c.topic for c in channels if c.topic in cameras and image_kind(c.type) in (STILL, VIDEO)}
     tracks = {key: TopicTrack(key) for key in {camera.key} | videos}
     start = MarkerTrack(segments.start, topics, where) if segments.start else None
     stop = MarkerTrack(segments.stop, topics, where) if segments.stop else None
-    _scan(bag, tracks, [marker for marker in (start, stop) if marker], headed)
+    markers = [marker for marker in (start, stop) if marker]
+    marked = {marker.track.topic for marker in markers}
+    for place, record in bag.records(RecordFilter(frozenset(tracks) | marked)):
+        topic = record.channel.topic
+        if topic in tracks:
+            message = decode(record.channel, record.data, where)
+            tracks[topic].add(record.channel, record.log_ns, place, message)
+        for marker in markers:
+            if marker.track.topic == topic:
+                marker.add(place, record)
     videos = {key for key in videos if tracks[key].kind == VIDEO}
 
     track = tracks[camera.key]
@@ -204,25 +189,6 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
         empty=len(parts) - len(found),
         keyframes={key: _keyframes(tracks[key]) for key in videos},
     )
-
-
-def _scan(
-    bag: Bag, tracks: dict[str, TopicTrack], markers: "list[MarkerTrack]", headed: frozenset[str]
-) -> None:
-    """Read the times of the cameras' messages and the markers, in one pass."""
-    where = str(bag.path)
-    marked = frozenset(marker.track.topic for marker in markers)
-    short = (headed & tracks.keys()) - marked
-    for place, record in bag.records(RecordFilter(frozenset(tracks) | marked, heads=short)):
-        topic = record.channel.topic
-        if topic in short:
-            tracks[topic].add_head(record.channel, record.log_ns, place, record.data)
-        elif topic in tracks:
-            message = decode(record.channel, record.data, where)
-            tracks[topic].add(record.channel, record.log_ns, place, message)
-        for marker in markers:
-            if marker.track.topic == topic:
-                marker.add(place, record)
 
 
 def _events(

@@ -26,7 +26,7 @@ from hma_data.sources.bags.container import Channel, Record, RecordFilter, damag
 from hma_data.sources.bags.images import image_kind
 from hma_data.sources.bags.inspect import report
 from hma_data.sources.bags.messages import decode
-from hma_data.sources.bags.segments import Rows, Table, heads, parted
+from hma_data.sources.bags.segments import Rows, Table, parted
 from hma_data.sources.bags.topic_track import Column, TopicTrack, camera_stream, missing_topic, parse_key
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values
 from hma_data.sources.common.places import existing_path, nothing_there
@@ -228,14 +228,9 @@ class _EpisodeReading:
     def _scan(self) -> None:
         key = self._embodiment.source.instruction
         instruction = parse_key(key, self._counts, self._where) if key else None
-        read = {topic for topic, track in self._tracks.items() if track.columns}
-        read |= {instruction.topic} if instruction else set()
-        short = heads(self._bag, self._tracks.keys() - read)
-        for place, record in self._records(frozenset(self._tracks) | read, short):
+        read = {instruction.topic} if instruction else set()
+        for place, record in self._records(frozenset(self._tracks) | read):
             topic = record.channel.topic
-            if topic in short:
-                self._tracks[topic].add_head(record.channel, record.log_ns, place, record.data)
-                continue
             message = decode(record.channel, record.data, self._where)
             if instruction and topic == instruction.topic:
                 text = str(instruction.value(message, self._where))
@@ -250,15 +245,15 @@ class _EpisodeReading:
                 fault = f"its index counts {self._counts[topic]} messages of {topic}, it holds {len(track)}"
                 raise damaged(self._bag.path, fault)
 
-    def _records(self, topics: frozenset[str], short: frozenset[str]) -> Iterator[tuple[BagPlace, Record]]:
+    def _records(self, topics: frozenset[str]) -> Iterator[tuple[BagPlace, Record]]:
         """Yield the messages of the bag; of an episode in it, those of its time and those still in force."""
         segment, table = self._segment, self._table
         if segment is None or table is None:
-            return self._bag.records(RecordFilter(topics, heads=short, again=True))
+            return self._bag.records(RecordFilter(topics, again=True))
         first_ns, last_ns = max(segment.first_ns - table.reach_ns, 0), segment.last_ns + table.reach_ns
         plain = topics - table.keyframes.keys()
         held = plain - {self._embodiment.primary_camera.key}
-        within = RecordFilter(plain, first_ns, last_ns, short, again=True)
+        within = RecordFilter(plain, first_ns, last_ns, again=True)
         parts = [iter(self._bag.before(held, first_ns)), self._bag.records(within)]
         for topic in sorted(topics & table.keyframes.keys()):
             keyframes = table.keyframes[topic]

@@ -11,7 +11,6 @@ topic is `header` or `receive`.
 """
 
 import re
-import struct
 from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from hma_data.errors import EpisodeError
 from hma_data.registry.components import Component
 from hma_data.sources.bags.bag import Bag, BagPlace
 from hma_data.sources.bags.clocks import Clock, set_back, sorted_by
-from hma_data.sources.bags.container import Channel, Data
+from hma_data.sources.bags.container import Channel
 from hma_data.sources.bags.images import (
     VIDEO,
     Messages,
@@ -44,7 +43,6 @@ from hma_data.sources.bags.messages import (
     NAMES_FIRST,
     child,
     field_names,
-    head_stamp,
     is_list,
     is_message_list,
     numbers,
@@ -273,22 +271,6 @@ class TopicTrack:
     def __len__(self) -> int:
         return len(self._log_ns)
 
-    def add_head(self, channel: Channel, log_ns: int, place: BagPlace, data: Data) -> None:
-        """Add the next message, of which only the time in its first bytes is needed.
-
-        Raises:
-            EpisodeError: its bytes hold no such time.
-        """
-        stamp = head_stamp(channel)
-        try:
-            own_ns = stamp(data) if stamp else 0
-        except (struct.error, IndexError) as fault:
-            raise EpisodeError(
-                self.topic, f"a message is not a {channel.type}: it has {len(data)} bytes"
-            ) from fault
-        self.kind = image_kind(channel.type)
-        self._take(channel, log_ns, place, own_ns)
-
     def add(self, channel: Channel, log_ns: int, place: BagPlace, message: Any) -> None:
         """Add the next message; a message that cannot be decoded is None, and keeps its time of receipt."""
         for column in self.columns:
@@ -297,13 +279,10 @@ class TopicTrack:
             self.kind = content_kind(message, image_kind(channel.type))
         if message is not None and self.kind == VIDEO:
             self._keyframes.append(self._is_keyframe(message))
-        self._take(channel, log_ns, place, stamp_ns(message))
-
-    def _take(self, channel: Channel, log_ns: int, place: BagPlace, own_ns: int) -> None:
         if channel not in self.channels:
             self.channels.append(channel)
         self._log_ns.append(min(log_ns, INT64.max))
-        self._stamp_ns.append(min(max(own_ns, INT64.min), INT64.max))
+        self._stamp_ns.append(min(max(stamp_ns(message), INT64.min), INT64.max))
         self._places.extend((*place, self.channels.index(channel)))
 
     def _is_keyframe(self, message: Any) -> bool | None:
