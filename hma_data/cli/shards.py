@@ -250,7 +250,7 @@ def shards_split(
 
 @shards_app.command("restat")
 def shards_restat(folder: Folder, workers: Workers = None, json: Json = False) -> None:
-    """Compute the statistics again and write a new manifest; the shards stay as they are.
+    """Write the manifest and the other derived files anew from the shards, which stay as they are.
 
     Example: hma shards restat shards/my_arm
     """

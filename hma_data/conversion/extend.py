@@ -54,11 +54,6 @@ log = logging.getLogger(__name__)
 _OF_THE_CUT = ("recording", "shards", "hash", "extends")
 
 
-def hashes(facts: dict[str, Any]) -> set[str]:
-    """Return the hashes of the plans whose shards belong to a set: its own, and those it extends."""
-    return {facts["hash"], *facts.get("extends", ())}
-
-
 def ways(facts: dict[str, Any]) -> dict[str, Any]:
     """Return the facts that a set and its extension share; the episodes and --shard-frames may differ."""
     ways = {key: value for key, value in facts.items() if key not in _OF_THE_CUT}

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from hma_data.conversion.extend import hashes, ways
+from hma_data.conversion.extend import ways
 from hma_data.conversion.plan import Plan, differences
 from hma_data.errors import HMAError, OutputError, StorageAwayError
 from hma_data.shards.manifest import (
@@ -25,6 +25,7 @@ from hma_data.shards.manifest import (
     SPLITS,
     WORKING,
     Manifest,
+    plan_hashes,
     shard_sizes,
 )
 from hma_data.shards.schema import PLAN_HASH, Footer, read_metadata
@@ -106,7 +107,7 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
             done.add(name)
             continue
         footer = Footer.from_metadata(metadata, str(out / name))
-        if base and footer.plan.get("extends") and hashes(base.plan) & hashes(footer.plan):
+        if base and footer.plan.get("extends") and plan_hashes(base.plan) & plan_hashes(footer.plan):
             (out / name).unlink()  # of an unfinished extension that differs from this one
         else:
             raise other_plan(out, plan.facts, footer.plan)
@@ -121,7 +122,7 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
 def refuse_other(out: Path, plan: Plan) -> None:
     """Raise OutputError unless the set in a folder is of this plan, or of one that it extends."""
     theirs = Manifest.load(out).plan
-    if theirs["hash"] not in hashes(plan.facts):
+    if theirs["hash"] not in plan_hashes(plan.facts):
         raise other_plan(out, plan.facts, theirs)
 
 

@@ -21,7 +21,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from hma_data.conversion.extend import hashes
 from hma_data.conversion.output import finished_shards, remove_notes
 from hma_data.conversion.plan import Plan, Settings, ShardUnit, make_plan
 from hma_data.errors import HMAError, ShardError, UsageError
@@ -31,10 +30,11 @@ from hma_data.shards.manifest import (
     EPISODES,
     MANIFEST,
     SPLITS,
-    Gathered,
+    Derived,
     Manifest,
     derive,
     digest,
+    plan_hashes,
     seal_problem,
     shard_sizes,
     stored_embodiment,
@@ -49,7 +49,7 @@ from hma_data.shards.schema import (
     to_numpy,
     token_column,
 )
-from hma_data.shards.verify import REMAKE, check_rows
+from hma_data.shards.verify import REMAKE, shard_problems
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.storage.locks import locked
@@ -389,7 +389,7 @@ def restat(
     """Write the manifest and the other derived files from the shards; do not change the shards.
 
     An undamaged manifest states which shards belong to the set and their hashes. Without one, the shards
-    themselves must show that none is missing. Statistics are computed anew from the rows.
+    themselves must show that none is missing.
 
     Args:
         folder: str or path of the set, or its URI.
@@ -402,21 +402,15 @@ def restat(
         raise ShardError(folder, "is not a folder", "name the --out folder of an hma convert")
     with locked(folder):
         known = _whole_manifest(folder)
-        sha256 = {shard.path: shard.sha256 for shard in known.shards} if known else {}
         if known:
-            names, plan, source, embodiment = list(sha256), known.plan, known.source, known.embodiment
+            hashes = {shard.path: shard.sha256 for shard in known.shards}
+            own = known.embodiment, known.tokenizer, known.plan, known.source
+            derived = derive(folder, list(hashes), *own, hashes)
         else:
-            names, plan, source, embodiment = _as_found(folder)
-        spec = TokenizerSpec.from_json(plan["tokenizer"])
-        derived = derive(folder, names, embodiment, spec, plan, source, sha256)
-        manifest = derived.manifest
-        problems, rows = check_rows(folder, manifest, workers, on_progress)
-        if problems:
+            derived = _as_found(folder)
+        if problems := shard_problems(folder, derived.manifest, workers, on_progress):
             more = f", and {len(problems) - 1} more problems" if len(problems) > 1 else ""
             raise ShardError("", problems[0] + more)
-        if not manifest.layout.strided:  # footers of strided sets also count steps that are not rows
-            stats = {name: merged.summary() for name, merged in rows.items()}
-            derived = replace(derived, manifest=replace(manifest, stats=stats or manifest.stats))
         return derived.write(folder)
 
 
@@ -427,47 +421,36 @@ def _whole_manifest(folder: Path) -> Manifest | None:
     return None
 
 
-def _as_found(folder: Path) -> tuple[list[str], dict[str, Any], str, Embodiment]:
-    """Return shards, plan, source and embodiment of a set without a manifest to trust."""
+def _as_found(folder: Path) -> Derived:
+    """Derive the files of a set without a manifest to trust; its shards must show that none is missing."""
     names = sorted(shard_sizes(folder))
     if not names:
         raise ShardError(folder, "holds no shards", "name the --out folder of an hma convert")
     footers = [read_footer(folder / name)[0] for name in names]
     plan = max((footer.plan for footer in footers), key=lambda plan: len(plan.get("extends", ())))
     for name, footer in zip(names, footers):
-        if footer.plan["hash"] not in hashes(plan) or footer.name != name:
+        if footer.plan["hash"] not in plan_hashes(plan) or footer.name != name:
             raise ShardError(folder / name, "is of another conversion than the shards beside it", REMAKE)
-    gathered = Gathered(_source(folder, footers))
-    for footer in footers:
-        gathered.add(footer)
+    embodiment, spec = stored_embodiment(folder), TokenizerSpec.from_json(plan["tokenizer"])
+    listed = _listed(folder)
+    own = {row.episode_index for footer in footers for row in footer.episodes if not row.source}
+    said = (row["source"] for row in listed.to_pylist() if row["episode_index"] in own) if listed else ()
+    derived = derive(folder, names, embodiment, spec, plan, next(iter(said), "unknown"))
     counts = Counter(footer.split for footer in footers)
     gapless = names == [f"{split}/shard-{i:05d}.parquet" for split in SPLITS for i in range(counts[split])]
     # the plan's digest holds unless an episode is in quarantine
     cut = [(name, footer.table["episode_index"].to_pylist()) for name, footer in zip(names, footers)]
-    if not gapless or not (plan["shards"] == digest(cut) or _lists(folder, gathered)):
+    is_listed = listed is not None and listed.equals(derived.episodes)
+    if not gapless or not (plan["shards"] == digest(cut) or is_listed):
         raise ShardError(folder, "cannot tell from its files whether all its shards are there", CONVERT_AGAIN)
-    embodiment = stored_embodiment(folder)
     if embodiment.digest != plan["embodiment_hash"]:
-        raise ShardError(
-            folder / EMBODIMENT, "is not the embodiment the shards were made with", CONVERT_AGAIN
-        )
-    return names, plan, gathered.source, embodiment
+        fault = "is not the embodiment the shards were made with"
+        raise ShardError(folder / EMBODIMENT, fault, CONVERT_AGAIN)
+    return derived
 
 
-def _lists(folder: Path, gathered: Gathered) -> bool:
-    """Check whether episodes.parquet lists the episodes of these footers and no others."""
-    try:
-        return bool(pq.read_table(parquet_input(folder / EPISODES)).equals(gathered.episodes()))
-    except (OSError, pa.ArrowException):
-        return False
-
-
-def _source(folder: Path, footers: list[Footer]) -> str:
-    """Return the URI the recordings came from, read from episodes.parquet; shards do not state it."""
-    own = {row.episode_index for footer in footers for row in footer.episodes if not row.source}
+def _listed(folder: Path) -> pa.Table | None:
+    """Read episodes.parquet, which alone states the URI of the recordings; None where it cannot be read."""
     with suppress(OSError, pa.ArrowException):
-        table = pq.read_table(parquet_input(folder / EPISODES), columns=["episode_index", "source"])
-        for row in table.to_pylist():
-            if row["episode_index"] in own:
-                return str(row["source"])
-    return "unknown"
+        return pq.read_table(parquet_input(folder / EPISODES))
+    return None

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from itertools import batched
 from pathlib import Path
 from typing import Any
 
@@ -274,17 +275,34 @@ def plan_hash(plan: dict[str, Any]) -> str:
     return digest({key: value for key, value in plan.items() if key != "hash"})
 
 
-class Gathered:
-    """The combined facts of a set's footers, added in the manifest's order; the footers are not kept."""
+def plan_hashes(plan: dict[str, Any]) -> set[str]:
+    """Return the hashes of the plans whose shards belong to a set: its own, and those it extends."""
+    return {plan["hash"], *plan.get("extends", ())}
 
-    def __init__(self, source: str) -> None:
-        self.source = source
-        self.stats: dict[str, Stats] = {}
-        self.refused: list[Refused] = []
-        self._tables: list[pa.Table] = []
 
-    def add(self, footer: Footer) -> None:
-        """Add the next shard's footer."""
+@dataclass
+class Derived:
+    """Everything of a set that is derived from its shards' footers; the footers themselves are not kept.
+
+    Attributes:
+        plan, embodiment, tokenizer, source: of the set, as in its manifest.
+        shards: as the manifest lists them, in plan order.
+        stats: "action" and, if recorded, "state", over train.
+        refused: the episodes in quarantine.
+    """
+
+    plan: dict[str, Any]
+    embodiment: Embodiment
+    tokenizer: TokenizerSpec
+    source: str
+    shards: list[ShardFile] = field(default_factory=list)
+    stats: dict[str, Stats] = field(default_factory=dict)
+    refused: list[Refused] = field(default_factory=list)
+    _tables: list[pa.Table] = field(default_factory=list)
+
+    def add(self, shard: ShardFile, footer: Footer) -> None:
+        """Add the next shard."""
+        self.shards.append(shard)
         self._tables.append(footer.table)
         self.refused += footer.quarantine
         for name, stats in footer.stats.items():
@@ -292,6 +310,7 @@ class Gathered:
             if footer.split == "train":
                 merged.merge(stats)
 
+    @cached_property
     def episodes(self) -> pa.Table:
         """Return the table of episodes.parquet, in order of episode_index."""
         table = pa.concat_tables([schema_of(EpisodeRow).empty_table(), *self._tables])
@@ -303,6 +322,7 @@ class Gathered:
         ]
         return pa.table(columns, schema=_EPISODE_SCHEMA)
 
+    @property
     def quarantine(self) -> str:
         """Return the text of quarantine.jsonl, in order of the ids."""
         lines = []
@@ -311,31 +331,35 @@ class Gathered:
             lines.append(json.dumps({"id": values.pop("id"), "uri": self.source, **values}) + "\n")
         return "".join(lines)
 
-    def summaries(self) -> dict[str, dict[str, Any]]:
-        """Return the manifest's `stats`, over train."""
-        return {name: stats.summary() for name, stats in self.stats.items()}
+    @cached_property
+    def manifest(self) -> Manifest:
+        """Return the manifest; its `files` are filled in when the other files are written."""
+        return Manifest(
+            plan=self.plan,
+            embodiment=self.embodiment,
+            tokenizer=self.tokenizer,
+            shards=tuple(self.shards),
+            splits={split: self._totals(split) for split in SPLITS},
+            stats={name: stats.summary() for name, stats in self.stats.items()},
+            quarantined=len(self.refused),
+            source=self.source,
+        )
 
-
-@dataclass(frozen=True)
-class Derived:
-    """Everything of a set that is derived from its shards, before it is written.
-
-    Attributes:
-        manifest: the manifest; its `files` are filled in when the other files are written.
-        episodes: content of episodes.parquet.
-        quarantine: content of quarantine.jsonl.
-    """
-
-    manifest: Manifest
-    episodes: pa.Table
-    quarantine: str
+    def _totals(self, split: str) -> dict[str, int]:
+        rows = self.episodes.filter(pc.equal(self.episodes["split"], split))
+        return {
+            "episodes": len(rows),
+            "frames": pc.sum(rows["length"]).as_py() or 0,
+            "rows": pc.sum(rows["rows"]).as_py() or 0,
+            "shards": sum(shard.split == split for shard in self.shards),
+        }
 
     def write(self, folder: Path) -> Manifest:
         """Write all files except the shards, the manifest last, and return the manifest."""
         with atomic_path(folder / EPISODES) as part:
             pq.write_table(self.episodes, part, compression="zstd")
         write_atomic(folder / QUARANTINE, self.quarantine)
-        write_atomic(folder / EMBODIMENT, self.manifest.embodiment.to_yaml())
+        write_atomic(folder / EMBODIMENT, self.embodiment.to_yaml())
         files = {name: file_sha256(folder / name) for name in (EPISODES, QUARANTINE, EMBODIMENT)}
         manifest = replace(self.manifest, files=files)
         write_atomic(folder / MANIFEST, manifest.to_text())
@@ -359,55 +383,23 @@ def derive(
         source: URI that the recordings came from.
         hashes: sha256 of shards whose sha256 is known, by name; they are not computed again.
     """
-    gathered = Gathered(source)
-    files: list[ShardFile] = []
-    plans = {plan["hash"], *plan.get("extends", ())}
-    for file, footer in _described(folder, names, hashes or {}):
-        if footer.plan["hash"] not in plans:
-            fault = f"is of the plan {footer.plan['hash']}, the set of {plan['hash']}: two jobs wrote here"
-            remedy = "start one of them anew with --overwrite, the other with another --out"
-            raise ShardError(folder / file.path, fault, remedy)
-        files.append(file)
-        gathered.add(footer)
-    episodes = gathered.episodes()
-    manifest = Manifest(
-        plan=plan,
-        embodiment=embodiment,
-        tokenizer=tokenizer,
-        shards=tuple(files),
-        splits={split: split_totals(episodes, files, split) for split in SPLITS},
-        stats=gathered.summaries(),
-        quarantined=len(gathered.refused),
-        source=source,
-    )
-    return Derived(manifest, episodes, gathered.quarantine())
-
-
-def _described(
-    folder: Path, names: Sequence[str], hashes: Mapping[str, str]
-) -> Iterator[tuple[ShardFile, Footer]]:
-    """Yield each shard as the manifest lists it, with its footer."""
+    known = hashes or {}
+    derived = Derived(plan, embodiment, tokenizer, source)
 
     def look(name: str) -> tuple[pq.FileMetaData, int, str]:
         path = folder / name
-        return read_metadata(path), path.stat().st_size, hashes.get(name) or file_sha256(path)
+        return read_metadata(path), path.stat().st_size, known.get(name) or file_sha256(path)
 
     with ThreadPoolExecutor(HASHERS) as pool:
-        for start in range(0, len(names), 4 * HASHERS):  # few footers are in memory at a time
-            part = names[start : start + 4 * HASHERS]
-            for name, (metadata, size, sha256) in zip(part, pool.map(look, part)):
+        for some in batched(names, 4 * HASHERS):  # few footers are in memory at a time
+            for name, (metadata, size, sha256) in zip(some, pool.map(look, some)):
                 footer = Footer.from_metadata(metadata.metadata, str(folder / name))
+                if footer.plan["hash"] not in plan_hashes(plan):
+                    theirs = footer.plan["hash"]
+                    fault = f"is of the plan {theirs}, the set of {plan['hash']}: two jobs wrote here"
+                    remedy = "start one of them anew with --overwrite, the other with another --out"
+                    raise ShardError(folder / name, fault, remedy)
                 rows = tuple(group_rows(metadata))
-                file = ShardFile(name, footer.split, sum(rows), len(footer.episodes), size, sha256, rows)
-                yield file, footer
-
-
-def split_totals(episodes: pa.Table, files: Sequence[ShardFile], split: str) -> dict[str, int]:
-    """Return the counts of one split, as the manifest states them."""
-    rows = episodes.filter(pc.equal(episodes["split"], split))
-    return {
-        "episodes": len(rows),
-        "frames": pc.sum(rows["length"]).as_py() or 0,
-        "rows": pc.sum(rows["rows"]).as_py() or 0,
-        "shards": sum(file.split == split for file in files),
-    }
+                shard = ShardFile(name, footer.split, sum(rows), len(footer.episodes), size, sha256, rows)
+                derived.add(shard, footer)
+    return derived

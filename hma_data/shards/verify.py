@@ -9,7 +9,7 @@ N rows of a shard, A values of an action.
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from itertools import batched
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +30,12 @@ from hma_data.shards.manifest import (
     QUARANTINE,
     SPLITS,
     WORKING,
-    Gathered,
+    Derived,
     Manifest,
     ShardFile,
     damaged_files,
     plan_hash,
     seal_problem,
-    split_totals,
     stored_embodiment,
 )
 from hma_data.shards.schema import Footer, read_footer, to_numpy
@@ -77,15 +76,11 @@ def verify(
         return [_line(unreadable, folder / MANIFEST)]
     restat = f"hma shards restat {folder} writes it anew from the shards"
     found = [f"{folder / MANIFEST}: {fault} — {restat}"] if fault else []
-    gathered, rows = Gathered(manifest.source), dict[str, Stats]()
-    whole = True
-    for checked in _checked(folder, manifest, workers, quick, on_progress):
-        found += checked.problems
-        if checked.footer is None or checked.problems:
-            whole = False
-            continue
-        gathered.add(checked.footer)
-        _merge_train(rows, checked)
+    derived = Derived(manifest.plan, manifest.embodiment, manifest.tokenizer, manifest.source)
+    for shard, problems, footer in _checked(folder, manifest, workers, quick, on_progress):
+        found += problems
+        if footer is not None and not problems:
+            derived.add(shard, footer)
     found += _foreign(folder, manifest)
     damaged = damaged_files(folder, manifest)
     found += [
@@ -95,66 +90,48 @@ def verify(
     try:
         if folder / EMBODIMENT not in damaged and stored_embodiment(folder) != manifest.embodiment:
             found.append(f"{folder / EMBODIMENT}: is another embodiment than the manifest's — {restat}")
-        if whole and not damaged:
-            found += _set_problems(folder, manifest, gathered, rows, restat)
+        if len(derived.shards) == len(manifest.shards) and not damaged:
+            found += _set_problems(folder, manifest, derived, restat)
     except (HMAError, OSError, pa.ArrowException) as unreadable:
         found.append(_line(unreadable, folder))
     return found
 
 
-def check_rows(
+def shard_problems(
     folder: Path, manifest: Manifest, workers: int | None, on_progress: OnProgress
-) -> tuple[list[str], dict[str, Stats]]:
-    """Return what is wrong with the shards, and the statistics of the train shards' rows."""
-    found: list[str] = []
-    rows: dict[str, Stats] = {}
-    for checked in _checked(folder, manifest, workers, False, on_progress):
-        found += checked.problems
-        _merge_train(rows, checked)
-    return found, rows
+) -> list[str]:
+    """Return everything wrong with the shards of a set, one line for each problem."""
+    checked = _checked(folder, manifest, workers, False, on_progress)
+    return [problem for _, problems, _ in checked for problem in problems]
 
 
 # -- one shard
 
 
-@dataclass
-class Checked:
-    """The result of checking one shard.
+def check_shard(
+    folder: Path, shard: ShardFile, manifest: Manifest, quick: bool
+) -> tuple[list[str], Footer | None]:
+    """Return everything wrong with one shard, and its footer, None where it cannot be read.
 
-    Attributes:
-        problems: one line for each problem.
-        footer: None if it cannot be read.
-        stats: statistics of its rows, "action" and "state"; empty for a quick check.
+    A `quick` check looks at size and footer only.
     """
-
-    problems: list[str] = field(default_factory=list)
-    footer: Footer | None = None
-    stats: dict[str, Stats] = field(default_factory=dict)
-
-
-def check_shard(folder: Path, shard: ShardFile, manifest: Manifest, quick: bool) -> Checked:
-    """Return everything wrong with one shard; `quick` checks size and footer only."""
     path = folder / shard.path
     try:
         if not path.is_file():
-            return Checked([f"{path}: is missing — run the same hma convert again"])
+            return [f"{path}: is missing — run the same hma convert again"], None
         if (size := path.stat().st_size) != shard.bytes:
-            return Checked([f"{path}: has {size:,} bytes, the manifest says {shard.bytes:,} — {REMAKE}"])
+            return [f"{path}: has {size:,} bytes, the manifest says {shard.bytes:,} — {REMAKE}"], None
         if not quick and file_sha256(path) != shard.sha256:
             fault = "its bytes changed since the manifest was written (sha256 differs)"
-            return Checked([f"{path}: {fault} — {REMAKE}"])
+            return [f"{path}: {fault} — {REMAKE}"], None
         footer, row_groups = read_footer(path)
         found = _footer_problems(path, shard, footer, row_groups, manifest)
-        stats: dict[str, Stats] = {}
         if not quick and not found:
             columns, found = _read_rows(path, manifest)
-            found = found or _row_problems(columns, footer, manifest)
-        if not quick and not found:
-            stats = _row_stats(columns, footer, manifest)
-            found = _stats_problems(columns, footer, stats, manifest)
-        return Checked([f"{path}: {problem} — {REMAKE}" for problem in found], footer, stats)
+            found = found or _row_problems(columns, footer) or _stats_problems(columns, footer, manifest)
+        return [f"{path}: {problem} — {REMAKE}" for problem in found], footer
     except (HMAError, pa.ArrowException, OSError, ValueError) as unreadable:
-        return Checked([_line(unreadable, path)])
+        return [_line(unreadable, path)], None
 
 
 def _line(fault: Exception, path: Path) -> str:
@@ -222,7 +199,7 @@ def _read_rows(path: Path, manifest: Manifest) -> tuple[dict[str, NDArray[Any]],
     return columns, found
 
 
-def _row_problems(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Manifest) -> list[str]:
+def _row_problems(columns: dict[str, NDArray[Any]], footer: Footer) -> list[str]:
     """Check rows against the footer: whole episodes, frames that count up, zeros where nothing is known."""
     found: list[str] = []
     length = to_numpy(footer.table["length"])
@@ -250,14 +227,13 @@ def _row_stats(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Manif
     return merged
 
 
-def _stats_problems(
-    columns: dict[str, NDArray[Any]], footer: Footer, rows: dict[str, Stats], manifest: Manifest
-) -> list[str]:
+def _stats_problems(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Manifest) -> list[str]:
     """Return where the footer's statistics are not those of its rows.
 
     The footer's statistics of a strided set count steps that its rows lack: a few steps at an episode's end,
     states between the rows, and the known steps of a chunk that is not wholly known.
     """
+    rows = _row_stats(columns, footer, manifest)
     found = []
     stride = manifest.frame_stride
     for name, own in rows.items():
@@ -271,19 +247,17 @@ def _stats_problems(
                 found.append(f"{name} statistics in its footer {counted}")
             elif own.count and ((own.min < said.min).any() or (own.max > said.max).any()):
                 found.append(f"{name} statistics in its footer are narrower than its rows")
-        elif not _same_stats(said.summary(), own.summary(), quantiles=False):
+        elif not _same_stats(said.summary(), own.summary()):
             found.append(f"{name} statistics in its footer are not those of its rows")
     return found
 
 
-def _same_stats(a: dict[str, Any], b: dict[str, Any], quantiles: bool = True) -> bool:
-    """Check whether two summaries are equal up to the rounding of sums; quantiles must be equal exactly."""
+def _same_stats(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    """Check whether two summaries are equal up to the rounding of sums, apart from their quantiles."""
     if any(a[key] != b[key] for key in ("count", "min", "max")):
         return False
     scale = 1e-9 * np.maximum(np.abs(a["min"]), np.abs(a["max"])) + 1e-300
-    if any((np.abs(np.subtract(a[name], b[name])) > scale).any() for name in ("mean", "std")):
-        return False
-    return not quantiles or bool(a["quantiles"] == b["quantiles"])
+    return not any((np.abs(np.subtract(a[name], b[name])) > scale).any() for name in ("mean", "std"))
 
 
 # -- the set
@@ -301,27 +275,20 @@ def _plan_problem(manifest: Manifest) -> str:
     return ""
 
 
-def _merge_train(rows: dict[str, Stats], checked: Checked) -> None:
-    if checked.footer and checked.footer.split == "train":
-        for name, stats in checked.stats.items():
-            rows.setdefault(name, Stats.empty(len(stats.mean))).merge(stats)
-
-
 def _checked(
     folder: Path, manifest: Manifest, workers: int | None, quick: bool, on_progress: OnProgress
-) -> Iterator[Checked]:
-    """Check each shard and yield the results in the manifest's order."""
+) -> Iterator[tuple[ShardFile, list[str], Footer | None]]:
+    """Yield each shard in the manifest's order, what is wrong with it, and its footer."""
     workers = workers or usable_cores()
     total = sum(shard.bytes for shard in manifest.shards)
-    done, batch = 0, 4 * workers
+    done = 0
     with ThreadPoolExecutor(workers) as pool:
-        for start in range(0, len(manifest.shards), batch):
-            shards = manifest.shards[start : start + batch]
+        for shards in batched(manifest.shards, 4 * workers):  # few footers are in memory at a time
             results = pool.map(lambda shard: check_shard(folder, shard, manifest, quick), shards)
-            for shard, checked in zip(shards, results):
+            for shard, (problems, footer) in zip(shards, results):
                 done += shard.bytes
                 on_progress(done, total)
-                yield checked
+                yield shard, problems, footer
 
 
 def _foreign(folder: Path, manifest: Manifest) -> Iterator[str]:
@@ -339,28 +306,22 @@ def _foreign(folder: Path, manifest: Manifest) -> Iterator[str]:
             yield f"{path}: is not in the manifest — move it out of the shard set"
 
 
-def _set_problems(
-    folder: Path, manifest: Manifest, gathered: Gathered, rows: dict[str, Stats], restat: str
-) -> Iterator[str]:
+def _set_problems(folder: Path, manifest: Manifest, derived: Derived, restat: str) -> Iterator[str]:
     """Yield problems: derived files that differ from the footers, episodes twice or in both splits."""
-    expected = gathered.episodes()
-    yield from _episode_problems(folder, expected)
-    if not pq.read_table(parquet_input(folder / EPISODES)).equals(expected):
+    yield from _episode_problems(folder, derived.episodes)
+    if not pq.read_table(parquet_input(folder / EPISODES)).equals(derived.episodes):
         yield f"{folder / EPISODES}: differs from the shards' footers — {restat}"
-    if (folder / QUARANTINE).read_bytes() != gathered.quarantine().encode():
+    if (folder / QUARANTINE).read_bytes() != derived.quarantine.encode():
         yield f"{folder / QUARANTINE}: differs from the shards' footers — {restat}"
-    where = folder / MANIFEST
-    for split in SPLITS:
-        if manifest.splits.get(split) != split_totals(expected, manifest.shards, split):
+    where, own = folder / MANIFEST, derived.manifest
+    for split, counts in own.splits.items():
+        if manifest.splits.get(split) != counts:
             yield f"{where}: its counts of split {split} are not those of the shards — {restat}"
-    if manifest.quarantined != len(gathered.refused):
-        counted = f"says {manifest.quarantined} are in quarantine, the shards say {len(gathered.refused)}"
+    if manifest.quarantined != own.quarantined:
+        counted = f"says {manifest.quarantined} are in quarantine, the shards say {own.quarantined}"
         yield f"{where}: {counted} — {restat}"
-    footers = gathered.summaries()
-    own = {name: stats.summary() for name, stats in rows.items()} or footers
-    for name in footers.keys() | manifest.stats.keys():
-        said = manifest.stats.get(name)
-        if not said or not any(name in s and _same_stats(said, s[name]) for s in (footers, own)):
+    for name in own.stats.keys() | manifest.stats.keys():
+        if manifest.stats.get(name) != own.stats.get(name):
             yield f"{where}: its statistics of {name} are not those of the train shards — {restat}"
 
 

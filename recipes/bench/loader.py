@@ -44,7 +44,7 @@ def _timed(work: Callable[..., dict[str, Any]], name: str, *given: Any) -> dict[
 
 def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
     """Write a shard set of random tokens and actions; only its first shard is a file of its own."""
-    from hma_data.shards.manifest import Derived, Gathered, Manifest, ShardFile, plan_hash, split_totals
+    from hma_data.shards.manifest import Derived, ShardFile, plan_hash
     from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema, read_footer
     from hma_data.shards.stats import Stats
     from hma_data.shards.writer import EpisodeRows, ShardWriter
@@ -83,7 +83,7 @@ def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
     first = folder / names[0]
     footer, row_groups = read_footer(first)
     sha256, size = file_sha256(first), first.stat().st_size
-    gathered, files = Gathered("generated"), []
+    derived = Derived(plan, robot, spec, "generated")
     for shard, name in enumerate(names):
         if shard:
             os.link(first, folder / name)
@@ -91,12 +91,9 @@ def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
             replace(row, episode_index=shard * each + i, id=str(shard * each + i), shard=name)
             for i, row in enumerate(footer.episodes)
         )
-        gathered.add(Footer(plan, name, "train", rows, (), footer.stats))
-        files.append(ShardFile(name, "train", sum(row_groups), len(rows), size, sha256, tuple(row_groups)))
-    table = gathered.episodes()
-    splits = {split: split_totals(table, files, split) for split in ("train", "val")}
-    manifest = Manifest(plan, robot, spec, tuple(files), splits, gathered.summaries(), 0, "generated")
-    Derived(manifest, table, "").write(folder)
+        file = ShardFile(name, "train", sum(row_groups), len(rows), size, sha256, tuple(row_groups))
+        derived.add(file, Footer(plan, name, "train", rows, (), footer.stats))
+    derived.write(folder)
     return folder
 
 
