@@ -1,12 +1,12 @@
-"""Show a shard set: in figures, and as images decoded from its tokens with the actions drawn as curves.
+"""Show a shard set: in figures, and as images decoded from its tokens with the actions drawn below.
 
-`describe` needs the manifest and episodes.parquet alone. T rows of an episode, A values of an action.
+`describe` needs the manifest and episodes.parquet alone.
 """
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from itertools import batched, chain
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.images import describe_resize, opencv
 from hma_data.episodes.sheets import (
-    INK,
+    GAP,
+    LABEL,
     PAPER,
     Images,
     fitted,
-    fitted_names,
-    text_width,
+    grid,
+    with_actions,
     write_mp4,
     write_png,
     write_text,
@@ -36,28 +37,8 @@ from hma_data.sources.common.survey import sampled
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
-THUMB_SIDE, GAP, LABEL_HEIGHT, STRIP_HEIGHT, FILM_SIDE = (
-    144,
-    4,
-    18,
-    22,
-    256,
-)  # pixels; STRIP_HEIGHT is the height of a strip in the sheet
+THUMB_SIDE, FILM_SIDE = 144, 256  # pixels of an image in the sheet and in the video
 FRAMES_DECODED = 16  # frames decoded at a time
-LINE_COLOUR, CURSOR_COLOUR, ZERO_COLOUR, UNKNOWN_COLOUR = (
-    (0, 114, 178),
-    (213, 94, 0),
-    (200, 200, 200),
-    (225, 225, 225),
-)
-MOST_STRIPS = 16  # strips; of further values only the number is shown
-LABELS_WIDTH, NAMES_WIDTH, FOOT_HEIGHT = (
-    240,
-    120,
-    16,
-)  # pixels left of the strips, of the names in them, and below the strips
-CURVES_WIDER = 232  # pixels by which the curves of the video are wider than its frame
-TEXT_SCALE = 0.36  # scale of the text beside the strips
 
 
 # -- in figures
@@ -128,94 +109,6 @@ def _episodes(shards: ShardSet) -> dict[str, Any]:
         "flags": flag_totals(table["flags"]),
         "quarantine": dict(Counter(str(item.get("type")) for item in shards.refused())),
     }
-
-
-# -- actions as curves
-
-
-@dataclass(frozen=True)
-class Curves:
-    """The actions of one episode, and how to draw them.
-
-    Attributes:
-        values: (T, A).
-        known: (T,) bool, or None.
-        low, high: (A,) range of each value, over the whole set.
-        names: A names.
-        seconds: time from the first row to the last.
-        width, height: size of the image in pixels.
-    """
-
-    values: NDArray[np.float32]
-    known: NDArray[np.bool_] | None
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    names: list[str]
-    seconds: float
-    width: int
-    height: int
-
-    @cached_property
-    def panel(self) -> Images:
-        """Draw all curves without a cursor; (height, width, 3)."""
-        image = np.full((self.height, self.width, 3), PAPER, np.uint8)
-        shown = min(self.values.shape[1], MOST_STRIPS)
-        rest = self.values.shape[1] - shown
-        tall = (self.height - FOOT_HEIGHT) // max(shown, 1)
-        for dim in range(shown):
-            self._strip(image, dim, dim * tall, tall)
-        text = f"0 to {self.seconds:.1f} s" + (f", {rest} more values" if rest else "")
-        write_text(image, text, (LABELS_WIDTH, self.height - 4), TEXT_SCALE)
-        return image
-
-    def at(self, row: int) -> Images:
-        """Return the panel with a cursor at a row."""
-        image = self.panel.copy()
-        x = self._x(np.array([row]))[0]
-        image[: self.height - FOOT_HEIGHT, max(x - 1, 0) : x + 1] = CURSOR_COLOUR
-        return image
-
-    def marked(self, rows: NDArray[np.int64]) -> Images:
-        """Return the panel with a tick below each of these rows."""
-        image = self.panel.copy()
-        for x in self._x(rows):
-            image[self.height - FOOT_HEIGHT - 2 : self.height - FOOT_HEIGHT + 3, x - 1 : x + 2] = (
-                CURSOR_COLOUR
-            )
-        return image
-
-    def _x(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        last = max(len(self.values) - 1, 1)
-        return (LABELS_WIDTH + rows / last * (self.width - LABELS_WIDTH - 6)).round().astype(np.int64)
-
-    def _strip(self, image: Images, dim: int, top: int, tall: int) -> None:
-        cv2 = opencv()
-        inner = max(tall - 5, 3)
-        span = self.high[dim] - self.low[dim]
-        scale = 1 / span if span > 0 else 0.0
-
-        def y(values: NDArray[np.floating]) -> NDArray[np.int64]:
-            share = np.clip((values - self.low[dim]) * scale, 0, 1) if span > 0 else np.full(len(values), 0.5)
-            return (top + 2 + (1 - share) * inner).round().astype(np.int64)
-
-        x = self._x(np.arange(len(self.values)))
-        if self.known is not None:
-            for at in x[~self.known]:
-                image[top + 2 : top + 3 + inner, max(at - 1, 0) : at + 2] = UNKNOWN_COLOUR
-        if self.low[dim] <= 0 <= self.high[dim]:
-            image[y(np.zeros(1))[0], LABELS_WIDTH : self.width - 6] = ZERO_COLOUR
-        points = np.stack([x, y(self.values[:, dim])], axis=1).astype(np.int32).reshape(-1, 1, 2)
-        cv2.polylines(image, [points], False, LINE_COLOUR, 1, cv2.LINE_AA)
-        image[top + 2 : top + 3 + inner, LABELS_WIDTH - 1] = INK
-        if tall >= 10:
-            height = top + tall // 2 + 4
-            limits = f"{self.low[dim]:.2g} to {self.high[dim]:.2g}"
-            write_text(image, self._names[dim], (4, height), TEXT_SCALE)
-            write_text(image, limits, (LABELS_WIDTH - 6 - text_width(limits, TEXT_SCALE), height), TEXT_SCALE)
-
-    @cached_property
-    def _names(self) -> list[str]:
-        return fitted_names(self.names[:MOST_STRIPS], NAMES_WIDTH - 8, TEXT_SCALE)
 
 
 # -- in images
@@ -306,8 +199,7 @@ def preview(
     total = sum(min(row["length"], frames) for row in rows)
 
     def film() -> Iterator[Images]:
-        drawn = (frame for one in seen for frame in one.film(frames))
-        for done, frame in enumerate(drawn, start=1):
+        for done, frame in enumerate(chain.from_iterable(one.film(frames) for one in seen), start=1):
             yield frame
             on_progress(done, total)
 
@@ -333,11 +225,9 @@ class _Seen:
         self._tokens = {camera: view[token_column(shards.spec)[0]] for camera, view in views.items()}
         values = views[cameras[0]]
         self._actions = values["action"][:, : shards.embodiment.action_dim]  # the first action of a chunk
-        self._known = values.get("action_known")
-        self._seconds = float(values["timestamp"][-1])
         self._length = row["length"]
         success = {True: "success", False: "failure", None: ""}[row["success"]]
-        length = f"{row['length']} frames, {self._seconds:.1f} s"
+        length = f"{row['length']} frames, {float(values['timestamp'][-1]):.1f} s"
         words = [row["id"], row["split"], length, row["instruction"], success]
         self._recorded: Recorded | None = None
         try:
@@ -356,53 +246,40 @@ class _Seen:
             found[f"{named}decoded"] = self._tokenizer.decode(self._shards.tokens(tokens[rows]))
         return found
 
-    def _curves(self, width: int, height: int) -> Curves:
+    def _with_actions(self, images: Images, rows: NDArray[np.int64]) -> Images:
+        """Return the images (n, H, W, 3) of some rows with their actions as bars below them."""
         stats = self._shards.manifest.stats["action"]
         low, high = np.array(stats["min"]), np.array(stats["max"])
-        names = self._shards.embodiment.action.names()
-        known = self._known
-        return Curves(self._actions, known, low, high, names, self._seconds, width, height)
+        return with_actions(images, self._actions[rows], low, high, self._shards.embodiment.action.names())
 
     def sheet(self, columns: int) -> Images:
-        """Return (H, W, 3): the label, two rows of frames a camera, and the actions of the whole episode."""
+        """Return (H, W, 3): the label, two rows of frames a camera, and the actions at these frames."""
         picks = np.unique(np.linspace(0, self._length - 1, columns).astype(int))
-        width = columns * (THUMB_SIDE + GAP) + GAP
-        shown = min(self._actions.shape[1], 16)
-        curves = self._curves(width, 16 + max(shown * STRIP_HEIGHT, 40))
-        strips = []
-        for number, (name, images) in enumerate(self._images(picks).items()):
-            strip = np.full((LABEL_HEIGHT + THUMB_SIDE + GAP, width, 3), PAPER, np.uint8)
-            words = "   ".join([name, *([] if number else [self.label])])
-            write_text(strip, fitted(words, width - 2 * GAP), (GAP, LABEL_HEIGHT - 5))
-            for place, image in enumerate(images):
-                left = GAP + place * (THUMB_SIDE + GAP)
-                strip[LABEL_HEIGHT : LABEL_HEIGHT + THUMB_SIDE, left : left + THUMB_SIDE] = _resized(
-                    image, THUMB_SIDE
-                )
-            strips.append(strip)
-        return np.concatenate([*strips, curves.marked(picks), np.full((2, width, 3), INK, np.uint8)])
+        shown = {name: _resized(images, THUMB_SIDE) for name, images in self._images(picks).items()}
+        labels = list(shown)
+        labels[0] += f"   {self.label}"
+        bars = self._with_actions(np.zeros((len(picks), 0, THUMB_SIDE, 3), np.uint8), picks)
+        sheet = np.concatenate([grid([list(view) for view in shown.values()], labels), grid([list(bars)])])
+        wider = columns * (THUMB_SIDE + GAP) + GAP - sheet.shape[1]  # where the episode has few frames
+        return np.pad(sheet, ((0, 0), (0, wider), (0, 0)), constant_values=PAPER[0])
 
     def film(self, most: int) -> Iterator[Images]:
-        """Yield (H, W, 3) for each frame: its images, and the actions with a cursor at its time."""
-        curves = self._curves(FILM_SIDE + CURVES_WIDER, FILM_SIDE)
-        for start in range(0, min(self._length, most), FRAMES_DECODED):
-            rows = np.arange(start, min(start + FRAMES_DECODED, self._length, most))
+        """Yield (H, W, 3) for each frame: the label, its images side by side, and its actions."""
+        for some in batched(range(min(self._length, most)), FRAMES_DECODED):
+            rows = np.array(some)
             shown = self._images(rows)
-            for row, *images in zip(rows, *shown.values()):
-                parts = [*(_resized(image, FILM_SIDE) for image in images), curves.at(int(row))]
-                film = np.concatenate(parts, axis=1)
-                bar = np.full((2 * LABEL_HEIGHT, film.shape[1], 3), PAPER, np.uint8)
-                write_text(bar, fitted(self.label, film.shape[1] - 2 * GAP), (GAP, LABEL_HEIGHT - 5))
-                for place, name in enumerate(shown):
-                    write_text(
-                        bar,
-                        fitted(name, FILM_SIDE - 2 * GAP),
-                        (GAP + place * FILM_SIDE, 2 * LABEL_HEIGHT - 5),
-                    )
-                yield np.concatenate([bar, film])
+            beside = np.concatenate([_resized(images, FILM_SIDE) for images in shown.values()], axis=2)
+            bar = np.full((2 * LABEL, beside.shape[2], 3), PAPER, np.uint8)
+            write_text(bar, fitted(self.label, beside.shape[2] - 2 * GAP), (GAP, LABEL - 5))
+            for place, name in enumerate(shown):
+                at = GAP + place * FILM_SIDE, 2 * LABEL - 5
+                write_text(bar, fitted(name, FILM_SIDE - 2 * GAP), at)
+            for frame in self._with_actions(beside, rows):
+                yield np.concatenate([bar, frame])
 
 
-def _resized(image: Images, side: int) -> Images:
+def _resized(images: Images, side: int) -> Images:
+    """Return images (n, H, W, 3) with sides of `side`; enlarged pixels stay sharp."""
     cv2 = opencv()
-    way = cv2.INTER_AREA if image.shape[0] >= side else cv2.INTER_NEAREST
-    return np.asarray(cv2.resize(image, (side, side), interpolation=way), np.uint8)
+    way = cv2.INTER_AREA if images.shape[1] >= side else cv2.INTER_NEAREST
+    return np.stack([cv2.resize(image, (side, side), interpolation=way) for image in images])

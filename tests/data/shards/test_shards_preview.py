@@ -4,12 +4,11 @@ from pathlib import Path
 
 import av
 import cv2
-import numpy as np
 import pytest
 
 from hma_data.conversion.plan import Settings
 from hma_data.errors import UsageError
-from hma_data.shards.preview import CURSOR_COLOUR, UNKNOWN_COLOUR, Curves, preview
+from hma_data.shards.preview import preview
 from hma_data.shards.reader import ShardSet
 from tests.conftest import BlockTokenizer, toy_shards
 
@@ -63,39 +62,3 @@ def test_another_camera_can_be_shown(made: Path, tmp_path: Path) -> None:
     assert last[1] == 17 * 13
     with pytest.raises(UsageError, match="top, side"):
         preview(made, tmp_path / "t", camera="nose", tokenizer=BlockTokenizer())
-
-
-def curves(values: np.ndarray, known: np.ndarray | None = None) -> Curves:
-    low, high = values.min(0).astype(np.float64), values.max(0).astype(np.float64)
-    names = [f"v{i}" for i in range(values.shape[1])]
-    return Curves(values.astype(np.float32), known, low, high, names, 3.0, 400, 200)
-
-
-def count(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
-    """Pixels of just that colour; lines are smoothed, so few of theirs are."""
-    return int((picture == colour).all(axis=-1).sum())
-
-
-def lines(picture: np.ndarray) -> int:
-    """Bluish pixels."""
-    return int((picture[..., 2].astype(int) - picture[..., 0] > 40).sum())
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (2, 7), (300, 7), (50, 40)])
-def test_curves_of_any_size_are_drawn(shape: tuple[int, int]) -> None:
-    values = np.random.default_rng(0).normal(size=shape)
-    picture = curves(values).at(0)
-    assert picture.shape == (200, 400, 3)
-    assert count(picture, CURSOR_COLOUR) >= 100
-    assert lines(curves(values).panel) > 20 or shape[0] == 1
-
-
-def test_constant_and_huge_values_are_drawn() -> None:
-    for values in (np.zeros((10, 2)), np.full((10, 2), 3e38), np.array([[-3e38], [3e38]])):
-        assert curves(values).panel.shape == (200, 400, 3)
-
-
-def test_what_is_not_known_is_grey() -> None:
-    values = np.sin(np.arange(40.0))[:, None]
-    assert count(curves(values, np.arange(40) % 20 > 5).panel, UNKNOWN_COLOUR) > 1000
-    assert count(curves(values, np.ones(40, bool)).panel, UNKNOWN_COLOUR) < 100
