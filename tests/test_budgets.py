@@ -18,7 +18,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/conversion": (3_310, 24_100, 12),
     "hma_data/episodes": (1_530, 13_400, 8),
     "hma_data/hub": (520, 3_800, 3),
-    "hma_data/inspection": (2_140, 19_900, 9),
+    "hma_data/inspection": (2_170, 20_300, 9),
     "hma_data/lab": (3_350, 31_600, 16),
     "hma_data/loading": (1_330, 11_200, 6),
     "hma_data/registry": (1_280, 8_200, 6),
@@ -42,7 +42,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_540, 11_500, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 59_600, 471_500
-TEST_LINES = 45_300
+TEST_LINES = 45_450
 DOC_WORDS = 38_000
 
 

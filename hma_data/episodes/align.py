@@ -121,7 +121,7 @@ def _shared_index(episode: Episode, embodiment: Embodiment) -> Clip:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise EpisodeError(episode.id, f"its streams differ in length: {listed}")
     times = episode.streams[embodiment.primary_camera.name].timestamps
-    _check_times(episode.id, embodiment.primary_camera.name, times)
+    _check_times(episode.id, embodiment.primary_camera.name, times, _clock_remedy(embodiment))
     shift = embodiment.sync.action_shift
     index = np.arange(max(0, -shift), len(times) - max(0, shift))
     if not len(index):
@@ -185,13 +185,13 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     for (name, signal, _, method), tolerance_s in zip(signals, tolerances, strict=True):
         timed.append((name, signal.timestamps, method, tolerance_s))
     for name, times, *_ in timed:
-        _check_times(episode.id, name, times)
+        _check_times(episode.id, name, times, _clock_remedy(embodiment))
     frames = np.unique(episode.streams[primary].timestamps)  # equal stamps give one frame of the grid
     repeated = len(episode.streams[primary].timestamps) - len(frames)
     if repeated > len(frames):
         total = repeated + len(frames)
         fault = f"{repeated} of {total} frames of {primary} have the same stamp as the frame before"
-        raise AlignmentError(episode.id, fault, "try stamp: receive")
+        raise AlignmentError(episode.id, fault, _clock_remedy(embodiment))
     grid, trimmed = _grid(episode.id, frames, embodiment, timed)
 
     skew: dict[str, Floats] = {}
@@ -284,11 +284,18 @@ def _grid(episode_id: str, frames: Floats, embodiment: Embodiment, timed: list[T
     if not len(grid):
         spans = ", ".join(f"{name} {times[0]:.3f} to {times[-1]:.3f} s" for name, times, *_ in timed)
         fault = f"its streams never run together: {spans}"
-        raise AlignmentError(episode_id, fault, "check the topics, or try stamp: receive")
+        raise AlignmentError(episode_id, fault, _clock_remedy(embodiment))
     return grid, total - len(grid)
 
 
-def _check_times(episode_id: str, name: str, times: Floats) -> None:
+def _clock_remedy(embodiment: Embodiment) -> str:
+    """Return what helps where times cannot be used: only messages of bags have a second clock."""
+    if embodiment.source.format == "rosbag" and embodiment.sync.stamp != "receive":
+        return "check the topics, or try sync: {stamp: receive}"
+    return "correct the recording's times, or leave the episode out with --exclude"
+
+
+def _check_times(episode_id: str, name: str, times: Floats, remedy: str) -> None:
     if not len(times):
         raise EpisodeError(episode_id, f"{name} has no samples")
     if not np.isfinite(times).all():
@@ -297,7 +304,7 @@ def _check_times(episode_id: str, name: str, times: Floats) -> None:
     if len(backwards):
         i = int(backwards[0])
         fault = f"{name} goes back in time at sample {i + 1}: {times[i]:.6f} then {times[i + 1]:.6f} s"
-        raise AlignmentError(episode_id, fault, "try stamp: receive")
+        raise AlignmentError(episode_id, fault, remedy)
 
 
 # -- the rate of a grid

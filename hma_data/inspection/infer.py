@@ -395,12 +395,11 @@ class _Draft:
         return next((one for one in found if one.check == "gaps" and one.key == key), None)
 
     def _rate_from(self) -> str:
-        if self.found.facts.get("pairing"):
-            return "measured: the timestamps of the rows; meta/info.json states another rate, the film's"
-        if self.found.format == "lerobot":
-            return "fps of the recording's meta/info.json"
         if not self.bag:
-            return self.found.facts.get("rate") or "the recording"
+            usual = (
+                "fps of the recording's meta/info.json" if self.found.format == "lerobot" else "the recording"
+            )
+            return self.found.facts.get("rate") or usual
         camera = self.seen.keys[0]
         moved = [key for key in (*self.action.keys, *self.states) if key.hz]
         rates = dict.fromkeys(f"{key.topic.name if key.topic else key.key} {_hz(key)}" for key in moved)

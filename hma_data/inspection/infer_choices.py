@@ -297,11 +297,12 @@ def _ordered_parts(parts: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
 
 
 def _each_once(parts: list[KeyInfo]) -> list[KeyInfo]:
-    """Remove second encodings of one action: velocities beside positions, poses beside joints."""
+    """Remove second encodings of one action: velocities beside positions, poses beside joints, the whole."""
 
     def what(key: KeyInfo) -> frozenset[str]:
         return frozenset(words(key.key)) - PLACE - MOTION
 
+    parts = [key for key in parts if not _is_whole_of(key, parts)]
     placed = {what(key) for key in parts if PLACE & set(words(key.key))}
     parts = [key for key in parts if not (MOTION & set(words(key.key)) and what(key) in placed)]
     arms = [key for key in parts if not is_gripper(key.key)]
@@ -309,6 +310,16 @@ def _each_once(parts: list[KeyInfo]) -> list[KeyInfo]:
     if poses and any(JOINT & set(words(key.key)) for key in arms):
         parts = [key for key in parts if key not in poses]
     return parts
+
+
+def _is_whole_of(key: KeyInfo, parts: list[KeyInfo]) -> bool:
+    """Check whether a key repeats all others of its group: as many values, in the same range."""
+    group = key.key[: -len(_last(key.key))]
+    others = [one for one in parts if one != key and group and one.key.startswith(group)]
+    ends = [end for one in others for end in (one.low, one.high) if end is not None]
+    if len(others) < 2 or dims(key) != sum(map(dims, others)):
+        return False
+    return not ends or (key.low, key.high) == (min(ends), max(ends))
 
 
 def _place(key: KeyInfo) -> int:

@@ -364,6 +364,24 @@ def _episodes(
         yield from (one for one in _times(clips, robot) if not (told and one.check == "gaps"))
         yield from (finding for _, finding in judged(clips, robot).values() if finding)
         yield from _numbers(np.concatenate([clip.actions for clip in clips]), robot)
+        yield from _states_as_actions(clips, robot)
+
+
+def _states_as_actions(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
+    """Yield a finding where actions are no commands, but the state of the same frame."""
+    recorded = [clip.states for clip in clips if clip.states is not None]
+    if not recorded:
+        return
+    states, actions = np.concatenate(recorded), np.concatenate([clip.actions for clip in clips])
+    moved = np.flatnonzero(actions.std(axis=0) > 0)
+    same = [i for i in moved if (states == actions[:, i : i + 1]).all(axis=0).any()]
+    if same:
+        names = robot.action.names()
+        said = f"equal the state of the same frame throughout: {', '.join(names[i] for i in same)}"
+        remedy = "name the key of the commands"
+        if robot.source.format in ONE_INDEX:
+            remedy += "; where none is recorded, sync: {action_shift: 1} takes the state of the next step"
+        yield Finding("action", "warn", f"actions {said}", remedy)
 
 
 def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:

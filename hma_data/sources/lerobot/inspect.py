@@ -33,6 +33,11 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
         looking.look()
     keys = tuple(survey.key(info) for info in _keys(meta))
     facts = {"version": str(meta.info.codebase_version), "tasks": str(len(meta.tasks))}
+    facts |= {"pairing": "index"} if looking.drifts else {}
+    hz = meta.fps
+    if looking.hz and (looking.drifts or abs(looking.hz / meta.fps - 1) > checks.DRIFT):
+        hz = looking.hz
+        facts["rate"] = f"measured: the timestamps of the rows; meta/info.json states {meta.fps:g} Hz"
     return Inspection(
         format="lerobot",
         uri=uri,
@@ -40,9 +45,9 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
         keys=keys,
         frames=sum(lengths),
         lengths=tuple(lengths[:MAX_LENGTHS]),
-        hz=looking.hz if looking.drifts else meta.fps,
+        hz=hz,
         robot=meta.info.robot_type or None,
-        facts=facts | ({"pairing": "index"} if looking.drifts else {}),
+        facts=facts,
         looked_at=len(survey.looked),
         findings=survey.findings(keys),
         checks=survey.checks(),

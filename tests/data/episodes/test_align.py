@@ -275,6 +275,19 @@ def test_time_that_goes_back_is_told_with_the_place() -> None:
         to_clip(episode(STEADY, back, STEADY, STEADY, STEADY), embodiment())
 
 
+@pytest.mark.parametrize(
+    ("stamp", "format_name", "advised"),
+    [("header", "rosbag", True), ("receive", "rosbag", False), ("header", "rh20t", False)],
+)
+def test_other_stamps_are_advised_only_where_there_are_others(
+    stamp: str, format_name: str, advised: bool
+) -> None:
+    robot = embodiment(stamp=stamp).to_dict() | {"source": {"format": format_name}}
+    with pytest.raises(AlignmentError) as fault:
+        to_clip(episode(STEADY, STEADY[::-1], STEADY, STEADY, STEADY), Embodiment.from_values(robot, "other"))
+    assert ("stamp: receive" in str(fault.value)) is advised
+
+
 def test_values_that_are_not_finite_are_told_with_the_frame() -> None:
     bad = episode(STEADY, STEADY, STEADY, STEADY, STEADY)
     bad.actions[1].values[4, 0] = np.nan

@@ -108,6 +108,18 @@ def test_degrees_stated_as_radians_are_noticed(tmp_path: Path) -> None:
     assert "are these degrees?" in {finding.remedy for finding in found}
 
 
+def test_actions_that_are_the_state_of_the_same_frame_are_noticed(tmp_path: Path) -> None:
+    def copy(file: h5py.File) -> None:
+        for demo in file["data"].values():
+            demo["obs/joints"] = demo["actions"][:][:, ::-1]
+
+    stated = ARM_YAML + "state: {components: [{key: obs/joints, dims: 3}]}\n"
+    (found,) = examined(tmp_path, copy, stated)
+    assert found.check == "action" and found.severity == "warn" and "throughout: a, b, c" in found.message
+    (tmp_path / "toy_arm.yaml").write_text(stated + "sync: {action_shift: 1}\n")
+    assert not examine(str(tmp_path / "toy.hdf5"), str(tmp_path / "toy_arm.yaml"))
+
+
 def test_a_yaml_that_says_bgr_of_pictures_in_order_is_noticed(tmp_path: Path) -> None:
     photo = skimage_data.chelsea()[:64, :64]  # it was a JPEG once, and its colours still show it
 

@@ -27,6 +27,24 @@ from tests.data.inferring import H, T, W, answered, first_clip, inferred, keys, 
 from tests.data.rlds_files import TEXT, features_dict, image, png, tensor
 from tests.data.videos import CAMERA, STILL, make_v2, make_v3
 
+
+def test_of_a_whole_and_its_parts_one_is_the_action(tmp_path: Path) -> None:
+    path, vector = tmp_path / "two_arms.hdf5", numbers(T, 6).astype(np.float32)
+    with h5py.File(path, "w") as file:
+        file["observation/head/rgb"] = np.stack(pictures(0))
+        file["joint_action/vector"] = vector
+        for name, part in (
+            ("left", slice(0, 2)),
+            ("left_gripper", 2),
+            ("right", slice(3, 5)),
+            ("right_gripper", 5),
+        ):
+            file[f"joint_action/{name}"] = vector[:, part]
+    values = inferred(path)
+    assert sum(part["dims"] for part in values["action"]["components"]) == 6
+    assert "also recorded: joint_action/vector?" in values["provenance"]["action"]
+
+
 # -- RLDS
 
 

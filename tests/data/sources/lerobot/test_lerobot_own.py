@@ -348,6 +348,20 @@ def test_templates_of_version_3_are_filled_in_version_2(apart: Path, tmp_path: P
         np.testing.assert_array_equal(episode.actions[0].values[row], item["action"].numpy())
 
 
+def test_where_the_stated_rate_is_not_that_of_the_rows_infer_takes_the_measured_one(
+    apart: Path, tmp_path: Path
+) -> None:
+    twice = as_v21(apart, tmp_path / "twice")
+    for keeps in (True, False):
+        info = json.loads((twice / "meta/info.json").read_text()) | {"fps": 2 * FPS}
+        if not keeps:  # some writers leave the times out of the features
+            info["features"].pop("timestamp", None)
+        (twice / "meta/info.json").write_text(json.dumps(info))
+        values = parse_yaml(infer(str(twice), "twice"), "twice.yaml")
+        assert values["frequency_hz"] == FPS and "layout" not in values["source"]
+        assert "the timestamps of the rows" in values["provenance"]["frequency_hz"]
+
+
 def test_stamps_that_drift_are_found_and_pairing_by_index_reads_them(apart: Path, tmp_path: Path) -> None:
     drifting = as_v21(apart, tmp_path / "cloth", row_hz=9.15)
     source = open_source("lerobot")
