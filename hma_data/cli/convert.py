@@ -24,7 +24,7 @@ from hma_data.errors import UsageError
 if TYPE_CHECKING:
     from hma_data.conversion.job import Conversion
     from hma_data.conversion.output import Share
-    from hma_data.conversion.report import Progress, Shared, Summary
+    from hma_data.conversion.report import Progress, Summary, UnfinishedShare
     from hma_data.registry.embodiment import Embodiment
     from hma_data.sources.common.checks import Finding
 
@@ -136,8 +136,9 @@ def convert(
     elif shard_index is not None or shard_count is not None:
         raise UsageError("hma convert", "--shard-index and --shard-count belong together", "give both")
     robot = _robot(embodiment, source, tokenizer, frequency_hz)
-    from hma_data.conversion.engines import Limits, Resources
+    from hma_data.conversion.engines import Limits
     from hma_data.conversion.job import Conversion
+    from hma_data.conversion.report import UnfinishedShare
 
     conversion = Conversion(
         robot,
@@ -153,18 +154,16 @@ def convert(
         max_quarantine=max_quarantine,
         overwrite=overwrite,
         extend=extend,
-        resources=Resources(worker_cpus, worker_gpus),
+        worker_cpus=worker_cpus,
+        worker_gpus=worker_gpus,
     )
     if dry_run:
         _print_plan(conversion, share, json)
         return
     with interruptible(lambda: _kept(conversion)), _shown(robot.id) as on_progress:
-        if share:
-            done = conversion.run_share(share, on_progress)
-        else:
-            summary = conversion.run(on_progress)
-    if share:
-        _report_share(done, share, json)
+        summary = conversion.run_share(share, on_progress) if share else conversion.run(on_progress)
+    if isinstance(summary, UnfinishedShare):
+        _report_share(summary, share, json)
         return
     from hma_data.inspection.kept import kept_findings
     from hma_data.shards.reader import ShardSet
@@ -281,29 +280,22 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
 # -- the result
 
 
-def _report_share(done: "Shared", share: "Share", json: bool) -> None:
+def _report_share(done: "UnfinishedShare", share: "Share | None", json: bool) -> None:
+    facts = {
+        "out": str(done.out),
+        "shards_made": done.made_shards,
+        "shards_kept": done.kept_shards,
+        "shards_missing": done.missing,
+        "seconds": done.seconds,
+    }
     if json:
-        print_json(
-            {
-                "out": str(done.out),
-                "shards_made": done.made_shards,
-                "shards_kept": done.kept_shards,
-                "shards_missing": done.missing,
-                "changed": done.changed,
-                "warning": done.warning,
-                "seconds": done.seconds,
-            }
-        )
+        print_json(facts)
         return
-    said = "all shards are there, the manifest is written"
-    if done.missing:
-        missing = human_count(done.missing, "shard")
-        said = f"{missing} left to the other shares; the last of them writes the manifest"
-    print(
-        f"{done.out}: share {share.name} made {human_count(done.made_shards, 'shard')} "
-        f"({done.kept_shards} were there already), {human_seconds(done.seconds)}; {said}"
-    )
-    _print_changes(done)
+    missing, made = human_count(done.missing, "shard"), human_count(done.made_shards, "shard")
+    name = f"share {share.name} " if share else ""
+    print(f"{done.out}: {name}made {made} ({done.kept_shards} were there already)", end="")
+    print(f", {human_seconds(done.seconds)}; {missing} left to the other shares; the last of them", end="")
+    print(" writes the manifest")
 
 
 def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float, json: bool) -> None:
@@ -320,6 +312,7 @@ def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float,
                 "splits": manifest.splits,
                 "shards_made": summary.made_shards,
                 "shards_kept": summary.kept_shards,
+                "shards_missing": 0,
                 "seconds": summary.seconds,
                 "cameras": manifest.cameras,
                 "pictures": summary.frame_sizes,
@@ -344,7 +337,10 @@ def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float,
         if summary.flags:
             counts = [f"{count:,} {flag_words(name)}" for name, count in summary.flags.items()]
             print(f"flags: {', '.join(counts)}")
-        _print_changes(summary)
+        if summary.changed:
+            print(summary.changed)
+        if summary.warning:
+            typer.echo(f"warning: {summary.warning}", err=True)
         for note in summary.notes:
             typer.echo(f"warning: {note}", err=True)
         for finding in lasting:
@@ -373,11 +369,3 @@ def _print_cameras(line: str, sizes: dict[str, tuple[int, int]], robot: Any, siz
 def _print_left_out(count: int) -> None:
     if count:
         print(f"left out by only and exclude: {human_count(count, 'episode')}")
-
-
-def _print_changes(done: "Shared | Summary") -> None:
-    """Print what of the YAML is new in a finished set, and the fault of its rate, a line each."""
-    if done.changed:
-        print(done.changed)
-    if done.warning:
-        typer.echo(f"warning: {done.warning}", err=True)

@@ -10,13 +10,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hma_data.conversion.engines import LIMITS, RESOURCES, Limits, Resources
+from hma_data.conversion.engines import LIMITS, Limits
 from hma_data.conversion.engines.local import end_worker_that_starts_workers
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.extend import content_of, extended
@@ -36,8 +35,8 @@ from hma_data.conversion.publish import HubOutput
 from hma_data.conversion.report import (
     Counter,
     Progress,
-    Shared,
     Summary,
+    UnfinishedShare,
     held_out_line,
     rate_warning,
     refusal_reasons,
@@ -131,7 +130,8 @@ class Conversion:
         max_quarantine: fraction of episodes that may be refused.
         overwrite: delete what `out` holds, if it is a shard set.
         extend: add the episodes that a finished set in `out` does not have yet.
-        resources: what a worker reserves with engine="ray".
+        worker_cpus, worker_gpus: what a worker reserves with engine="ray"; fractions let several share a CPU
+            or a GPU. None: one GPU where the tokenizer runs on one.
     """
 
     embodiment: Embodiment
@@ -147,7 +147,8 @@ class Conversion:
     max_quarantine: float = 0.01
     overwrite: bool = False
     extend: bool = False
-    resources: Resources = RESOURCES
+    worker_cpus: float = 1.0
+    worker_gpus: float | None = None
 
     def run(self, on_progress: OnProgress = lambda progress: None) -> Summary:
         """Make the shard set; running it again continues.
@@ -161,78 +162,50 @@ class Conversion:
             HMAError: the embodiment or the tokenizer cannot be used; or a script converts with workers
                 outside of `if __name__ == "__main__":`.
         """
-        end_worker_that_starts_workers(self.workers)
-        begun, out = time.monotonic(), place(self.out)
-        hub = HubOutput.of(out)
-        folder = hub.staging if hub else out
-        run = _Run(self, folder)
-        with locked(folder):
+        run = _Run(self)
+        with locked(run.folder):
             if self.overwrite:
-                clear(folder)
+                clear(run.folder)
             plan, base = run.plan()
-            if hub and hub.prepare() and not self.overwrite:
-                refuse_other(out, plan)
-            kept, made = run.make(plan, base, None, on_progress)
-            manifest = run.finish(plan, base, bool(made))
-            reasons = refusal_reasons(folder)
-            episodes = sum(split["episodes"] for split in manifest.splits.values())
-            if not episodes:
-                clear(folder)
-                worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
-                told = "; ".join(f"{count} × {reason}" for reason, count in worst)
-                raise SourceError(run.uri, f"gave no usable episode, so nothing was written: {told}")
-            flags = flag_totals(parquet_file(folder / EPISODES).read(columns=["flags"])["flags"])
-            warning = rate_warning(folder, out) if OFF_RATE in flags else ""
-            notes = training_notes(folder, out, plan)
-            if hub:
-                hub.upload()
-        return Summary(
-            out=out,
-            manifest=manifest,
-            kept_shards=kept,
-            made_shards=made,
-            seconds=time.monotonic() - begun,
-            reasons=reasons,
-            flags=flags,
-            too_many=manifest.quarantined > self.max_quarantine * (episodes + manifest.quarantined),
-            frame_sizes=run.frame_sizes,
-            left_out=run.whole.left_out,
-            changed=run.changed,
-            warning=warning,
-            notes=notes,
-            held_out=held_out_line(manifest, run.whole),
-        )
+            if run.hub and run.hub.prepare() and not self.overwrite:
+                refuse_other(run.out, plan)
+            run.make(plan, base, None, on_progress)
+            return run.finish(plan, base, bool(run.made))
 
-    def run_share(self, share: Share, on_progress: OnProgress = lambda progress: None) -> Shared:
+    def run_share(
+        self, share: Share, on_progress: OnProgress = lambda progress: None
+    ) -> Summary | UnfinishedShare:
         """Make one share of the shards, for an array of jobs that write one folder which all of them see.
 
         The bytes are those that `run` alone would write. The share that ends last finishes the set.
         """
-        end_worker_that_starts_workers(self.workers)
-        begun, out = time.monotonic(), place(self.out)
-        run = _Run(self, out)
-        with locked(out, share.name):
+        run = _Run(self)
+        with locked(run.out, share.name):
             plan, base = run.plan()
-            kept, made = run.make(plan, base, share, on_progress)
-        missing = len({unit.name for unit in plan.units} - shard_sizes(out).keys())
-        warning = ""
+            run.make(plan, base, share, on_progress)
+        missing = len({unit.name for unit in plan.units} - shard_sizes(run.out).keys())
         if not missing:
-            with suppress(OutputError), locked(out):  # others are still writing: the last of them finishes
-                missing = len(plan.units) - len(finished_shards(out, plan, base, shared=False))
+            with (
+                suppress(OutputError),
+                locked(run.out),
+            ):  # others are still writing: the last of them finishes
+                missing = len(plan.units) - len(finished_shards(run.out, plan, base, shared=False))
                 if not missing:
                     # A journal shows that some share has made shards since the manifest was written.
-                    run.finish(plan, base, bool(made or known_hashes(out)))
-                    warning = rate_warning(out, out)
-        return Shared(out, kept, made, missing, time.monotonic() - begun, run.changed, warning)
+                    return run.finish(plan, base, bool(run.made or known_hashes(run.out)))
+        return UnfinishedShare(run.out, run.kept, run.made, missing, time.monotonic() - run.begun)
 
 
 class _Run:
-    """A conversion that runs: its tokenizer, its plan and what it has learned so far."""
+    """A conversion that runs: its folder, its tokenizer, its plan and what it has learned so far."""
 
-    def __init__(self, given: Conversion, folder: Path) -> None:
-        self.given, self.folder = given, folder
+    def __init__(self, given: Conversion) -> None:
+        end_worker_that_starts_workers(given.workers)
+        self.given, self.begun, self.out = given, time.monotonic(), place(given.out)
+        self.hub = HubOutput.of(self.out)
+        self.folder = self.hub.staging if self.hub else self.out
         self.workers = given.workers
-        if not isinstance(given.tokenizer, str) or str(folder).startswith("memory:"):
+        if not isinstance(given.tokenizer, str) or str(self.folder).startswith("memory:"):
             self.workers = 0  # no other process sees them
         self._opened: Tokenizer | None = None
         tokenizer = given.tokenizer
@@ -246,7 +219,7 @@ class _Run:
             self._spec = self._opened.spec
         self.whole, self.uri = plan_conversion(given.embodiment, given.source, self._spec, given.settings)
         self.frame_sizes: dict[str, tuple[int, int]] = {}
-        self.changed = ""
+        self.kept = self.made = 0  # shards that were there, and that this run has made
 
     def plan(self) -> tuple[Plan, Manifest | None]:
         """Return the plan, and the manifest it extends or None.
@@ -285,10 +258,8 @@ class _Run:
             remedy = f"set stride: {stride} in the YAML, choose another --out, or --overwrite to start anew"
             raise OutputError(self.folder, fault, remedy)
 
-    def make(
-        self, plan: Plan, base: Manifest | None, share: Share | None, on_progress: OnProgress
-    ) -> tuple[int, int]:
-        """Make the shards that are missing; return how many shards were kept and how many were made."""
+    def make(self, plan: Plan, base: Manifest | None, share: Share | None, on_progress: OnProgress) -> None:
+        """Make the shards that are missing."""
         tasks = share.count if share else 1
         mine = plan.units[share.index :: tasks] if share else plan.units
         there = finished_shards(self.folder, plan, base, shared=share is not None)
@@ -313,7 +284,7 @@ class _Run:
                 for made in self._made(todo, plan, Counter(progress, on_progress)):
                     journal.add(made)
                     on_progress(progress)
-        return progress.kept_shards, len(todo)
+        self.kept, self.made = progress.kept_shards, len(todo)
 
     def _made(self, todo: list[ShardUnit], plan: Plan, on_event: Counter) -> Iterator[Made]:
         given = self.given
@@ -330,37 +301,74 @@ class _Run:
         if given.engine == "ray":
             from hma_data.conversion.engines.ray import run as run_ray
 
-            gpus = given.resources.gpus
+            cpus, gpus = given.worker_cpus, given.worker_gpus
             if gpus is None:
                 gpus = 1.0 if given.device.startswith("cuda") else 0.0
-            cpus = given.resources.cpus
             return run_ray(todo, MakeWork(job), self.workers, on_event, given.limits, cpus, gpus)
         return run_local(todo, MakeWork(job, self._opened), self.workers, on_event, given.limits)
 
-    def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Manifest:
-        """Return the manifest; write it and the other files derived from footers, unless nothing changed.
+    def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Summary:
+        """Write what is derived from the shards, publish the set where it is made for a hub, and sum up.
 
         Args:
-            changed: True where shards may have been made. A finished set is written anew too where the YAML
-                has changed: its shards stay, and readers take target_hz and stride from the manifest.
+            changed: True where shards may have been made.
         """
-        folder, embodiment = self.folder, self.given.embodiment
+        folder, out = self.folder, self.out
+        manifest, news = self._derived(plan, base, changed)
+        reasons = refusal_reasons(folder)
+        episodes = sum(split["episodes"] for split in manifest.splits.values())
+        if not episodes:
+            clear(folder)
+            worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
+            told = "; ".join(f"{count} × {reason}" for reason, count in worst)
+            raise SourceError(self.uri, f"gave no usable episode, so nothing was written: {told}")
+        flags = flag_totals(parquet_file(folder / EPISODES).read(columns=["flags"])["flags"])
+        warning = rate_warning(folder, out) if OFF_RATE in flags else ""
+        notes = training_notes(folder, out, plan)
+        if self.hub:
+            self.hub.upload()
+        most = self.given.max_quarantine * (episodes + manifest.quarantined)
+        return Summary(
+            out=out,
+            manifest=manifest,
+            kept_shards=self.kept,
+            made_shards=self.made,
+            seconds=time.monotonic() - self.begun,
+            reasons=reasons,
+            flags=flags,
+            too_many=manifest.quarantined > most,
+            frame_sizes=self.frame_sizes,
+            left_out=self.whole.left_out,
+            changed=news,
+            warning=warning,
+            notes=notes,
+            held_out=held_out_line(manifest, self.whole),
+        )
+
+    def _derived(self, plan: Plan, base: Manifest | None, changed: bool) -> tuple[Manifest, str]:
+        """Return the manifest, and in words what of the YAML a finished set did not say yet.
+
+        The manifest and the other files derived from footers are written, unless nothing has changed. A
+        finished set is written anew too where the YAML has changed: its shards stay, and readers take
+        target_hz and stride from the manifest.
+        """
+        folder, embodiment, news = self.folder, self.given.embodiment, ""
         remove_parts(folder)  # of workers that died
         before = Manifest.load(folder) if (folder / MANIFEST).is_file() else None
         kept = base.shards if base else ()
         if before is not None:
-            self.changed = yaml_change(before.embodiment, embodiment)
+            news = yaml_change(before.embodiment, embodiment)
             if not changed and not damaged_files(folder, before):
-                if not self.changed and before.plan["hash"] == plan.facts["hash"]:
+                if not news and before.plan["hash"] == plan.facts["hash"]:
                     remove_notes(folder)
-                    return before
+                    return before, ""
                 kept = before.shards  # their hashes are known
         names = list(dict.fromkeys([*(shard.path for shard in kept), *(unit.name for unit in plan.units)]))
         known = {shard.path: shard.sha256 for shard in kept} | known_hashes(folder)
         derived = derive(folder, names, embodiment, self._spec, plan.facts, self.uri, hashes=known)
         manifest = derived.write(folder)
         remove_notes(folder)
-        return manifest
+        return manifest, news
 
 
 def _encoded(units: Sequence[ShardUnit], layout: RowLayout) -> int:

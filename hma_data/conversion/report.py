@@ -73,12 +73,11 @@ class Summary:
 
 
 @dataclass(frozen=True)
-class Shared:
-    """The result of one share of a conversion; the last share to end finishes the shard set.
+class UnfinishedShare:
+    """The result of a share of a conversion that leaves shards, or the manifest, to the other shares.
 
     Attributes:
         missing: number of shards that other shares have still to make.
-        changed, warning: see `Summary`; empty for a share that does not finish the set.
     """
 
     out: Path
@@ -86,8 +85,6 @@ class Shared:
     made_shards: int
     missing: int
     seconds: float
-    changed: str = ""
-    warning: str = ""
 
 
 class Counter:

@@ -19,7 +19,7 @@ from hma_data.errors import UsageError
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Time the tokenizer alone on as many frames, then run the conversion and measure its processes."""
-    from hma_data.conversion.engines import Limits, Resources
+    from hma_data.conversion.engines import Limits
     from hma_data.conversion.job import convert
     from hma_data.conversion.plan import Settings
 
@@ -47,7 +47,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
             settings=Settings(shard_frames=settings["shard_frames"]),
             workers=workers,
             engine=settings["engine"],
-            resources=Resources(settings["worker_cpus"]),
+            worker_cpus=settings["worker_cpus"],
             limits=Limits(quiet_s=None),
             on_progress=watch.mark,
         )

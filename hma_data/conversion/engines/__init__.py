@@ -61,17 +61,6 @@ class Limits:
 LIMITS = Limits()
 
 
-@dataclass(frozen=True)
-class Resources:
-    """What a worker of a cluster reserves; fractions let several share a CPU or a GPU."""
-
-    cpus: float = 1.0
-    gpus: float | None = None  # None: one where the tokenizer runs on a GPU
-
-
-RESOURCES = Resources()
-
-
 class Ledger:
     """The units that wait, run, or have failed, and the rules for trying again.
 
