@@ -248,6 +248,7 @@ class _Draft:
             "kind": "simulation" if facts.get("simulator") else f"{TODO}: real, simulation or human?",
             "frequency_hz": self._rate() or f"{TODO}: at how many Hz were actions recorded?",
             "target_hz": self._target(),
+            **({"stride": 1} if self._short_at_any_rate() else {}),
             "action": {
                 "space": f"{TODO}: one of {', '.join(spaces[:-1])} or {spaces[-1]}?",
                 "components": _told_apart([self._component(key) for key in self._commands()]),
@@ -293,6 +294,11 @@ class _Draft:
         stride = max(1, min(slowest, int(length // FRAMES_PER_EPISODE)))
         rate = round(hz / stride, 3)
         return TARGET_HZ if stride == slowest else int(rate) if rate == int(rate) else rate
+
+    def _short_at_any_rate(self) -> bool:
+        """Check whether nobody knows the rate yet, and episodes are so short that every frame is needed."""
+        lengths = self.found.lengths
+        return not self._rate() and bool(lengths) and statistics.median(lengths) < 2 * FRAMES_PER_EPISODE
 
     def _commands(self) -> list[KeyInfo]:
         """Return the keys of the action as the YAML names them: of RH20T, those of the next sample."""
@@ -351,9 +357,9 @@ class _Draft:
 
     def _provenance(self) -> dict[str, str]:
         said = {"frequency_hz": self._rate_from() if self.hz else f"{TODO}: who says so?"}
-        if self._target() != TARGET_HZ:
+        if self._target() != TARGET_HZ or self._short_at_any_rate():
             length = f"{statistics.median(self.found.lengths):g} steps"
-            said["target_hz"] = (
+            said["stride" if self._short_at_any_rate() else "target_hz"] = (
                 f"so that a model sees {FRAMES_PER_EPISODE} frames of an episode of {length}, if it has them"
             )
         names = {topic.name for topic in infer_topics.about(self.used)}

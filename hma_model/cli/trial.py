@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
-from hma_data.cli.options import robot_option
+from hma_data.cli.options import choice_option, robot_option
 from hma_data.cpu import usable_cores
 from hma_data.errors import Interrupted, RegistryError, UsageError
 from hma_model.cli.options import embedded_robots
@@ -36,6 +36,7 @@ def try_recording(
         list[str] | None,
         Option(metavar="KEY=VALUE", help="Answer a question of the robot's YAML; repeat it for more."),
     ] = None,
+    only: Annotated[list[str] | None, choice_option("Episode to take")] = None,
     minutes: Annotated[float, Option(min=0.1, help="Minutes of training.")] = 5.0,
     out: Annotated[Path | None, Option(help="Folder for everything; default: hma-try-NAME.")] = None,
 ) -> None:
@@ -68,14 +69,15 @@ def try_recording(
             step("registry", "infer", data, "--id", name, "--out", yaml)
         _answer(yaml, answer or [])
         embodiment = str(yaml)
-    step("convert", data, "-e", embodiment, "--tokenizer", TOKENIZER, "--out", shards)
+    chosen = [word for name in only or () for word in ("--only", name)]
+    step("convert", data, "-e", embodiment, "--tokenizer", TOKENIZER, *chosen, "--out", shards)
     time_limit = (f"cpu_seconds={cpu_seconds}", f"steps={UNLIMITED_STEPS}")
     step("finetune", shards, "--from", BUNDLED, *time_limit, "--out", run)
     step("evaluate", run, shards, "--windows", 24, "--out", folder / "evaluation")
     if not film.is_file():
         frames = ("--prompt", PROMPT, "--frames", _film_frames(shards))
         step("generate", run, shards, *frames, "--unmask-steps", 8, "--out", film)
-    print(f"open {_write_page(folder, film, done)}")
+    print(f"open {_write_page(folder, shards, film, done)}")
 
 
 def _run(words: list[str]) -> None:
@@ -112,6 +114,10 @@ def _answer(path: Path, given: list[str]) -> None:
         _set(values, key, parse_yaml(text, word, UsageError))
     open_questions = []
     for key, question in todos(values):
+        whole_image = key == "provenance.crop" and sys.stdin.isatty() and _denied(question)
+        for camera in values["cameras"] if whole_image else ():
+            camera.pop("crop", None)
+            camera.pop("resize", None)
         if key == "robot" or key.startswith("provenance"):
             _set(values, key, "not stated")  # a text for people, which changes nothing
         elif sys.stdin.isatty():
@@ -123,6 +129,10 @@ def _answer(path: Path, given: list[str]) -> None:
         flags = " ".join(f"--answer {key}=…" for key, _ in open_questions)
         raise RegistryError(path, f"has open questions: {asked}", f"answer by {flags}, or in the file")
     write_atomic(path, write_yaml(values))
+
+
+def _denied(question: str) -> bool:
+    return input(f"{question} [Y/n] ").strip().lower().startswith("n")
 
 
 def _set(values: Any, key: str, value: Any) -> None:
@@ -141,9 +151,11 @@ def _parts(key: str) -> Iterator[str | int]:
         yield word or int(number)
 
 
-def _write_page(folder: Path, film: Path, done: list[list[str]]) -> Path:
+def _write_page(folder: Path, shards: Path, film: Path, done: list[list[str]]) -> Path:
     """Write the page with the film, what was measured, and the commands."""
     from hma_data.episodes.sheets import webp_bytes
+    from hma_data.inspection.kept import kept_findings
+    from hma_data.shards.reader import ShardSet
     from hma_data.storage.files import write_atomic
     from hma_model.evaluation.pages import Page
     from hma_model.evaluation.verdict import verdict
@@ -153,6 +165,8 @@ def _write_page(folder: Path, film: Path, done: list[list[str]]) -> Path:
     frames, fps = _frames(film)
     caption = "Recorded frames, decoded from tokens; predicted from the recorded actions; from other actions."
     page.picture(webp_bytes(frames, fps), "webp", caption)
+    for found in kept_findings(ShardSet(shards)):
+        page.text(f"Tokens of {found}.")
     page.section("Files", f"{film.name} is this film. evaluation/report.html has all figures and charts.")
     page.section("Commands")
     page.commands("\n".join(shlex.join(["hma", *words]) for words in done))

@@ -8,6 +8,7 @@ import pytest
 
 from hma_data.lab import record
 from hma_data.registry.embodiment import Embodiment
+from hma_data.storage.yaml_io import read_yaml, write_yaml
 from hma_model.cli import trial
 from tests.command import fails, hma, hma_process
 
@@ -44,6 +45,19 @@ def test_what_the_recording_cannot_say_is_asked_and_answered_by_flags(
     fails(hma("try", "nowhere.hdf5"), 1, "does not exist")
 
 
+@pytest.mark.parametrize(("said", "cropped"), [("", True), ("n", False)])
+def test_a_proposed_crop_is_asked_about_in_a_terminal(
+    said: str, cropped: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = {"name": "front", "key": "k", "crop": [0, 0, 9, 9]}
+    path = tmp_path / "robot.yaml"
+    path.write_text(write_yaml({"cameras": [camera], "provenance": {"crop": "TODO: does it hold all?"}}))
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", lambda question: said)
+    trial._answer(path, [])
+    assert ("crop" in read_yaml(path)["cameras"][0]) is cropped
+
+
 @pytest.mark.slow
 def test_one_command_ends_with_a_film_and_a_page_and_continues(recording: Path, tmp_path: Path) -> None:
     words = ("try", str(recording), "--minutes", "0.1", "--out", str(tmp_path / "out"), *ANSWER)
@@ -55,7 +69,12 @@ def test_one_command_ends_with_a_film_and_a_page_and_continues(recording: Path, 
     with av.open(str(tmp_path / "out" / "film.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) > 10
     page = (tmp_path / "out" / "index.html").read_text()
-    assert "its actions" in page and "data:image/webp" in page and "hma finetune" in page
+    assert (
+        "its actions" in page
+        and "data:image/webp" in page
+        and "hma finetune" in page
+        and "decoded frames show" in page
+    )
     again = hma_process(*words)
     assert again.returncode == 0, again.stderr
     assert "$ hma generate" not in again.stdout and "$ hma registry infer" not in again.stdout
