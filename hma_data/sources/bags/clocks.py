@@ -13,9 +13,13 @@ so.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hma_data.episodes.episode import Floats
+from hma_data.errors import EpisodeError
 
 Times = NDArray[np.int64]
 SECOND_NS = 10**9
@@ -69,13 +73,6 @@ def _crowded(times: Times, order: NDArray[np.int64], behind: NDArray[np.bool_]) 
     return bool(beside_moved.any() and np.mean(steps[beside_moved] < CROWDED * usual) > CROWDED_SHARE)
 
 
-def set_back(times: Times) -> tuple[int, float]:
-    """Return the message at which a clock goes back furthest, and by how many seconds."""
-    steps = np.diff(times)
-    at = int(np.argmin(steps)) + 1
-    return at, -float(steps[at - 1]) / SECOND_NS
-
-
 @dataclass(frozen=True)
 class Clock:
     """The clock by which the messages of a topic are timed, beside their times of receipt.
@@ -92,17 +89,6 @@ class Clock:
     delay_s: float = 0.0
     drift_s: float = 0.0
 
-    @classmethod
-    def of(cls, topic: str, stamps: Times | None, received: Times) -> "Clock":
-        """Measure a clock; without stamps, it is that of receipt."""
-        if stamps is None or not len(stamps):
-            return cls(topic, False)
-        delays = (received - stamps) / SECOND_NS
-        third = max(len(delays) // 3, 1)
-        # Medians of the first and last third lie two thirds of the recording apart.
-        drift = 1.5 * float(np.median(delays[-third:]) - np.median(delays[:third]))
-        return cls(topic, True, float(np.median(delays)), drift if len(delays) >= 9 else 0.0)
-
     def __str__(self) -> str:
         """Return how the stamps lie beside receipt."""
         if not self.by_header:
@@ -114,6 +100,94 @@ class Clock:
         if abs(self.drift_s) > AHEAD_S:
             said += f" and drift by {abs(self.drift_s):.3g} s over the recording"
         return said
+
+
+@dataclass(frozen=True)
+class MessageTimes:
+    """The times of messages of one topic by both clocks, in the order of the files.
+
+    A clock is named `header` (receipt, where there are no header stamps), `receive`, or `stored` for the
+    order of the files.
+
+    Attributes:
+        received: (T,) of receipt.
+        stamps: (T,) of the header stamps; None where they are no clock: a message of the topic has none, or
+            they never change.
+        files: (T,) the number of the file of each message.
+    """
+
+    topic: str
+    received: Times
+    stamps: Times | None
+    files: Times
+
+    def __len__(self) -> int:
+        return len(self.received)
+
+    def __getitem__(self, rows: NDArray[Any]) -> "MessageTimes":
+        """Return the times of some messages."""
+        stamps = None if self.stamps is None else self.stamps[rows]
+        return MessageTimes(self.topic, self.received[rows], stamps, self.files[rows])
+
+    def by(self, clock: str) -> Times:
+        """Return the times (T,) by a clock."""
+        return self.stamps if clock == "header" and self.stamps is not None else self.received
+
+    def seconds(self, clock: str) -> Floats:
+        """Return the times (T,) by a clock, in seconds."""
+        nanoseconds = self.by(clock)
+        # Whole seconds are divided first, because 61 bits do not fit a float.
+        return nanoseconds // SECOND_NS + (nanoseconds % SECOND_NS) / 1e9
+
+    def by_receipt(self) -> NDArray[np.int64]:
+        """Return the order (T,) of receipt, even where the recorder's clock was set back."""
+        return np.argsort(self.received, kind="stable")
+
+    def order(self, clock: str) -> NDArray[np.int64] | None:
+        """Return the order (T,) by a clock; None where it was set back."""
+        return np.arange(len(self)) if clock == "stored" else sorted_by(self.by(clock), self.files)
+
+    def order_or_raise(self, clock: str, where: str) -> NDArray[np.int64]:
+        """Return the order (T,) by a clock.
+
+        Raises:
+            EpisodeError: the clock was set back.
+        """
+        order = self.order(clock)
+        if order is None:
+            raise self.set_back_error(clock, where)
+        return order
+
+    def set_back_error(self, clock: str, where: str) -> EpisodeError:
+        """Return the error of a clock that was set back; its remedy makes no data worse."""
+        by_header = clock == "header" and self.stamps is not None
+        steps = np.diff(self.by(clock))
+        at = int(np.argmin(steps)) + 1
+        seconds = -float(steps[at - 1]) / SECOND_NS
+        usable = self.stamps is not None and self.order("receive" if by_header else "header") is not None
+        remedy = "cut the file there, and keep the parts in folders of their own"
+        if by_header:
+            fault = f"header stamps go back by {seconds:.3g} s at message {at}: their clock was set back"
+            fault += ", or a simulation began anew"
+            if usable:
+                remedy = "sync: {stamp: receive} reads on by the times of receipt"
+                if seconds > 1:  # segments divide where a clock jumps back as far as they state
+                    remedy = f"source.segments: {{gap_s: 1}} makes the parts episodes of their own; {remedy}"
+        else:
+            fault = f"times of receipt go back by {seconds:.3g} s at message {at}: "
+            fault += "the recorder's clock was set back"
+            remedy = "sync: {stamp: header} takes the header stamps, which are in order" if usable else remedy
+        return EpisodeError(where, fault, remedy)
+
+    def clock(self, clock: str = "header") -> Clock:
+        """Measure the clock that times the messages."""
+        if clock != "header" or self.stamps is None or not len(self):
+            return Clock(self.topic, False)
+        delays = (self.received - self.stamps) / SECOND_NS
+        third = max(len(delays) // 3, 1)
+        # Medians of the first and last third lie two thirds of the recording apart.
+        drift = 1.5 * float(np.median(delays[-third:]) - np.median(delays[:third]))
+        return Clock(self.topic, True, float(np.median(delays)), drift if len(delays) >= 9 else 0.0)
 
 
 def apart(one: Clock, other: Clock, period_s: float) -> str:

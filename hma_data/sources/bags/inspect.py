@@ -16,6 +16,7 @@ from hma_data.episodes.episode import Floats
 from hma_data.episodes.offset import measure as measure_offset
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag
+from hma_data.sources.bags.clocks import MessageTimes
 from hma_data.sources.bags.images import (
     MONO16,
     VIDEO,
@@ -247,7 +248,9 @@ class _BagInspection:
         if self._frozen:
             said = f"{', '.join(self._frozen[:8])}: header stamps never change; receive times are used"
             survey.note(Finding("stamps", "warn", said, numbers={"topics": self._frozen}))
-        self.clocks = {name: _clock(topic.track) for name, topic in self._topics.items() if len(topic.track)}
+        self.clocks = {
+            name: _clock(topic.track.times) for name, topic in self._topics.items() if len(topic.track)
+        }
         self._skew()
         cameras = {key.topic.name for key in self.keys if key.kind == "camera" and key.topic}
         self.keys = [self._timed(key, cameras) for key in self.keys]
@@ -279,7 +282,7 @@ class _BagInspection:
             self._survey.note(Finding("readable", "warn", topic.fault, key=name))
         stated = track.channels[0]
         kind = track.kind
-        times = _clock(track).header
+        times = _clock(track.times).header
         measured = measure(times) if name in LOG_TOPICS else self._times(track, times, bool(kind))
         found: list[KeyInfo] = []
         if not topic.fault:
@@ -294,16 +297,15 @@ class _BagInspection:
         found = found or [KeyInfo(name, "other", (), stated.type or stated.encoding)]
         for value in topic.values:
             value.hand_on(self._survey, self._name)
-        clock = track.clock("header", np.arange(len(track)))
+        clock = track.times.clock()
         stamped = clock.by_header and not topic.fault
-        everything = np.arange(len(track))
         about = TopicInfo(
             name,
             stated.type or stated.encoding,
             delay_ms=clock.delay_s * 1e3 if stamped else None,
             drift_ms=clock.drift_s * 1e3 if stamped else 0.0,
-            goes_back=stamped and track.sorted_rows("header", everything) is None,
-            receipt_goes_back=track.sorted_rows("receive", everything) is None,
+            goes_back=stamped and track.times.order("header") is None,
+            receipt_goes_back=track.times.order("receive") is None,
         )
         hz, jitter_ms = measured.hz, measured.jitter_ms
         return [replace(key, hz=hz, count=topic.count, jitter_ms=jitter_ms, topic=about) for key in found]
@@ -312,19 +314,18 @@ class _BagInspection:
         """Hand the times to the survey; check what only messages with two times can show."""
         self._survey.made.add("stamps")
         self._frozen += [track.topic] if track.frozen else []
-        if track.stamped:
-            apart = float(np.median(np.abs(track.seconds("header") - track.seconds("receive"))))
+        own = track.times
+        if own.stamps is not None:
+            apart = float(np.median(np.abs(own.seconds("header") - own.seconds("receive"))))
             if apart > APART_S:
                 said = f"{track.topic}: header stamps are {apart:.3g} s from receive times"
                 self._survey.note(
                     Finding("stamps", "warn", said, key=track.topic, numbers={"seconds": apart})
                 )
-        everything = np.arange(len(track))
-        clock = "header" if track.stamped else "receive"
-        if track.sorted_rows(clock, everything) is None:
-            remedy = track.set_back_error(clock, str(self.bag.path), everything).remedy
+        if own.order("header") is None:
+            remedy = own.set_back_error("header", str(self.bag.path)).remedy
             return self._survey.times(self._name, track.topic, times, camera, remedy)
-        if late := int(np.sum(np.diff(track.stamps()) < 0)) if track.stamped else 0:
+        if late := 0 if own.stamps is None else int(np.sum(np.diff(own.stamps) < 0)):
             said = f"{track.topic}: {late} messages arrived out of order; their header stamps order them"
             self._survey.note(Finding("back", "info", said, key=track.topic, numbers={"count": late}))
         return self._survey.times(self._name, track.topic, times, camera)
@@ -342,7 +343,7 @@ class _BagInspection:
                 self._survey.pictures(self._name, name, frames, run, stored)
             grey, stated = is_grey(topic.sample, kind), encoding(topic.sample, kind)
             if grey and stated == MONO16:
-                messages = Messages(self.bag, track.channels, track.places()[track.by_receipt()], name)
+                messages = Messages(self.bag, track.channels, track.places()[track.times.by_receipt()], name)
                 high = float(max(wide_grey(one, kind, name).max() for one in messages.read(indices)))
         except EpisodeError as fault:
             self._survey.note(Finding("readable", "warn", f"{name}: {fault.fault}", key=name))
@@ -390,12 +391,12 @@ class _BagInspection:
                 self._survey.skew(name, skew(self.clocks[name].header, primary), period_s)
 
 
-def _clock(track: TopicTrack) -> _Clock:
+def _clock(times: MessageTimes) -> _Clock:
     """Return the times of a topic by both clocks; those of a clock that was set back in order of receipt."""
-    by_receipt = track.by_receipt()
-    order = track.sorted_rows("header", np.arange(len(track)))
-    header = track.seconds("header")[by_receipt if order is None else order]
-    return _Clock(header, track.seconds("receive")[by_receipt])
+    by_receipt = times.by_receipt()
+    order = times.order("header")
+    header = times.seconds("header")[by_receipt if order is None else order]
+    return _Clock(header, times.seconds("receive")[by_receipt])
 
 
 def _gap_ms(times: Floats, seen: list[Floats]) -> float | None:

@@ -27,13 +27,13 @@ from hma_data.errors import EpisodeError
 from hma_data.registry.components import Marker, Segments
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace
+from hma_data.sources.bags.clocks import SECOND_NS, MessageTimes
 from hma_data.sources.bags.container import Record, RecordFilter
 from hma_data.sources.bags.images import STILL, VIDEO, image_kind
 from hma_data.sources.bags.messages import decode
 from hma_data.sources.bags.topic_track import TopicTrack, missing_topic, parse_key
 from hma_data.storage.files import cache_folder, write_atomic
 
-SECOND_NS = 10**9
 SHOWN = 8  # values of a marker in an error
 MAX_DELAY_S = 10.0  # header stamps further from receipt than this come from another clock
 KEPT_BAGS = 2
@@ -164,23 +164,23 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
                 marker.add(place, record)
     videos = {key for key in videos if tracks[key].kind == VIDEO}
 
-    track = tracks[camera.key]
-    if not len(track):
+    times = tracks[camera.key].times
+    if not len(times):
         raise EpisodeError(where, f"{camera.key} has no messages")
     stated = camera.stamp or embodiment.sync.stamp
-    clock = "header" if stated == "header" and track.stamped else "receive"
-    order = track.by_receipt()
-    received, times = track.received()[order], track.seconds(clock)[order]
-    runs = _runs(_events(start, stop, received, times, clock), len(times), begun=start is None)
-    parts = [piece for begin, end in runs for piece in _at_gaps(times, begin, end, segments.gap_s)]
-    found = tuple(_segment(received, begin, end) for begin, end in parts if begin < end)
+    clock = "header" if stated == "header" and times.stamps is not None else "receive"
+    times = times[times.by_receipt()]
+    shown = times.seconds(clock)
+    runs = _runs(_events(start, stop, times, clock), len(times), begun=start is None)
+    parts = [piece for begin, end in runs for piece in _at_gaps(shown, begin, end, segments.gap_s)]
+    found = tuple(_segment(times.received, begin, end) for begin, end in parts if begin < end)
     if not found:
         fault = f"no episode in it holds a frame of {camera.key}"
         if start and not len(start.moments()):
             fault = f"no episode begins in it: {start.never()}"
         raise EpisodeError(where, fault, "correct source.segments in the YAML")
     # The camera's frames may arrive late; other messages may arrive without that delay.
-    delay_s = np.abs(track.seconds("receive") - track.seconds(clock)).max()
+    delay_s = np.abs(times.seconds("receive") - shown).max()
     return Table(
         segments=found,
         frames=len(times),
@@ -192,23 +192,23 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
 
 
 def _events(
-    start: "MarkerTrack | None", stop: "MarkerTrack | None", received: Rows, times: Floats, clock: str
+    start: "MarkerTrack | None", stop: "MarkerTrack | None", times: MessageTimes, clock: str
 ) -> list[tuple[int, bool, int]]:
     """Return the events of the markers.
 
     Each is a marker's time of receipt, whether it begins an episode, and the index of the first frame after
     it. Times of the same clock are compared: the messages' own where camera and marker both have them.
     """
-    own = np.maximum.accumulate(times)
     events = []
     for marker in filter(None, (start, stop)):
-        for i in marker.moments().tolist():
-            log_ns = int(marker.track.received()[i])
-            if clock == "header" and marker.track.stamped:
-                at = int(np.searchsorted(own, marker.track.seconds("header")[i]))
-            else:
-                at = int(np.searchsorted(received, log_ns))
-            events.append((log_ns, marker is start, at))
+        moments = marker.track.times[marker.moments()]
+        common = clock if moments.stamps is not None else "receive"
+        rising = np.maximum.accumulate(times.seconds(common))
+        at = np.searchsorted(rising, moments.seconds(common))
+        events += [
+            (log_ns, marker is start, frame)
+            for log_ns, frame in zip(moments.received.tolist(), at.tolist(), strict=True)
+        ]
     return sorted(events)
 
 
@@ -242,7 +242,7 @@ def _segment(received: Rows, begin: int, stop: int) -> Segment:
 
 
 def _keyframes(track: TopicTrack) -> Rows:
-    flags, received = track.keyframes(), track.received()
+    flags, received = track.keyframes(), track.times.received
     return np.sort(received[:1] if flags is None else received[flags])
 
 
@@ -279,7 +279,7 @@ class MarkerTrack:
 
     def moments(self) -> Rows:
         """Return the indices of the messages that count, in order of receipt."""
-        order = self.track.by_receipt()
+        order = self.track.times.by_receipt()
         if self.marker.equals is None:
             return order
         fitting = np.array(self._fitting, bool)[order]

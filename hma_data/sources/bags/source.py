@@ -21,12 +21,12 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Camera, Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace, find_bags
-from hma_data.sources.bags.clocks import MAX_LATE_S, apart
+from hma_data.sources.bags.clocks import MAX_LATE_S, MessageTimes, apart
 from hma_data.sources.bags.container import Channel, Record, RecordFilter, damaged
 from hma_data.sources.bags.images import image_kind
 from hma_data.sources.bags.inspect import report
 from hma_data.sources.bags.messages import decode
-from hma_data.sources.bags.segments import Rows, Table, parted
+from hma_data.sources.bags.segments import Table, parted
 from hma_data.sources.bags.topic_track import Column, TopicTrack, camera_stream, missing_topic, parse_key
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values
 from hma_data.sources.common.places import existing_path, nothing_there
@@ -180,7 +180,10 @@ class _EpisodeReading:
         for camera in embodiment.cameras:
             same = camera is embodiment.primary_camera
             streams[camera.name] = primary if same else self._stream(camera, shown)
-        clocks = {topic: "header" if track.stamped else "receive" for topic, track in self._tracks.items()}
+        clocks = {
+            topic: "receive" if track.times.stamps is None else "header"
+            for topic, track in self._tracks.items()
+        }
         parted = self._table is not None and len(self._table.segments) > 1
         action_signals = tuple(self._signal(column, shown) for column in actions)
         flags = self._held_actions(actions, action_signals, shown)
@@ -282,27 +285,27 @@ class _EpisodeReading:
         track, clock = self._tracks[camera.key], camera.stamp or self._embodiment.sync.stamp
         if self._segment is None or self._table is None:
             return camera_stream(self._bag, track, clock, levels=camera.levels)
-        order = track.by_receipt()
-        received = track.received()[order]
+        times = track.times
+        times = times[times.by_receipt()]
         if shown is not None:
-            around = self._around(received, track.seconds(clock)[order], shown)
+            around = self._around(times, clock, shown)
             return camera_stream(self._bag, track, clock, around, camera.levels)
-        begin = int(np.searchsorted(received, self._segment.first_ns)) + self._segment.skip
+        begin = int(np.searchsorted(times.received, self._segment.first_ns)) + self._segment.skip
         within = (begin, begin + len(self._segment))
         return camera_stream(self._bag, track, self._table.clock, within, camera.levels)
 
     def _signal(self, column: Column, shown: Floats) -> Signal:
-        track, rows = self._tracks[column.field.topic], column.rows()
+        track, values = self._tracks[column.field.topic], column.values()
+        times = track.times[column.rows()]
         clock = column.component.stamp or self._embodiment.sync.stamp
-        chosen: Rows = np.arange(len(rows))
         if self._segment:
-            chosen = track.by_receipt(rows)
-            times = track.seconds(clock)[rows[chosen]]
-            begin, stop = self._around(track.received()[rows[chosen]], times, shown)
-            chosen = np.sort(chosen[begin:stop])
-        chosen = chosen[track.order(clock, f"{self._where}, {track.topic}", rows[chosen])]
-        values = component_values(column.component, column.values()[chosen], self._where)
-        return Signal(track.seconds(clock)[rows[chosen]], values)
+            by_receipt = times.by_receipt()
+            begin, stop = self._around(times[by_receipt], clock, shown)
+            kept = np.sort(by_receipt[begin:stop])
+            times, values = times[kept], values[kept]
+        order = times.order_or_raise(clock, f"{self._where}, {track.topic}")
+        composed = component_values(column.component, values[order], self._where)
+        return Signal(times.seconds(clock)[order], composed)
 
     def _require_one_clock(self, shown: Floats) -> None:
         """Raise EpisodeError if the primary camera and another topic are timed by clocks that differ.
@@ -317,15 +320,14 @@ class _EpisodeReading:
         topics = dict.fromkeys(topic for topic, stamp in others if not (stamp or primary.stamp))
         clocks = []
         for topic in (primary.key, *topics):
-            track = self._tracks[topic]
-            rows: Rows = np.arange(len(track))
-            if track.sorted_rows("receive", rows) is None:
+            times = self._tracks[topic].times
+            if times.order("receive") is None:
                 return  # the recorder's clock was set back, so it cannot compare the others
             if self._segment:  # clocks may begin anew between the episodes of a bag
-                received = track.received()
-                rows = rows[(received >= self._segment.first_ns) & (received <= self._segment.last_ns)]
-            if len(rows):
-                clocks.append(track.clock(stated, rows))
+                received = times.received
+                times = times[(received >= self._segment.first_ns) & (received <= self._segment.last_ns)]
+            if len(times):
+                clocks.append(times.clock(stated))
         period_s = float(np.median(np.diff(shown))) if len(shown) > 1 else 0.0
         for clock in clocks[1:]:
             if fault := apart(clocks[0], clock, period_s):
@@ -335,7 +337,7 @@ class _EpisodeReading:
                 )
                 raise EpisodeError(self._where, fault, remedy)
 
-    def _around(self, received: Rows, times: Floats, shown: Floats) -> tuple[int, int]:
+    def _around(self, samples: MessageTimes, clock: str, shown: Floats) -> tuple[int, int]:
         """Return the range of samples, in order of receipt, that the frames shown need.
 
         It begins with the sample in force at the first frame. It ends with the first sample at or after the
@@ -343,7 +345,8 @@ class _EpisodeReading:
         episodes, only the samples on this episode's side count.
         """
         assert self._segment
-        inside = np.searchsorted(received, [self._segment.first_ns, self._segment.last_ns + 1])
+        times = samples.seconds(clock)
+        inside = np.searchsorted(samples.received, [self._segment.first_ns, self._segment.last_ns + 1])
         breaks = np.flatnonzero(np.diff(times) < -MAX_LATE_S) + 1
         earlier, later = breaks[breaks <= inside[0]], breaks[breaks >= max(inside[1], 1)]
         low = int(earlier[-1]) if len(earlier) else 0

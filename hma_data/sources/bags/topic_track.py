@@ -24,7 +24,7 @@ from hma_data.episodes.episode import Floats, Stream
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import Component
 from hma_data.sources.bags.bag import Bag, BagPlace
-from hma_data.sources.bags.clocks import Clock, set_back, sorted_by
+from hma_data.sources.bags.clocks import MessageTimes
 from hma_data.sources.bags.container import Channel
 from hma_data.sources.bags.images import (
     VIDEO,
@@ -294,83 +294,19 @@ class TopicTrack:
         except (KeyError, TypeError, ValueError) as fault:
             raise EpisodeError(self.topic, f"a message is not a frame of a video: {fault!r}") from fault
 
-    def by_receipt(self, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-        """Return the order of receipt: of all messages, or of those rows (then an index into `rows`)."""
-        received = self.received()
-        return np.argsort(received if rows is None else received[rows], kind="stable")
-
-    def order(self, clock: str, where: str, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-        """Return the order by one of the clocks: of all messages, or of those rows (an index into `rows`).
-
-        Args:
-            rows: rising.
-
-        Raises:
-            EpisodeError: the clock was set back.
-        """
-        rows = np.arange(len(self)) if rows is None else rows
-        order = self.sorted_rows(clock, rows)
-        if order is None:
-            raise self.set_back_error(clock, where, rows)
-        return order
-
-    def set_back_error(self, clock: str, where: str, rows: NDArray[np.int64]) -> EpisodeError:
-        """Return the error of a clock that was set back; its remedy makes no data worse."""
-        by_header = clock == "header" and self.stamped
-        at, seconds = set_back((self.stamps() if by_header else self.received())[rows])
-        other = "receive" if by_header else "header"
-        usable = (by_header or self.stamped) and self.sorted_rows(other, rows) is not None
-        remedy = "cut the file there, and keep the parts in folders of their own"
-        if by_header:
-            fault = f"header stamps go back by {seconds:.3g} s at message {at}: their clock was set back"
-            fault += ", or a simulation began anew"
-            if usable:
-                remedy = "sync: {stamp: receive} reads on by the times of receipt"
-                if seconds > 1:  # segments divide where a clock jumps back as far as they state
-                    remedy = f"source.segments: {{gap_s: 1}} makes the parts episodes of their own; {remedy}"
-        else:
-            fault = f"times of receipt go back by {seconds:.3g} s at message {at}: "
-            fault += "the recorder's clock was set back"
-            remedy = "sync: {stamp: header} takes the header stamps, which are in order" if usable else remedy
-        return EpisodeError(where, fault, remedy)
-
-    def sorted_rows(self, clock: str, rows: NDArray[np.int64]) -> NDArray[np.int64] | None:
-        """Return the order of rows by a clock, or as they are stored; None where the clock was set back."""
-        if clock == "stored":
-            return np.arange(len(rows))
-        times = self.stamps() if clock == "header" and self.stamped else self.received()
-        return sorted_by(times[rows], self.places()[rows, 0])
-
-    def clock(self, clock: str, rows: NDArray[np.int64]) -> Clock:
-        """Measure the clock by which some of the messages are timed."""
-        stamps = self.stamps()[rows] if clock == "header" and self.stamped else None
-        return Clock.of(self.topic, stamps, self.received()[rows])
-
-    def stamps(self) -> NDArray[np.int64]:
-        """Return (T,) nanoseconds of the header stamps, in the file's order."""
-        return np.frombuffer(self._stamp_ns, np.int64)
-
-    def received(self) -> NDArray[np.int64]:
-        """Return (T,) nanoseconds of receipt, in the file's order."""
-        return np.frombuffer(self._log_ns, np.int64)
-
     @property
-    def stamped(self) -> bool:
-        """Check whether every message carries its own time, and these times are not all the same."""
+    def times(self) -> MessageTimes:
+        """Return the times of the messages; none can be added while the caller holds them."""
         stamps = np.frombuffer(self._stamp_ns, np.int64)
-        return bool(len(stamps) and np.all(stamps)) and not self.frozen
+        known = bool(len(stamps) and np.all(stamps)) and not self.frozen
+        received = np.frombuffer(self._log_ns, np.int64)
+        return MessageTimes(self.topic, received, stamps if known else None, self.places()[:, 0])
 
     @property
     def frozen(self) -> bool:
         """Check whether the messages' own times never change: such stamps are not a clock."""
         stamps = np.frombuffer(self._stamp_ns, np.int64)
         return bool(len(stamps) > 1 and stamps[0] and np.all(stamps == stamps[0]))
-
-    def seconds(self, clock: str) -> Floats:
-        """Return (T,) seconds in the file's order: `header` where messages are stamped, else `receive`."""
-        nanoseconds = self.stamps() if clock == "header" and self.stamped else self.received()
-        # Whole seconds are divided first, because 61 bits do not fit a float.
-        return nanoseconds // 10**9 + (nanoseconds % 10**9) / 1e9
 
     def places(self) -> NDArray[np.int64]:
         """Return (T, 4): file, two numbers of the place in it, index into `channels`."""
@@ -408,19 +344,21 @@ def camera_stream(
     if track.kind is None or len({image_kind(channel.type) for channel in track.channels}) > 1:
         types = ", ".join(sorted({channel.type or channel.encoding for channel in track.channels}))
         raise EpisodeError(where, f"holds {types}, not images", "name a topic of images as the camera's key")
-    rows = track.by_receipt()
+    times = track.times
+    rows = times.by_receipt()
     begin, stop = shown or (0, len(rows))
-    if track.kind != VIDEO:
-        rows = np.sort(rows[begin:stop])
-        rows = rows[track.order(clock, where, rows)]
-        messages = Messages(bag, track.channels, track.places()[rows], where)
-        return StillStream(track.seconds(clock)[rows], messages, track.kind, levels)
-    return _video_stream(bag, track, clock, (begin, stop), where)
+    if track.kind == VIDEO:
+        return _video_stream(bag, track, clock, (begin, stop), where)
+    rows = np.sort(rows[begin:stop])
+    rows = rows[times[rows].order_or_raise(clock, where)]
+    messages = Messages(bag, track.channels, track.places()[rows], where)
+    return StillStream(times.seconds(clock)[rows], messages, track.kind, levels)
 
 
 def _video_stream(bag: Bag, track: TopicTrack, clock: str, shown: tuple[int, int], where: str) -> VideoStream:
     begin, stop = shown
-    rows = track.by_receipt()
+    times = track.times
+    rows = times.by_receipt()
     keyframes = track.keyframes()
     if keyframes is None:  # only the first message is certain to be one
         keyframes = np.arange(len(track)) == rows[0]
@@ -443,16 +381,16 @@ def _video_stream(bag: Bag, track: TopicTrack, clock: str, shown: tuple[int, int
     if reorders:  # the last frames may build on messages up to the next key frame
         later = key_places[key_places >= stop]
         rows = np.sort(rows[first : int(later[0]) if len(later) else len(rows)])
-        times = track.seconds(clock)[rows]
-        times = times[track.order(clock, where, rows)]
+        times = times[rows]
+        seconds = times.seconds(clock)[times.order_or_raise(clock, where)]
     else:
         rows = np.sort(rows[first:stop])
-        rows = rows[track.order(clock, where, rows)]
+        rows = rows[times[rows].order_or_raise(clock, where)]
         overtaken = int(np.argmax(keyframes[rows]))  # messages that arrived late, from before the key frame
         rows, begin = rows[overtaken:], max(begin - overtaken, first)
-        times = track.seconds(clock)[rows]
+        seconds = times.seconds(clock)[rows]
     messages = Messages(bag, track.channels, track.places()[rows], where)
     decoder_rows = keyframes[rows]
     return VideoStream(
-        times[begin - first : stop - first], messages, decoder_rows, track.codec, begin - first, reorders
+        seconds[begin - first : stop - first], messages, decoder_rows, track.codec, begin - first, reorders
     )

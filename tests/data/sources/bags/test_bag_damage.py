@@ -80,7 +80,6 @@ def test_a_bag_that_holds_less_than_its_index_counts_is_refused(bags, tmp_path) 
 
 
 def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(bags, tmp_path, monkeypatch) -> None:
-
     monkeypatch.setattr(container, "MAX_CHUNK", 4000)
     for kind in ("ros1-bz2", "mcap-cdr-zstd", "mcap-ros1-lz4"):
         with pytest.raises(EpisodeError, match="more than 4,000"):

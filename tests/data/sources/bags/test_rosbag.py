@@ -125,7 +125,7 @@ def test_messages_out_of_order_come_in_order_of_receipt(tmp_path: Path) -> None:
         message = decode(record.channel, record.data, "")
         track.add(record.channel, record.log_ns, place, message)
         values.append(message["value"])
-    assert [values[i] for i in track.by_receipt()] == expected == list(range(50))
+    assert [values[i] for i in track.times.by_receipt()] == expected == list(range(50))
 
 
 @pytest.fixture
