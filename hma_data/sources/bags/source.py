@@ -295,8 +295,8 @@ class _EpisodeReading:
         return camera_stream(self._bag, track, self._table.clock, within, camera.levels)
 
     def _signal(self, column: Column, shown: Floats) -> Signal:
-        track, values = self._tracks[column.field.topic], column.values()
-        times = track.times[column.rows()]
+        track = self._tracks[column.field.topic]
+        times, values = track.times[column.rows()], column.values()
         clock = column.component.stamp or self._embodiment.sync.stamp
         if self._segment:
             by_receipt = times.by_receipt()
