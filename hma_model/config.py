@@ -84,29 +84,17 @@ _CHOICES = {
     "masked_input": ("learned", "previous"),
     "digit_order": ("together", "chain"),
     "position_init": ("random", "sinusoid"),
-    "time_position": ("rotary", "learned"),
+    "layout": ("ours", "released"),
     "action_alignment": ("previous", "current"),
-    "modulation_out": ("trunk", "embodiment"),
     "absent_action": ("embedding", "skip", "tokens"),
-    "add_at": ("input", "layers"),
-    "norms": ("before", "qk"),
     "action_loss": ("mse", "diffusion"),
     "diffusion_target": ("noise", "velocity"),
-    "action_target": ("normalized", "raw"),
 }
 _AT_LEAST_ONE = (
     *("layers", "width", "heads", "mlp_ratio", "frames", "channels", "patch", "action_tokens", "base_width"),
-    *("merge", "history_frames", "diffusion_depth", "diffusion_width", "diffusion_train_steps", "views"),
-    *("diffusion_sample_steps", "diffusion_repeats"),
+    *("merge", "diffusion_depth", "diffusion_width", "diffusion_sample_steps", "views"),
 )
-_SHARES = (
-    "label_smoothing",
-    "corrupt_max",
-    "history_probability",
-    "mask_ratio_min",
-    "dropout",
-    "whole_share",
-)
+_SHARES = ("label_smoothing", "corrupt_max", "history_probability", "whole_share")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +119,6 @@ class HMAConfig:
     frames: int = 12  # T, the window; in a longer rollout, temporal attention sees this many frames
     grid: tuple[int, int] = (16, 16)  # the tokenizer's (h, w); a continuous model's tokens are patches of it
     views: int = 1  # cameras in a frame, stacked along the height: a frame has views · h rows of tokens
-    dropout: float = 0.0  # in the MLPs
 
     factored: tuple[int, ...] = (512, 512)  # discrete: values a digit, low digit first
     merge: int = 1  # discrete: the side of a square of stored tokens that becomes one token of the trunk
@@ -141,9 +128,7 @@ class HMAConfig:
 
     conditioning: tuple[str, ...] = ("modulation",)  # any of CONDITIONINGS together
     shared_modulation: bool = False  # False: modulation weights per embodiment (paper); True: in the trunk
-    modulation_out: str = "trunk"  # owner of the projection after the modulated norm; released: embodiment
     action_tokens: int = 1  # copies of the action embedding put after a frame's tokens (concat)
-    add_at: str = "input"  # where embeddings are added (add); "layers": in every block (released)
     # The conditioning of a pass without any actions. "embedding": a learned embedding replaces each action;
     # "skip": no conditioning (released); "tokens": only learned action tokens (released, actions predicted
     # too). With "tokens", a single hidden chunk is hidden only in the action tokens; modulation still sees
@@ -154,23 +139,19 @@ class HMAConfig:
     action_waves: int = 0
     action_alignment: str = "previous"  # chunk k conditions frame k+1; "current": frame k (released)
 
-    time_position: str = "rotary"  # relative, so that a cache may roll; "learned": absolute (released)
-    rotary_base: float = 100.0  # ratio of the longest wavelength to the shortest; windows are short
-    norms: str = "before"  # before spatial attention and the MLP; "qk": none there (released with qk_norm)
-    temporal_norm: bool = True  # norm before temporal attention; the released code has none
-    final_norm: bool = True  # norm after the last block; the released code has none
+    # "released": learned absolute times, so no rollout is longer than the window; no norm before temporal
+    # attention or after the last block; the projection after the modulated norm by embodiment; raw targets
+    # of actions.
+    layout: str = "ours"
     qkv_bias: bool = False
-    proj_bias: bool = True
     mlp_bias: bool = True
-    qk_norm: bool = False
+    qk_norm: bool = False  # norms of queries and keys in place of those before spatial attention and MLP
     mup: bool = False  # attention scale 8 / head_dim, and a readout scaled down as the width grows
     base_width: int = 256  # the width at which muP's multipliers are one
 
     # How often each objective is drawn.
     objectives: Mapping[str, float] = field(default_factory=lambda: {"forward": 1.0})
     action_loss: str = "mse"
-    action_target: str = "normalized"  # "raw": the released action heads were trained on raw actions
-    action_loss_weight: float = 0.5  # relative to the video loss
     label_smoothing: float = 0.01
     corrupt_max: float = 0.2  # discrete: a sample's share of digits replaced at random is U(0, this)
     # continuous: the standard deviation of the noise in a visible frame, in units of its corruption, which is
@@ -179,8 +160,6 @@ class HMAConfig:
     told_noise: bool = False  # tell the model each frame's corruption; 0 for what it is shown after training
     # The share of samples whose longer history stays unmasked, with later frames corrupted more.
     history_probability: float = 0.2
-    history_frames: int = 4  # the shortest such history
-    mask_ratio_min: float = 0.0  # a masked frame's smallest mask probability
     # The frames of a training pass that predicts video. "window": the window's, masked (paper). "pairs": the
     # true frames, and a masked copy of each from the second on, which sees the true frames before it.
     training_pass: str = "window"
@@ -203,10 +182,7 @@ class HMAConfig:
     diffusion_target: str = "velocity"  # what the head predicts: defined at full noise too; "noise" (paper)
     diffusion_depth: int = 3
     diffusion_width: int = 1024
-    diffusion_train_steps: int = 1000
     diffusion_sample_steps: int = 4  # the paper's 100 are for the noise
-    diffusion_clip: float = 10.0  # a step's estimate of the clean sample is clipped to ± this
-    diffusion_repeats: int = 1  # noise levels drawn per token and training step
     diffusion_variance: bool = False  # the head has variance outputs, which DDIM never reads (released)
 
     tokenizer: Mapping[str, Any] = field(default_factory=dict)  # the tokenizer's spec, kept for checkpoints
@@ -221,6 +197,11 @@ class HMAConfig:
         _check_scalars(self)
         _check_shapes(self)
         _check_sets(self)
+
+    @property
+    def released(self) -> bool:
+        """Return whether the layout is that of the paper's released weights."""
+        return self.layout == "released"
 
     @property
     def token_grid(self) -> tuple[int, int]:
@@ -348,13 +329,10 @@ def _check_scalars(config: HMAConfig) -> None:
         raise _refuse("latent_noise", config.latent_noise, "a number of at least 0")
     if not (math.isfinite(config.motion_weight) and config.motion_weight >= 0):
         raise _refuse("motion_weight", config.motion_weight, "a number of at least 0")
-    for name in ("latent_scale", "rotary_base", "diffusion_clip"):
-        if not (math.isfinite(value := getattr(config, name)) and value > 0):
-            raise _refuse(name, value, "a positive number")
+    if not (math.isfinite(config.latent_scale) and config.latent_scale > 0):
+        raise _refuse("latent_scale", config.latent_scale, "a positive number")
     if not 0 <= config.action_waves <= 16:
         raise _refuse("action_waves", config.action_waves, "a number from 0 to 16")
-    if not (math.isfinite(config.action_loss_weight) and config.action_loss_weight >= 0):
-        raise _refuse("action_loss_weight", config.action_loss_weight, "a number of at least 0")
 
 
 def _check_shapes(config: HMAConfig) -> None:
@@ -364,7 +342,7 @@ def _check_shapes(config: HMAConfig) -> None:
         raise _refuse("factored", config.factored, "at least one digit of at least two values")
     if config.width % config.heads:
         raise _refuse("heads", config.heads, f"a divisor of the width, {config.width}")
-    if config.time_position == "rotary" and config.head_dim % 2:
+    if not config.released and config.head_dim % 2:
         raise _refuse(
             "heads", config.heads, f"a width a head that is even, not {config.head_dim}, for rotary time"
         )
@@ -384,16 +362,14 @@ def _check_sets(config: HMAConfig) -> None:
     weights = list(config.objectives.values())
     if not weights or min(weights) < 0 or not 0 < sum(weights) < math.inf:
         raise _refuse("objectives", config.objectives, "weights of at least 0 that do not all vanish")
-    if config.norms == "qk" and not config.qk_norm:
-        raise _refuse("norms", "qk", "before, as qk_norm is off")
     if config.video_loss == "regression" and config.kind == "discrete":
         raise _refuse("video_loss", "regression", "diffusion, or a continuous tokenizer")
     if config.video_loss == "regression" and not config.copy_previous:
         raise _refuse("copy_previous", False, "true: regression predicts the change since the frame before")
     if config.trunk == "unet":
         _check_unet(config)
-    if config.shared_modulation and config.modulation_out == "embodiment":
-        raise _refuse("modulation_out", "embodiment", "trunk, as shared_modulation is on")
+    if config.shared_modulation and config.released:
+        raise _refuse("layout", "released", "ours, as shared_modulation is on")
 
 
 def _check_unet(config: HMAConfig) -> None:
@@ -402,7 +378,7 @@ def _check_unet(config: HMAConfig) -> None:
     for name, value in (
         ("conditioning", ("modulation",)),
         ("shared_modulation", True),
-        ("time_position", "rotary"),
+        ("layout", "ours"),
         ("absent_action", "embedding"),
     ):
         if getattr(config, name) != value:

@@ -21,9 +21,10 @@ if TYPE_CHECKING:
 State = dict[str, "Tensor"]
 STATISTICS = "normalizer."  # the beginning of their names in a stem
 LARGEST_COUNT = 1_000_000  # upper limit of every count in a configuration
-_COUNTS = ("layers", "width", "heads", "frames", "channels", "patch", "action_tokens", "history_frames",
-           "diffusion_depth", "diffusion_width", "diffusion_train_steps", "diffusion_sample_steps",
-           "grid", "views", "factored")  # fmt: skip
+_COUNTS = (
+    *("layers", "width", "heads", "frames", "channels", "patch", "action_tokens", "grid", "views"),
+    *("factored", "diffusion_depth", "diffusion_width", "diffusion_sample_steps"),
+)
 _REMEDY = "pull the checkpoint again; if it stays so, do not use it"
 
 
@@ -120,7 +121,7 @@ def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: 
     needed = {
         "layers": config.layers * width * max(width, hidden),
         "grid": config.tokens_per_frame * width,
-        "frames": config.frames * width if config.time_position == "learned" else 0,
+        "frames": config.frames * width if config.released else 0,
     }
     if config.kind == "discrete":
         needed["factored"] = sum(config.digits) * width

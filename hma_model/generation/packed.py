@@ -116,7 +116,7 @@ def packed[M: nn.Module](module: M, dtype: torch.dtype = torch.float32) -> M:
 def _pack(module: nn.Module | None, dtype: torch.dtype) -> nn.Module | None:
     if isinstance(module, nn.Linear):
         return _linear(module, dtype)
-    if isinstance(module, MLP) and not module.dropout.p:
+    if isinstance(module, MLP):
         return PackedMLP(module, dtype)
     return None if module is None else packed(module, dtype)
 

@@ -107,7 +107,7 @@ class Passes:
 
     def _newest(self, rows: list[int]) -> Pass:
         """Return the pass over the newest frame and the next one with a cache."""
-        last = self.config.frames - 1 if self.config.time_position == "learned" else max(self.state.times)
+        last = self.config.frames - 1 if self.config.released else max(self.state.times)
         begin = [max(min(self.state.times[row], last) - 1, 0) for row in rows]  # of idle rows any will do
         times = self.state.cached_times(rows, begin, 2)
         times.wanted = 1

@@ -303,7 +303,7 @@ class Rollout:
 
     def _make_room(self, rows: list[int]) -> None:
         """Make room for the next frame of rows."""
-        if self.config.time_position == "learned":
+        if self.config.released:
             self.state.slide(rows)
         if not self.caching:
             self.state.grow(rows)

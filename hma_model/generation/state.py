@@ -121,7 +121,7 @@ class RowState:
         batch, config = len(self.embodiments), model.config
         self.times, self.pending, self.prompts = [0] * batch, [0] * batch, [0] * batch
         self.generators: list[torch.Generator | None] = [None] * batch
-        slots = config.frames + (config.time_position == "rotary")
+        slots = config.frames + (not config.released)
         blank = self.blank(batch).unsqueeze(1)
         self.frames = torch.zeros_like(blank).repeat(1, slots, *[1] * (blank.dim() - 2))
         self.chunks = torch.zeros(batch, slots, model.widest_chunk(self.embodiments), device=model.device)

@@ -24,6 +24,8 @@ from hma_model.network.trunks.contract import rows_at
 ABSOLUTE_SHARE = 0.2  # of the absolute error beside the squared one: edges stay sharper
 MOTION_SLOPE = 3.0  # a change of a third of a unit has most of the weight of motion
 _LEVEL_VALUES = 256  # sinusoids that describe a noise level
+TRAINING_LEVELS = 1000  # of noise
+CLIP = 10.0  # a step's estimate of the clean sample is clipped to ± this
 
 
 type Generators = torch.Generator | Sequence[torch.Generator] | None  # several draw equal parts of axis 0
@@ -217,7 +219,7 @@ class LatentReadout(nn.Module):
         super().__init__()
         self.proj = Linear(config.width, config.width)
         self.norm = nn.LayerNorm(config.width, eps=1e-6)
-        times = config.frames if config.time_position == "learned" else 1
+        times = config.frames if config.released else 1
         self.position = nn.Parameter(torch.zeros(times, config.tokens_per_frame, config.width))
         self.diffusion = DiffusionHead(config, config.patch_dim)
         nn.init.normal_(self.proj.weight, std=config.width**-0.5)
@@ -408,9 +410,9 @@ class DiffusionHead(nn.Module):
     def __init__(self, config: HMAConfig, values: int) -> None:
         super().__init__()
         width = config.diffusion_width
-        self.values, self.clip = values, config.diffusion_clip
+        self.values = values
         self.velocity = config.diffusion_target == "velocity"
-        self.repeats, self.sample_steps = config.diffusion_repeats, config.diffusion_sample_steps
+        self.sample_steps = config.diffusion_sample_steps
         self.input = Linear(values, width)
         self.condition = Linear(config.width, width)
         self.level_in = Linear(_LEVEL_VALUES, width)
@@ -419,7 +421,7 @@ class DiffusionHead(nn.Module):
         self.modulation = Linear(width, 2 * width)
         self.output = Linear(width, values * (2 if config.diffusion_variance else 1))
         # as a list too, so that sampling does not wait for a GPU
-        self.alpha_bars: list[float] = cosine_levels(config.diffusion_train_steps).float().tolist()
+        self.alpha_bars: list[float] = cosine_levels(TRAINING_LEVELS).float().tolist()
         self.register_buffer("levels", torch.tensor(self.alpha_bars), persistent=False)
         for name, module in self.named_modules():
             if isinstance(module, nn.Linear):
@@ -434,8 +436,7 @@ class DiffusionHead(nn.Module):
 
     def loss(self, target: Tensor, condition: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return the squared error (M,) float32 of the prediction for samples (M, C), conditions (M, D)."""
-        rows = len(target)
-        target, condition = (x.repeat(self.repeats, 1) for x in (target.float(), condition))
+        target = target.float()
         draw = uniform((len(target),), generator, target.device)
         level = (draw * len(self.levels)).long().clamp(max=len(self.levels) - 1)
         noise = randn(target.shape, generator, target.device)
@@ -443,7 +444,7 @@ class DiffusionHead(nn.Module):
         signal, spread = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
         predicted = self(signal * target + spread * noise, level, condition)
         goal = signal * noise - spread * target if self.velocity else noise
-        return F.mse_loss(predicted, goal, reduction="none").mean(-1).view(self.repeats, rows).mean(0)
+        return F.mse_loss(predicted, goal, reduction="none").mean(-1)
 
     @torch.no_grad()
     def sample(
@@ -487,7 +488,7 @@ class DiffusionHead(nn.Module):
         """Make one DDIM step from a level of signal share `alpha_bar` to one where it is `after`."""
         signal, spread = math.sqrt(alpha_bar), math.sqrt(1 - alpha_bar)
         clean = signal * x - spread * predicted if self.velocity else (x - spread * predicted) / signal
-        clean = clean.clamp(-self.clip, self.clip)
+        clean = clean.clamp(-CLIP, CLIP)
         if after == 1.0:
             return clean
         noise = (x - signal * clean) / spread  # consistent with the clipped estimate

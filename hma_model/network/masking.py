@@ -14,6 +14,8 @@ from hma_model.config import HMAConfig
 from hma_model.network.head import device_of, nearby, uniform
 from hma_model.network.stem import from_digits, to_digits
 
+HISTORY_FRAMES = 4  # of the shortest history that stays unmasked
+
 
 @dataclass
 class VideoMask:
@@ -40,7 +42,7 @@ def draw_pairs_mask(
     corruption = draw_video_mask(config, batch, frames, generator).corruption[:, :past]
     whole = uniform((batch, frames - 1), generator, where) < config.whole_share
     ratio = torch.cos(uniform((batch, frames - 1), generator, where) * (math.pi / 2))
-    ratio = torch.where(whole, 1.0, ratio.clamp(min=config.mask_ratio_min)).unsqueeze(-1)
+    ratio = torch.where(whole, 1.0, ratio).unsqueeze(-1)
     copies = uniform((batch, frames - 1, config.tokens_per_frame), generator, where) < ratio
     masked = torch.cat([copies.new_zeros(batch, past, copies.shape[2]), copies], dim=1)
     return VideoMask(masked, F.pad(corruption, (0, frames - 1)))
@@ -51,7 +53,7 @@ def draw_video_mask(
 ) -> VideoMask:
     """Mask the tokens of each frame with probability cos(u pi/2), and corrupt a share of all tokens.
 
-    With `history_probability` a sample keeps a history of at least `history_frames` frames unmasked. With
+    With `history_probability` a sample keeps a history of at least HISTORY_FRAMES frames unmasked. With
     `drift`, each frame after it is corrupted more than the one before, as in a rollout of the model's own
     predictions. Each sample has its own draws.
     """
@@ -59,11 +61,10 @@ def draw_video_mask(
     where = device_of(generator)
     index = torch.arange(frames, device=where)
     draw = uniform((2, batch), generator, where)
-    start = min(config.history_frames, frames - 1)
+    start = min(HISTORY_FRAMES, frames - 1)
     long = (draw[0] < config.history_probability) & (frames > 2)
     first = torch.where(long, start + (draw[1] * (frames - start)).long(), 1).unsqueeze(1)
     ratio = torch.cos(uniform((batch, frames), generator, where) * (math.pi / 2))
-    ratio = ratio.clamp(min=config.mask_ratio_min)
     masked = uniform((batch, frames, tokens), generator, where) < ratio.unsqueeze(-1)
     masked &= (index >= first).unsqueeze(-1)
 

@@ -178,7 +178,7 @@ class Network(nn.Module):
 
     def time_positions(self, frames: int) -> TimePositions:
         """Return the times of a window of this many frames."""
-        if frames > self.config.frames and self.config.time_position == "learned":
+        if frames > self.config.frames and self.config.released:
             fault = f"{frames} frames where the learned positions end at {self.config.frames}"
             raise HMAError("window", fault, "give a shorter window")
         return window_times(self.config, frames, self.device)
@@ -272,4 +272,4 @@ class Network(nn.Module):
         if lag := readout.lag:
             after = head.predict(pooled[:, lag:].flatten(0, 1), readout, generator)
             chunks = torch.cat([after.unflatten(0, (len(pooled), -1)), chunks[:, -lag:]], dim=1)
-        return chunks if self.config.action_target == "raw" else self.stem(embodiment).normalizer.undo(chunks)
+        return chunks if self.config.released else self.stem(embodiment).normalizer.undo(chunks)

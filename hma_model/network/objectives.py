@@ -31,6 +31,8 @@ from hma_model.network.trunks.contract import TimePositions, paired_times
 if TYPE_CHECKING:
     from hma_data.loading.rows import Batch
 
+ACTION_LOSS_WEIGHT = 0.5  # relative to the video loss
+
 
 @dataclass
 class Output:
@@ -151,7 +153,7 @@ def compute(
             logits = _video_logits(model, features, own, before, frames, layout, groups)
     loss = torch.zeros((), device=features.device)
     loss = loss if video_loss is None else loss + video_loss
-    loss = loss if action_loss is None else loss + config.action_loss_weight * action_loss
+    loss = loss if action_loss is None else loss + ACTION_LOSS_WEIGHT * action_loss
     masked = masked.to(features.device).unflatten(2, config.token_grid)
     return Output(loss, video_loss, action_loss, per_sample.detach(), masked, name, logits)
 
@@ -308,7 +310,7 @@ def _action_loss(
         sample, frame = predicted[span].nonzero(as_tuple=True)
         stem = model.stem(name)
         target = chunks[span, :, : stem.input.in_features][sample, frame]
-        if model.config.action_target == "normalized":
+        if not model.config.released:
             target = stem.normalizer(target)
         losses.append(model.head(name).loss(pooled[span][sample, frame], target, readout, generator))
         samples.append(sample + span.start)

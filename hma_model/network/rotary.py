@@ -8,12 +8,14 @@ from torch import Tensor
 
 from hma_model.config import HMAConfig
 
+ROTARY_BASE = 100.0  # ratio of the longest wavelength to the shortest; windows are short
+
 
 def rotary_angles(config: HMAConfig, positions: Tensor) -> tuple[Tensor, Tensor]:
     """Return cos and sin, float32 (..., head_dim / 2), of the rotary angles at the times (...)."""
     half = max(config.head_dim // 2, 1)
     steps = torch.arange(half, device=positions.device, dtype=torch.float32) / half
-    angles = positions.float().unsqueeze(-1) * config.rotary_base**-steps
+    angles = positions.float().unsqueeze(-1) * ROTARY_BASE**-steps
     return angles.cos(), angles.sin()
 
 

@@ -241,8 +241,8 @@ class Normalizer(nn.Module):
 class Modulation(nn.Module):
     """The map from action embeddings to every layer's (shift, gain), all layers in two batched products.
 
-    Weights are stacked over layers, (L, in, out). With `modulation_out == "embodiment"` it also holds each
-    layer's projection after the modulated norm, as the released code does.
+    Weights are stacked over layers, (L, in, out). In the released layout it also holds each
+    layer's projection after the modulated norm.
     """
 
     def __init__(self, config: HMAConfig) -> None:
@@ -254,7 +254,7 @@ class Modulation(nn.Module):
         self.bias = nn.Parameter(torch.zeros(layers, 1, 2 * width))
         self.out_weight: nn.Parameter | None = None
         self.out_bias: nn.Parameter | None = None
-        if config.modulation_out == "embodiment":
+        if config.released:
             self.out_weight = nn.Parameter(torch.randn(layers, width, width) / math.sqrt(2 * layers * width))
             self.out_bias = nn.Parameter(torch.zeros(layers, width))
 

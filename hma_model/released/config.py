@@ -1,10 +1,8 @@
 """Convert the configuration of the paper's released checkpoints to ours, and ours to theirs.
 
-The released layout differs from our default in the fields of `_LAYOUT`: no norm before temporal attention or
-after the last block, chunk k at frame k, learned positions over time and space, and action heads trained on
-raw actions. Substrings of its `action_network` state how actions enter the network: "concat" appends copies
-of the embedding to every frame; "mlp" (added in every block), "cross_attention" or "modulate" acts in the
-blocks.
+Released weights have the layout that `HMAConfig.layout` explains, and chunk k at frame k. Substrings of their
+`action_network` state how actions enter the network: "concat" appends copies of the embedding to every frame;
+"mlp" (added in every block), "cross_attention" or "modulate" acts in the blocks.
 
 D width, T frames, S tokens of a frame.
 """
@@ -19,40 +17,27 @@ from hma_model.config import INVERSE, OBJECTIVES, POLICY, HMAConfig
 LATENT_SCALE = 0.18215  # the factor by which the released loader multiplies stored latents
 _WHERE = "config.json"
 _REMEDY = "is it a released checkpoint?"
-_LAYOUT: dict[str, Any] = {
-    "modulation_out": "embodiment",
-    "action_alignment": "current",
-    "action_target": "raw",
-    "time_position": "learned",
-    "temporal_norm": False,
-    "final_norm": False,
-    "add_at": "layers",
-}
+_LAYOUT: dict[str, Any] = {"layout": "released", "action_alignment": "current"}
 # What an export need not keep: read by training alone, or folded into the weights.
 _FREE = {
-    "action_target", "diffusion_variance", "dropout", "label_smoothing", "latent_noise", "mask_ratio_min",
-    "modulation_out", "objectives", "position_init", "rotary_base", "shared_modulation", "tokenizer",
+    "diffusion_variance", "label_smoothing", "latent_noise", "objectives", "position_init", "tokenizer",
     "training_pass", "whole_share",
 }  # fmt: skip
-_DISCRETE_ONLY = {"factored", "corrupt_max", "history_probability", "history_frames"}
+_DISCRETE_ONLY = {"factored", "corrupt_max", "history_probability"}
 _CONTINUOUS_ONLY = {
     "channels", "patch", "latent_scale", "diffusion_target", "diffusion_depth", "diffusion_width",
-    "diffusion_train_steps", "diffusion_sample_steps", "diffusion_clip", "diffusion_repeats",
+    "diffusion_sample_steps",
 }  # fmt: skip
 # Their field: ours with the same meaning.
 _SAME = {
     "num_layers": "layers", "num_heads": "heads", "d_model": "width", "T": "frames", "mlp_ratio": "mlp_ratio",
-    "mlp_drop": "dropout", "mlp_bias": "mlp_bias", "qkv_bias": "qkv_bias", "proj_bias": "proj_bias",
-    "qk_norm": "qk_norm", "use_mup": "mup", "action_token_size": "action_tokens",
-    "action_loss_weight": "action_loss_weight",
+    "mlp_bias": "mlp_bias", "qkv_bias": "qkv_bias", "qk_norm": "qk_norm", "use_mup": "mup",
+    "action_token_size": "action_tokens",
 }  # fmt: skip
-_SAME_DISCRETE = {
-    "max_corrupt_rate": "corrupt_max", "non_mlm_ratio": "history_probability",
-    "num_prompt_frames": "history_frames",
-}  # fmt: skip
+_SAME_DISCRETE = {"max_corrupt_rate": "corrupt_max", "non_mlm_ratio": "history_probability"}
 _SAME_CONTINUOUS = {
     "vae_embed_dim": "channels", "patch_size": "patch", "diffloss_d": "diffusion_depth",
-    "diffloss_w": "diffusion_width", "diffusion_batch_mul": "diffusion_repeats",
+    "diffloss_w": "diffusion_width",
 }  # fmt: skip
 # Our objective by their (jointly_predict_actions, jointly_predict_states). Without the first, the second is
 # ignored: video is predicted.
@@ -65,19 +50,18 @@ _OBJECTIVE = {
 # The values of fields that a released file does not state.
 _DEFAULTS: dict[str, Any] = {
     "T": 12, "S": 256, "image_vocab_size": 262144, "num_factored_vocabs": 1,
-    "max_corrupt_rate": 0.2, "non_mlm_ratio": 0.2, "num_prompt_frames": 4,
+    "max_corrupt_rate": 0.2, "non_mlm_ratio": 0.2,
     "action_network": "mlp", "jointly_predict_actions": False, "jointly_predict_states": True,
-    "action_token_size": 64, "action_loss_weight": 0.5,
-    "use_mup": False, "qk_norm": True, "qkv_bias": False, "proj_bias": True,
-    "mlp_ratio": 4.0, "mlp_drop": 0.0, "mlp_bias": True,
+    "action_token_size": 64,
+    "use_mup": False, "qk_norm": True, "qkv_bias": False, "mlp_ratio": 4.0, "mlp_bias": True,
 }  # fmt: skip
 _CONTINUOUS_DEFAULTS: dict[str, Any] = {
-    "image_vocab_size": None, "action_loss_weight": 1.0, "patch_size": 1, "vae_embed_dim": 4,
-    "diffloss_d": 4, "diffloss_w": 1024, "num_sampling_steps": "100", "diffusion_batch_mul": 1,
+    "image_vocab_size": None, "patch_size": 1, "vae_embed_dim": 4,
+    "diffloss_d": 4, "diffloss_w": 1024, "num_sampling_steps": "100",
 }  # fmt: skip
 _COUNTS = {"num_layers": 1000, "diffloss_d": 1000, "num_factored_vocabs": 64} | dict.fromkeys(
-    ("num_heads", "d_model", "T", "S", "action_token_size", "patch_size", "vae_embed_dim", "diffloss_w",
-     "diffusion_batch_mul"), 1_000_000
+    ("num_heads", "d_model", "T", "S", "action_token_size", "patch_size", "vae_embed_dim", "diffloss_w"),
+    1_000_000,
 )  # fmt: skip
 
 
@@ -101,6 +85,8 @@ def config_from_released(
                 raise CheckpointError(
                     _WHERE, f"{name} is {value!r}, not a whole number from 1 to {most}", _REMEDY
                 )
+        if not values.get("proj_bias", True):
+            raise CheckpointError(_WHERE, "is without proj_bias, unlike any release", _REMEDY)
         shared = _shared(values, (case or {}).get("grid"))
         own = _continuous(values) if continuous else _discrete(values)
         return HMAConfig(**_LAYOUT, **shared, **own)
@@ -131,7 +117,6 @@ def _shared(values: Mapping[str, Any], grid: Any) -> dict[str, Any]:
         "grid": (height, width),
         "conditioning": _conditioning(str(values["action_network"])),
         "absent_action": "tokens" if joint else "skip",
-        "norms": "qk" if values["qk_norm"] else "before",
         "objectives": {objective: 1.0},
     }
 
@@ -186,6 +171,7 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
     named = {"concat": "concat", "modulation": "modulate", "add": "mlp"}
     same = _SAME | _SAME_DISCRETE | ({} if discrete else _SAME_CONTINUOUS)
     values = {theirs: getattr(config, ours) for theirs, ours in same.items()} | {
+        "proj_bias": True,
         "S": math.prod(config.grid),
         "image_vocab_size": config.vocab_size if discrete else None,
         "num_factored_vocabs": len(config.factored) if discrete else 2,
@@ -197,7 +183,6 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
         values |= {"Diffusion": True, "num_sampling_steps": str(config.diffusion_sample_steps)}
     free = _FREE | (_CONTINUOUS_ONLY if discrete else _DISCRETE_ONLY)
     free |= set() if config.mup else {"base_width"}
-    free |= set() if "add" in config.conditioning else {"add_at"}
     try:
         again = config_from_released(values, where=where)
         faults = [

@@ -4,9 +4,8 @@ A released folder holds config.json and model.safetensors, or pytorch_model.bin.
 everything before it writes anything. Facts that the release does not state (cameras, rates, units) are marked
 unknown in the embodiments' YAML, unless the registry has an embodiment of the domain's name and width.
 
-An export repeats the weights that our embodiments share for each of them. It folds the normalisation of
-action targets, variance outputs and readouts before a diffusion head into the weights of the layout. It
-refuses a configuration that the layout cannot express, with every reason.
+An export takes models of that layout. It folds variance outputs and readouts before a diffusion head into its
+weights, and refuses what the layout cannot express, with every reason.
 """
 
 import keyword

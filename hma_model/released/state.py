@@ -91,7 +91,7 @@ def state_to_released(
         released["token_embed.mask_token_embed"] = trunk["trunk.embed.mask"].unsqueeze(0)
         released |= {theirs: trunk[ours] for theirs, ours in _digits(config).items()}
     for name, (stem, head) in parts.items():
-        released |= _stem_back(stem, trunk, name, config) | _head_back(head, stem, name, config)
+        released |= _stem_back(stem, name, config) | _head_back(head, stem, name, config)
     return {name: tensor.float().contiguous() for name, tensor in released.items()}
 
 
@@ -100,7 +100,7 @@ def _renamed(config: HMAConfig) -> dict[str, str]:
     names = {}
     for layer in range(config.layers):
         for theirs, ours in _BLOCK.items():
-            if config.norms == "before" or not theirs.startswith("norm"):
+            if not (config.qk_norm and theirs.startswith("norm")):
                 names[f"decoder.layers.{layer}.{theirs}"] = f"trunk.blocks.{layer}.{ours}"
     if config.kind == "discrete":
         return names | {"out_x_proj": "readout.linear"}
@@ -243,7 +243,7 @@ def _stem(source: State, domain: str, config: HMAConfig) -> State:
     return stem
 
 
-def _stem_back(stem: State, trunk: Mapping[str, Tensor], domain: str, config: HMAConfig) -> State:
+def _stem_back(stem: State, domain: str, config: HMAConfig) -> State:
     """Convert a stem to released names.
 
     Dims that pass through get mean 0 and std 1. Dims that never vary get no weight, because our stem sets
@@ -260,9 +260,7 @@ def _stem_back(stem: State, trunk: Mapping[str, Tensor], domain: str, config: HM
     for old, new in _STEM.items():
         released |= _move(stem, new, f"action_mlp.{domain}.{old}")
     released[f"action_mlp.{domain}.model.0.weight"] = weight.masked_fill(columns, 0.0)
-    return released | (
-        _modulation_back(stem, trunk, domain, config) if "modulation" in config.conditioning else {}
-    )
+    return released | (_modulation_back(stem, domain, config) if "modulation" in config.conditioning else {})
 
 
 def _still(stem: State) -> Tensor:
@@ -273,20 +271,16 @@ def _still(stem: State) -> Tensor:
     return ~(std > 1e-6 * mean.abs() + 1e-9) & normalize
 
 
-def _modulation_back(stem: State, trunk: Mapping[str, Tensor], domain: str, config: HMAConfig) -> State:
-    """Convert the modulation of one embodiment; shared weights are repeated for each embodiment."""
-    source, prefix = (trunk, "trunk.modulation") if config.shared_modulation else (stem, "modulation")
+def _modulation_back(stem: State, domain: str, config: HMAConfig) -> State:
+    """Convert the modulation of one embodiment."""
     released = {}
     for layer in range(config.layers):
         theirs = f"decoder.layers.{layer}.action_projectors.{domain}"
         for old, suffix in _MODULATION.items():
-            released[f"{theirs}.{old}.weight"] = source[f"{prefix}.weight{suffix}"][layer].mT
-            released[f"{theirs}.{old}.bias"] = source[f"{prefix}.bias{suffix}"][layer, 0]
-        if config.modulation_out == "trunk":
-            released |= _move(trunk, f"trunk.blocks.{layer}.modulation_out", f"{theirs}.linear_out")
-        else:
-            released[f"{theirs}.linear_out.weight"] = stem["modulation.out_weight"][layer]
-            released[f"{theirs}.linear_out.bias"] = stem["modulation.out_bias"][layer]
+            released[f"{theirs}.{old}.weight"] = stem[f"modulation.weight{suffix}"][layer].mT
+            released[f"{theirs}.{old}.bias"] = stem[f"modulation.bias{suffix}"][layer, 0]
+        released[f"{theirs}.linear_out.weight"] = stem["modulation.out_weight"][layer]
+        released[f"{theirs}.linear_out.bias"] = stem["modulation.out_bias"][layer]
     return released
 
 
@@ -315,9 +309,4 @@ def _head_back(head: State, stem: State, domain: str, config: HMAConfig) -> Stat
         weight, bias = _with_variance(head["diffusion.output.weight"], head["diffusion.output.bias"], values)
         last = f"{theirs}.final_layer.linear"
         return released | {f"{last}.weight": weight, f"{last}.bias": bias}
-    if config.action_target == "normalized":  # the released heads give raw actions
-        mean, std = stem["normalizer.mean"].float(), stem["normalizer.std"].float()
-        plain, steps = ~stem["normalizer.normalize"], len(bias) // len(mean)
-        scale = std.masked_fill(_still(stem), 0.0).masked_fill(plain, 1.0).repeat(steps)
-        weight, bias = weight * scale[:, None], bias * scale + mean.masked_fill(plain, 0.0).repeat(steps)
     return {f"action_out_projectors.{domain}.weight": weight, f"action_out_projectors.{domain}.bias": bias}

@@ -51,7 +51,7 @@ def activation_bytes(config: HMAConfig, recipe: Recipe, windows: int) -> float:
         if config.digit_order == "chain":
             read += SCORE_COPIES * len(config.digits) * config.width
     else:
-        layers = config.diffusion_depth * config.diffusion_repeats
+        layers = config.diffusion_depth
         read = int(DIFFUSION_VALUES * layers * config.diffusion_width)
     return 4.0 * (values * (kept + PASS_VALUES) + hidden * read)
 

@@ -36,8 +36,7 @@ STATE, OPTIMIZER, WEIGHTS = "state.json", "optimizer.safetensors", "weights.safe
 VERSION = 1  # of `training/`; any change in the meaning of its files raises it
 # fields that may differ from the checkpoint's network, because no weight's meaning depends on them
 TRAINED_BY = {
-    *("dropout", "action_loss_weight", "label_smoothing", "corrupt_max", "history_probability"),
-    *("history_frames", "mask_ratio_min", "diffusion_repeats", "diffusion_sample_steps"),
+    *("label_smoothing", "corrupt_max", "history_probability", "diffusion_sample_steps"),
     *("training_pass", "whole_share", "position_init", "latent_noise"),
 }
 
@@ -71,7 +70,7 @@ class State:
 
 def require_network(before: HMAConfig, now: HMAConfig, where: object) -> None:
     """Raise RecipeError if a run would resume with another network or tokenizer; --force does not help."""
-    free = TRAINED_BY | {"objectives"} | ({"frames"} if before.time_position == "rotary" else set())
+    free = TRAINED_BY | {"objectives"} | (set() if before.released else {"frames"})
     for item in dataclasses.fields(HMAConfig):
         old, new = getattr(before, item.name), getattr(now, item.name)
         if item.name in free or old == new:

@@ -239,7 +239,6 @@ class Run:
     def _pass(self, number: int, batch: Batch, last: bool) -> Any:
         """Run a forward and backward pass; the loss of a step is the mean over the passes of all ranks."""
         recipe = self.recipe
-        torch.manual_seed(seed_for(recipe.seed, "dropout", self.step, number))
         generator = torch.Generator().manual_seed(seed_for(recipe.seed, "masks", self.step, number))
         with self.parallel_model.passing(last):
             with self._autocast():

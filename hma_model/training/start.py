@@ -118,7 +118,7 @@ class Start:
         if (views := view_count(recipe.cameras)) != config.views:
             fault = f"are {views} in a frame, the checkpoint that the run starts from has {config.views}"
             raise RecipeError("recipe: cameras", fault, "name as many, or train from scratch")
-        if config.time_position == "learned" and recipe.frames > config.frames:
+        if config.released and recipe.frames > config.frames:
             fault = f"{recipe.frames} are more than the checkpoint's {config.frames}"
             raise RecipeError("recipe: frames", fault, "use fewer")
         return config.replace(**changes)

@@ -46,10 +46,8 @@ def test_continuous_tokens_are_patches() -> None:
         ({"objectives": {"forward": 0.0}}, "objectives"),
         ({"objectives": {"dream": 1.0}}, "objectives"),
         ({"label_smoothing": 1.5}, "label_smoothing"),
-        ({"action_loss_weight": float("nan")}, "action_loss_weight"),
-        ({"norms": "qk"}, "norms"),
-        ({"add_at": "end"}, "add_at"),
-        ({"shared_modulation": True, "modulation_out": "embodiment"}, "modulation_out"),
+        ({"layout": "theirs"}, "layout"),
+        ({"shared_modulation": True, "layout": "released"}, "layout"),
     ],
 )
 def test_bad_values_name_their_field(change: dict, name: str) -> None:

@@ -123,7 +123,7 @@ class Attention(nn.Module):
         self.heads, self.normed = config.heads, config.qk_norm
         self.scale = 8 / config.head_dim if config.mup else config.head_dim**-0.5
         self.qkv = Linear(width, 3 * width, bias=config.qkv_bias)
-        self.proj = Linear(width, width, bias=config.proj_bias)
+        self.proj = Linear(width, width)
         self.q_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
         self.k_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
 
@@ -160,7 +160,7 @@ class TemporalAttention(Attention):
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__(config)
-        self.rotary = config.time_position == "rotary"
+        self.rotary = not config.released
 
     def forward(self, x: Tensor, norm: nn.Module, times: TimePositions, cache: LayerCache | None) -> Tensor:
         """Apply `norm` and attention over time to (B, T, N, D); keep the shape."""
@@ -219,7 +219,7 @@ class ActionAttention(nn.Module):
         self.scale = 8 / config.head_dim if config.mup else config.head_dim**-0.5
         self.q = Linear(width, width, bias=config.qkv_bias)
         self.kv = Linear(width, 2 * width, bias=config.qkv_bias)
-        self.proj = Linear(width, width, bias=config.proj_bias)
+        self.proj = Linear(width, width)
 
     def forward(self, x: Tensor, embedding: Tensor, times: TimePositions, cache: LayerCache | None) -> Tensor:
         """Attend from tokens (B, T, N, D) to action embeddings (B, T, D); return (B, T, N, D)."""
@@ -248,14 +248,10 @@ class MLP(nn.Module):
         hidden = int(config.width * config.mlp_ratio)
         self.fc1 = Linear(config.width, hidden, bias=config.mlp_bias)
         self.fc2 = Linear(hidden, config.width, bias=config.mlp_bias)
-        self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, x: Tensor, norm: nn.Module) -> Tensor:
         """Apply `norm` and the two maps to (..., D); keep the shape."""
-        hidden = after_norm(norm, self.fc1, x)
-        if self.dropout.p:
-            return self.dropout(self.fc2(self.dropout(F.gelu(hidden))))
-        return after_gelu(self.fc2, hidden)
+        return after_gelu(self.fc2, after_norm(norm, self.fc1, x))
 
 
 class Block(nn.Module):
@@ -264,19 +260,19 @@ class Block(nn.Module):
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         width = config.width
-        self.space_norm = nn.LayerNorm(width) if config.norms == "before" else nn.Identity()
+        self.space_norm = nn.Identity() if config.qk_norm else nn.LayerNorm(width)
         self.space = Attention(config)
         self.modulation_out: nn.Linear | None = None
-        if "modulation" in config.conditioning and config.modulation_out == "trunk":
+        if "modulation" in config.conditioning and not config.released:
             self.modulation_out = Linear(width, width)
-        self.adds = "add" in config.conditioning and config.add_at == "layers"
+        self.adds = "add" in config.conditioning
         self.action: ActionAttention | None = None
         if "cross_attention" in config.conditioning:
             self.action_norm = nn.LayerNorm(width)
             self.action = ActionAttention(config)
-        self.time_norm = nn.LayerNorm(width) if config.temporal_norm else nn.Identity()
+        self.time_norm = nn.Identity() if config.released else nn.LayerNorm(width)
         self.time = TemporalAttention(config)
-        self.mlp_norm = nn.LayerNorm(width) if config.norms == "before" else nn.Identity()
+        self.mlp_norm = nn.Identity() if config.qk_norm else nn.LayerNorm(width)
         self.mlp = MLP(config)
 
     def forward(
@@ -323,7 +319,7 @@ class Transformer(nn.Module):
         self.config = config
         self.checkpointing = False
         continuous = config.kind == "continuous"
-        positions = config.frames if config.time_position == "learned" else 1
+        positions = config.frames if config.released else 1
         tokens = config.tokens_per_frame + max(config.appended_tokens, config.absent_tokens)
         self.embed = LatentEmbedding(config) if continuous else TokenEmbedding(config)
         self.noise = NoiseEmbedding(config) if config.told_noise else None
@@ -337,7 +333,7 @@ class Transformer(nn.Module):
         if "modulation" in config.conditioning and config.shared_modulation:
             self.modulation = Modulation(config)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
-        self.norm = nn.LayerNorm(config.width) if config.final_norm else nn.Identity()
+        self.norm = nn.Identity() if config.released else nn.LayerNorm(config.width)
         branches = (3 + bool({"modulation", "cross_attention"} & set(config.conditioning))) * config.layers
         for name, module in self.blocks.named_modules():
             if isinstance(module, nn.Linear):  # maps keep unit variance, and the branches that of the stream
@@ -372,9 +368,7 @@ class Transformer(nn.Module):
         self, x: Tensor, conditioning: Conditioning, times: TimePositions, carried: KeyValues | None = None
     ) -> Tensor:
         """Map embedded frames to features, as `Trunk.__call__` says."""
-        embedding, config = conditioning.embedding, self.config
-        if embedding is not None and "add" in config.conditioning and config.add_at == "input":
-            x = x + embedding.unsqueeze(2)
+        config = self.config
         if conditioning.tokens is not None:
             copies = conditioning.tokens.unsqueeze(2).expand(-1, -1, config.action_tokens, -1)
             x = torch.cat([x, copies.to(x.dtype)], dim=2)

@@ -36,7 +36,7 @@ def test_the_cached_chunk_is_that_of_the_whole_history(layout: str, kind: str, c
     rollout = Rollout(model, NAMES, 2, cache=cache)
     for row, count in enumerate(PROMPTS):
         rollout.reset([row], frames[[row], :count], chunks[[row], :count], known[[row], :count], [0])
-    learned = model.config.time_position == "learned"  # which end with the window
+    learned = model.config.released  # which end with the window
     for step in range((model.config.frames + 1 if learned else TOTAL) - max(PROMPTS)):
         if step % 3 != 1:  # several frames may come before the next command
             made = rollout.act()
@@ -82,7 +82,7 @@ def test_acting_leaves_no_trace_in_the_video() -> None:
 
 
 def test_a_diffusion_head_draws_each_rows_own_noise() -> None:
-    model = small_model(action_loss="diffusion", diffusion_clip=1.0, **ACTS)
+    model = small_model(action_loss="diffusion", **ACTS)
     batch = small_batch(model.config, NAMES, frames=3)
     both = Rollout(model, NAMES[::-1], 2)
     both.reset([1, 0], batch.tokens, batch.actions, None, [5, 6], NAMES)

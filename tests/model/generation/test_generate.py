@@ -18,11 +18,10 @@ COMBINATIONS = [
 ]  # each by itself, in pairs, and all
 LAYOUTS = {
     "rotary": {},
-    "learned": {"time_position": "learned"},
+    "learned": {"layout": "released"},
     "released": {
-        "time_position": "learned", "conditioning": ("concat", "modulation"), "action_tokens": 3,
-        "modulation_out": "embodiment", "absent_action": "skip", "action_alignment": "current",
-        "temporal_norm": False, "final_norm": False,
+        "layout": "released", "conditioning": ("concat", "modulation"), "action_tokens": 3,
+        "absent_action": "skip", "action_alignment": "current",
     },
     "cross": {"conditioning": ("add", "cross_attention")},
     "previous": {"masked_input": "previous"},
@@ -63,7 +62,7 @@ def test_the_cache_changes_nothing(layout: str, prompt: int, actions: bool) -> N
 
 @pytest.mark.parametrize("layout", ["rotary", "released", "previous"])
 def test_the_cache_changes_no_latents(layout: str) -> None:
-    model = small_model(kind="continuous", diffusion_clip=1.0, **LAYOUTS[layout])
+    model = small_model(kind="continuous", **LAYOUTS[layout])
     for parameter in model.latent_readout.diffusion.parameters():
         parameter.data *= 0.1  # the noisiest level divides by almost nothing, which would enlarge rounding
     cached, plain = (_rollout(model, cache, 2, 6, unmask_steps=3, temperature=0.5) for cache in (True, False))
@@ -75,7 +74,7 @@ def test_the_cache_changes_no_latents(layout: str) -> None:
 def test_every_pass_of_a_cached_rollout_has_the_features_of_full_recomputation(
     kind: str, conditioning: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = small_model(kind=kind, conditioning=conditioning, action_tokens=2, diffusion_clip=1.0)
+    model = small_model(kind=kind, conditioning=conditioning, action_tokens=2)
     seen: list[list[torch.Tensor]] = []
     plain = Passes.features
 

@@ -57,7 +57,7 @@ def test_a_model_that_knows_nothing_has_the_entropy_of_the_vocabulary() -> None:
 
 @pytest.mark.parametrize("options", [{}, {"temperature": 1.0, "unmask_steps": 3}])
 def test_the_spread_of_latents_is_measured_and_changes_nothing(options: dict[str, Any]) -> None:
-    model = small_model(kind="continuous", diffusion_clip=1.0)
+    model = small_model(kind="continuous")
     frames, spreads = [], []
     for made in (Rollout, measuring, measuring):
         rollout = made(model, "arm", 2, **options)  # type: ignore[operator]
@@ -69,7 +69,7 @@ def test_the_spread_of_latents_is_measured_and_changes_nothing(options: dict[str
 
 
 def test_a_row_has_the_spread_that_it_has_alone() -> None:
-    model, found = small_model(kind="continuous", diffusion_clip=1.0), []
+    model, found = small_model(kind="continuous"), []
     prompt = latents(3, model)
     for rows in ([0, 1, 2], [1]):
         rollout = measuring(model, "arm", len(rows))
@@ -99,11 +99,11 @@ def test_a_trained_model_is_less_sure_of_what_nobody_can_know() -> None:
     torch.manual_seed(0)
     config = small_config(
         kind="continuous", grid=(4, 4), channels=1, latent_scale=1.0, frames=2, corrupt_max=0.0,
-        history_probability=0.0, training_pass="pairs", diffusion_repeats=4, whole_share=1.0,
+        history_probability=0.0, training_pass="pairs", whole_share=1.0,
     )  # fmt: skip
     model = HMA(config)
     model.add_embodiment(replace(ARM, mean=(0.0,) * 3, std=(1.0,) * 3))
-    optimizer, steps = torch.optim.AdamW(model.parameters(), 5e-3), 150
+    optimizer, steps = torch.optim.AdamW(model.parameters(), 5e-3), 400
     for step in range(steps):
         optimizer.param_groups[0]["lr"] = 5e-3 * (1 - step / steps)
         command = torch.randint(0, 2, (16,)) * 2.0 - 1

@@ -18,13 +18,13 @@ def test_frames_are_masked_with_the_mean_of_the_cosine() -> None:
 
 
 def test_a_long_history_stays_unmasked_as_often_as_configured() -> None:
-    mask = draw_video_mask(small_config(history_probability=0.25, history_frames=3), 2000, 5, seeded())
+    mask = draw_video_mask(small_config(history_probability=0.25), 2000, 5, seeded())
     visible = ~mask.masked.any(2)
-    assert abs(visible[:, 1:3].all(1).float().mean().item() - 0.25 - 0.75 * 0.01) < 0.05
+    assert abs(visible[:, 1:4].all(1).float().mean().item() - 0.25) < 0.05
 
 
 def test_frames_after_a_long_history_are_corrupted_more_and_more() -> None:
-    mask = draw_video_mask(small_config(history_probability=1.0, history_frames=2), 200, 8, seeded())
+    mask = draw_video_mask(small_config(history_probability=1.0), 200, 8, seeded())
     assert (mask.corruption.diff(dim=1) >= -1e-6).all()
     assert (mask.corruption[:, -1] > mask.corruption[:, 0]).float().mean() > 0.9
 
@@ -33,11 +33,6 @@ def test_each_sample_of_a_batch_draws_its_own_mask() -> None:
     mask = draw_video_mask(small_config(), 64, 5, seeded())
     assert mask.masked.flatten(1).unique(dim=0).shape[0] > 60
     assert mask.corruption[:, 0].unique().numel() > 60
-
-
-def test_the_smallest_mask_probability_holds() -> None:
-    config = small_config(mask_ratio_min=0.5, history_probability=0.0, grid=(32, 32))
-    assert draw_video_mask(config, 50, 5, seeded()).masked[:, 1:].float().mean(2).min() > 0.4
 
 
 def test_digits_are_corrupted_at_the_given_rate_and_masked_tokens_hidden() -> None:

@@ -178,11 +178,9 @@ def test_every_combination_of_conditionings_is_causal(conditioning: tuple[str, .
     assert torch.equal(before[:, :3], after[:, :3]) and not torch.equal(before[:, 3], after[:, 3])
 
 
-@pytest.mark.parametrize("target", ["normalized", "raw"])
-def test_action_loss_is_the_mean_over_present_chunks(target: str) -> None:
-    model = small_model(
-        corrupt_max=0.0, action_target=target, objectives={"forward": 1, "policy": 1, "inverse": 1}
-    )
+@pytest.mark.parametrize("layout", ["ours", "released"])
+def test_action_loss_is_the_mean_over_present_chunks(layout: str) -> None:
+    model = small_model(corrupt_max=0.0, layout=layout, objectives={"forward": 1, "policy": 1, "inverse": 1})
     batch = small_batch(model.config, ["arm", "hand.v1", "arm"])
     batch.action_mask[0, 1] = batch.action_mask[1, 3:] = False
     out = model(batch, "policy", seeded(5))
@@ -194,11 +192,11 @@ def test_action_loss_is_the_mean_over_present_chunks(target: str) -> None:
     for row, name in enumerate(batch.embodiment):
         stem = model.stem(name)
         one, two = (x[row, :, : stem.input.in_features] for x in (chunks, batch.actions))
-        if target == "normalized":
+        if layout == "ours":
             one, two = stem.normalizer(one), stem.normalizer(two)
         losses.append((one - two).pow(2).mean(-1)[batch.action_mask[row]])
     assert out.action_loss is not None
-    if target == "raw":
+    if layout == "released":
         assert torch.allclose(out.action_loss, torch.cat(losses).mean(), rtol=1e-4)
     else:  # raw predictions have lost what the head says of the hand's constant dim
         expected = torch.stack([losses[0].mean(), losses[2].mean()])

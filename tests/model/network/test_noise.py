@@ -59,7 +59,7 @@ def test_the_embedding_learns_from_noise_in_the_past(kind):
     assert model.trunk.noise.weight.grad.abs().sum() > 0
 
 
-@pytest.mark.parametrize("changes", [{}, {"masked_input": "previous"}, {"time_position": "learned"}], ids=str)
+@pytest.mark.parametrize("changes", [{}, {"masked_input": "previous"}, {"layout": "released"}], ids=str)
 def test_a_rollout_tells_the_level_of_its_own_frames_only(changes, monkeypatch):
     model = small_model(told_noise=True, frames=4, **changes)
     batch = small_batch(model.config, NAMES, frames=7)

@@ -16,11 +16,11 @@ from tests.model.network_parts import ARM, HAND, small_batch, small_config, smal
 
 LAYOUTS = [
     {"conditioning": ("modulation",)},
-    {"conditioning": ("concat", "modulation"), "action_tokens": 3, "modulation_out": "embodiment"},
-    {"conditioning": ("add",), "time_position": "learned"},
+    {"conditioning": ("concat", "modulation"), "action_tokens": 3, "layout": "released"},
+    {"conditioning": ("add",), "layout": "released"},
     {"conditioning": ("cross_attention",), "qk_norm": True},
     {"conditioning": ("modulation",), "shared_modulation": True, "action_alignment": "current", "mup": True},
-    {"conditioning": ("add", "concat"), "add_at": "layers", "qk_norm": True, "norms": "qk"},
+    {"conditioning": ("add", "concat"), "qk_norm": True},
     {"conditioning": ("concat", "modulation"), "absent_action": "tokens", "action_alignment": "current"},
 ]
 
@@ -156,7 +156,7 @@ def test_a_window_longer_than_the_configured_sees_only_its_length_back() -> None
 
 
 def test_learned_positions_refuse_a_longer_window() -> None:
-    model = small_model(time_position="learned")
+    model = small_model(layout="released")
     batch = small_batch(model.config, ["arm"], frames=6)
     with pytest.raises(HMAError, match="6 frames where the learned positions end at 5"):
         _logits(model, batch)

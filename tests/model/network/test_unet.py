@@ -129,7 +129,7 @@ def test_each_pass_makes_one_more_frame_of_the_past_that_of_a_rollout() -> None:
         ({"levels": (8, 16, 32, 64)}, "levels"),
         ({"shared_modulation": False}, "shared_modulation"),
         ({"conditioning": ("concat",)}, "conditioning"),
-        ({"time_position": "learned"}, "time_position"),
+        ({"layout": "released"}, "layout"),
         ({"copy_previous": False}, "copy_previous"),
         ({"motion_weight": -1.0}, "motion_weight"),
     ],

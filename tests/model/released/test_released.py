@@ -26,9 +26,8 @@ from tests.hub_server import connect, serve
 from tests.model.network_parts import small_batch, small_config
 
 RELEASED: dict[str, Any] = {
-    "time_position": "learned", "action_alignment": "current", "temporal_norm": False, "final_norm": False,
-    "absent_action": "skip", "add_at": "layers", "modulation_out": "embodiment", "base_width": 256,
-    "factored": (6, 6), "action_target": "raw", "diffusion_target": "noise",
+    "layout": "released", "action_alignment": "current", "absent_action": "skip", "base_width": 256,
+    "factored": (6, 6), "diffusion_target": "noise",
 }  # fmt: skip
 CONTINUOUS = {"kind": "continuous", "action_loss": "diffusion", "latent_scale": 0.18215}
 LAYOUTS: dict[str, dict[str, Any]] = {
@@ -39,7 +38,7 @@ LAYOUTS: dict[str, dict[str, Any]] = {
     "joint": {"conditioning": ("concat", "modulation"), "action_tokens": 3, "absent_action": "tokens",
               "objectives": {"full": 1.0}},
     "joint modulate": {"absent_action": "tokens", "action_tokens": 2, "objectives": {"full": 1.0}},
-    "qk norm": {"qk_norm": True, "norms": "qk"},
+    "qk norm": {"qk_norm": True},
     "mup": {"mup": True},
     "continuous": CONTINUOUS,
     "continuous joint": CONTINUOUS | {"absent_action": "tokens", "objectives": {"full": 1.0}},
@@ -363,14 +362,11 @@ def test_a_folder_that_is_no_checkpoint_is_not_replaced(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"time_position": "rotary"}, "time_position 'rotary'"),
-        ({"temporal_norm": True, "final_norm": True}, "temporal_norm True; final_norm True"),
+        ({"layout": "ours"}, "layout 'ours'"),
         ({"action_alignment": "previous"}, "action_alignment 'previous'"),
         ({"absent_action": "embedding"}, "absent_action 'embedding'"),
         ({"conditioning": ("cross_attention",)}, "action_network '' uses actions in no way"),
         ({"conditioning": ("add", "modulation")}, r"conditioning \('add', 'modulation'\)"),
-        ({"conditioning": ("add",), "add_at": "input"}, "add_at 'input'"),
-        ({"qk_norm": True}, "norms 'before'"),
         ({"grid": (4, 5)}, "S is 20, which is not 4 x 4"),
         ({"objectives": {"inverse": 1.0}}, "objective inverse"),
         ({"objectives": {"policy": 1.0}}, "objective policy"),
@@ -392,7 +388,7 @@ def test_what_the_release_cannot_express_is_named(change: dict[str, Any], named:
 def test_our_default_names_everything_against_it() -> None:
     with pytest.raises(CheckpointError) as error:
         config_to_released(HMAConfig(), "model")
-    assert str(error.value).count(";") == 4
+    assert str(error.value).count(";") == 2
 
 
 def test_the_command_line_imports_and_exports(tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ DISCRETE: dict[str, dict[str, Any]] = {
         "jointly_predict_actions": True, "action_network": "mlp", "action_token_size": 20},
     "joint muP": {"jointly_predict_actions": True, "use_mup": True, "d_model": 64},
     "policy only": {"jointly_predict_actions": True, "jointly_predict_states": False},
-    "other biases": {"qkv_bias": True, "proj_bias": False, "mlp_bias": False, "mlp_ratio": 2.5},
+    "narrow MLP": {"mlp_ratio": 2.5},
     "one digit": {"image_vocab_size": 1000, "num_factored_vocabs": 1},
     "three digits": {"image_vocab_size": 4096, "num_factored_vocabs": 3},
     "a dim that never varies": {"still": True},
@@ -188,17 +188,14 @@ SPACES = (
     ActionSpace("hand", 2, 1, (0.0, 3.0), (1.0, 0.0), (True, True)),
 )
 OURS: dict[str, Any] = {
-    "layers": 2, "width": 32, "heads": 4, "frames": 5, "grid": (4, 4), "time_position": "learned",
-    "action_alignment": "current", "temporal_norm": False, "final_norm": False, "absent_action": "skip",
-    "add_at": "layers",
+    "layers": 2, "width": 32, "heads": 4, "frames": 5, "grid": (4, 4), "layout": "released",
+    "action_alignment": "current", "absent_action": "skip",
 }  # fmt: skip
 EXPORTED: dict[str, dict[str, Any]] = {
-    "shared modulation": {"shared_modulation": True},
-    "projections in the trunk": {"conditioning": ("concat", "modulation"), "action_tokens": 3},
-    "projections by embodiment": {"modulation_out": "embodiment"},
-    "normalised action targets": {"absent_action": "tokens", "objectives": {"full": 1.0}},
-    "raw action targets": {"absent_action": "tokens", "action_target": "raw", "objectives": {"full": 1.0}},
-    "qk norm": {"qk_norm": True, "norms": "qk"},
+    "modulation": {},
+    "concat+modulation": {"conditioning": ("concat", "modulation"), "action_tokens": 3},
+    "actions": {"absent_action": "tokens", "objectives": {"full": 1.0}},
+    "qk norm": {"qk_norm": True},
     "muP": {"mup": True, "width": 64, "conditioning": ("concat",), "absent_action": "tokens"},
     "three digits": {"factored": (8, 8, 8)},
 }

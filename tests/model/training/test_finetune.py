@@ -170,7 +170,7 @@ def test_another_network_is_refused(base, leg, tmp_path):
 
 
 def test_how_it_is_trained_may_differ(base, leg, tmp_path):
-    assert tune(base.out, leg, tmp_path / "run", "model.dropout=0.1", "model.width=16").step == 4
+    assert tune(base.out, leg, tmp_path / "run", "model.label_smoothing=0.1", "model.width=16").step == 4
 
 
 def test_a_killed_finetuning_goes_on_bit_for_bit_though_its_source_is_gone(base, leg, tmp_path):

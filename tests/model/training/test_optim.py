@@ -34,7 +34,7 @@ def test_every_parameter_is_in_exactly_one_group():
 
 
 def test_only_matrices_decay():
-    model = make_model(ROBOTS, config=CONFIG.replace(qkv_bias=True, qk_norm=True))
+    model = make_model(ROBOTS, config=CONFIG.replace(qk_norm=True))
     for name, (_, decay) in by_name(model).items():
         kind = name.rsplit(".", 1)[-1]
         vector = kind.startswith("bias") or kind in ("mask", "position", "absent") or "norm" in name

@@ -112,7 +112,7 @@ def test_what_is_wrong_is_said_with_key_value_and_remedy(write, text, message):
         ("model: {layers: two}", r"model\.layers: must be a whole number .*\(is 'two'\)"),
         ("model: {layers: null}", r"model\.layers: must be a whole number .*\(is None\)"),
         ("model: {mup: 'yes please'}", r"model\.mup: must be true or false"),
-        ("model: {dropout: .nan}", r"model\.dropout: must be a finite number"),
+        ("model: {corrupt_max: .nan}", r"model\.corrupt_max: must be a finite number"),
         ("model: {conditioning: modulatio}", r"model\.conditioning: .*not allowed.*modulation"),
         ("model: {conditioning: [3]}", r"model\.conditioning: must be a word or a list"),
         ("model: {width: 33, heads: 2}", r"model\.heads: 2 is not allowed: give a divisor of the width, 33"),
@@ -140,8 +140,8 @@ def test_slips_of_the_hand_are_told_before_any_shard_is_opened(write, text, mess
 
 
 def test_numbers_of_the_network_may_be_written_as_yaml_reads_texts():
-    model = load_recipe("discrete_tiny", ["model.dropout=1e-1", "model.layers=2.0"]).model
-    assert (model["dropout"], model["layers"]) == (0.1, 2) and isinstance(model["layers"], int)
+    model = load_recipe("discrete_tiny", ["model.corrupt_max=1e-1", "model.layers=2.0"]).model
+    assert (model["corrupt_max"], model["layers"]) == (0.1, 2) and isinstance(model["layers"], int)
 
 
 def test_what_a_recipe_extends_cannot_be_overridden():

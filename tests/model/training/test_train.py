@@ -94,7 +94,6 @@ def test_a_killed_run_goes_on_bit_for_bit(recipe, tmp_path, killed_after):
     changes = {
         "accumulate": 2,
         "objectives": {"forward": 1, "full": 1},
-        "model": {**TINY["model"], "dropout": 0.1},
     }
     whole = train(recipe(**changes), out=tmp_path / "whole", show=False)
     with pytest.raises(StopAt):

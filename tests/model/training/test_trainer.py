@@ -44,7 +44,13 @@ def part(batch, rows: slice):
 
 
 def test_accumulated_passes_have_the_gradient_of_the_whole_batch(recipe, tmp_path):
-    model = {**TINY["model"], "mask_ratio_min": 1.0, "corrupt_max": 0.0, "history_probability": 0.0}
+    model = {
+        **TINY["model"],
+        "training_pass": "pairs",
+        "whole_share": 1.0,
+        "corrupt_max": 0.0,
+        "history_probability": 0.0,
+    }
     whole = recipe(batch_size=8, model=model)
     _, batch = next(TrainData(whole, Run(whole, tmp_path, torch.device("cpu")).sets, World()).step())
     one = gradients(whole, tmp_path / "one", [batch])
@@ -56,9 +62,8 @@ def test_accumulated_passes_have_the_gradient_of_the_whole_batch(recipe, tmp_pat
 
 
 def test_recomputing_activations_changes_no_loss(recipe, tmp_path):
-    network = {**TINY["model"], "dropout": 0.1}
-    plain = losses(recipe, tmp_path / "a", model=network)
-    assert losses(recipe, tmp_path / "b", model=network, checkpointing=True) == plain
+    plain = losses(recipe, tmp_path / "a")
+    assert losses(recipe, tmp_path / "b", checkpointing=True) == plain
 
 
 @pytest.mark.slow
