@@ -23,6 +23,7 @@ Manoeuvre = Callable[[float, float], float]  # (angle, speed) -> torque
 
 STEPS, PERIOD_S = 100, 0.05
 TORQUE = 2.0  # the environment's limit
+ROD = 26.0  # px of the frame from the axle to the middle of the rod
 SIZE, ZOOMED, DRAWN = 128, 256, 464  # pixels: the frame, the square that it shows, the whole drawing
 
 
@@ -65,6 +66,16 @@ class Pendulum:
         """Return (3,) cosine and sine of the angle, and the speed: the environment's observation."""
         return np.array([np.cos(self.angle), np.sin(self.angle), self.speed], dtype=np.float32)
 
+    @property
+    def own(self) -> Floats:
+        """Return the middle (1, 2) of the rod in the frame."""
+        return SIZE / 2 - ROD * np.array([[np.sin(self.angle), np.cos(self.angle)]])
+
+    @property
+    def loose(self) -> Floats:
+        """Return no places (0, 2): nothing lies loose."""
+        return np.empty((0, 2))
+
     def picture(self) -> NDArray[np.uint8]:
         """Render the rod; (SIZE, SIZE, 3) RGB."""
         import cv2
@@ -85,6 +96,12 @@ def start(seed: int, episode: int) -> tuple[Pendulum, np.random.Generator]:
     return Pendulum(rng.uniform(-np.pi, np.pi), rng.uniform(-4, 4)), rng
 
 
+def begin(robot: str, seed: int, episode: int) -> tuple[Pendulum, Callable[[], NDArray[np.float32]]]:
+    """Return the simulation of an episode at its start, and the recorder's driver."""
+    world, rng = start(seed, episode)
+    return world, driver(world, rng, episode)
+
+
 def driver(world: Pendulum, rng: np.random.Generator, episode: int) -> Callable[[], NDArray[np.float32]]:
     """Return the recorder's driver of an episode, which returns the next torque (1,)."""
     _, manoeuvre = DRIVERS[episode % len(DRIVERS)]
@@ -99,9 +116,8 @@ def driver(world: Pendulum, rng: np.random.Generator, episode: int) -> Callable[
 def _episode(seed: int, episode: int) -> RldsEpisode:
     import cv2
 
-    world, rng = start(seed, episode)
+    world, drive = begin("pendulum", seed, episode)
     instruction, _ = DRIVERS[episode % len(DRIVERS)]
-    drive = driver(world, rng, episode)
     pictures, observations, actions = [], [], []
     for _ in range(STEPS):
         _, png = cv2.imencode(".png", world.picture()[..., ::-1])

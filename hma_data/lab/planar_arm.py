@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.lab import imported
-from hma_data.lab.writers import Demo, write_hdf5
+from hma_data.lab.family.look import SCALE, SIZE, Color, Shape, draw, shrunk
+from hma_data.lab.writers import Demo, block_demo, write_hdf5
 from hma_data.registry.embodiment import find
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 
@@ -39,7 +40,7 @@ SPEED = 2.6  # fastest action
 ELBOW_STOP, ELBOW_TURN = 2.5, 2.2  # angles: limit of the elbow, and where drivers turn it back
 MOVED = 20.0  # distance that a block must move for success
 
-SIZE, DRAWN, SHIFT = 128, 256, 4  # of the frame; of the drawing; its coordinates' fractional bits
+PX = SIZE / ARENA  # px of the frame in one of the arena
 TABLE, DARK = (226, 226, 220), (45, 45, 50)  # colours are RGB
 UPPER_COLOR, FORE_COLOR = (40, 90, 200), (240, 145, 30)
 BLOCK_COLORS = ((200, 40, 50), (30, 150, 90), (140, 60, 170))
@@ -47,7 +48,8 @@ BLOCK_COLORS = ((200, 40, 50), (30, 150, 90), (140, 60, 170))
 
 def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
     """Record the arm as a file of robomimic's layout, or as a LeRobotDataset; see `hma_data.lab`."""
-    demos = (_demo(seed, episode) for episode in episodes)
+    begun = (begin(robot, seed, episode) for episode in episodes)
+    demos = (block_demo(arm, drive, STEPS, MOVED, seed) for arm, drive in begun)
     if robot == "planar_arm":
         write_hdf5(part, demos, {"env_name": robot, "type": 2, "env_kwargs": {"control_freq": HZ}})
     else:
@@ -114,7 +116,7 @@ class Arm:
         return body
 
     @property
-    def joints(self) -> Floats:
+    def angles(self) -> Floats:
         """Return the (J,) angles; the shoulder's is within ±π."""
         shoulder = (self._upper.angle + np.pi) % (2 * np.pi) - np.pi
         return np.array([shoulder, self._fore.angle - self._upper.angle])
@@ -126,9 +128,24 @@ class Arm:
         return np.array([upper, fore - upper])
 
     @property
+    def joints(self) -> dict[str, Floats]:
+        """Return the angles (J,) and velocities (J,)."""
+        return {"joint_pos": self.angles, "joint_vel": self.velocities}
+
+    @property
     def observed(self) -> NDArray[np.float32]:
         """Return (2·J,) joint angles and velocities, as recorded."""
-        return np.concatenate([self.joints, self.velocities]).astype(np.float32)
+        return np.concatenate([self.angles, self.velocities]).astype(np.float32)
+
+    @property
+    def own(self) -> Floats:
+        """Return the middles (J, 2) of the links in the frame."""
+        return link_middles(self.angles)
+
+    @property
+    def loose(self) -> Floats:
+        """Return the middles (B, 2) of the blocks in the frame."""
+        return PX * self.blocks[:, :2]
 
     @property
     def blocks(self) -> Floats:
@@ -138,7 +155,7 @@ class Arm:
     @property
     def state(self) -> Floats:
         """Return (2·J + 3·B,): joint angles and velocities, poses of the blocks."""
-        return np.concatenate([self.joints, self.velocities, self.blocks.ravel()])
+        return np.concatenate([self.angles, self.velocities, self.blocks.ravel()])
 
     def advance(self, action: NDArray[np.float32]) -> None:
         """Simulate one frame with the motors set to velocities (J,)."""
@@ -149,21 +166,18 @@ class Arm:
 
     def picture(self) -> NDArray[np.uint8]:
         """Draw the arm and the blocks; (SIZE, SIZE, 3) RGB."""
-        import cv2
-
-        image = np.full((DRAWN, DRAWN, 3), TABLE, dtype=np.uint8)
+        shapes = []
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * BLOCK / 2
         for (x, y, angle), color in zip(self.blocks, BLOCK_COLORS, strict=True):
             cos, sin = np.cos(angle), np.sin(angle)
             outline = corners @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
-            cv2.fillConvexPoly(image, _fixed(outline), color, cv2.LINE_AA, SHIFT)
-        elbow, tip = elbow_and_tip(self.joints)
-        _draw_link(image, BASE, elbow, UPPER_COLOR)
-        _draw_link(image, elbow, tip, FORE_COLOR)
-        for point, radius in ((BASE, RADIUS * 0.7), (elbow, RADIUS * 0.45)):
-            cv2.circle(image, _fixed(point), int(_fixed(radius)), DARK, -1, cv2.LINE_AA, SHIFT)
-        small: NDArray[np.uint8] = cv2.resize(image, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
-        return small
+            shapes.append(Shape(PX * outline, 0, color))
+        elbow, tip = elbow_and_tip(self.angles)
+        shapes += [*_link(BASE, elbow, UPPER_COLOR), *_link(elbow, tip, FORE_COLOR)]
+        shapes += [_disc(BASE, RADIUS * 0.7, DARK), _disc(elbow, RADIUS * 0.45, DARK)]
+        image = np.full((SIZE * SCALE, SIZE * SCALE, 3), TABLE, dtype=np.uint8)
+        draw(image, shapes)
+        return shrunk(image)
 
 
 def elbow_and_tip(joints: Floats) -> tuple[Floats, Floats]:
@@ -171,6 +185,12 @@ def elbow_and_tip(joints: Floats) -> tuple[Floats, Floats]:
     shoulder, whole = joints[0], joints[0] + joints[1]
     elbow = BASE + UPPER * np.array([np.cos(shoulder), np.sin(shoulder)])
     return elbow, elbow + FORE * np.array([np.cos(whole), np.sin(whole)])
+
+
+def link_middles(joints: Floats) -> Floats:
+    """Return the middles (J, 2) of the links in the frame at joint angles (J,)."""
+    elbow, tip = elbow_and_tip(joints)
+    return PX * np.stack([BASE + elbow, elbow + tip]) / 2
 
 
 def joints_at(tip: Floats, bend: int) -> Floats:
@@ -198,47 +218,20 @@ def start(seed: int, episode: int) -> tuple[Arm, np.random.Generator]:
     return Arm(joints, np.stack(blocks)), rng
 
 
-def _demo(seed: int, episode: int) -> Demo:
+def begin(robot: str, seed: int, episode: int) -> tuple[Arm, Callable[[], NDArray[np.float32]]]:
+    """Return the simulation of an episode at its start, and the recorder's driver."""
     arm, rng = start(seed, episode)
-    drive = driver(arm, rng)
-    lay = arm.blocks
-    rows: list[tuple[Any, ...]] = []
-    for _ in range(STEPS):
-        seen = arm.picture(), arm.joints, arm.velocities, arm.state
-        before = arm.blocks
-        action = drive()
-        arm.advance(action)
-        rows.append((*seen, action, _distances(before, arm.blocks).sum()))
-    images, joints, velocities, states, actions, rewards = map(np.stack, zip(*rows, strict=True))
-    return Demo(
-        actions=actions,
-        observations={"image": images, "joint_pos": joints, "joint_vel": velocities},
-        states=states,
-        rewards=rewards,
-        success=bool(_distances(lay, arm.blocks).max() >= MOVED),
-        facts={"seed": seed},
-    )
+    return arm, driver(arm, rng)
 
 
-def _distances(before: Floats, after: Floats) -> Floats:
-    moved: Floats = np.linalg.norm(after[:, :2] - before[:, :2], axis=1)
-    return moved
+def _disc(place: Floats, radius: float, color: Color) -> Shape:
+    return Shape(PX * place[None], PX * radius, color)
 
 
-def _fixed(points: Floats | float) -> NDArray[np.int32]:
-    """Convert arena coordinates to the drawing's, in OpenCV's fixed point; pixel centres are whole there."""
-    scaled = np.asarray(points) * (DRAWN / ARENA)
-    return np.rint((scaled - 0.5 * (scaled.ndim > 0)) * 2**SHIFT).astype(np.int32)
-
-
-def _draw_link(image: NDArray[np.uint8], here: Floats, there: Floats, color: tuple[int, int, int]) -> None:
-    import cv2
-
+def _link(here: Floats, there: Floats, color: Color) -> list[Shape]:
     side = (there - here)[::-1] * (1, -1) * RADIUS / np.linalg.norm(there - here)
     outline = np.array([here + side, there + side, there - side, here - side])
-    cv2.fillConvexPoly(image, _fixed(outline), color, cv2.LINE_AA, SHIFT)
-    for end in (here, there):
-        cv2.circle(image, _fixed(end), int(_fixed(RADIUS)), color, -1, cv2.LINE_AA, SHIFT)
+    return [Shape(PX * outline, 0, color), _disc(here, RADIUS, color), _disc(there, RADIUS, color)]
 
 
 # -- driver
@@ -260,7 +253,7 @@ def driver(arm: Arm, rng: np.random.Generator) -> Callable[[], NDArray[np.float3
             left = int(rng.integers(9, 25 if kind == 3 else 46))
         left -= 1
         velocities = np.clip(manoeuvre(arm), -SPEED, SPEED)
-        elbow = arm.joints[1]
+        elbow = arm.angles[1]
         if abs(elbow) > ELBOW_TURN and elbow * velocities[1] > 0:
             velocities[1] = -velocities[1]
         return velocities.astype(np.float32)
@@ -277,13 +270,13 @@ def _go(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
     angle, far = rng.uniform(-np.pi, np.pi), rng.uniform(60, 220)
     point = BASE + far * np.array([np.cos(angle), np.sin(angle)])
     if rng.random() < 0.6:
-        _, tip = elbow_and_tip(arm.joints)
+        _, tip = elbow_and_tip(arm.angles)
         block = arm.blocks[rng.integers(len(BLOCK_COLORS)), :2]
         point = block + (block - tip) * 0.3
     goal, gain = joints_at(point, int(rng.choice((-1, 1)))), rng.uniform(3, 7)
 
     def drive(arm: Arm) -> Floats:
-        error = goal - arm.joints
+        error = goal - arm.angles
         error[0] = (error[0] + np.pi) % (2 * np.pi) - np.pi
         return gain * error
 

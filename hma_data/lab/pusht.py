@@ -20,15 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.lab.pusher import Floats, Planned, Tee, Wandering, rotation
-from hma_data.lab.tee_table import GOAL, TICK_S, TeeTable
-from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mcap
+from hma_data.lab.tee_table import GOAL, SIDE, TICK_S, TeeTable
+from hma_data.lab.writers import BagEpisode, Demo, write_hdf5, write_mcap
 
 SUCCESS = 0.95  # share of the goal that the T covers
 LAG_S = 0.2  # delay of the pusher's spring (k_v / k_p of the environment) behind a moving target
 SPEED = 300.0  # px/s of planned motion
 PLACED_PX = 4.0  # mean distance of the T's corners from the goal at which a driver that looks has done
 STARTS = ("near", "random", "near", "far", "near")
-EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps; episodes are a minute apart
 
 
 class Look(NamedTuple):
@@ -46,6 +45,8 @@ FAST_STEPS, SLOW_TICKS = 80, 720
 CAMERA_TICKS, COMMAND_TICKS = 8, 20  # of pusht_slow: from one frame, and one action, to the next
 FAST_PERIOD_S = 0.1
 HELD = 4  # control steps for which a random target is held
+PX = 128 / SIDE  # px of a frame of 128 in one of the arena
+STEM = np.array([0.0, 70.0])  # a point on the T's stem, px of the arena
 SHORTEST_S = 4.0  # of an episode
 REST_S = 0.6  # recorded after success
 
@@ -149,10 +150,49 @@ def _within(target: Floats) -> Floats:
     return np.clip(target, 15.0, 497.0)
 
 
+class _Pusher:
+    """What both robots have: an arena, which the camera shows whole."""
+
+    arena: Arena
+
+    @property
+    def own(self) -> Floats:
+        """Return the middle (1, 2) of the pusher in a frame of 128 px."""
+        return PX * self.arena.agent[None]
+
+    @property
+    def loose(self) -> Floats:
+        """Return two places (2, 2) of the T in a frame of 128 px: its origin, and a point on its stem."""
+        return tee_places(self.arena.pose)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Render the arena; (size, size, 3) RGB."""
+        return self.arena.picture()
+
+
+def begin(
+    robot: str, seed: int, episode: int
+) -> "tuple[FastPusher | SlowPusher, Callable[[], NDArray[np.float32]]]":
+    """Return the simulation of an episode at its start, and the recorder's driver."""
+    pusher = FastPusher(seed, episode) if robot == "pusht_fast" else SlowPusher(seed, episode)
+    return pusher, pusher.driver()
+
+
+def tee_pose(places: Floats) -> Floats:
+    """Return the pose (3,) x, y, angle of the T, in px of the arena, whose places (2, 2) these are."""
+    along = places[1] - places[0]
+    return np.append(places[0] / PX, np.arctan2(along[1], along[0]) - np.arctan2(STEM[1], STEM[0]))
+
+
+def tee_places(pose: Floats) -> Floats:
+    """Return two places (2, 2) of the T in a frame of 128 px, for its pose (3,) in px of the arena."""
+    return PX * np.stack([pose[:2], pose[:2] + rotation(pose[2]) @ STEM])
+
+
 # -- pusht_fast
 
 
-class FastPusher:
+class FastPusher(_Pusher):
     """pusht_fast: an arena whose actions are targets of the pusher, one each 0.1 s."""
 
     def __init__(
@@ -166,10 +206,6 @@ class FastPusher:
     def observed(self) -> NDArray[np.float32]:
         """Return the centre (2,) of the pusher, as recorded."""
         return self.arena.agent.astype(np.float32)
-
-    def picture(self) -> NDArray[np.uint8]:
-        """Render the arena; (size, size, 3) RGB."""
-        return self.arena.picture()
 
     def advance(self, action: NDArray[np.float32]) -> None:
         """Simulate 0.1 s with the target at (x, y)."""
@@ -261,7 +297,7 @@ def fast_demo(
 # -- pusht_slow
 
 
-class SlowPusher:
+class SlowPusher(_Pusher):
     """pusht_slow: an arena whose actions are the velocity of the pusher's setpoint, and whether it is up."""
 
     def __init__(self, seed: int, episode: int) -> None:
@@ -275,10 +311,6 @@ class SlowPusher:
     def observed(self) -> NDArray[np.float32]:
         """Return (3,) the centre of the pusher, and 1 if it is up, as recorded."""
         return np.append(self.arena.agent, self.arena.raised).astype(np.float32)
-
-    def picture(self) -> NDArray[np.uint8]:
-        """Render the arena; (size, size, 3) RGB."""
-        return self.arena.picture()
 
     def take(self, action: Floats | NDArray[np.float32]) -> None:
         """Set the velocity (vx, vy) in px/s, and raise or lower the pusher."""
@@ -331,11 +363,9 @@ def _slow_schedule(rng: np.random.Generator) -> list[tuple[int, str]]:
 
 
 def _slow_bag(path: Path, seed: int, episode: int) -> None:
-    import cv2
-
     robot = SlowPusher(seed, episode)
     arena, rng, action, stop = robot.arena, robot.rng, robot.commander(), SLOW_TICKS
-    messages: list[Message] = []
+    bag = BagEpisode(episode, "arena", rng)
     for tick, event in _slow_schedule(rng):
         if tick >= stop:
             break
@@ -344,28 +374,15 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
             robot.run(ticks)
             if arena.success and not before:
                 stop = min(stop, max(round(SHORTEST_S / TICK_S), tick + round(REST_S / TICK_S)))
-        fields: dict[str, Any]
+        at = tick * round(TICK_S * 1e9)
         if event == "camera":
-            topic, kind = "/camera/image/compressed", "sensor_msgs/msg/CompressedImage"
-            _, png = cv2.imencode(".png", arena.picture()[..., ::-1])
-            fields = {"format": "png", "data": png.reshape(-1)}
+            bag.image(at, arena.picture())
         elif event == "joints":
-            topic, kind = "/joint_states", "sensor_msgs/msg/JointState"
             place, motion = np.append(arena.agent, arena.raised), np.append(arena.velocity, 0.0)
-            fields = {"name": ["x", "y", "lift"], "position": place, "velocity": motion}
-            fields["effort"] = np.empty(0)
+            bag.joints(at, ["x", "y", "lift"], place, motion)
         else:
-            topic, kind = "/command", "geometry_msgs/msg/TwistStamped"
             given = action()
             robot.take(given)
-            vector = "geometry_msgs/msg/Vector3"
-            linear = ros_value(vector, *given.tolist())
-            turn = ros_value(vector, 0.0, 0.0, 0.0)
-            fields = {"twist": ros_value("geometry_msgs/msg/Twist", linear=linear, angular=turn)}
-        stamp = EPOCH_NS + episode * 60_000_000_000 + tick * round(TICK_S * 1e9)
-        camera = event == "camera"
-        delay = rng.integers(12_000_000, 20_000_000) if camera else rng.integers(500_000, 2_000_000)
-        frame, received = "camera" if camera else "arena", stamp + int(delay)
-        messages.append(Message(topic, stamp, received, kind, frame, fields))
+            bag.command(at, given)
     facts = {"success": str(arena.success).lower(), "start": STARTS[episode % len(STARTS)], "seed": str(seed)}
-    write_mcap(path, messages, {"robot": "pusht_slow", **facts})
+    write_mcap(path, bag.messages, {"robot": "pusht_slow", **facts})

@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.lab import FAMILY, planar_arm, pusht, truth
+from hma_data.lab import FAMILY, planar_arm, pusht
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.driver import Driver, Reacher
 from hma_data.lab.family.world import REACH, World
@@ -46,12 +46,11 @@ def steerable(robot: str) -> bool:
 def state_of(simulation: Simulation) -> State:
     """Return the true state of a robot that is steerable."""
     if isinstance(simulation, World):
-        return State(simulation.pose, simulation.blocks, simulation.held >= 0)
+        return State(simulation.pose, simulation.loose, simulation.held >= 0)
     if isinstance(simulation, pusht.FastPusher):
-        _, places = truth.parts_of(simulation)
-        return State(simulation.arena.agent, places[1:], False)
+        return State(simulation.arena.agent, simulation.loose, False)
     assert isinstance(simulation, planar_arm.Arm)
-    return State(simulation.joints, truth.PX * simulation.blocks[:, :2], False)
+    return State(simulation.angles, simulation.loose, False)
 
 
 def reacher(robot: str) -> Callable[[State], NDArray[np.float32]]:
@@ -71,12 +70,12 @@ def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[Stat
         return lambda state: drive(state.pose, state.blocks, state.holding).astype(np.float32)
     if robot == PUSHER:
         push = pusht.pusher_of(pose, rng)
-        return lambda state: push(truth.tee_pose(state.blocks), state.pose)
-    arm = SimpleNamespace(joints=pose, blocks=np.zeros((1, 2)))
+        return lambda state: push(pusht.tee_pose(state.blocks), state.pose)
+    arm = SimpleNamespace(angles=pose, blocks=np.zeros((1, 2)))
     next_command = planar_arm.driver(arm, rng)  # type: ignore[arg-type]
 
     def action(state: State) -> NDArray[np.float32]:
-        arm.joints, arm.blocks = state.pose, state.blocks / truth.PX
+        arm.angles, arm.blocks = state.pose, state.blocks / planar_arm.PX
         return next_command()
 
     return action
@@ -111,7 +110,7 @@ class SeenPush:
     """The state of pusht_fast: the pusher follows its target with the lag of its spring."""
 
     def __init__(self, places: Floats) -> None:
-        self._agent, self._tee = places[0] / truth.PX, places[1:]
+        self._agent, self._tee = places[0] / pusht.PX, places[1:]
 
     @property
     def state(self) -> State:
@@ -121,15 +120,16 @@ class SeenPush:
         self._agent = self._agent + (action - self._agent) * (1 - np.exp(-pusht.FAST_PERIOD_S / pusht.LAG_S))
 
     def see(self, places: Floats) -> None:
-        self._agent, self._tee = places[0] / truth.PX, places[1:]
+        self._agent, self._tee = places[0] / pusht.PX, places[1:]
 
 
 class SeenPose:
     """The state of a robot of the family or `planar_arm`; the arguments are those of `seen_state`."""
 
     def __init__(self, robot: str, own: NDArray[np.int64], places: Floats) -> None:
-        self._forward, self._own = truth.own_places(robot), own
+        self._own = own
         self._body = Body.of(robot) if FAMILY.fullmatch(robot) else None
+        self._forward = planar_arm.link_middles if self._body is None else self._body.own
         low, high = np.array([[-np.pi, -np.pi], [np.pi, np.pi]]) if self._body is None else self._body.limits
         self._width = high - low
         starts = np.random.default_rng(0).uniform(low, high, (STARTS, len(low)))

@@ -12,6 +12,7 @@ A values of an action, S values of a state.
 """
 
 from collections.abc import Callable
+from importlib import import_module
 from typing import Protocol
 
 import numpy as np
@@ -19,10 +20,11 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.images import prepare
 from hma_data.errors import UsageError
-from hma_data.lab import FAMILY, family, pendulum, planar_arm, pusht
+from hma_data.lab import FAMILY, RECORDERS, family
 from hma_data.registry.embodiment import Embodiment, find
 
 SIZE = 128  # pixels: the side of the frames
+Floats = NDArray[np.float64]
 Driver = Callable[[], NDArray[np.float32]]
 
 
@@ -32,6 +34,14 @@ class Simulation(Protocol):
     @property
     def observed(self) -> NDArray[np.float32]:
         """Return the state (S,) that is recorded with a frame."""
+
+    @property
+    def own(self) -> Floats:
+        """Return the places (P, 2) of the robot's own parts, in px of a frame of 128 by 128."""
+
+    @property
+    def loose(self) -> Floats:
+        """Return the places (L, 2) of what lies loose."""
 
     def picture(self) -> NDArray[np.uint8]:
         """Draw the scene, as the camera records it."""
@@ -53,17 +63,16 @@ class LabSimulator:
     """
 
     def __init__(self, robot: str, seed: int = 0) -> None:
-        if not simulated(robot):
-            known = f"{', '.join(_BEGINNINGS)}, and the family, such as mover_04"
-            raise UsageError(robot, "has no simulator in the laboratory", f"known: {known}")
-        self.embodiment: Embodiment = family.embodiment(robot) if FAMILY.fullmatch(robot) else find(robot)
+        self.embodiment = embodiment(robot)
         self.reset(seed)
 
     def reset(self, seed: int, episode: int = 0) -> NDArray[np.uint8]:
         """Begin the scene of an episode that `hma_data.lab.record` numbers so; return its first frame."""
         robot = self.embodiment.id
+        module, _ = RECORDERS.get(robot, ("hma_data.lab.family", ""))
+        begun: tuple[Simulation, Driver] = import_module(module).begin(robot, seed, episode)
         self.seed, self.episode = seed, episode
-        self.simulation, self._driver = _BEGINNINGS.get(robot, _family)(robot, seed, episode)
+        self.simulation, self._driver = begun
         self._commands: list[NDArray[np.float32]] = []
         return self.picture()
 
@@ -107,38 +116,18 @@ class LabSimulator:
 
 def simulated(robot: str) -> bool:
     """Check whether the laboratory has a simulator of a robot."""
-    return robot in _BEGINNINGS or FAMILY.fullmatch(robot) is not None
+    return robot in RECORDERS or FAMILY.fullmatch(robot) is not None
 
 
-def _family(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
-    world, rng = family.start(family.Body.of(robot), seed, episode)
-    return world, family.driver(world, rng)
+def embodiment(robot: str) -> Embodiment:
+    """Return the embodiment of a laboratory robot.
 
-
-def _pendulum(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
-    world, rng = pendulum.start(seed, episode)
-    return world, pendulum.driver(world, rng, episode)
-
-
-def _planar_arm(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
-    arm, rng = planar_arm.start(seed, episode)
-    return arm, planar_arm.driver(arm, rng)
-
-
-def _pusht_fast(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
-    pusher = pusht.FastPusher(seed, episode)
-    return pusher, pusher.driver()
-
-
-def _pusht_slow(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
-    pusher = pusht.SlowPusher(seed, episode)
-    return pusher, pusher.driver()
-
-
-_BEGINNINGS: dict[str, Callable[[str, int, int], tuple[Simulation, Driver]]] = {
-    "pendulum": _pendulum,
-    "planar_arm": _planar_arm,
-    "planar_arm_lerobot": _planar_arm,
-    "pusht_fast": _pusht_fast,
-    "pusht_slow": _pusht_slow,
-}
+    Raises:
+        UsageError: there is no such robot.
+    """
+    if FAMILY.fullmatch(robot):
+        return family.embodiment(robot)
+    if robot in RECORDERS:
+        return find(robot)
+    known = f"{', '.join(RECORDERS)}, and the family, such as {family.TRUNK[0]}"
+    raise UsageError(robot, "has no simulator in the laboratory", f"known: {known}")

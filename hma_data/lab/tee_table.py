@@ -106,7 +106,7 @@ class TeeTable:
         for outline in self._outlines(self._goal()):
             points = [(round(x), round(y)) for x, y in outline]
             game.draw.polygon(screen, game.Color("LightGreen"), points)
-        self._space.debug_draw(_pencil(self._munk, game, screen))
+        self._space.debug_draw(_pencil(screen))
         pixels = game.surfarray.array3d(screen).swapaxes(0, 1)
         small: NDArray[np.uint8] = cv2.resize(np.ascontiguousarray(pixels), (size, size))
         return small
@@ -135,35 +135,23 @@ def _clip(polygon: Floats, convex: Floats) -> Floats:
     return polygon
 
 
-def _pencil(munk: Any, game: Any, screen: Any) -> Any:
+def _pencil(screen: Any) -> Any:
     """Return what draws a space of pymunk on a surface, in flat colours with a dark outline."""
+    from pymunk import pygame_util
 
-    class Pencil(munk.SpaceDebugDrawOptions):
+    game: Any = pygame_util.pygame
+
+    class Pencil(pygame_util.DrawOptions):
         def draw_circle(self, pos: Any, angle: float, radius: float, outline: Any, fill: Any) -> None:
             game.draw.circle(screen, fill.as_int(), _rounded(pos), round(radius))
             game.draw.circle(screen, _light(fill), _rounded(pos), round(radius - 4))
-
-        def draw_segment(self, a: Any, b: Any, color: Any) -> None:  # where bodies touch
-            game.draw.aalines(screen, color.as_int(), False, [_rounded(a), _rounded(b)])
-
-        def draw_fat_segment(self, a: Any, b: Any, radius: float, outline: Any, fill: Any) -> None:
-            start, stop = np.array(_rounded(a)), np.array(_rounded(b))
-            game.draw.lines(screen, fill.as_int(), False, [start.tolist(), stop.tolist()], round(2 * radius))
-            across = np.abs(stop - start)[::-1]
-            if not across.any():
-                return
-            across = np.round(across * (radius / np.hypot(*across))).astype(int)
-            corners = [start - across, start + across, stop + across, stop - across]
-            game.draw.polygon(screen, fill.as_int(), [corner.tolist() for corner in corners])
-            for end in (start, stop):
-                game.draw.circle(screen, fill.as_int(), end.tolist(), round(radius))
 
         def draw_polygon(self, verts: Any, radius: float, outline: Any, fill: Any) -> None:
             game.draw.polygon(screen, _light(fill), [_rounded(corner) for corner in verts])
             for here, there in zip(verts, [*verts[1:], verts[0]], strict=True):
                 self.draw_fat_segment(here, there, 2, fill, fill)
 
-    return Pencil()
+    return Pencil(screen)
 
 
 def _rounded(place: Any) -> tuple[int, int]:

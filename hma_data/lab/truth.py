@@ -10,26 +10,18 @@ it does not tell a hoist, a lift and a magnet.
 T frames a chunk apart, S pixels a side, K = stride * action dim, P parts.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import UsageError
-from hma_data.lab import FAMILY, family, pendulum, planar_arm, pusht
-from hma_data.lab.family.look import SIZE
-from hma_data.lab.family.world import World
-from hma_data.lab.pusher import rotation
+from hma_data.lab import pusht
+from hma_data.lab.family.look import SIZE as SIZE
 from hma_data.lab.simulator import LabSimulator, Simulation
-from hma_data.registry.embodiment import Embodiment, find
 
 Floats = NDArray[np.float64]
 PUSHERS = ("pusht_fast", "pusht_slow")
-SIMPLE = ("pendulum", "planar_arm", *PUSHERS)
-PX = SIZE / planar_arm.ARENA  # px of an image of SIZE in one of an arena; gym-pusht's is as large
-ROD = 26.0  # px from the pendulum's axle to the middle of its rod
-STEM = np.array([0.0, 70.0])  # a point on the T's stem, px of the arena
 
 
 @dataclass(frozen=True)
@@ -49,18 +41,6 @@ class Episode:
     parts: Floats
     states: NDArray[np.float32]
     driven: int
-
-
-def embodiment(robot: str) -> Embodiment:
-    """Return the embodiment of a laboratory robot.
-
-    Raises:
-        UsageError: there is no such robot here.
-    """
-    if robot not in SIMPLE and not FAMILY.fullmatch(robot):
-        remedy = f"name one of {', '.join(SIMPLE)}, or of the family, such as {family.TRUNK[0]}"
-        raise UsageError(robot, "is no simulator of the laboratory", remedy)
-    return find(robot) if robot in SIMPLE else family.embodiment(robot)
 
 
 def episode(
@@ -103,47 +83,12 @@ def episode(
     return Episode(np.stack(pictures), chunks, np.stack(parts), np.stack(states), driven)
 
 
-def own_places(robot: str) -> Callable[[Floats], Floats]:
-    """Return a function from a pose (Q,) to the places (P, 2) of a robot's own parts.
-
-    A pose is that of the family, or the joint angles of `planar_arm`.
-    """
-    if FAMILY.fullmatch(robot):
-        shapes = family.Body.of(robot).mechanism.shapes
-        return lambda pose: np.stack([shape.points.mean(axis=0) for shape in shapes(pose)])
-    return _links
-
-
 def parts_of(simulation: Simulation) -> tuple[int, Floats]:
     """Return how many parts are driven, and the places (P, 2) of all, the driven ones first."""
-    if isinstance(simulation, World):
-        own = own_places(simulation.body.name)(simulation.pose)
-        return len(own), np.concatenate([own, simulation.blocks])
-    if isinstance(simulation, planar_arm.Arm):
-        return 2, np.concatenate([_links(simulation.joints), PX * simulation.blocks[:, :2]])
-    if isinstance(simulation, pendulum.Pendulum):
-        return 1, SIZE / 2 - ROD * np.array([[np.sin(simulation.angle), np.cos(simulation.angle)]])
-    assert isinstance(simulation, pusht.FastPusher | pusht.SlowPusher)
-    arena = simulation.arena
-    return 1, np.concatenate([PX * arena.agent[None], tee_places(arena.pose)])
+    own = simulation.own
+    return len(own), np.concatenate([own, simulation.loose])
 
 
 def goal_of(robot: str) -> Floats | None:
     """Return the places (2, 2) of the T of a pusher when it lies on its goal; other robots have no goal."""
-    return tee_places(np.array(pusht.GOAL)) if robot in PUSHERS else None
-
-
-def tee_pose(places: Floats) -> Floats:
-    """Return the pose (3,) x, y, angle of a pusher's T, in px of its arena, whose places (2, 2) these are."""
-    along = places[1] - places[0]
-    return np.append(places[0] / PX, np.arctan2(along[1], along[0]) - np.arctan2(STEM[1], STEM[0]))
-
-
-def tee_places(pose: Floats) -> Floats:
-    """Return the places (2, 2) of a pusher's T at a pose (3,) in px of its arena."""
-    return PX * np.stack([pose[:2], pose[:2] + rotation(pose[2]) @ STEM])
-
-
-def _links(joints: Floats) -> Floats:
-    elbow, tip = planar_arm.elbow_and_tip(joints)
-    return PX * np.stack([planar_arm.BASE + elbow, elbow + tip]) / 2
+    return pusht.tee_places(np.array(pusht.GOAL)) if robot in PUSHERS else None

@@ -8,11 +8,11 @@ T frames of an episode, A action dims, S state dims.
 import json
 import struct
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import google_crc32c
 import h5py
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 DISTRO = "jazzy"  # of ROS
+EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps
 _CORE = "tensorflow_datasets.core.features"
 
 # -- HDF5
@@ -35,6 +36,54 @@ class Demo:
     rewards: NDArray[np.float64]  # (T,)
     success: bool  # whether the task was done at the end
     facts: Mapping[str, str | int | float]  # stored as attributes
+
+
+class BlockWorld(Protocol):
+    """A simulated robot among loose blocks, as `block_demo` records it."""
+
+    @property
+    def joints(self) -> Mapping[str, NDArray[np.float64]]:
+        """Return what the robot measures of itself: key -> (n,)."""
+
+    @property
+    def blocks(self) -> NDArray[np.float64]:
+        """Return the places of the blocks: (B, 2), or (B, 3) with their angles."""
+
+    @property
+    def state(self) -> NDArray[np.float64]:
+        """Return the whole state (S,)."""
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Draw the scene."""
+
+    def advance(self, action: NDArray[np.float32], /) -> None:
+        """Simulate one control step."""
+
+
+def block_demo(
+    world: BlockWorld, drive: Callable[[], NDArray[np.float32]], steps: int, moved: float, seed: int
+) -> Demo:
+    """Record `steps` frames; the reward is the way that the blocks moved, success that one moved `moved`."""
+    first = before = world.blocks[:, :2].copy()
+    rows: list[tuple[Any, ...]] = []
+    for _ in range(steps):
+        seen = world.picture(), world.state
+        joints = {key: values.copy() for key, values in world.joints.items()}
+        action = drive()
+        world.advance(action)
+        after = world.blocks[:, :2].copy()
+        rows.append((*seen, action, np.linalg.norm(after - before, axis=1).sum(), joints))
+        before = after
+    *columns, measured = zip(*rows, strict=True)
+    images, states, actions, rewards = map(np.stack, columns)
+    return Demo(
+        actions=actions,
+        observations={"image": images} | {key: np.stack([one[key] for one in measured]) for key in joints},
+        states=states,
+        rewards=rewards,
+        success=bool(np.linalg.norm(before - first, axis=1).max() >= moved),
+        facts={"seed": seed},
+    )
 
 
 def write_hdf5(path: Path, demos: Iterable[Demo], env_args: Mapping[str, Any]) -> None:
@@ -222,6 +271,59 @@ class Message:
     type: str  # one with a header, e.g. sensor_msgs/msg/JointState
     frame: str  # frame_id of the header
     fields: Mapping[str, Any]  # values of the other fields
+
+
+class BagEpisode:
+    """The messages of one episode of a simulated robot; receipt is 0.5 to 20 ms after the event.
+
+    Args:
+        number: of the episode; episodes are a minute apart.
+        frame: the frame_id of all but images.
+        rng: draws the delays.
+    """
+
+    def __init__(self, number: int, frame: str, rng: np.random.Generator) -> None:
+        self.messages: list[Message] = []
+        self._start = EPOCH_NS + number * 60_000_000_000
+        self._frame = frame
+        self._rng = rng
+
+    def image(self, at_ns: int, picture: NDArray[np.uint8]) -> None:
+        """Add a frame (H, W, 3) RGB as a PNG."""
+        import cv2
+
+        _, png = cv2.imencode(".png", picture[..., ::-1])
+        fields = {"format": "png", "data": png.reshape(-1)}
+        late = int(self._rng.integers(12_000_000, 20_000_000))
+        self._add(
+            "/camera/image/compressed", "sensor_msgs/msg/CompressedImage", at_ns, late, "camera", fields
+        )
+
+    def joints(
+        self, at_ns: int, names: list[str], position: NDArray[Any], velocity: NDArray[np.float64]
+    ) -> None:
+        """Add what the robot measures of itself (n,)."""
+        fields = {"name": names, "position": position, "velocity": velocity, "effort": np.empty(0)}
+        self._add("/joint_states", "sensor_msgs/msg/JointState", at_ns, self._soon(), self._frame, fields)
+
+    def command(self, at_ns: int, values: NDArray[np.float64]) -> None:
+        """Add an action of up to three values, as a twist's linear part."""
+        linear, angular = (
+            ros_value("geometry_msgs/msg/Vector3", *part.tolist())
+            for part in (np.pad(values, (0, 3 - len(values))), np.zeros(3))
+        )
+        twist = ros_value("geometry_msgs/msg/Twist", linear=linear, angular=angular)
+        kind = "geometry_msgs/msg/TwistStamped"
+        self._add("/command", kind, at_ns, self._soon(), self._frame, {"twist": twist})
+
+    def _soon(self) -> int:
+        return int(self._rng.integers(500_000, 2_000_000))
+
+    def _add(
+        self, topic: str, kind: str, at_ns: int, late: int, frame: str, fields: Mapping[str, Any]
+    ) -> None:
+        stamp = self._start + at_ns
+        self.messages.append(Message(topic, stamp, stamp + late, kind, frame, fields))
 
 
 def ros_value(kind: str, *values: Any, **named: Any) -> Any:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hma_data.episodes.images import opencv, prepare
-from hma_data.lab import truth
+from hma_data.lab import simulator, truth
 from hma_model.evaluation.tee import TeeFinder
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ def state_errors(probe: Probe, pictures: Images, parts: Floats) -> Floats:
 
 def as_seen(robot: str, tokenizer: "Tokenizer", pictures: Images) -> Images:
     """Return a recorder's pictures (N, …) as the tokenizer takes them (N, S, S, 3)."""
-    spec, (camera, *_) = tokenizer.spec, truth.embodiment(robot).cameras
+    spec, (camera, *_) = tokenizer.spec, simulator.embodiment(robot).cameras
     return prepare(pictures, camera, spec.image_size, spec.resize_filter)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hma_data.lab import truth
+from hma_data.lab import simulator, truth
 from hma_data.loading.dataset import Batch
 from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded, summary
@@ -67,7 +67,7 @@ def measure_state(
     Raises:
         UsageError: it is no robot of the laboratory.
     """
-    truth.embodiment(robot)
+    simulator.embodiment(robot)
     stride = model.embodiments[robot].stride
     probe = train_probe(robot, tokenizer, stride, seed)
     simulate = partial(truth.episode, robot, frames, stride, seed)

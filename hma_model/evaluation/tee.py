@@ -43,15 +43,15 @@ class TeeFinder:
         """Return parts (N, P, 2) with the middles of the T's bars instead of the last two, its places."""
         found = parts.copy()
         for row, places in enumerate(parts[:, -2:]):
-            pose = truth.tee_pose(places)
+            pose = pusht.tee_pose(places)
             middles = self.shape.boxes.mean(axis=1) @ rotation(pose[2]).T + pose[:2]
-            found[row, -2:] = truth.PX * middles
+            found[row, -2:] = pusht.PX * middles
         return found
 
     def find(self, pixels: NDArray[np.bool_]) -> Floats | None:
         """Return the places (2, 2) of the T that has the pixels (S, S); None if they are too few."""
         side = len(pixels)
-        size = truth.SIZE / truth.PX / side  # px of the arena
+        size = truth.SIZE / pusht.PX / side  # px of the arena
         y, x = np.nonzero(pixels)
         boxes = self.shape.boxes
         areas = (boxes[:, 1] - boxes[:, 0]).prod(axis=1)
@@ -62,7 +62,7 @@ class TeeFinder:
         angles = np.arange(ANGLES) * (2 * np.pi / ANGLES)
         starts = np.array([[*(points.mean(axis=0) - rotation(a) @ middle), a] for a in angles])
         pose = starts[self._outside(points, starts).argmin()]
-        return truth.tee_places(self._nearer(points, pose))
+        return pusht.tee_places(self._nearer(points, pose))
 
     def _nearer(self, points: Floats, pose: Floats) -> Floats:
         """Return the best pose near another."""

@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import HMAError, UsageError
-from hma_data.lab import truth
 from hma_data.lab.scripted import steerable
-from hma_data.lab.simulator import simulated
+from hma_data.lab.simulator import embodiment, simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import EpisodeReader, ShardSet
@@ -236,7 +235,7 @@ def _stated(
 ) -> tuple[Embodiment, Reader] | None:
     """Return the real robot, and what reads its state off images; None if no state is known."""
     if shards is None:
-        robot = truth.embodiment(settings.embodiment)
+        robot = embodiment(settings.embodiment)
         if robot.state is None:
             return None
         return robot, simulated_reader(robot.id, world.tokenizer, robot.stride, settings.seed, tell)

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from hma_data.episodes.align import pauses, to_clip
 from hma_data.episodes.images import prepared
 from hma_data.errors import HMAError, UsageError
-from hma_data.lab import FAMILY, RECORDERS, record
+from hma_data.lab import record
+from hma_data.lab.simulator import simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import EpisodeReader, ShardSet
@@ -143,7 +144,7 @@ def starting_window(model: "HMA", embodiment: str, seed: int = 0) -> Prompt:
         HMAError: the model lacks the embodiment, or it is no robot of the laboratory.
     """
     robot = described(model, embodiment)
-    if robot is None or not (embodiment in RECORDERS or FAMILY.fullmatch(embodiment)):
+    if robot is None or not simulated(embodiment):
         raise HMAError(
             f"prompt of {embodiment}", "none comes along: it is no robot of the laboratory", PROMPT_FORMS
         )

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from hma_data.bench import Bench
 from hma_data.errors import UsageError
-from hma_data.lab import truth
+from hma_data.lab import simulator, truth
 from hma_data.storage.yaml_io import parse_yaml
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     samplings = _samplings(settings["sampling"])
     robots = [name.strip() for name in settings["robots"].split(",")]
     for robot in robots:
-        truth.embodiment(robot)
+        simulator.embodiment(robot)
     for key, least in (("frames", EARLY), ("rollouts", 2)):
         if settings[key] < least:
             raise UsageError("bench drift", f"{key}={settings[key]} is not allowed", f"give at least {least}")

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.driver import Driver, Reacher
-from hma_data.lab.family.look import SIZE, Floats
+from hma_data.lab.family.look import SIZE
 from hma_data.lab.family.mechanisms import MAKERS, Axis
 from hma_data.lab.family.world import World, start
-from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mcap
+from hma_data.lab.writers import BagEpisode, Demo, block_demo, write_hdf5, write_mcap
 from hma_data.registry.embodiment import Embodiment
 
 SECONDS = 8.0  # of an episode
@@ -41,7 +41,6 @@ PROVENANCE = {
     "success": f"some block ended {MOVED:g} px or more of the {SIZE} by {SIZE} px picture from where it lay",
 }
 NOTES = "Random manoeuvres: going to a pose or a block, holding a velocity, weaving, resting."
-EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps; episodes are a minute apart
 
 
 def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
@@ -126,36 +125,16 @@ def _component(body: Body, number: int, bags: bool) -> dict[str, Any]:
 
 
 def _write_bag(path: Path, body: Body, seed: int, number: int) -> None:
-    """Write frames, poses and actions at the control rate; receipt is 0.5 to 20 ms later."""
-    import cv2
-
+    """Write frames, poses and actions at the control rate."""
     demo = episode(body, seed, number)
-    rng = np.random.default_rng((seed, 7, number))
-    messages: list[Message] = []
+    bag = BagEpisode(number, "table", np.random.default_rng((seed, 7, number)))
     for row, action in enumerate(demo.actions):
-        stamp = EPOCH_NS + number * 60_000_000_000 + round(row * 1e9 / body.hz)
-        _, png = cv2.imencode(".png", demo.observations["image"][row][..., ::-1])
-        image = {"format": "png", "data": png.reshape(-1)}
-        pose, empty = demo.observations["joint_pos"][row], np.empty(0)
-        joints = {"name": [a.name for a in body.axes], "position": pose, "velocity": empty, "effort": empty}
-        linear, turn = (
-            ros_value("geometry_msgs/msg/Vector3", *part.tolist())
-            for part in (np.pad(action.astype(np.float64), (0, 3 - len(action))), np.zeros(3))
-        )
-        twist = {"twist": ros_value("geometry_msgs/msg/Twist", linear=linear, angular=turn)}
-        for topic, kind, frame, fields in (
-            ("/camera/image/compressed", "sensor_msgs/msg/CompressedImage", "camera", image),
-            ("/joint_states", "sensor_msgs/msg/JointState", "table", joints),
-            ("/command", "geometry_msgs/msg/TwistStamped", "table", twist),
-        ):
-            late = (
-                rng.integers(12_000_000, 20_000_000)
-                if frame == "camera"
-                else rng.integers(500_000, 2_000_000)
-            )
-            messages.append(Message(topic, stamp, stamp + int(late), kind, frame, fields))
+        at = round(row * 1e9 / body.hz)
+        bag.image(at, demo.observations["image"][row])
+        bag.joints(at, [axis.name for axis in body.axes], demo.observations["joint_pos"][row], np.empty(0))
+        bag.command(at, action.astype(np.float64))
     facts = {"success": str(demo.success).lower(), "seed": str(seed)}
-    write_mcap(path, messages, {"robot": body.name, **facts})
+    write_mcap(path, bag.messages, {"robot": body.name, **facts})
 
 
 def write_file(part: Path, body: Body, demos: Iterable[Demo]) -> None:
@@ -170,23 +149,13 @@ def episode(
     """Simulate an episode, with random manoeuvres or a reach; the same arguments give the same bytes."""
     world, rng = start(body, seed, number)
     drive = driver(world, rng, reach)
-    lay = world.blocks.copy()
-    rows: list[tuple[Any, ...]] = []
-    for _ in range(round(seconds * body.hz)):
-        seen = world.picture(), world.pose.copy(), world.state
-        before = world.blocks.copy()
-        action = drive()
-        world.advance(action)
-        rows.append((*seen, action, _distances(before, world.blocks).sum()))
-    images, poses, states, commands, rewards = map(np.stack, zip(*rows, strict=True))
-    return Demo(
-        actions=commands,
-        observations={"image": images, "joint_pos": poses},
-        states=states,
-        rewards=rewards,
-        success=bool(_distances(lay, world.blocks).max() >= MOVED),
-        facts={"seed": seed},
-    )
+    return block_demo(world, drive, round(seconds * body.hz), MOVED, seed)
+
+
+def begin(robot: str, seed: int, number: int) -> tuple[World, Callable[[], NDArray[np.float32]]]:
+    """Return the simulation of an episode at its start, and the recorder's driver."""
+    world, rng = start(Body.of(robot), seed, number)
+    return world, driver(world, rng)
 
 
 def driver(
@@ -195,8 +164,3 @@ def driver(
     """Return the recorder's driver, which returns the next action (A,)."""
     drive = reach or Driver(world.body, world.pose, rng)
     return lambda: drive(world.pose, world.blocks, world.held >= 0).astype(np.float32)
-
-
-def _distances(before: Floats, after: Floats) -> Floats:
-    moved: Floats = np.linalg.norm(after - before, axis=1)
-    return moved

@@ -78,6 +78,10 @@ class Body:
         """Return whether the gripper is closed, or the magnet on."""
         return bool(self.grip) and bool((pose[-1] < GRIP) == (self.grip == "gripper"))
 
+    def own(self, pose: Floats) -> Floats:
+        """Return the middles (P, 2) of the moving parts at a pose (Q,)."""
+        return np.stack([shape.points.mean(axis=0) for shape in self.mechanism.shapes(pose)])
+
     def moved(self, pose: Floats, action: Floats) -> Floats:
         """Return the pose (Q,) one control step later."""
         step, action = 1 / self.hz, np.clip(action, *self.ranges)

@@ -33,9 +33,24 @@ class World:
         return np.concatenate([self.pose, self.blocks.ravel(), [self.held]])
 
     @property
+    def joints(self) -> dict[str, Floats]:
+        """Return the pose (Q,)."""
+        return {"joint_pos": self.pose}
+
+    @property
     def observed(self) -> NDArray[np.float32]:
         """Return the pose (Q,), as recorded."""
         return self.pose.astype(np.float32)
+
+    @property
+    def own(self) -> Floats:
+        """Return the middles (P, 2) of the moving parts."""
+        return self.body.own(self.pose)
+
+    @property
+    def loose(self) -> Floats:
+        """Return the middles (B, 2) of the blocks."""
+        return self.blocks
 
     def advance(self, action: Floats | NDArray[np.float32]) -> None:
         """Simulate one control step under an action (A,)."""

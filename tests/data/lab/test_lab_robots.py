@@ -236,4 +236,4 @@ def test_elbow_holds_at_its_stop() -> None:
     arm, _ = planar_arm.start(SEED, 0)
     for _ in range(90):
         arm.advance(np.array([0.0, 2.6], dtype=np.float32))
-    assert arm.joints[1] == pytest.approx(planar_arm.ELBOW_STOP, abs=0.05)
+    assert arm.angles[1] == pytest.approx(planar_arm.ELBOW_STOP, abs=0.05)

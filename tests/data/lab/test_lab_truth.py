@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hma_data.errors import UsageError
-from hma_data.lab import planar_arm, record, truth
+from hma_data.lab import pendulum, planar_arm, record, simulator, truth
 from hma_data.lab.family import TRUNK
 from hma_data.lab.family.look import SIZE
 
@@ -25,9 +25,12 @@ def test_an_episode_is_the_one_that_the_recorder_writes(robot: str, tmp_path: Pa
     np.testing.assert_array_equal(found.chunks.reshape(actions.shape), actions)
 
 
-@pytest.mark.parametrize("robot", [*truth.SIMPLE, "mover_10", "gantry_04", "crane_01", "rails_09"])
+ROBOTS = ("pendulum", "planar_arm", *truth.PUSHERS, "mover_10", "gantry_04", "crane_01", "rails_09")
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_episodes_are_repeatable_and_of_any_length(robot: str) -> None:
-    own = truth.embodiment(robot)
+    own = simulator.embodiment(robot)
     short, long = (truth.episode(robot, frames, own.stride, 2, 3) for frames in (4, 30))
     np.testing.assert_array_equal(short.pictures, long.pictures[:4])
     np.testing.assert_array_equal(short.parts, long.parts[:4])
@@ -41,7 +44,7 @@ def test_episodes_are_repeatable_and_of_any_length(robot: str) -> None:
 
 def test_an_episode_is_longer_than_a_recording() -> None:
     smooth = 1  # of the pendulum's drivers; its torques are a function of time
-    assert len(truth.episode("pendulum", 60, 2, 0, smooth).parts) * 2 > truth.pendulum.STEPS
+    assert len(truth.episode("pendulum", 60, 2, 0, smooth).parts) * 2 > pendulum.STEPS
 
 
 def test_parts_are_where_their_colours_are() -> None:
@@ -54,7 +57,5 @@ def test_parts_are_where_their_colours_are() -> None:
 
 
 def test_a_robot_that_has_no_simulator_is_refused() -> None:
-    with pytest.raises(
-        UsageError, match=f"bridge: is no simulator of the laboratory — name one of .*{TRUNK[0]}"
-    ):
-        truth.embodiment("bridge")
+    with pytest.raises(UsageError, match=f"bridge: has no simulator in the laboratory — known: .*{TRUNK[0]}"):
+        simulator.embodiment("bridge")

@@ -82,7 +82,7 @@ def test_the_pose_of_a_tee_is_read_off_its_places() -> None:
     for number in range(8):
         simulator.reset(5, number)
         arena = simulator.simulation.arena
-        pose = truth.tee_pose(truth.parts_of(simulator.simulation)[1][1:])
+        pose = pusht.tee_pose(truth.parts_of(simulator.simulation)[1][1:])
         np.testing.assert_allclose(pose[:2], arena.pose[:2], atol=1e-9)
         assert abs(wrapped(pose[2:] - arena.pose[2:])[0]) < 1e-9
 

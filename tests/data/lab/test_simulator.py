@@ -71,5 +71,5 @@ def test_a_copy_goes_on_alone_as_the_original_does(robot: str) -> None:
 
 def test_a_robot_without_simulator_is_refused() -> None:
     assert simulated("rails_09") and not simulated("bridge") and not simulated("rails")
-    with pytest.raises(UsageError, match=r"bridge: has no simulator.*mover_04"):
+    with pytest.raises(UsageError, match=r"bridge: has no simulator.*arm1_02"):
         LabSimulator("bridge")

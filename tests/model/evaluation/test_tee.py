@@ -40,7 +40,7 @@ def test_the_middles_of_the_bars_lie_within_the_tee() -> None:
     _, parts = truth.parts_of(simulator.simulation)
     (within,) = finder.within(parts[None])
     np.testing.assert_allclose(within[0], parts[0])
-    pose = truth.tee_pose(parts[1:])
-    arena = within[1:] / truth.PX - pose[:2]
+    pose = pusht.tee_pose(parts[1:])
+    arena = within[1:] / pusht.PX - pose[:2]
     c, s = np.cos(pose[2]), np.sin(pose[2])
     assert (pusht.tee().distance(arena @ np.array([[c, -s], [s, c]])) < -10).all()
