@@ -10,7 +10,7 @@ n images, H×W pixels, uint8 RGB.
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from io import BytesIO
 from typing import Any, Literal
@@ -385,12 +385,12 @@ def runs(indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
 
 
-def stacked(images: list[Images]) -> Iterator[tuple[int, Images]]:
+def stacked(images: Sequence[Images] | Images) -> Iterator[tuple[int, Images]]:
     """Yield runs of images of one size as (n, H, W, 3), with the index at which each run begins."""
     start = 0
     for i in range(1, len(images) + 1):
         if i == len(images) or images[i].shape != images[start].shape:
-            yield start, np.stack(images[start:i])
+            yield start, np.stack(list(images[start:i]))
             start = i
 
 

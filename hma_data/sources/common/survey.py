@@ -1,14 +1,16 @@
 """Gather what a sample of episodes shows; the same for every format.
 
-For each episode, a source hands in the lengths of the keys, their numbers, a few images, and times
-where there are any. A defect of a key becomes one finding, however many episodes have it.
+For each episode a source names its keys, and how each is read (`Series`). `look` reads them: the numbers, a
+few images, and times where there are any. A defect of a key becomes one finding, however many episodes
+have it. Bags hand in the same while they are read message by message.
 
 T samples of a key in an episode, A values a sample.
 """
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,8 +22,8 @@ from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import Images
 from hma_data.errors import HMAError
 from hma_data.sources.common import checks
-from hma_data.sources.common.checks import Finding, Look, Severity, StreamTimes
-from hma_data.sources.common.inspection import KeyInfo
+from hma_data.sources.common.checks import Finding, Look, Severity, StreamTimes, is_times, seconds_of
+from hma_data.sources.common.inspection import Inspection, KeyInfo
 
 CHECKS = {  # the checks of an inspection, in the order they are printed
     "readable": "episodes that can be read",
@@ -50,7 +52,31 @@ LOSSY = ("jpeg", "h264", "av1", "hevc", "vp8", "vp9", "mpeg4", "mjpeg")
 SHOWN = 5  # faults and episodes named at most
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 MAX_VALUES = 20_000_000  # numbers of one key of an episode
+MAX_LENGTHS = 1_000  # episodes whose lengths an inspection has
 _COMMANDS = re.compile(r"(^|[^a-z])(actions?|commands?|cmd|ctrl|control|targets?)([^a-z]|$)")
+
+
+@dataclass(frozen=True)
+class Series:
+    """How a key of one episode is read. Every function may raise an HMAError.
+
+    Attributes:
+        numbers: returns the values (T, …) of a vector.
+        frames: returns the images (H, W, 3) of the given frames of a camera.
+        count: frames of the camera.
+        starts: for each frame the one at which its decoding begins; of films.
+        codec: of the images.
+        times: (T,) seconds of a key with a clock of its own.
+        info: the key, where only reading it shows what it is.
+    """
+
+    numbers: Callable[[], NDArray[Any]] | None = None
+    frames: Callable[[NDArray[np.int64]], Sequence[Images] | Images] | None = None
+    count: int = 0
+    starts: NDArray[np.int64] | None = None
+    codec: str | None = None
+    times: Floats | None = None
+    info: KeyInfo | None = None
 
 
 @dataclass
@@ -91,6 +117,8 @@ class Survey:
         self.episodes, self.alone, self.by_field = episodes, alone, by_field
         self.looked: list[str] = []
         self.looks: dict[str, Look] = {}
+        self.infos: dict[str, KeyInfo] = {}  # of the first episode that has the key
+        self.pairs = 1  # of neighbouring frames looked at, for a camera of an episode
         self.made: set[str] = {"readable"}
         self._faults: dict[tuple[str, str], HMAError] = {}  # (episode, key or "") -> why
         self._numbers: dict[str, _Numbers] = {}
@@ -101,6 +129,68 @@ class Survey:
         self._shown: dict[str, str] = {}  # camera -> the episode last looked at
 
     # -- what sources hand in
+
+    def sample(self, names: Sequence[str], wanted: int) -> list[str]:
+        """Choose the episodes to look into, spread evenly over all."""
+        chosen = [names[i] for i in sampled(len(names), wanted)] if names else []
+        self.pairs = max(1, checks.PAIRS // max(len(chosen), 1))
+        return chosen
+
+    @contextmanager
+    def reading(self, name: str, key: str = "") -> Iterator[None]:
+        """Note an error as a fault of an episode, or of a key of it."""
+        try:
+            yield
+        except HMAError as fault:
+            self.fault(name, fault, key)
+
+    def look(
+        self,
+        name: str,
+        keys: Mapping[str, Callable[[], Series]],
+        hz: float | None = None,
+        source: str = "the recording states",
+    ) -> int:
+        """Read what an episode has at each key: all numbers and times, and some frames.
+
+        Args:
+            name: of the episode.
+            keys: how each is opened.
+            hz: the rate that clocks are compared with; `source` says who stated it.
+
+        Returns:
+            the frames of the first camera that can be opened; 0 where there is none.
+        """
+        self.episode(name)
+        first: Series | None = None
+        for key, opened in keys.items():
+            with self.reading(name, key):
+                series = opened()
+                if series.info:
+                    self.infos.setdefault(key, series.info)
+                first = first or (series if series.frames else None)
+                values = series.numbers() if series.numbers else None
+                times = series.times
+                if values is not None:
+                    self.numbers(name, key, values)
+                    if times is None and is_times(key, values.shape[1:]):
+                        times = seconds_of(values, key)
+                if times is not None:
+                    clock = self.times(name, key, times, camera=bool(series.frames))
+                    self.made |= {"rate"} if hz else set()
+                    for found in checks.drift(f"{name}: {key}", clock.hz, hz, source):
+                        self.note(found)
+                if series.frames and first and series.count:
+                    self._frames(name, key, series.frames, series)
+                    if first.times is not None and times is not None and series is not first:
+                        period_s = float(np.median(np.diff(first.times)))
+                        self.skew(key, checks.skew(times, first.times), period_s)
+        return first.count if first else 0
+
+    def _frames(self, name: str, key: str, frames: Callable[..., Any], series: Series) -> None:
+        for run in checks.runs(checks.choose(series.count, self.pairs, series.starts)):
+            for start, images in checks.stacked(frames(run)):
+                self.pictures(name, key, images, run[start : start + len(images)], series.codec)
 
     def episode(self, name: str) -> None:
         """Note that an episode is sampled."""
@@ -195,6 +285,36 @@ class Survey:
             )
 
     # -- results
+
+    def rate(self, key: str) -> float | None:
+        """Return the first rate in Hz that was measured by the clock of a key."""
+        held = self._times.get(key)
+        return next((times.hz for times in held.met.values() if times.hz), None) if held else None
+
+    def inspection(
+        self,
+        format: str,
+        uri: str,
+        keys: Iterable[KeyInfo],
+        lengths: Sequence[int],
+        facts: Mapping[str, str],
+        **about: Any,
+    ) -> Inspection:
+        """Return the inspection; `lengths` are of the readable episodes, `about` more of its attributes."""
+        measured = tuple(map(self.key, keys))
+        return Inspection(
+            format=format,
+            uri=uri,
+            episodes=self.episodes,
+            keys=measured,
+            frames=sum(lengths) if len(lengths) == self.episodes else None,
+            lengths=tuple(lengths[:MAX_LENGTHS]),
+            facts={name: fact for name, fact in facts.items() if fact},
+            looked_at=len(self.looked),
+            findings=self.findings(measured),
+            checks=self.checks(),
+            **about,
+        )
 
     def key(self, info: KeyInfo) -> KeyInfo:
         """Return the key with what was measured of it."""

@@ -9,6 +9,7 @@ R hands found.
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,10 @@ import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import HandsLayout
-from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.places import file_fingerprint, local_path, unfollowed
-from hma_data.sources.common.survey import Survey, sampled
+from hma_data.sources.common.survey import Series, Survey
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.detect import VERSION, Hand, HandModels, MediaPipeHands
 from hma_data.sources.hands.runs import (
@@ -117,9 +117,12 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
             headers[name] = header_of(video.path)
         except EpisodeError as fault:
             survey.fault(name, fault)
-    chosen = [list(headers)[i] for i in sampled(len(headers), episodes)] if headers else []
+    chosen = survey.sample(list(headers), episodes)
+    survey.made |= {"frames"} if chosen else set()
     for name in chosen:
-        _look(name, videos[name], headers[name], survey, max(1, checks.PAIRS // len(chosen)))
+        opened = partial(_film, name, videos[name], headers[name], survey)
+        # few containers state a rate
+        survey.look(name, {"video": opened}, headers[name].hz or None, "measured over its whole length")
     facts = {"keys": "each point also with /next (value at the next labelled frame) and /delta"}
     kinds = Counter((each.height, each.width, round(each.hz, 2), each.codec) for each in headers.values())
     if len(kinds) > 1:
@@ -137,22 +140,8 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
     keys = [KeyInfo("video", "camera", size, "uint8", hz, codec=first.codec or None)]
     for point, width in POINTS.items():
         keys.append(KeyInfo(point, "vector", (width,), "float32", hz, ("x", "y") if width == 2 else None))
-    lengths = [each.frames for each in headers.values()]
-    measured = tuple(survey.key(key) for key in keys)
-    return Inspection(
-        format="hands",
-        uri=uri,
-        episodes=len(videos),
-        keys=measured,
-        frames=sum(lengths),
-        lengths=tuple(lengths[:1_000]),
-        hz=hz,
-        robot="human hands",
-        facts=facts,
-        looked_at=len(survey.looked),
-        findings=survey.findings(measured),
-        checks=survey.checks(),
-    )
+    lengths = [headers[name].frames if name in headers else 0 for name in videos]
+    return survey.inspection("hands", uri, keys, lengths, facts, hz=hz, robot="human hands")
 
 
 def _near(root: Path) -> Iterator[Path]:
@@ -160,25 +149,14 @@ def _near(root: Path) -> Iterator[Path]:
     return islice((root if root.is_dir() else root.parent).rglob("*"), MAX_FILES_BESIDE)
 
 
-def _look(name: str, video: Video, header: Header, survey: Survey, pairs: int) -> None:
-    """Hand one video's times and some frames to the survey; compare its packets with its header."""
-    survey.made |= {"frames", "rate"}
-    try:
-        file = VideoFile(video.path)
-        survey.episode(name)
-        clock = survey.times(name, "video", file.timestamps, camera=True)
-        source = "measured over its whole length"  # few containers state a rate
-        for found in checks.drift(f"{name}: video", clock.hz, header.hz or None, source):
-            survey.note(found)
-        if header.frames and abs(len(file) - header.frames) > 1:
-            said = f"{name}: holds {len(file):,} frames, its header states {header.frames:,}"
-            numbers = {"frames": len(file), "stated": header.frames}
-            survey.note(Finding("frames", "warn", said, key="video", numbers=numbers))
-        for run in checks.runs(checks.choose(len(file), pairs, file.table.keys)):
-            survey.pictures(name, "video", file.frames(run), run, header.codec)
-        file.close()
-    except EpisodeError as fault:
-        survey.fault(name, fault)
+def _film(name: str, video: Video, header: Header, survey: Survey) -> Series:
+    """Open a video; compare its packets with its header."""
+    file = VideoFile(video.path)
+    if header.frames and abs(len(file) - header.frames) > 1:
+        said = f"{name}: holds {len(file):,} frames, its header states {header.frames:,}"
+        numbers = {"frames": len(file), "stated": header.frames}
+        survey.note(Finding("frames", "warn", said, key="video", numbers=numbers))
+    return Series(None, file.frames, len(file), file.table.keys, header.codec, file.timestamps)
 
 
 def _hands_in(videos: dict[str, Video], chosen: list[str], survey: Survey) -> dict[str, str]:

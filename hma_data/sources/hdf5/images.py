@@ -18,6 +18,7 @@ from hma_data.sources.hdf5.file import EpisodeFinder, EpisodeGroup, OpenFiles, d
 
 PIXELS = {"0-1": 1.0, "0-255": 255.0, "0-65535": 65535.0}
 LEAST_SIDE = 16  # pixels: a smaller array of other numbers than uint8 is not taken for images
+NO_TIMES: Floats = np.zeros(0)
 _CHANNELS = (1, 3, 4)
 _SLACK = 1e-3  # share of the range by which values may exceed it, as resizing can cause
 
@@ -137,7 +138,7 @@ class ImageRows:
         place: EpisodeGroup,
         key: str,
         layout: Hdf5Layout,
-        times: Floats,
+        times: Floats = NO_TIMES,
     ) -> None:
         self.timestamps = times
         self._finder, self._files, self._place = finder, files, place
@@ -151,8 +152,8 @@ class ImageRows:
         if self._kind == "raw":
             axes_of(found.shape, layout, self._where)
 
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """See Stream."""
+    def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Images | list[Images]:
+        """Return the images of those frames, which may differ in size where each is encoded."""
         with explained(self._place):
             group = self._finder.group(self._place)
             found = rows(self._files.cached(self._place.file, group, self._key, str(self._place)), indices)
@@ -160,12 +161,16 @@ class ImageRows:
             return as_rgb(
                 as_bytes(found, self._layout, self._where), axes_of(found.shape, self._layout, self._where)
             )
-        if not len(found):
-            return np.zeros((0, 1, 1, 3), np.uint8)
-        images = [
+        return [
             decode_image(encoded(row), f"{self._where}[{index}]")
             for row, index in zip(found, indices, strict=True)
         ]
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See Stream."""
+        images = self.each(indices)
+        if not isinstance(images, list):
+            return images
         if len({image.shape for image in images}) > 1:
             raise EpisodeError(self._place, f"{self._key!r} has images of several sizes")
-        return np.stack(images)
+        return np.stack(images) if images else np.zeros((0, 1, 1, 3), np.uint8)

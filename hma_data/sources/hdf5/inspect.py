@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Container, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import h5py
@@ -14,10 +15,10 @@ from hma_data.episodes.images import decode_image
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import Hdf5Layout
 from hma_data.sources.common import checks
-from hma_data.sources.common.checks import Finding, is_times, seconds_a_unit, seconds_of
+from hma_data.sources.common.checks import Finding, is_times, seconds_a_unit
 from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.places import local_path, unfollowed
-from hma_data.sources.common.survey import MAX_VALUES, Survey, listed, sampled
+from hma_data.sources.common.survey import MAX_LENGTHS, MAX_VALUES, Series, Survey, listed
 from hma_data.sources.hdf5.file import (
     TEXT_KEYS,
     WHOLE_FILE,
@@ -25,6 +26,7 @@ from hma_data.sources.hdf5.file import (
     EpisodeGroup,
     OpenFiles,
     Recorded,
+    dataset,
     explained,
     is_plausible,
     json_of,
@@ -34,10 +36,9 @@ from hma_data.sources.hdf5.file import (
     text,
     walk,
 )
-from hma_data.sources.hdf5.images import as_bytes, as_rgb, encoded, image_kind, pixels_of
+from hma_data.sources.hdf5.images import ImageRows, as_rgb, encoded, image_kind, pixels_of
 from hma_data.sources.hdf5.videos import is_video, video_keys, videos_beside
 
-MAX_LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
 _ENDS = ("episode_ends", "episode_lengths", "terminals", "timeouts", "dones")  # of episodes end to end
 _BESIDE = ("compress_len",)  # not rows over time: the bytes of ALOHA's JPEGs, (cameras, T)
@@ -67,40 +68,39 @@ def inspect(
     """
     found = finder.all(uri, pattern)
     order = list(found)
-    chosen = {order[i] for i in sampled(len(order), episodes)}
     survey, first = Survey(len(order)), _First()
+    chosen = survey.sample(order, episodes)
     for link in unfollowed(local_path(uri)):
         survey.note(link)
     lengths: dict[str, int] = {}
     held: Counter[str] = Counter()
-    pairs = max(1, checks.PAIRS // len(chosen))
-    for name in [*order[:MAX_LENGTHS], *(name for name in order[MAX_LENGTHS:] if name in chosen)]:
+    for name in dict.fromkeys([*order[:MAX_LENGTHS], *chosen]):
         place = found[name]
-        try:
-            with explained(place):
-                group = finder.group(place)
-                sizes = {key: item.shape[0] for key, item in walk(group) if item.shape}
-                recorded = Recorded(group, _length(sizes))
-                lengths[name] = recorded.rows
-                if not lengths[name]:
-                    raise EpisodeError(name, "has no frames")
-                if unused := max(sizes.values()) - recorded.of(max(sizes.values())):
-                    said = f"{name}: {unused:,} rows beyond the {recorded.rows:,} that it states are left out"
-                    survey.note(Finding("rows", "info", said, numbers={"rows": unused}))
-                sizes = {key: recorded.of(size) for key, size in sizes.items()}
-                if not first.keys:
-                    first.name = name
-                    _tell(first, group, files, place)
-                    _end_to_end(name, group, place, survey)
-                held.update(sizes)
-                kinds = {key: info.kind for key, info in first.keys.items() if not is_video(key)}
-                series = [key for key, kind in kinds.items() if kind in ("camera", "vector")]
-                survey.lengths(name, lengths[name], sizes, series)
-                if name in chosen:
-                    survey.episode(name)
-                    _look(name, group, first, survey, pairs, recorded)
-        except HMAError as fault:
-            survey.fault(name, fault)
+        with survey.reading(name), explained(place):
+            group = finder.group(place)
+            sizes = {key: item.shape[0] for key, item in walk(group) if item.shape}
+            recorded = Recorded(group, _length(sizes))
+            lengths[name] = recorded.rows
+            if not lengths[name]:
+                raise EpisodeError(name, "has no frames")
+            if unused := max(sizes.values()) - recorded.of(max(sizes.values())):
+                said = f"{name}: {unused:,} rows beyond the {recorded.rows:,} that it states are left out"
+                survey.note(Finding("rows", "info", said, numbers={"rows": unused}))
+            sizes = {key: recorded.of(size) for key, size in sizes.items()}
+            if not first.keys:
+                first.name = name
+                _tell(first, group, files, place)
+                _end_to_end(name, group, place, survey)
+            held.update(sizes)
+            series = [key for key, info in first.keys.items() if info.kind in ("camera", "vector")]
+            series = [key for key in series if not is_video(key)]
+            survey.lengths(name, lengths[name], sizes, series)
+            if name in chosen:
+                looked = _Looked(name, place, finder, files, first, recorded)
+                keys = {key: partial(looked.series, key) for key in series if key in sizes}
+                measured = first.facts["rate"].startswith(_MEASURED)
+                source = f"{first.name} at" if measured else "the recording states"
+                survey.look(name, keys, first.rate, source)
     for file in {found[name].file for name in chosen}:
         masks: dict[str, set[str]] = {}
         with suppress(HMAError), explained(file):  # what a damaged file lacks is told of its episodes
@@ -113,24 +113,11 @@ def inspect(
     lacking = [key for key, count in held.items() if key not in first.keys and 2 * count >= len(lengths)]
     if lacking:
         survey.note(Finding("keys", "warn", f"{first.name}: has no {listed(lacking)}, which others have"))
-    keys = tuple(
-        survey.key(replace(info, hz=first.rate if info.count else None)) for info in first.keys.values()
-    )
+    keys_told = [replace(info, hz=first.rate if info.count else None) for info in first.keys.values()]
     robots = first.robots
-    return Inspection(
-        format="hdf5",
-        uri=uri,
-        episodes=len(found),
-        keys=keys,
-        frames=sum(lengths.values()) if len(lengths) == len(found) else None,
-        lengths=tuple(lengths[name] for name in order[:MAX_LENGTHS] if name in lengths),
-        hz=first.rate,
-        robot=robots if isinstance(robots, str) else ", ".join(map(str, robots)) if robots else None,
-        facts={name: fact for name, fact in first.facts.items() if fact},
-        looked_at=len(survey.looked),
-        findings=survey.findings(keys),
-        checks=survey.checks(),
-    )
+    robot = robots if isinstance(robots, str) else ", ".join(map(str, robots)) if robots else None
+    every = [lengths[name] for name in order if name in lengths]
+    return survey.inspection("hdf5", uri, keys_told, every, first.facts, hz=first.rate, robot=robot)
 
 
 def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: EpisodeGroup) -> None:
@@ -174,39 +161,32 @@ def _environment(handle: h5py.File) -> dict[str, Any]:
     return {**found, **inner} if isinstance(inner, dict) else found
 
 
-def _look(
-    name: str, group: h5py.Group, first: _First, survey: Survey, pairs: int, recorded: Recorded
-) -> None:
-    """Hand one episode's numbers, times and some frames to the survey."""
-    for key, info in first.keys.items():
-        item = group.get(key)
-        if not (isinstance(item, h5py.Dataset) and item.shape and item.shape[0] and is_plausible(item)):
-            continue
-        where = f"{name} {key}"
-        try:
-            with explained(where):
-                if info.kind == "camera":
-                    layout = Hdf5Layout.model_validate({"pixels": first.pixels.get(key)})
-                    chosen = checks.choose(recorded.of(item.shape[0]), pairs)
-                    for run in checks.runs(chosen):
-                        _images(name, key, item, info, survey, run, layout)
-                elif info.kind == "vector" and item.size <= MAX_VALUES:
-                    values = numbers(group, key, name)
-                    _values(name, key, values[: recorded.of(len(values))], info, survey, first)
-        except HMAError as fault:
-            survey.fault(name, fault, key)
+@dataclass
+class _Looked:
+    """An episode that is looked into."""
 
+    name: str
+    place: EpisodeGroup
+    finder: EpisodeFinder
+    files: OpenFiles
+    first: _First
+    recorded: Recorded
 
-def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, first: _First) -> None:
-    survey.numbers(name, key, values)
-    seconds = seconds_of(values, key) if is_times(key, info.shape) else None
-    if seconds is not None:
-        clock = survey.times(name, key, seconds)
-        survey.made.add("rate")
-        measured = first.facts["rate"].startswith(_MEASURED)
-        source = f"{first.name} at" if measured else "the recording states"
-        for found in checks.drift(f"{name}: {key}", clock.hz, first.rate, source):
-            survey.note(found)
+    def series(self, key: str) -> Series:
+        """Return how a key is read."""
+        info = self.first.keys[key]
+        group = self.finder.group(self.place)
+        size = dataset(group, key, self.name).size
+        if info.kind == "camera":
+            layout = Hdf5Layout.model_validate({"pixels": self.first.pixels.get(key)})
+            images = ImageRows(self.finder, self.files, self.place, key, layout)
+            return Series(None, images.each, self.recorded.of(images.rows), codec=info.codec)
+        return Series(partial(self._numbers, group, key)) if size <= MAX_VALUES else Series()
+
+    def _numbers(self, group: h5py.Group, key: str) -> Any:
+        with explained(f"{self.name} {key}"):
+            values = numbers(group, key, self.name)
+        return values[: self.recorded.of(len(values))]
 
 
 def _pixels(group: h5py.Group) -> dict[str, str]:
@@ -218,21 +198,6 @@ def _pixels(group: h5py.Group) -> dict[str, str]:
             found |= {key: stated} if stated else {}
     first = next(iter(found.values()), "")
     return {key: stated for key, stated in found.items() if stated == first}
-
-
-def _images(
-    name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, run: Any, layout: Hdf5Layout
-) -> None:
-    found = rows(item, run)
-    if info.codec == "raw":
-        found = as_bytes(found, layout, f"{name} {key}")
-        survey.pictures(name, key, as_rgb(found), run, info.codec)
-        return
-    images = [
-        decode_image(encoded(row), f"{name} {key}, frame {i}") for row, i in zip(found, run, strict=True)
-    ]
-    for start, frames in checks.stacked(images):
-        survey.pictures(name, key, frames, run[start : start + len(frames)], info.codec)
 
 
 def _length(sizes: dict[str, int]) -> int:

@@ -4,20 +4,21 @@ All of the metadata is checked. Numbers, times and a few frames are checked for 
 whose files are there. Nothing is fetched from the Hub for this.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
-from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.inspection import Inspection, KeyInfo
-from hma_data.sources.common.survey import MAX_VALUES, Survey, sampled
+from hma_data.sources.common.survey import MAX_VALUES, Series, Survey, sampled
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.sources.lerobot.films import BY_INDEX, Fit, fit_of, frames_of_rows
-from hma_data.sources.lerobot.metadata import Feature, Metadata, Span, episode_name
+from hma_data.sources.lerobot.metadata import Feature, Metadata, episode_name
 from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, tasks_of, times_of
 
-MAX_LENGTHS = 1_000  # most lengths in the inspection
 MAX_EPISODES = 20_000  # most episodes whose files are looked for, spread over all
 TIMES = "timestamp"  # the column
 MAX_VIDEOS = 64  # videos opened at most, over all cameras
@@ -31,27 +32,14 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
     looking = _Looking(meta, survey, episodes)
     if not meta.folder.repo:
         looking.look()
-    keys = tuple(survey.key(info) for info in _keys(meta))
     facts = {"version": str(meta.info.codebase_version), "tasks": str(len(meta.tasks))}
     facts |= {"pairing": "index"} if looking.drifts else {}
-    hz = meta.fps
-    if looking.hz and (looking.drifts or abs(looking.hz / meta.fps - 1) > checks.DRIFT):
-        hz = looking.hz
+    hz, measured = meta.fps, survey.rate(TIMES)
+    if measured and (looking.drifts or abs(measured / meta.fps - 1) > checks.DRIFT):
+        hz = measured
         facts["rate"] = f"measured: the timestamps of the rows; meta/info.json states {meta.fps:g} Hz"
-    return Inspection(
-        format="lerobot",
-        uri=uri,
-        episodes=len(lengths),
-        keys=keys,
-        frames=sum(lengths),
-        lengths=tuple(lengths[:MAX_LENGTHS]),
-        hz=hz,
-        robot=meta.info.robot_type or None,
-        facts=facts,
-        looked_at=len(survey.looked),
-        findings=survey.findings(keys),
-        checks=survey.checks(),
-    )
+    robot = meta.info.robot_type or None
+    return survey.inspection("lerobot", uri, _keys(meta), lengths, facts, hz=hz, robot=robot)
 
 
 def _totals(meta: Metadata, survey: Survey) -> None:
@@ -72,7 +60,6 @@ class _Looking:
 
     Attributes:
         drifts: whether a video has a frame for each row, but not at the times of the rows.
-        hz: rate of the rows by their times; None where they have none.
     """
 
     def __init__(self, meta: Metadata, survey: Survey, episodes: int) -> None:
@@ -81,7 +68,6 @@ class _Looking:
         indices = list(meta.episodes)
         self._indices = [indices[i] for i in sampled(len(indices), MAX_EPISODES)]
         self.drifts = False
-        self.hz: float | None = None
         self._videos_seen: set[tuple[str, str]] = set()
 
     def look(self) -> None:
@@ -89,17 +75,17 @@ class _Looking:
         whole = self._present("parquet files")
         for key in self._videos:
             whole &= self._present(f"videos of {key}", key)
-        order = [index for index in self._indices if index in whole]
-        chosen = [order[i] for i in sampled(len(order), self._episodes)] if order else []
-        pairs = max(1, checks.PAIRS // max(len(chosen), 1))
+        names = {episode_name(index): index for index in self._indices if index in whole}
+        chosen = self._survey.sample(list(names), self._episodes)
+        self._survey.made |= {"frames", "skew"} if chosen and self._videos else set()
         limit = max(1, MAX_VIDEOS // max(len(self._videos), 1))
-        shown = set(chosen[:: max(1, -(-len(chosen) // limit))])
-        for index in chosen:
-            self._survey.episode(episode_name(index))
-            self._rows(index, pairs)
-        for key in self._videos:
-            for index in sorted(shown):
-                self._video(key, index, pairs)
+        shown = chosen[:: max(1, -(-len(chosen) // limit))]
+        for name in chosen:
+            with self._survey.reading(name):
+                keys = self._of_rows(name, names[name])
+                if name in shown:
+                    keys |= {key: partial(self._video, key, names[name]) for key in self._videos}
+                self._survey.look(name, keys, self._meta.fps)
 
     def _present(self, what: str, key: str = "") -> set[int]:
         """Return the episodes whose file is there; report the missing files as one finding."""
@@ -119,68 +105,56 @@ class _Looking:
         there = set(distinct) - set(missing)
         return {index for index, path in paths.items() if path in there}
 
-    def _rows(self, index: int, pairs: int) -> None:
-        """Hand one episode's numbers, times and parquet images to the survey."""
-        meta, name = self._meta, episode_name(index)
-        try:
-            rows = rows_of(meta, index)
-        except HMAError as fault:
-            self._survey.fault(name, fault)
-            return
+    def _of_rows(self, name: str, index: int) -> dict[str, Callable[[], Series]]:
+        """Return how the columns of one episode are read; check that all are there."""
+        meta, rows = self._meta, rows_of(self._meta, index)
         self._survey.made.add("text")
         if not tasks_of(meta, index, rows):
             self._survey.note(Finding("text", "warn", f"{name}: has no task in words", key="task_index"))
         wanted = [key for key, item in meta.features.items() if item.dtype != "video"]
+        there = [key for key in wanted if key in rows.columns]
         length = meta.episodes[index]["length"]
-        self._survey.lengths(name, length, {key: len(rows) for key in wanted if key in rows.columns}, wanted)
+        self._survey.lengths(name, length, dict.fromkeys(there, len(rows)), wanted)
         if TIMES not in wanted and TIMES in rows.columns:
-            self._numbers(name, TIMES, rows)  # some writers leave it out of the features
-        for key in wanted:
-            feature = meta.features[key]
-            if key not in rows.columns:
-                continue
-            try:
-                if feature.is_camera:
-                    self._stills(name, key, rows, pairs)
-                elif _is_vector(feature) and np.prod(feature.shape, dtype=float) * len(rows) <= MAX_VALUES:
-                    self._numbers(name, key, rows)
-            except HMAError as fault:
-                self._survey.fault(name, fault, key)
+            there.append(TIMES)  # some writers leave it out of the features
+        return {key: partial(self._column, rows, key) for key in there}
 
-    def _numbers(self, name: str, key: str, rows: Rows) -> None:
-        values = rows.numbers(key)
-        self._survey.numbers(name, key, values)
+    def _column(self, rows: Rows, key: str) -> Series:
+        feature = self._meta.features.get(key)
         if key == TIMES:
-            clock = self._survey.times(name, key, values.reshape(len(values), -1)[:, 0].astype(np.float64))
-            self.hz = self.hz or clock.hz
-            self._survey.made.add("rate")
-            for found in checks.drift(f"{name}: {key}", clock.hz, self._meta.fps):
-                self._survey.note(found)
+            values = rows.numbers(key)
+            return Series(lambda: values, times=values.reshape(len(values), -1)[:, 0].astype(np.float64))
+        if feature and feature.is_camera:
+            stream = StillImages(rows, key, np.zeros(len(rows)), self._meta.folder)
+            return Series(None, stream.frames, len(rows), codec=stream.codec())
+        if feature and _is_vector(feature) and np.prod(feature.shape, dtype=float) * len(rows) <= MAX_VALUES:
+            return Series(partial(rows.numbers, key))
+        return Series()
 
-    def _stills(self, name: str, key: str, rows: Rows, pairs: int) -> None:
-        stream = StillImages(rows, key, np.zeros(len(rows)), self._meta.folder)
-        codec = stream.codec()
-        for run in checks.runs(checks.choose(len(rows), pairs)):
-            self._survey.pictures(name, key, stream.frames(run), run, codec)
-
-    def _video(self, key: str, index: int, pairs: int) -> None:
+    def _video(self, key: str, index: int) -> Series:
         """Compare a video with its episodes, and an episode's frames with its rows."""
         meta, name = self._meta, episode_name(index)
-        self._survey.made |= {"frames", "skew"}
+        span = meta.video(index, key)
+        file = VideoFile(meta.folder.path(span.path))
+        found = fit_of(meta, key, file, span)
+        self._whole_video(key, span.path, file, found)
+        if span.index in found.unused:
+            count = found.unused[span.index]
+            said = f"{span.path} has {count:,} frames after the last row of {name} that no row asks for"
+            self._survey.note(Finding("frames", "warn", said, key=key, numbers={"frames": count}))
+        times = times_of(rows_of(meta, index), meta.fps)
+        codec, keys = file.table.codec, file.table.keys
         try:
-            span = meta.video(index, key)
-            file = VideoFile(meta.folder.path(span.path))
-            found = fit_of(meta, key, file, span)
-            self._whole_video(key, span.path, file, found)
-            if span.index in found.unused:
-                count = found.unused[span.index]
-                said = f"{span.path} has {count:,} frames after the last row of {name} that no row asks for"
-                self._survey.note(Finding("frames", "warn", said, key=key, numbers={"frames": count}))
-            for run in self._sampled_frames(key, index, span, file, pairs):
-                self._survey.pictures(name, key, file.frames(run), run, file.table.codec)
-            file.close()
-        except HMAError as fault:
-            self._survey.fault(name, fault, key)
+            indices = frames_of_rows(meta, key, file, span, times, None)
+        except EpisodeError as fault:
+            if not found.fault:
+                self.drifts |= BY_INDEX in fault.remedy
+                said = f"{name} {key}: {fault.fault}"
+                remedy = fault.remedy if BY_INDEX in fault.remedy else ""
+                self._survey.note(Finding("skew", "warn", said, remedy, key))
+            return Series(None, file.frames, len(file), keys, codec)
+        starts = np.searchsorted(indices, keys[indices])
+        return Series(None, lambda run: file.frames(indices[run]), len(indices), starts, codec)
 
     def _whole_video(self, key: str, path: str, file: VideoFile, found: Fit) -> None:
         """Note once what is wrong with a video as a whole."""
@@ -195,26 +169,6 @@ class _Looking:
         elif found.shift:
             said = f"{path} begins {found.shift:+.3f} s from where its metadata say, with one frame a row"
             self._survey.note(Finding("frames", "info", said, key=key, numbers=numbers))
-
-    def _sampled_frames(
-        self, key: str, index: int, span: Span, file: VideoFile, pairs: int
-    ) -> list[NDArray[np.int64]]:
-        """Return runs of frames of an episode to look at; note stamps that are not the times of the rows."""
-        try:
-            times = times_of(rows_of(self._meta, index), self._meta.fps)
-        except HMAError:
-            return []  # `_rows` has noted it
-        try:
-            indices = frames_of_rows(self._meta, key, file, span, times, None)
-        except EpisodeError as fault:
-            if not fit_of(self._meta, key, file, span).fault:
-                self.drifts |= BY_INDEX in fault.remedy
-                said = f"{episode_name(index)} {key}: {fault.fault}"
-                remedy = fault.remedy if BY_INDEX in fault.remedy else ""
-                self._survey.note(Finding("skew", "warn", said, remedy, key))
-            return checks.runs(checks.choose(len(file), pairs, file.table.keys))
-        chosen = checks.choose(len(indices), pairs, np.searchsorted(indices, file.table.keys[indices]))
-        return checks.runs(indices[chosen])
 
 
 def _is_vector(feature: Feature) -> bool:

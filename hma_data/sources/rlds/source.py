@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,9 +24,8 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Component, Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, KeyInfo, compose
-from hma_data.sources.common import checks
-from hma_data.sources.common.checks import Finding, is_times, seconds_of
-from hma_data.sources.common.survey import Survey, sampled
+from hma_data.sources.common.checks import Finding
+from hma_data.sources.common.survey import Series, Survey
 from hma_data.sources.rlds.example import Example
 from hma_data.sources.rlds.features import Feature, Steps, scalar
 from hma_data.sources.rlds.folder import Folder, Shard, episode_id, open_folder
@@ -330,85 +330,60 @@ def _inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
     survey.made |= {"files", "rows"}  # a column of another length than the episode cannot be read
     for problem in folder.problems:
         survey.note(Finding("files", "warn", problem))
-    chosen = sampled(len(refs), episodes)
-    lengths, first = _survey(folder, refs, chosen, survey)
+    lengths, first = _survey(folder, [ref.id for ref in refs], episodes, survey)
     if first is None:
         found = survey.findings(())
         why = next((one for one in reversed(found) if one.check == "files"), found[0])
         raise SourceError(uri, f"holds no readable episode: {why}", "copy its files again")
-    keys = tuple(survey.key(_key_info(first, key, survey)) for key in folder.step_features)
-    return Inspection(
-        format="rlds",
-        uri=uri,
-        episodes=len(refs),
-        keys=keys,
-        frames=sum(lengths) if len(lengths) == len(refs) else None,
-        lengths=lengths,
-        facts=_facts(folder),
-        looked_at=len(survey.looked),
-        findings=survey.findings(keys),
-        checks=survey.checks(),
-    )
+    keys = [_key_info(first, key, survey) for key in folder.step_features]
+    return survey.inspection("rlds", uri, keys, lengths, _facts(folder))
 
 
 def _survey(
-    folder: Folder, refs: list[EpisodeRef], chosen: list[int], survey: Survey
-) -> tuple[tuple[int, ...], Steps | None]:
-    """Sample the chosen episodes; return the lengths of the episodes read, and the first of them."""
-    wanted = set(chosen)
-    more = range(0 if folder.remote else min(len(refs), COUNTED_EPISODES))
-    lengths: dict[int, int] = {}
+    folder: Folder, names: list[str], episodes: int, survey: Survey
+) -> tuple[list[int], Steps | None]:
+    """Look into a sample of the episodes; return the lengths of those read, and the first of the sample."""
+    chosen = survey.sample(names, episodes)
+    more = names[: 0 if folder.remote else COUNTED_EPISODES]
+    lengths: dict[str, int] = {}
     first: Steps | None = None
     budget = COUNTED_BYTES
-    pairs = max(1, checks.PAIRS // max(len(chosen), 1))
-    for i in [*chosen, *(i for i in more if i not in wanted)]:
-        if budget < 0 and i not in wanted:
+    for name in dict.fromkeys([*chosen, *more]):
+        if budget < 0 and name not in chosen:
             break
-        name = refs[i].id
-        try:
+        with survey.reading(name):
             steps = Steps(folder.example(name)[0], folder.step_features, name)
             _require_one_episode(steps)
-        except EpisodeError as fault:
-            survey.fault(name, fault)
-            continue
-        budget -= steps.example.size
-        lengths[i] = steps.count
-        first = first or steps
-        if i in wanted:
-            survey.episode(name)
-            _look(steps, survey, pairs)
-    return tuple(lengths[i] for i in sorted(lengths)), first
+            budget -= steps.example.size
+            lengths[name] = steps.count
+            first = first or steps
+            if name in chosen:
+                survey.look(name, {key: partial(_series, steps, key, survey) for key in steps.features})
+    return [lengths[name] for name in names if name in lengths], first
 
 
-def _look(steps: Steps, survey: Survey, pairs: int) -> None:
-    """Hand the numbers, times and some images of one episode to the survey."""
-    for key, feature in steps.features.items():
-        try:
-            if is_camera(feature):
-                decode, codec = steps.decoder(key), _codec(steps, key)
-                for run in checks.runs(checks.choose(steps.count, pairs)):
-                    for start, frames in checks.stacked([decode(int(i)) for i in run]):
-                        survey.pictures(steps.name, key, frames, run[start : start + len(frames)], codec)
-            elif feature.kind == "number" and 0 < (feature.width or 0) <= MAX_VECTOR:
-                values = steps.numbers(key)
-                if "action" in key and _ends_with_padding(steps, [key]):
-                    said = f"{key}: the action of the last step (is_last) is padding; the step is left out"
-                    survey.note(Finding("padding", "info", said, key=key))
-                    values = values[:-1]
-                survey.numbers(steps.name, key, values)
-                seconds = seconds_of(values, key) if is_times(key, values.shape[1:]) else None
-                if seconds is not None:
-                    survey.times(steps.name, key, seconds)
-        except EpisodeError as fault:
-            survey.fault(steps.name, fault, key)
+def _series(steps: Steps, key: str, survey: Survey) -> Series:
+    """Return how a key of an episode is read, without padding in place of the last action."""
+    feature = steps.features[key]
+    if is_camera(feature):
+        decode = steps.decoder(key)
+        frames = lambda run: [decode(int(i)) for i in run]  # noqa: E731
+        return Series(frames=frames, count=steps.count, codec=_codec(steps, key))
+    if feature.kind != "number" or not 0 < (feature.width or 0) <= MAX_VECTOR:
+        return Series()
+    values = steps.numbers(key)
+    if "action" in key and _ends_with_padding(steps, [key]):
+        said = f"{key}: the action of the last step (is_last) is padding; the step is left out"
+        survey.note(Finding("padding", "info", said, key=key))
+        values = values[:-1]
+    return Series(numbers=lambda: values)
 
 
 def _facts(folder: Folder) -> dict[str, str]:
     splits = [f"{name} {sum(shard.count() for shard in shards)}" for name, shards in folder.splits.items()]
     outside = [name for name in folder.features if not name.startswith("steps/")]
     found = {"dataset": folder.name, "version": folder.version}
-    found |= {"splits": ", ".join(splits), "episode keys": ", ".join(outside)}
-    return {name: value for name, value in found.items() if value}
+    return found | {"splits": ", ".join(splits), "episode keys": ", ".join(outside)}
 
 
 def _key_info(steps: Steps, key: str, survey: Survey) -> KeyInfo:
