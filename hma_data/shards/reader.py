@@ -30,11 +30,12 @@ from hma_data.shards.schema import flag_pauses, mask_columns, to_numpy, token_co
 from hma_data.storage.files import cache_folder, file_sha256, parse_json, part_of
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath
-from hma_data.storage.remote import AHEAD, RangeFile, RemotePath, parquet_file, place
+from hma_data.storage.remote import RemotePath, parquet_file, place, remote_file
 
 Ints = NDArray[np.int64]
 CACHE_VARIABLE, DEFAULT_GB = "HMA_CACHE_GB", 20.0
 IN_USE_S = 3600.0
+DOWNLOADED_BYTES = 8 << 20  # of a shard at once
 SPARE_SHARE, SPARE_BYTES = 0.1, 5 * 10**9  # free space to leave: a tenth of the disk, but at most 5 GB
 
 
@@ -175,7 +176,7 @@ class ShardSet:
         if self._cache and whole <= limit_bytes() and (kept := kept_shard(path, listed.sha256, listed.bytes)):
             return pq.ParquetFile(kept, pre_buffer=False, page_checksum_verification=True)
         metadata = _footer(path, listed.bytes, listed.sha256)
-        given = RangeFile(path, listed.bytes)
+        given = remote_file(path, listed.bytes)
         return pq.ParquetFile(given, pre_buffer=True, metadata=metadata, page_checksum_verification=True)
 
     @cached_property
@@ -206,7 +207,7 @@ class ShardSet:
 @lru_cache(maxsize=64)
 def _footer(path: RemotePath, size: int, sha256: str) -> pq.FileMetaData:
     """Read the footer of a shard in a store; it is read once for each sha256."""
-    return pq.read_metadata(RangeFile(path, size))
+    return pq.read_metadata(remote_file(path, size))
 
 
 class EpisodeReader:
@@ -330,7 +331,7 @@ def _download(path: RemotePath, sha256: str, size: int, final: Path) -> Path:
     part = part_of(final)
     try:
         with part.open("wb") as out:
-            shutil.copyfileobj(RangeFile(path, size), out, AHEAD)
+            shutil.copyfileobj(remote_file(path, size), out, DOWNLOADED_BYTES)
         if file_sha256(part) != sha256:
             fault = "its bytes are not those of the manifest (sha256 differs)"
             raise ShardError(path, fault, "run hma shards verify to see what is damaged")

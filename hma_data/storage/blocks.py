@@ -8,21 +8,18 @@ it can keep until then. One cache serves all files of a process, so memory does 
 size.
 """
 
+import io
 import itertools
 import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import lru_cache, partial
-from pathlib import Path
+from functools import lru_cache
 from threading import Lock
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-
-from hma_data.errors import StorageError
-from hma_data.storage.remote import RemotePath, SeekableFile, fetch_range
 
 BLOCK = 1 << 20  # bytes of a request
 BLOCKS_AHEAD = 32  # expected blocks on their way while one is read
@@ -164,17 +161,32 @@ class Blocks:
         return _cache(os.getpid()).want((self._number, number), lambda: self._fetch(start, end))
 
 
-class BlockFile(SeekableFile):
+class BlockFile(io.RawIOBase):
     """A position in a file that is read by blocks; as many as one likes share their blocks."""
 
     def __init__(self, blocks: Blocks) -> None:
-        super().__init__(blocks.size)
         self.blocks = blocks
+        self._at = 0
         self._begin, self._held = 0, b""  # the block that was read last
 
-    def _bytes(self, count: int) -> bytes:
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self.blocks.size}[whence]
+        return self._at
+
+    def read(self, size: int | None = -1) -> bytes:
+        """Return exactly `size` bytes, or fewer at the end of the file."""
+        count = self.blocks.size if size is None or size < 0 else size
         number = self._at // BLOCK
-        if self._at % BLOCK + count > BLOCK or self._at >= self._size:
+        if self._at % BLOCK + count > BLOCK or self._at >= self.blocks.size:
             data = self.blocks.read(self._at, self._at + count)
         else:
             if self._begin != number * BLOCK or not self._held:
@@ -183,32 +195,11 @@ class BlockFile(SeekableFile):
         self._at += len(data)
         return data
 
-
-class LargeFile:
-    """A file that is opened again and again: a local one as it is, a remote one by blocks.
-
-    The size of a remote file is asked for once, so it must not change meanwhile.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._blocks: Blocks | None = None
-
-    def open(self) -> BinaryIO:
-        """Open the file for reading."""
-        if not isinstance(self._path, RemotePath):
-            return self._path.open("rb")
-        if self._blocks is None:
-            self._blocks = remote_blocks(self._path)
-        return cast(BinaryIO, BlockFile(self._blocks))
-
-
-def remote_blocks(path: RemotePath) -> Blocks:
-    """Return the blocks of a file of a store."""
-    size = path.info().get("size")
-    if size is None:
-        raise StorageError(path, "its server does not state its length", "copy the file here")
-    return Blocks(partial(fetch_range, path), int(size))
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        data = self.read(len(view))
+        view[: len(data)] = data
+        return len(data)
 
 
 def expect(file: BinaryIO, parts: Iterable[tuple[int, int]]) -> None:

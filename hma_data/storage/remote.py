@@ -12,19 +12,19 @@ import os
 import re
 import stat
 import threading
-from abc import abstractmethod
 from collections.abc import Callable, Generator
 from contextlib import suppress
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path, PosixPath, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 from hma_data.errors import HMAError, StorageAwayError, StorageError
+from hma_data.storage.blocks import BlockFile, Blocks
 from hma_data.storage.fetch import ABSENT, file_system, retried, said
 from hma_data.storage.paths import StrPath, as_text
 
 WAITS_S = (0.3, 1.5, 6.0)  # before the second, third and fourth try
-TAIL, AHEAD = 256 << 10, 8 << 20  # bytes read at once: at the end of a file; ahead of a sequential reader
 WHOLE_PUTS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "memory"}  # an object appears whole or not at all
 _SCHEME = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
 
@@ -215,7 +215,7 @@ class RemotePath(PosixPath):
         if mode not in ("r", "rb", "rt"):
             remedy = "a file of a store is written as a whole"
             raise StorageError(self, f"cannot be opened for {mode!r}", remedy)
-        data = io.BufferedReader(RangeFile(self), 1 << 20)
+        data = io.BufferedReader(remote_file(self), 1 << 20)
         if "b" in mode:
             return data
         return io.TextIOWrapper(data, encoding=options.get("encoding"), newline=options.get("newline"))
@@ -323,69 +323,36 @@ def fetch_range(path: RemotePath, start: int, stop: int) -> bytes:
     return attempt(path, "read", ask)
 
 
-class SeekableFile(io.RawIOBase):
-    """A position in a file of `size` bytes; subclasses read from it."""
-
-    def __init__(self, size: int) -> None:
-        self._at, self._size = 0, size
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._at
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
-        return self._at
-
-    def read(self, size: int | None = -1) -> bytes:
-        """Return exactly `size` bytes, or fewer at the end of the file."""
-        return bytes(self._bytes(self._size if size is None or size < 0 else size))
-
-    def readinto(self, buffer: Any) -> int:
-        view = memoryview(buffer).cast("B")
-        data = self._bytes(len(view))
-        view[: len(data)] = data
-        return len(data)
-
-    @abstractmethod
-    def _bytes(self, count: int) -> bytes | memoryview:
-        """Return up to `count` bytes from the position on, and move behind them."""
+def remote_file(path: RemotePath, size: int | None = None) -> BlockFile:
+    """Open a file of a store, which can be read at any position; its size is asked for unless it is given."""
+    size = path.info().get("size") if size is None else size
+    if size is None:
+        raise StorageError(path, "its server does not state its length", "copy the file here")
+    return BlockFile(Blocks(partial(fetch_range, path), int(size)))
 
 
-class RangeFile(SeekableFile):
-    """A remote file that can be read at any position.
+class LargeFile:
+    """A file that is opened again and again: a local one as it is, a remote one by blocks.
 
-    The end of the file is read at once and the rest on request; a sequential reader is read ahead of.
+    The size of a remote file is asked for once, so it must not change meanwhile.
     """
 
-    def __init__(self, path: RemotePath, size: int | None = None) -> None:
-        super().__init__(int(path.info()["size"]) if size is None else size)
-        self._path, self._last = path, -1
-        self._begin, self._kept = 0, b""
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._blocks: Blocks | None = None
 
-    def _bytes(self, count: int) -> memoryview:
-        begin, end = self._at, min(self._at + count, self._size)
-        if end <= begin:
-            return memoryview(b"")
-        if begin < self._begin or end > self._begin + len(self._kept):
-            start, stop = begin, end
-            if begin == self._last:
-                stop = min(max(end, begin + AHEAD), self._size)
-            elif end > self._size - TAIL:
-                start, stop = min(begin, max(0, self._size - TAIL)), self._size
-            self._kept, self._begin = fetch_range(self._path, start, stop), start
-        self._at = self._last = end
-        return memoryview(self._kept)[begin - self._begin : end - self._begin]
+    def open(self) -> BinaryIO:
+        """Open the file for reading."""
+        if not isinstance(self._path, RemotePath):
+            return self._path.open("rb")
+        if self._blocks is None:
+            self._blocks = remote_file(self._path).blocks
+        return cast(BinaryIO, BlockFile(self._blocks))
 
 
 def parquet_input(path: Path) -> Any:
-    """Return what pyarrow can read a parquet file from: the local path, or a RangeFile."""
-    return RangeFile(path) if isinstance(path, RemotePath) else path
+    """Return what pyarrow can read a parquet file from: the local path, or an open file of a store."""
+    return remote_file(path) if isinstance(path, RemotePath) else path
 
 
 def parquet_file(path: Path, **options: Any) -> Any:

@@ -23,9 +23,9 @@ from typing import BinaryIO, NamedTuple
 from mcap.exceptions import McapError
 
 from hma_data.errors import EpisodeError
-from hma_data.storage.blocks import BlockFile, LargeFile, expect
+from hma_data.storage.blocks import BlockFile, expect
 from hma_data.storage.kinds import unreadable
-from hma_data.storage.remote import is_remote
+from hma_data.storage.remote import LargeFile, is_remote
 
 CACHED_BYTES = 64 << 20  # of unpacked chunks that a bag keeps
 MAX_CHUNK = 512 << 20  # most bytes of an unpacked chunk, against decompression bombs and errors

@@ -9,7 +9,7 @@ from typing import BinaryIO, cast
 from hma_data.errors import SourceError
 from hma_data.sources.common.checks import Finding
 from hma_data.storage.kinds import unreadable
-from hma_data.storage.remote import RangeFile, RemotePath, is_remote, place
+from hma_data.storage.remote import RemotePath, is_remote, place, remote_file
 
 
 def is_away(uri: str) -> bool:
@@ -75,7 +75,7 @@ def first_bytes(path: Path, count: int) -> bytes:
 
 def _opened(path: Path) -> BinaryIO:
     """Open a file to read a few bytes at some places."""
-    return cast(BinaryIO, RangeFile(path)) if isinstance(path, RemotePath) else path.open("rb")
+    return cast(BinaryIO, remote_file(path)) if isinstance(path, RemotePath) else path.open("rb")
 
 
 def file_fingerprint(path: Path) -> str:

@@ -19,7 +19,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.storage import remote as store
 from hma_data.storage.files import file_sha256
-from hma_data.storage.remote import RangeFile, RemotePath, place, put_bytes, put_file
+from hma_data.storage.remote import RemotePath, place, put_bytes, put_file, remote_file
 
 
 def a_disk_with(monkeypatch: pytest.MonkeyPatch, free: int, total: int) -> None:
@@ -95,7 +95,7 @@ def test_a_remote_path_is_never_taken_for_one_of_this_machine(bucket: RemotePath
 def test_any_read_of_a_range_file_gives_the_bytes_that_are_there(bucket: RemotePath) -> None:
     data = np.random.default_rng(0).bytes(3 << 20)
     put_bytes(data, bucket / "x")
-    file, rng, at = RangeFile(bucket / "x"), np.random.default_rng(1), 0
+    file, rng, at = remote_file(bucket / "x"), np.random.default_rng(1), 0
     for _ in range(200):
         if rng.random() < 0.5:
             at = file.seek(int(rng.integers(len(data) + 10)))
