@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument, Option
 
 from hma_data.console import interruptible, print_lines
-from hma_data.tables import Table
 from hma_model.cli.options import (
     Cameras,
     Checkpoint,
@@ -102,45 +101,27 @@ def evaluate(
     if json:
         for part in parts:
             print(json_text.dumps(part.found, ensure_ascii=False))
-    elif len(parts) == 1:
-        _print_one(parts[0])
     else:
-        _print_table(parts)
+        _print(parts)
     if out is not None and not json:
         print(f"open {page}")
 
 
-def _print_one(part: "Part") -> None:
-    from hma_model.evaluation.tables import conditions, details, rollouts, state
-    from hma_model.evaluation.verdict import verdict
-
-    print(conditions(part.found))
-    details(part.found).print()
-    rollouts(part.found).print()
-    for table, about in state(part.found.get("state")):
-        table.print()
-        if about:
-            print(about)
-    _print_absences([part])
-    print(f"{part.checkpoint} {verdict(part.found)}")
-
-
-def _print_table(parts: "Sequence[Part]") -> None:
-    from hma_model.evaluation.tables import comparison, renamed, verdicts
+def _print(parts: "Sequence[Part]") -> None:
+    from hma_model.evaluation.tables import absences, comparison, conditions, renamed, single, state, verdicts
 
     parts, legend = renamed(parts)
     print_lines(legend)
-    table, repeated = comparison(parts, intervals=False), 2
-    if len({part.checkpoint for part in parts}) == 1:  # the same in every row, and perhaps long
-        print(parts[0].checkpoint)
-        table, repeated = Table(table.columns[1:], [row[1:] for row in table.rows]), 1
-    table.print(repeated=repeated)
-    _print_absences(parts)
+    if len(parts) == 1:
+        found = parts[0].found
+        print(conditions(found))
+        single(parts[0]).print()
+        for table, about in state(found.get("state")):
+            table.print()
+            if about:
+                print(about)
+    else:
+        comparison(parts, intervals=False).print(repeated=2)
+    print_lines(absences(parts))
     for whose, said in verdicts(parts):
         print(f"{whose} {said}")
-
-
-def _print_absences(parts: "Sequence[Part]") -> None:
-    from hma_model.evaluation.tables import absences
-
-    print_lines(absences(parts))

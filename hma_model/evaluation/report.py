@@ -23,14 +23,13 @@ from hma_model.evaluation.rollout_video import GIVEN_COLOUR, PREDICTED_COLOUR
 from hma_model.evaluation.showcase import Showcase, choose
 from hma_model.evaluation.suite import RESULTS, Part
 from hma_model.evaluation.tables import (
-    MEANINGS,
     ROLLOUTS,
     absences,
-    comparison,
     markdown,
     renamed,
     results,
     state,
+    turned,
     value,
 )
 from hma_model.evaluation.verdict import verdict
@@ -69,7 +68,8 @@ def page(parts: Sequence[Part], command: str) -> str:
     made.section("Does it follow its actions?")
     made.definitions([(_whose(part, parts), verdict(part.found)) for part in parts])
     made.section("Figures", "Below a figure: the 95 % interval of its mean, by bootstrap of whole episodes.")
-    _figures(made, parts)
+    table = turned(parts)
+    made.table(table.columns, table.rows)
     if said := absences(parts):
         made.section("Not measured, and to be known")
         made.definitions(said)
@@ -86,26 +86,10 @@ def page(parts: Sequence[Part], command: str) -> str:
     return made.html()
 
 
-def _figures(made: Page, parts: Sequence[Part]) -> None:
-    """Add the table: a column a checkpoint and robot, so that what is compared stands side by side."""
-    table = comparison(parts)
-    several = len({part.checkpoint for part in parts}) > 1
-    heads = [f"{row[0]}\n{row[1]}" if several else row[1] for row in table.rows]
-    turned = []
-    for column, name in enumerate(table.columns[2:], 2):
-        about = f"{name}\n{MEANINGS.get(name, '')}"
-        turned.append([about, *(_interval_below(row[column]) for row in table.rows)])
-    made.table(["figure", *heads], turned)
-
-
 def _whose(part: Part, parts: Sequence[Part]) -> str:
     """Return the robot of a part, and its checkpoint where there are several."""
     robot: str = part.found["embodiment"]
     return robot if len({each.checkpoint for each in parts}) == 1 else f"{part.checkpoint}, {robot}"
-
-
-def _interval_below(cell: Any) -> Any:
-    return cell.replace(" [", "\n", 1).rstrip("]").replace(", ", " to ") if isinstance(cell, str) else cell
 
 
 def _units(found: dict[str, Any]) -> str:

@@ -95,12 +95,13 @@ FIGURES = (
         "error of the recorded state at the last frame, in its standard deviations",
         by_window="state.error_sd_last", within=NATURAL,
     ),
+    _of_windows(
+        "PSNR shuffled", "shuffled.psnr_last", 2, "dB, last frame, another window's actions", PSNR_RANGE
+    ),
     _of_windows("PSNR none", "none.psnr_last", 2, "dB, last frame, without actions", PSNR_RANGE),
     _of_windows("PSNR copy", "copy.psnr_last", 2, "dB, the prompt's last frame repeated", PSNR_RANGE),
 )  # fmt: skip
 MEANINGS = {figure.name: figure.meaning for figure in FIGURES}
-OF_ROLLOUTS = (("PSNR dB", "psnr", 2), ("last frame dB", "psnr_last", 2), ("SSIM", "ssim", 3),
-               ("LPIPS", "lpips", 3), ("FID", "fid", 2), ("FVD", "fvd", 2))  # fmt: skip
 
 
 def renamed(parts: Sequence[Part]) -> tuple[list[Part], list[tuple[str, str]]]:
@@ -122,11 +123,12 @@ def value(found: Mapping[str, Any], path: str) -> Any:
 
 
 def present(parts: Sequence[Part]) -> list[Figure]:
-    """Return the figures of the comparing table that some part has."""
+    """Return the figures that some part has; details of a single part only."""
     return [
         figure
         for figure in FIGURES
-        if not figure.detail and any(value(part.found, figure.path) is not None for part in parts)
+        if (len(parts) == 1 or not figure.detail)
+        and any(value(part.found, figure.path) is not None for part in parts)
     ]
 
 
@@ -168,18 +170,37 @@ def comparison(parts: Sequence[Part], intervals: bool = True) -> Table:
         label = average["checkpoint"]
         own = [part.found for part in parts if part.checkpoint == label]
         for found in own:
-            row = [label, found["embodiment"], found["windows"], found["episodes"]]
-            for figure in figures:
-                ends = value(found, f"{figure.path}_95") if intervals else None
-                row.append(_cell(value(found, figure.path), ends, figure.digits))
-            rows.append(row)
+            cells = [_cell(*_estimate(found, figure, intervals), figure.digits) for figure in figures]
+            rows.append([label, found["embodiment"], found["windows"], found["episodes"], *cells])
         if len(own) > 1:
-            row = [label, MEAN, average["windows"], average["episodes"]]
+            cells = []
             for figure in figures:  # the keys of a mean are whole paths
                 ends = average.get(f"{figure.path}_95") if intervals else None
-                row.append(_cell(average.get(figure.path), ends, figure.digits))
-            rows.append(row)
+                cells.append(_cell(average.get(figure.path), ends, figure.digits))
+            rows.append([label, MEAN, average["windows"], average["episodes"], *cells])
     return Table(["checkpoint", "robot", "windows", "episodes", *(figure.name for figure in figures)], rows)
+
+
+def turned(parts: Sequence[Part]) -> Table:
+    """Return the table of all parts with a row a figure; a second line has its meaning, or its interval."""
+    table = comparison(parts)
+    several = len({part.checkpoint for part in parts}) > 1
+    heads = [f"{row[0]}\n{row[1]}" if several else row[1] for row in table.rows]
+    rows = []
+    for column, name in enumerate(table.columns[2:], 2):
+        about = f"{name}\n{MEANINGS.get(name, '')}"
+        rows.append([about, *(_interval_below(row[column]) for row in table.rows)])
+    return Table(["figure", *heads], rows)
+
+
+def _estimate(
+    found: Mapping[str, Any], figure: Figure, intervals: bool = True
+) -> tuple[float | None, Sequence[float] | None]:
+    return value(found, figure.path), value(found, f"{figure.path}_95") if intervals else None
+
+
+def _interval_below(cell: Any) -> Any:
+    return cell.replace(" [", "\n", 1).rstrip("]").replace(", ", " to ") if isinstance(cell, str) else cell
 
 
 def _cell(figure: float | None, ends: Sequence[float] | None, digits: int) -> str | Decimal | None:
@@ -250,26 +271,13 @@ def conditions(found: Mapping[str, Any]) -> str:
     )
 
 
-def details(found: Mapping[str, Any]) -> Table:
-    """Return the figures of one part that are no rollout's and not of its state."""
+def single(part: Part) -> Table:
+    """Return the figures of one part, with what they mean."""
     rows = []
-    for figure in FIGURES:
-        number = value(found, figure.path)
-        elsewhere = figure.path.split(".")[0] in (*ROLLOUTS, "state")
-        if number is not None and not elsewhere:
-            ends = _ends(value(found, f"{figure.path}_95"))
-            rows.append([figure.name, _digits(number, figure.digits), ends, figure.meaning])
+    for figure in present([part]):
+        number, ends = _estimate(part.found, figure)
+        rows.append([figure.name, _digits(number, figure.digits), _ends(ends), figure.meaning])
     return Table(["figure", "value", "95 %", "meaning"], rows)
-
-
-def rollouts(found: Mapping[str, Any]) -> Table:
-    """Return the table of the rollouts of one part."""
-    columns = [column for column in OF_ROLLOUTS if found["true"].get(column[1]) is not None]
-    rows = []
-    for kind in ("true", "shuffled", "none", "copy"):
-        figures = [_digits(found[kind].get(key), digits) for _, key, digits in columns]
-        rows.append([kind, *figures, _ends(found[kind]["psnr_last_95"]), ROLLOUTS[kind]])
-    return Table(["rollout", *(column[0] for column in columns), "last frame, 95 %", "given"], rows)
 
 
 def state(found: Mapping[str, Any] | None) -> list[tuple[Table, str]]:
