@@ -225,7 +225,6 @@ def _meaning(name: str, field: Any) -> str:
 
 _OBVIOUS = {
     "mixture": "[below](#mixture)",
-    "readout_bias": "what the bias of the token readout starts with: the tokens' log frequencies, or zero",
     "steps": "updates of the weights",
     "lr": "learning rate",
     "schedule": "how the learning rate goes on after `warmup`",

@@ -12,7 +12,6 @@ short side and cropped; those of fewer than ten frames are stretched to sixteen 
 N pictures or videos, B windows, T frames, S pixels a side, D features.
 """
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,9 +24,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hma_data.errors import UsageError
-from hma_data.storage.files import cache_folder, file_sha256, write_atomic
+from hma_data.storage.files import file_sha256
 from hma_data.storage.paths import StrPath, as_text
-from hma_data.storage.remote import is_remote, place
 from hma_model.evaluation.frechet import Moments, frechet_distance
 
 Images = NDArray[np.uint8]
@@ -35,7 +33,6 @@ Network = Callable[[Tensor], Tensor]
 I3D_SIDE = 224  # pixels of the short side of I3D's videos
 SHORT_VIDEO, STRETCHED_FRAMES = 10, 16  # frames below which a video is stretched, and those that it then has
 BATCH_SIZE = 32  # pictures in a pass
-SHA256 = re.compile(r"[0-9a-f]{64}")
 REMEDIES = {
     "lpips": '--lpips FILE#SHA256: torch.jit.trace of lpips.LPIPS(net="alex")',
     "fid": "--fid FILE#SHA256: inception-2015-12-05.pt of NVIDIA",
@@ -92,7 +89,9 @@ def open_script(file: StrPath, metric: str) -> tuple[Any, dict[str, str]]:
     """
     option = f"--{metric}"
     name, _, stated = as_text(file).partition("#")
-    path = _local(name, stated.lower(), option)
+    path = Path(name).expanduser()
+    if not path.is_file():
+        raise UsageError(option, f"{name}: no such file", "give the path of the network's weights")
     found = file_sha256(path)
     if not stated:
         remedy = f"compare with its publisher's, and give {option} {name}#{found}"
@@ -104,23 +103,6 @@ def open_script(file: StrPath, metric: str) -> tuple[Any, dict[str, str]]:
     except Exception as fault:  # torch raises several kinds for a file that is no TorchScript
         raise UsageError(option, f"{name} is no TorchScript", f"give {REMEDIES[metric]}") from fault
     return script, {"file": Path(name).name, "sha256": found}
-
-
-def _local(name: str, stated: str, option: str) -> Path:
-    """Return the path of a file; that of a store is kept in the cache's folder `networks`."""
-    path = place(name)
-    if not is_remote(path):
-        path = path.expanduser()
-        if not path.is_file():
-            raise UsageError(option, f"{name}: no such file", "give the path or URI of the network's weights")
-        return path
-    if not SHA256.fullmatch(stated):
-        raise UsageError(option, f"{name} comes without its SHA-256", f"give {option} {name}#SHA256")
-    kept = cache_folder() / "networks" / stated
-    if not kept.is_file():
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(kept, path.read_bytes())
-    return kept
 
 
 def _features(script: Any) -> Network:

@@ -11,7 +11,6 @@ bytes of results.json.
 """
 
 import hashlib
-import io
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -31,7 +30,7 @@ from hma_data.loading.views import Cameras
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import finite, to_json, write_atomic
+from hma_data.storage.files import atomic_path, finite
 from hma_data.storage.kept import kept_arrays
 from hma_data.storage.paths import StrPath, as_path, as_text, is_repository
 from hma_model.checkpoint.folder import EMBEDDED
@@ -241,27 +240,27 @@ def _folder(out: Path) -> Path:
     return out
 
 
+def _path(folder: Path, mark: str, robot: str) -> Path:
+    return folder / PARTS / f"{robot}-{mark}.npz"
+
+
 def _keep(folder: Path, mark: str, part: Part) -> None:
-    """Write a part: its predictions first, so that the figures' file says that it is whole."""
-    stem = folder / PARTS / f"{part.found['embodiment']}-{mark}"
-    buffer = io.BytesIO()  # in memory first, so that the file appears whole
-    np.savez_compressed(buffer, **part.predicted)  # type: ignore[arg-type]
-    write_atomic(stem.with_suffix(".npz"), buffer.getvalue())
-    rows = {name: values.tolist() for name, values in part.by_window.items()}
-    content = {"fingerprint": mark, "found": part.found, "by_window": finite(rows)}
-    write_atomic(stem.with_suffix(".json"), to_json(content))
+    """Write a part as one file of arrays, which appears whole."""
+    arrays: Any = {f"predicted.{kind}": values for kind, values in part.predicted.items()}
+    arrays |= {f"by_window.{name}": values for name, values in part.by_window.items()}
+    arrays["found"] = np.array(json.dumps(part.found))
+    with atomic_path(_path(folder, mark, part.found["embodiment"])) as path, path.open("wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
 def _kept(folder: Path, mark: str, label: str, shards: ShardSet) -> Part | None:
     """Return a part that is done, under the names of this command; None if it is not done, or damaged."""
-    stem = folder / PARTS / f"{shards.embodiment.id}-{mark}"
-    try:
-        content = json.loads(stem.with_suffix(".json").read_bytes())
-    except (OSError, ValueError):
+    arrays = kept_arrays(_path(folder, mark, shards.embodiment.id))
+    if arrays is None:
         return None
-    predicted = kept_arrays(stem.with_suffix(".npz"))
-    if predicted is None:
-        return None
-    rows = {name: np.array(values, float) for name, values in content["by_window"].items()}
-    found = content["found"] | {"checkpoint": label, "data": str(shards.folder)}
-    return Part(label, str(shards.folder), found, rows, predicted)
+    found = json.loads(str(arrays.pop("found"))) | {"checkpoint": label, "data": str(shards.folder)}
+    sorted_out: dict[str, dict[str, Any]] = {"predicted": {}, "by_window": {}}
+    for key, values in arrays.items():
+        kind, _, name = key.partition(".")
+        sorted_out[kind][name] = values
+    return Part(label, str(shards.folder), found, sorted_out["by_window"], sorted_out["predicted"])

@@ -1,10 +1,9 @@
-"""Sum up training steps, and detect bad ones: a loss that is not finite, or a gradient far above its mean."""
+"""Sum up training steps, and name the windows of those whose loss or gradient is not finite."""
 
 import math
 import resource
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import pyarrow.compute as pc
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from hma_model.network.objectives import Output
 
 NAMED = 4  # windows named in an error
-MEMORY = 0.98  # decay of the running mean of norms
-SETTLED = 20  # steps before a norm can be a spike
 
 
 class StepMetrics:
@@ -68,30 +65,6 @@ def peak_memory_mib(device: torch.device) -> float:
         return round(torch.cuda.max_memory_allocated(device) / 2**20, 1)
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit, 1)
-
-
-@dataclass
-class GradientSpikeDetector:
-    """The running mean of gradient norms."""
-
-    limit: float = 0.0  # a norm above this many times the mean is a spike; with 0 no norm is
-    mean: float = 0.0  # of the norms of steps that were taken
-    count: int = 0  # of these steps
-
-    def fault(self, loss: float, norm: float) -> str:
-        """Return the fault of a step; an empty string if the step may be taken."""
-        if not math.isfinite(loss) or not math.isfinite(norm):
-            return f"the loss is {loss}, the gradient's norm {norm}"
-        if self.limit and self.count >= SETTLED and norm > self.limit * self.mean:
-            times = norm / max(self.mean, 1e-12)
-            return f"the gradient's norm {norm:.4g} is {times:.1f} times its running mean {self.mean:.4g}"
-        return ""
-
-    def take(self, norm: float) -> None:
-        """Update the mean with the norm of a step that was taken."""
-        weight = max(1 - MEMORY, 1 / (self.count + 1))
-        self.mean += weight * (norm - self.mean)
-        self.count += 1
 
 
 def suspects(

@@ -43,7 +43,7 @@ class TrainResult:
     masked_val_loss: float | None
     baseline: float | None
     interrupted: bool  # a signal ended the run early
-    skipped: int  # number of steps skipped because of a bad loss or gradient
+    skipped: int  # number of steps skipped because a loss or gradient was not finite
     seconds: float  # time spent in steps, all sessions together
 
 

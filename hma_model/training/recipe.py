@@ -138,8 +138,6 @@ class Recipe(_Settings):
     digits: Count = Field(0, ge=0, description="0: the tokenizer's; 8 splits 512 into 8 · 8 · 8; 512 joins")
     # model.merge or model.patch, unless the recipe gives it, is the least that leaves so few
     places: Count = Field(0, ge=0, description="of the trunk in a camera's frame, at most; 0 has no limit")
-    # what the bias of the token readout starts with: the log frequencies of the training tokens
-    readout_bias: Literal["frequencies", "zero"] = "frequencies"
 
     steps: Count = Field(1000, ge=1, le=10**12)
     # an end by time: of a rank's process in steps, all its threads; lr then falls by the share that is spent
@@ -155,13 +153,11 @@ class Recipe(_Settings):
     eps: Number = Field(1e-8, gt=0, le=1e6)
     weight_decay: Number = Field(0.05, ge=0, le=1e6)
     clip: Number = Field(1.0, gt=0, description="limit of the gradient's norm")
-    nonfinite: Literal["stop", "skip"] = Field("stop", description="at a loss that is not finite, or a spike")
-    spike: Number = Field(0.0, ge=0, description="a gradient's norm above spike × its mean is one; 0 never")
+    nonfinite: Literal["stop", "skip"] = Field("stop", description="at a loss that is not finite")
     ema: Beta = Field(0.0, description="decay of averaged weights, which are evaluated and saved; 0 without")
     self_forward: Share = Field(0.0, description="share of windows whose past is the model's prediction")
     self_forward_frames: Count = Field(2, ge=1, description="frames in a row of such a past")
-    self_forward_from: Steps = Field(0, description="step from which this share rises")
-    self_forward_over: Steps = Field(0, description="number of steps in which this share rises")
+    self_forward_from: Steps = Field(0, description="first step with such windows, counted from 0")
 
     seed: Count = Field(42, ge=0, lt=2**63)
     precision: Literal["fp32", "bf16"] = "fp32"

@@ -53,11 +53,10 @@ class State:
     recipe: dict[str, Any]  # `Recipe.identity` of the run
     data: dict[str, str]  # embodiment id -> digest of its shards
     sampler: dict[str, Any]  # `TrainData.state`
-    skipped: int = 0  # number of steps skipped because of a bad loss or gradient
+    skipped: int = 0  # number of steps skipped because a loss or gradient was not finite
     seconds: float = 0.0  # time spent in steps so far
     cpu_seconds: float = 0.0  # and CPU time, the mean over the ranks
     evaluation: dict[str, Any] = field(default_factory=dict)  # the figures of the last evaluation
-    norms: list[float] = field(default_factory=list)  # running mean of the gradients' norms, and their number
 
     def require_same(self, recipe: dict[str, Any], data: dict[str, str], where: object) -> None:
         """Raise RecipeError with the differences unless recipe and shards are those of the run."""

@@ -4,6 +4,7 @@
 writes files.
 """
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -44,7 +45,7 @@ from hma_model.training.resume import (
     write_state,
 )
 from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment
-from hma_model.training.scheduled_sampling import forwarded, share_at
+from hma_model.training.scheduled_sampling import forwarded
 from hma_model.training.start import Start
 
 
@@ -90,7 +91,6 @@ class Run:
         self.held_out = {name: shards for name, shards, dataset in splits if len(dataset)}
         self.step, self.skipped, self.seconds = 0, 0, 0.0  # finished steps, and the time they took
         self.cpu_seconds = 0.0  # of the steps, the mean over the ranks
-        self.spike_detector = guards.GradientSpikeDetector(recipe.spike)
         self.evaluation: dict[str, Any] = {}  # the figures of the last one
         self.likes: dict[str, str] = {}  # new robot -> the robot with whose stem it began
         self.notes: list[str] = []  # texts for the user that nobody has shown yet
@@ -151,7 +151,7 @@ class Run:
         if self.start:
             self._begin_like(self.start.checkpoint)
             return
-        if self.recipe.readout_bias == "zero" or self.model.config.kind != "discrete":
+        if self.model.config.kind != "discrete":
             return
         drawn = zip(self.train_data.mixture.p, self.sets.values())
         given: Any = {"cameras": self.recipe.cameras, "factored": self.model.config.factored}
@@ -207,12 +207,10 @@ class Run:
         norm = self.parallel_model.clip(recipe.clip)
         loss, by_embodiment, by_objective = metrics.whole(self.world, self.train_data.passes)
         self.step += 1
-        fault = self.spike_detector.fault(loss, norm)
-        if fault:
-            self._refuse(fault, seen)
+        if not (math.isfinite(loss) and math.isfinite(norm)):
+            self._refuse(f"the loss is {loss}, the gradient's norm {norm}", seen)
         else:
             self.optimizer.step()
-            self.spike_detector.take(norm)
             if self.average:
                 self.average.update(self.step)
         spent = time.monotonic() - begun
@@ -254,11 +252,10 @@ class Run:
     def _with_own_past(self, number: int, batch: Batch) -> Batch:
         """Return the batch, in which the past of some windows is the model's own, as the recipe has it."""
         recipe = self.recipe
-        share = share_at(self.step, recipe)
-        if not share:
+        if not recipe.self_forward or self.step < recipe.self_forward_from:
             return batch
         draws = torch.Generator().manual_seed(seed_for(recipe.seed, "self_forward", self.step, number))
-        return forwarded(self.model, batch, share, recipe.self_forward_frames, draws)
+        return forwarded(self.model, batch, recipe.self_forward, recipe.self_forward_frames, draws)
 
     def _uncompiled(self) -> AbstractContextManager[Any]:
         """Let compiled blocks run as they are: each number of windows would be compiled anew."""
@@ -363,7 +360,6 @@ class Run:
             seconds=self.seconds,
             cpu_seconds=self.cpu_seconds,
             evaluation=self.evaluation,
-            norms=[self.spike_detector.mean, float(self.spike_detector.count)],
         )
 
         def write() -> Path:
@@ -448,8 +444,6 @@ class Run:
         self.step, self.skipped, self.seconds = state.step, state.skipped, state.seconds
         self.cpu_seconds = state.cpu_seconds
         self.evaluation = state.evaluation
-        if state.norms:
-            self.spike_detector.mean, self.spike_detector.count = state.norms[0], int(state.norms[1])
         self.notes += [*notes, f"resuming from step {state.step}"]
         if fault := self.train_data.load_state(state.sampler, force):
             self.notes.append(f"the sampler starts again: {fault}")

@@ -2,8 +2,8 @@
 
 In some windows of a batch, a few past frames are replaced by the model's predictions, one after the other.
 Each is predicted from the true frames before it and those already replaced. The target of the loss stays the
-true frame. The share of such windows may rise over the run, because predictions of an untrained model teach
-nothing. (The paper corrupts the past at random instead; see `corrupt_max` and `history_probability`.)
+true frame. Such windows may begin late in the run, because predictions of an untrained model teach nothing.
+(The paper corrupts the past at random instead; see `corrupt_max` and `history_probability`.)
 
 B batch, T frames of a window, h,w token grid, c,H,W latents, D frames replaced.
 """
@@ -24,19 +24,10 @@ from hma_model.network.trunks.contract import Conditioning, TimePositions
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
-    from hma_model.training.recipe import Recipe
 
 type Under = tuple[Conditioning, Groups, TimePositions]
 
 SAMPLE_STEPS = 8  # of the diffusion head; enough for a past to learn from
-
-
-def share_at(step: int, recipe: "Recipe") -> float:
-    """Return the share of windows that have predicted past frames in step `step`, counted from 0."""
-    if step < recipe.self_forward_from:
-        return 0.0
-    along = (step + 1 - recipe.self_forward_from) / max(recipe.self_forward_over, 1)
-    return recipe.self_forward * min(along, 1.0)
 
 
 @torch.no_grad()

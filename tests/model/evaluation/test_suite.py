@@ -134,7 +134,7 @@ def test_parts_that_are_done_are_not_computed_again(made, tmp_path, monkeypatch)
     whole = results(run(made, tmp_path))
     assert calls == ["arm", "hand"]
     assert results(run(made, tmp_path)) == whole and len(calls) == 2
-    lost = sorted((tmp_path / "parts").glob("hand-*.json"))[0]
+    lost = sorted((tmp_path / "parts").glob("hand-*.npz"))[0]
     lost.unlink()
     assert results(run(made, tmp_path)) == whole and calls[2:] == ["hand"]
     damaged = sorted((tmp_path / "parts").glob("arm-*.npz"))[0]

@@ -38,7 +38,7 @@ def test_killed_actions_continue_and_give_the_same_bytes(tmp_path: Path) -> None
         words = ["evaluate", "embedded", *(str(whole / robot) for robot in ROBOTS), "--split", "train"]
         words += ["--windows", "2", "--out", "out"]
         if killed:
-            run(words, folder, until="out/parts/*.json")
+            run(words, folder, until="out/parts/*.npz")
         run(words, folder)
     assert contents(cut / ROBOTS[0]) == contents(whole / ROBOTS[0])
     assert contents(cut / "out") == contents(whole / "out")

@@ -305,7 +305,6 @@ def test_the_paper_rule_and_batch_are_those_of_the_mixture_of_forty():
     [
         ("track: [tensorbord]", r"track\.0: .*'tensorboard', 'trackio' or 'wandb'"),
         ("ema: 1", "ema: .*less than 1"),
-        ("spike: -1", "spike: .*greater than or equal to 0"),
         ("freeze: all", "freeze: .*'nothing' or 'trunk'"),
         ("parallel: dp", "parallel: .*'ddp' or 'fsdp'"),
         ("self_forwrd: 1", r"self_forwrd: unknown key, did you mean 'self_forward'\?"),

@@ -13,7 +13,7 @@ from hma_model.training.loop import train
 from hma_model.training.parallel import World
 from hma_model.training.recipe import make_recipe
 from hma_model.training.run import Run
-from hma_model.training.scheduled_sampling import SAMPLE_STEPS, forwarded, share_at
+from hma_model.training.scheduled_sampling import SAMPLE_STEPS, forwarded
 from tests.model.robots import CONFIG, make_model
 from tests.model.runs import TINY
 from tests.model.shards import make_shards
@@ -115,14 +115,6 @@ def test_latents_are_replaced_by_what_the_diffusion_head_samples():
     assert given.context.shape == true.latents.shape and given.context.isfinite().all()
     assert changed(given, true.latents).sum(1).tolist() == [2] * 4
     model(given, "forward", torch.Generator().manual_seed(5)).loss.backward()
-
-
-def test_the_share_rises_from_a_step_over_a_number_of_steps():
-    recipe = make_recipe({"self_forward": 0.5, "self_forward_from": 10, "self_forward_over": 4})
-    assert [share_at(step, recipe) for step in (0, 9, 10, 11, 13, 14, 99)] == [
-        0, 0, 0.125, 0.25, 0.5, 0.5, 0.5,
-    ]  # fmt: skip
-    assert share_at(0, make_recipe({"self_forward": 0.5})) == 0.5
 
 
 def test_a_run_with_a_past_of_its_own_goes_on_bit_for_bit(tmp_path):

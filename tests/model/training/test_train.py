@@ -68,9 +68,7 @@ def test_training_beats_what_ignoring_everything_reaches(recipe, tmp_path):
 
 def test_the_first_step_stands_where_the_frequencies_do(recipe, tmp_path):
     known = train(recipe(steps=1, lr=1e-9), out=tmp_path / "known", show=False)
-    plain = train(recipe(steps=1, lr=1e-9, readout_bias="zero"), out=tmp_path / "plain", show=False)
     assert known.masked_val_loss == pytest.approx(known.baseline, rel=0.15)
-    assert plain.masked_val_loss == pytest.approx(np.log(64), rel=0.1)
 
 
 def test_the_result_is_a_checkpoint_with_cards(recipe, tmp_path):

@@ -1,14 +1,12 @@
-"""Options of a step: precision, accumulation, averages, recomputation, compilation, spikes."""
+"""Options of a step: precision, accumulation, averages, recomputation, compilation."""
 
 import numpy as np
 import pytest
 import torch
 
-from hma_data.errors import RecipeError, TrainingError
-from hma_model.checkpoint import io as checkpoint
-from hma_model.network.model import HMA
+from hma_data.errors import RecipeError
 from hma_model.training.data import TrainData, share
-from hma_model.training.guards import SETTLED, GradientSpikeDetector, listed
+from hma_model.training.guards import listed
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.optim import Average
@@ -152,55 +150,6 @@ def test_what_is_trained_is_what_is_evaluated(recipe, tmp_path, objective):
     (evaluation,) = result.evaluations
     assert evaluation["objective"] == objective and np.isfinite(evaluation["loss"])
     assert ("baseline" in evaluation) == (objective == "full")
-
-
-# -- spikes
-
-
-def test_a_norm_far_above_its_running_mean_is_a_spike():
-    detector = GradientSpikeDetector(limit=3.0)
-    assert detector.fault(1.0, 1e9) == ""
-    for _ in range(SETTLED):
-        detector.take(2.0)
-    assert detector.fault(1.0, 5.9) == ""
-    assert "3.5 times its running mean 2" in detector.fault(1.0, 7.0)
-    assert GradientSpikeDetector().fault(1.0, 1e30) == ""
-
-
-@pytest.mark.parametrize(("loss", "norm"), [(float("nan"), 1.0), (1.0, float("inf"))])
-def test_what_is_no_number_is_always_a_fault(loss, norm):
-    assert "the loss is" in GradientSpikeDetector().fault(loss, norm)
-
-
-@pytest.fixture
-def spiking(monkeypatch):
-    """The loss of a late batch is a million times what it was."""
-    plain, calls = HMA.forward, []
-
-    def forward(self, batch, objective=None, generator=None):
-        output = plain(self, batch, objective, generator)
-        if self.training:
-            calls.append(batch)
-            if len(calls) == SETTLED + 2:
-                output.loss = output.loss * 1e6
-        return output
-
-    monkeypatch.setattr(HMA, "forward", forward)
-
-
-def test_a_spike_stops_and_names_the_windows_with_the_largest_loss(recipe, tmp_path, spiking):
-    long = recipe(steps=SETTLED + 4, spike=10, eval_every=0, checkpoint_every=0)
-    with pytest.raises(
-        TrainingError, match=r"times its running mean.*episode \d+ \(e\d+\) frames \d+ to \d+"
-    ):
-        train(long, out=tmp_path / "run", show=False)
-
-
-def test_a_spike_can_be_skipped_and_is_counted(recipe, tmp_path, spiking):
-    long = recipe(steps=SETTLED + 4, spike=10, nonfinite="skip", eval_every=0, checkpoint_every=0)
-    result = train(long, out=tmp_path / "run", show=False)
-    assert result.skipped == 1
-    assert all(torch.isfinite(v).all() for v in checkpoint.load(result.checkpoint).state_dict().values())
 
 
 def test_long_lists_of_windows_are_cut():
