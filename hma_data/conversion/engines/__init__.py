@@ -61,6 +61,23 @@ class Limits:
 LIMITS = Limits()
 
 
+# how work ended: "done" with its result, "short of memory", or "failed" with the error that ends the job
+End = tuple[str, Any]
+
+
+def outcome(task: Callable[..., Any], *arguments: Any) -> End:
+    """Return in a worker how a task ended."""
+    try:
+        return "done", task(*arguments)
+    except MemoryError:
+        return "short of memory", None
+    except HMAError as fault:
+        return "failed", fault
+    except Exception as fault:
+        text = f"stopped with {type(fault).__name__}: {fault}"
+        return "failed", HMAError("a worker", text, "report this as a bug; --debug --workers 0 shows where")
+
+
 class Ledger:
     """The units that wait, run, or have failed, and the rules for trying again.
 

@@ -26,6 +26,7 @@ from hma_data.conversion.engines import (
     OnEvent,
     Step,
     Work,
+    outcome,
 )
 from hma_data.cpu import take_ordinary_priority
 from hma_data.errors import HMAError
@@ -241,23 +242,18 @@ def serve(pipe: Connection, make_work: Callable[[int], Work], workers: int) -> N
             except (BrokenPipeError, ConnectionResetError):
                 os._exit(1)  # the job is over; no unit is at fault
 
-    try:
-        work = make_work(workers)
-        send("ready")
-        while True:
-            try:
-                unit, attempt = pipe.recv()
-            except EOFError:
-                return
-            try:
-                send("done", work(unit, lambda event: send("event", event), attempt))
-            except MemoryError:
-                send("short of memory")
-    except HMAError as fault:
-        send("failed", fault)
-    except Exception as fault:
-        text = f"stopped with {type(fault).__name__}: {fault}"
-        send("failed", HMAError("a worker", text, "report this as a bug; --debug --workers 0 shows where"))
+    kind, work = outcome(make_work, workers)
+    if kind != "done":
+        send("failed", work or HMAError("a worker", "has no memory to start", "try fewer --workers"))
+        return
+    send("ready")
+    while kind != "failed":
+        try:
+            unit, attempt = pipe.recv()
+        except EOFError:
+            return
+        kind, value = outcome(work, unit, partial(send, "event"), attempt)
+        send(kind, value)
 
 
 def _end_with_parent() -> None:

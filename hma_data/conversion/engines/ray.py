@@ -20,7 +20,19 @@ from functools import partial
 from threading import Condition
 from typing import Any
 
-from hma_data.conversion.engines import LIMITS, Attempt, Cause, Ledger, Limits, Notice, OnEvent, Step, Work
+from hma_data.conversion.engines import (
+    LIMITS,
+    Attempt,
+    Cause,
+    End,
+    Ledger,
+    Limits,
+    Notice,
+    OnEvent,
+    Step,
+    Work,
+    outcome,
+)
 from hma_data.cpu import take_ordinary_priority
 from hma_data.errors import HMAError, MissingDependencyError, install_command
 
@@ -129,10 +141,6 @@ def _lack_of_room(ray: Any, wanted: dict[str, float]) -> str:
 # -- in an actor
 
 
-# "done" with a result, "failed" with the error that ends the job, "short of memory", "closed" if never opened
-End = tuple[str, Any]
-
-
 class Worker:
     """An actor that makes units. It collects their events until the driver looks."""
 
@@ -146,14 +154,14 @@ class Worker:
     def open(self, make_work: Callable[[int], Work], workers: int) -> End:
         """Load the tokenizer."""
         take_ordinary_priority()
-        end, self._work = _outcome(make_work, workers)
+        end, self._work = outcome(make_work, workers)
         return ("done", None) if end == "done" else ("failed", self._work or MemoryError("no room to start"))
 
     def do(self, number: int, unit: Any, attempt: Attempt) -> tuple[End, list[tuple[int, Any]]]:
         """Make a unit; return how it ended, and its events that no look has returned."""
-        if self._work is None:  # the one that was opened is lost, and Ray gave its task to this one
+        if self._work is None:  # the actor that was opened is lost, and Ray gave its task to this one
             return ("closed", None), []
-        end = _outcome(self._work, unit, partial(self._report, number, attempt), attempt)
+        end = outcome(self._work, unit, partial(self._report, number, attempt), attempt)
         with self._news:
             events, self._events = self._events, []
         return end, events
@@ -176,18 +184,6 @@ class Worker:
                 self._urgent = True
                 self._news.notify_all()
                 self._news.wait_for(lambda: not self._events and not self._given)
-
-
-def _outcome(task: Callable[..., Any], *arguments: Any) -> End:
-    try:
-        return "done", task(*arguments)
-    except MemoryError:
-        return "short of memory", None
-    except HMAError as fault:
-        return "failed", fault
-    except Exception as fault:
-        text = f"stopped with {type(fault).__name__}: {fault}"
-        return "failed", HMAError("a worker", text, "report this as a bug; --debug --workers 0 shows where")
 
 
 # -- in the driver
