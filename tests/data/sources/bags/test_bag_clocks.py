@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.clocks import MessageTimes, sorted_by
 from tests.data.bag_files import arm, make_recording, read, write_ros1
@@ -19,35 +18,6 @@ def shifted(tmp_path: Path, shift_s: np.ndarray) -> Path:
     """A bag whose camera's header stamps, and no others, are off by that many seconds."""
     shift = np.round(shift_s * SECOND).astype(np.int64)
     return write_ros1(tmp_path / "run.bag", replace(make_recording(FRAMES), stamp_shift_ns=shift))
-
-
-@pytest.mark.parametrize(
-    ("shift_s", "says"),
-    [
-        (np.full(FRAMES, 0.3), r"0\.\d+ s ahead of receipt.* off by 0\.\d+ s"),
-        (np.full(FRAMES, -0.5), r"0\.5\d* s behind receipt"),
-        (np.arange(FRAMES) * -0.02, "drift by"),
-        (np.full(FRAMES, -1e9), "simulated time"),
-    ],
-)
-def test_clocks_that_are_apart_are_measured_named_and_asked_about(tmp_path, shift_s, says) -> None:
-    path = shifted(tmp_path, shift_s)
-    with pytest.raises(EpisodeError, match=says) as fault:
-        read(path, arm())
-    assert "stamp: receive" in str(fault.value) and "\n" not in str(fault.value)
-    by_receipt = to_clip(read(path, arm(**{"sync: {": "sync: {stamp: receive, "})), arm())
-    (tmp_path / "even").mkdir()
-    even = to_clip(read(shifted(tmp_path / "even", np.zeros(FRAMES)), arm()), arm())
-    np.testing.assert_array_equal(by_receipt.actions, even.actions)
-
-
-def test_a_stamp_stated_at_the_camera_keeps_the_shift(tmp_path: Path) -> None:
-    path = shifted(tmp_path, np.full(FRAMES, -0.5))
-    stated = arm(**{"name: front,": "name: front, stamp: header,"})
-    assert read(path, stated).streams["front"].timestamps[0] == pytest.approx(
-        read(path, arm(**{"sync: {": "sync: {stamp: receive, "})).streams["front"].timestamps[0] - 0.5,
-        abs=0.01,
-    )
 
 
 def test_one_stamp_of_zero_is_no_shift(tmp_path: Path) -> None:

@@ -213,39 +213,6 @@ def test_unknown_video_is_refused(tmp_path: Path) -> None:
         read(tmp_path / "v.mcap", arm(VIDEO_YAML))
 
 
-@pytest.mark.parametrize("name", ["jpeg2000", "bgr8; h264 compressed"])
-def test_h264_is_found_by_its_content_whatever_the_format_says(tmp_path: Path, name: str) -> None:
-    pictures = write_video(
-        tmp_path / "v.mcap", "libx264", name, LOW_DELAY, kind="sensor_msgs/CompressedImage"
-    )
-    stream = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"]
-    for indices in (range(30), [25, 3]):
-        assert np.abs(stream.frames(indices).astype(int) - pictures[list(indices)]).mean() < 4
-
-
-@pytest.mark.parametrize("codec", ["libx264", "libx265"])
-def test_frames_stored_out_of_order_come_in_the_order_they_are_shown(tmp_path: Path, codec: str) -> None:
-    name = {"libx264": "h264", "libx265": "h265"}[codec]
-    options = {"g": "10", "bf": "2", "crf": "10", "x265-params": "log-level=none:keyint=10:bframes=2"}
-    pictures = write_video(tmp_path / "v.mcap", codec, name, options)
-    stream = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"]
-    for indices in (range(30), [12], [25, 3], [29, 0]):
-        assert np.abs(stream.frames(indices).astype(int) - pictures[list(indices)]).mean() < 4, indices
-
-
-@pytest.mark.parametrize("pattern", ["rggb", "bggr"])
-def test_a_compressed_mosaic_becomes_colours(pattern: str) -> None:
-    rgb = smooth()
-    mosaic = np.zeros(rgb.shape[:2], np.uint8)
-    for i, colour in enumerate(pattern.upper()):
-        mosaic[i // 2 :: 2, i % 2 :: 2] = rgb[i // 2 :: 2, i % 2 :: 2, "RGB".index(colour)]
-    data = cv2.imencode(".png", mosaic)[1].tobytes()
-    found = picture(
-        {"format": f"bayer_{pattern}8; png compressed bayer_{pattern}8", "data": data}, "still", ""
-    )
-    assert np.abs(found[2:-2, 2:-2].astype(int) - rgb[2:-2, 2:-2]).max() <= 6
-
-
 @pytest.mark.parametrize("padding", [0, 4])
 @pytest.mark.parametrize("encoding", ["nv12", "nv21"])
 def test_semi_planar_yuv_is_converted_plane_by_plane(encoding: str, padding: int) -> None:

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from mcap.writer import Writer
 
 from hma_data.errors import EpisodeError
@@ -156,59 +155,3 @@ def test_a_key_reads_the_type_that_has_its_field_and_infer_asks(tmp_path: Path) 
 
 
 # -- descriptors of protobuf
-
-F = descriptor_pb2.FieldDescriptorProto
-
-
-def descriptor(name: str, fields: list[tuple[str, int, str, int]], needs: list[str]):
-    package, message = name.split(".")
-    found = descriptor_pb2.FileDescriptorProto(
-        name=f"{package}/{message}.proto", package=package, syntax="proto3", dependency=needs
-    )
-    kind = found.message_type.add(name=message)
-    for number, (field, type_, of, label) in enumerate(fields, 1):
-        added = kind.field.add(name=field, number=number, type=type_, label=label)
-        if of:
-            added.type_name = of
-    return found
-
-
-def descriptors() -> list[descriptor_pb2.FileDescriptorProto]:
-    """The file of the message last, as protoc writes them."""
-    time = descriptor_pb2.FileDescriptorProto()
-    timestamp_pb2.DESCRIPTOR.CopyToProto(time)
-    vector = descriptor("toy.Vector", [("v", F.TYPE_DOUBLE, "", 3)], [])
-    stamp = ("timestamp", F.TYPE_MESSAGE, ".google.protobuf.Timestamp", 1)
-    command = descriptor(
-        "toy.Command", [stamp, ("joints", F.TYPE_MESSAGE, ".toy.Vector", 1)], [time.name, vector.name]
-    )
-    return [time, vector, command]
-
-
-@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (2, 0, 1), (2, 1)])
-def test_a_set_of_descriptors_is_read_in_any_order(order: tuple[int, ...], tmp_path: Path) -> None:
-    """The last one lacks the file of Timestamp, which comes along with protobuf."""
-    files, pool = descriptors(), descriptor_pool.DescriptorPool()
-    for file in files:
-        pool.Add(file)
-    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("toy.Command"))
-    chosen = descriptor_pb2.FileDescriptorSet(file=[files[i] for i in order])
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as out:
-        writer = Writer(out)
-        writer.start()
-        schema = writer.register_schema("toy.Command", "protobuf", chosen.SerializeToString())
-        commands = writer.register_channel("/cmd", "protobuf", schema)
-        text = ros2.TYPES.generate_msgdef("sensor_msgs/msg/CompressedImage", ros_version=2)[0].encode()
-        images = writer.register_schema("sensor_msgs/msg/CompressedImage", "ros2msg", text)
-        camera = writer.register_channel("/cam", "cdr", images)
-        for i in range(FRAMES):
-            image = ros2.image(at(i), i)
-            data = bytes(ros2.TYPES.serialize_cdr(image, image.__msgtype__))
-            writer.add_message(camera, at(i), data, at(i))
-            message = kind()
-            message.timestamp.seconds, message.timestamp.nanos = divmod(at(i), 10**9)
-            message.joints.v.append(float(i))
-            writer.add_message(commands, at(i), message.SerializeToString(), at(i))
-        writer.finish()
-    assert pairs(path, robot(action="/cmd.joints.v")) == [(i, i) for i in range(FRAMES)]
