@@ -1,7 +1,6 @@
 """Open a bag: one recording, in one file or in a ROS 2 folder of several files; detect its format."""
 
 import logging
-import os
 import re
 import shutil
 import tempfile
@@ -103,6 +102,13 @@ class Bag:
                 counts.update(file.counts())
             self._counts = counts
         return self._counts
+
+    def topics(self) -> Counter[str]:
+        """Count the messages of each topic."""
+        topics: Counter[str] = Counter()
+        for channel, count in self.counts().items():
+            topics[channel.topic] += count
+        return topics
 
     def span(self) -> tuple[int, int]:
         """Return the earliest and latest time of receipt."""
@@ -212,9 +218,16 @@ def find_bags(root: Path) -> dict[str, Path]:
     if root.is_file() or is_bag_folder(root):
         return {root.stem if root.is_file() else root.name: root}
     found: dict[Path, str] = {}  # bag -> its id
-    for path, is_folder in (_remote_bags if isinstance(root, RemotePath) else _local_bags)(root):
-        name = path.relative_to(root)
-        found[path] = (name if is_folder else name.with_suffix("")).as_posix()
+    files = [path for path in root.rglob("*") if _is_bag_name(path.name) or path.name == "metadata.yaml"]
+    folders = {path.parent for path in files if path.name == "metadata.yaml" and is_bag_folder(path.parent)}
+    for path in folders:
+        found[path] = path.relative_to(root).as_posix()
+    for path in files:
+        is_file = (
+            is_remote(path) or not path.is_dir()
+        )  # also a link to nothing, which is told when it is read
+        if is_file and _is_bag_name(path.name) and folders.isdisjoint(path.parents):
+            found[path] = path.relative_to(root).with_suffix("").as_posix()
     for path in sorted(path for path in found if _part_number(path) is not None):
         parts = following_parts(path) if path in found else []
         if parts and (match := SPLIT_PART.fullmatch(path.name)):
@@ -228,34 +241,9 @@ def find_bags(root: Path) -> dict[str, Path]:
     return dict(sorted(named.items()))
 
 
-def _local_bags(root: Path) -> Iterator[tuple[Path, bool]]:
-    """Yield each bag under a folder, and whether it is a folder itself."""
-    for folder, folders, names in os.walk(root):
-        here = Path(folder)
-        if here != root and is_bag_folder(here):
-            folders.clear()
-            yield here, True
-            continue
-        yield from ((here / name, False) for name in names if _is_bag_file(here / name))
-
-
-def _remote_bags(root: Path) -> Iterator[tuple[Path, bool]]:
-    """Yield the same of a store, where bag files are known by their names alone."""
-    files = [path for path in root.rglob("*") if _is_bag_name(path.name) or path.name == "metadata.yaml"]
-    folders = {path.parent for path in files if path.name == "metadata.yaml" and is_bag_folder(path.parent)}
-    yield from ((folder, True) for folder in sorted(folders))
-    for path in files:
-        if _is_bag_name(path.name) and folders.isdisjoint(path.parents):
-            yield path, False
-
-
 def is_bag_folder(path: Path) -> bool:
     """Check whether a folder is a ROS 2 bag."""
     return b"rosbag2_bagfile_information" in first_bytes(path / "metadata.yaml", 4096)
-
-
-def _is_bag_file(path: Path) -> bool:
-    return _is_bag_name(path.name) or first_bytes(path, 8).startswith((b"#ROSBAG", MCAP_MAGIC))
 
 
 def _container(path: Path, chunks: ChunkCache) -> Container:

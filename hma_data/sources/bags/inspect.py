@@ -156,9 +156,7 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
             bag = Bag(path, root)
             for remark in bag.remarks:
                 survey.note(Finding("files", "info" if path.is_file() else "warn", remark))
-            counts: Counter[str] = Counter()
-            for channel, count in bag.counts().items():
-                counts[channel.topic] += count
+            counts = bag.topics()
         except EpisodeError as fault:
             survey.fault(name, fault)
             continue
@@ -239,10 +237,9 @@ class _BagInspection:
     def __init__(self, name: str, bag: Bag, survey: Survey, budget: _Budget) -> None:
         self.bag, self._name, self._survey = bag, name, survey
         self._frozen: list[str] = []
-        counts = bag.counts()
-        self._topics = {topic: _Topic(TopicTrack(topic)) for topic in sorted({at.topic for at in counts})}
-        for channel, count in counts.items():
-            self._topics[channel.topic].count += count
+        self._topics = {
+            topic: _Topic(TopicTrack(topic), count) for topic, count in sorted(bag.topics().items())
+        }
         self._measure(budget)
         self.keys = [key for topic in self._topics.values() for key in self._keys(topic)]
         if self._frozen:

@@ -12,9 +12,9 @@ arrives, or when a field of it becomes a value.
 import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import asdict, astuple, dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ SHOWN = 8  # values of a marker in an error
 MAX_DELAY_S = 10.0  # header stamps further from receipt than this come from another clock
 KEPT_BAGS = 2
 KEPT_TABLES = 512
-TABLE = 1  # version of what is kept of a table
+TABLE = 2  # version of what is kept of a table
 Rows = NDArray[np.int64]
 
 
@@ -79,7 +79,7 @@ class Table:
     clock: str
     reach_ns: int
     empty: int = 0
-    keyframes: dict[str, Rows] = field(default_factory=dict)
+    keyframes: dict[str, list[int]] = field(default_factory=dict)
 
     @property
     def left_out(self) -> int:
@@ -112,17 +112,11 @@ def _stored(key: Any, make: Callable[[], Table]) -> Table:
     kept = cache_folder() / "bags" / f"{hashlib.sha256(repr((TABLE, key)).encode()).hexdigest()[:32]}.json"
     with suppress(OSError, ValueError, KeyError, TypeError):
         values = json.loads(kept.read_bytes())
-        segments = tuple(Segment(*values) for values in values.pop("segments"))
-        keyframes = {name: np.array(ns, np.int64) for name, ns in values.pop("keyframes").items()}
-        return Table(segments=segments, keyframes=keyframes, **values)
+        return Table(tuple(Segment(**one) for one in values.pop("segments")), **values)
     table = make()
-    values = asdict(table) | {
-        "segments": [astuple(segment) for segment in table.segments],
-        "keyframes": {name: ns.tolist() for name, ns in table.keyframes.items()},
-    }
     with suppress(OSError):
         kept.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(kept, json.dumps(values))
+        write_atomic(kept, json.dumps(asdict(table)))
     return table
 
 
@@ -141,14 +135,13 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
     Raises:
         EpisodeError: the bag is damaged, lacks a topic, or no episode is in it.
     """
-    where, channels = str(bag.path), list(bag.counts())
-    topics = [channel.topic for channel in channels]
+    where, topics = str(bag.path), bag.topics()
     camera = embodiment.primary_camera
     if camera.key not in topics:
         raise missing_topic(camera.key, topics, where)
     cameras = {camera.key for camera in embodiment.cameras}
     # Only the messages tell whether compressed images are frames of a video.
-    videos = {c.topic for c in channels if c.topic in cameras and image_kind(c.type) in (STILL, VIDEO)}
+    videos = {c.topic for c in bag.counts() if c.topic in cameras and image_kind(c.type) in (STILL, VIDEO)}
     tracks = {key: TopicTrack(key) for key in {camera.key} | videos}
     start = MarkerTrack(segments.start, topics, where) if segments.start else None
     stop = MarkerTrack(segments.stop, topics, where) if segments.stop else None
@@ -241,9 +234,9 @@ def _segment(received: Rows, begin: int, stop: int) -> Segment:
     return Segment(begin, stop, first_ns, int(received[stop - 1]), skip)
 
 
-def _keyframes(track: TopicTrack) -> Rows:
+def _keyframes(track: TopicTrack) -> list[int]:
     flags, received = track.keyframes(), track.times.received
-    return np.sort(received[:1] if flags is None else received[flags])
+    return sorted((received[:1] if flags is None else received[flags]).tolist())
 
 
 # -- markers
@@ -259,7 +252,7 @@ class MarkerTrack:
         EpisodeError: the bag has no such topic.
     """
 
-    def __init__(self, marker: Marker, topics: list[str], where: str) -> None:
+    def __init__(self, marker: Marker, topics: Iterable[str], where: str) -> None:
         self.marker, self._where = marker, where
         self._field = parse_key(marker.key, topics, where)
         self.track = TopicTrack(self._field.topic)

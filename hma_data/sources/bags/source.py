@@ -8,7 +8,6 @@ An episode inside a bag is read together with the earlier messages that are stil
 
 import logging
 import re
-from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from itertools import chain
@@ -22,7 +21,7 @@ from hma_data.registry.components import Camera, Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace, find_bags
 from hma_data.sources.bags.clocks import MAX_LATE_S, MessageTimes, apart
-from hma_data.sources.bags.container import Channel, Record, RecordFilter, damaged
+from hma_data.sources.bags.container import Record, RecordFilter, damaged
 from hma_data.sources.bags.images import image_kind
 from hma_data.sources.bags.inspect import report
 from hma_data.sources.bags.messages import decode
@@ -116,7 +115,7 @@ def _refs(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> l
         fingerprint = bag.fingerprint()
         segments = embodiment.source.segments if embodiment else None
         if not embodiment or not segments:
-            return [EpisodeRef(name, _frames(bag.counts(), embodiment), fingerprint=fingerprint)]
+            return [EpisodeRef(name, _frames(bag, embodiment), fingerprint=fingerprint)]
         table = parted(path, root, embodiment, segments)[1]
     except (EpisodeError, OSError):
         return [EpisodeRef(name, 0, fingerprint=fingerprint)]
@@ -126,13 +125,13 @@ def _refs(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> l
     ]
 
 
-def _frames(counts: Counter[Channel], embodiment: Embodiment | None) -> int:
+def _frames(bag: Bag, embodiment: Embodiment | None) -> int:
     """Count the frames of the primary camera; without an embodiment, of the camera with most frames."""
-    topics: Counter[str] = Counter()
-    for channel, count in counts.items():
-        if embodiment or image_kind(channel.type):
-            topics[channel.topic] += count
-    return topics[embodiment.primary_camera.key] if embodiment else max(topics.values(), default=0)
+    topics = bag.topics()
+    if embodiment:
+        return topics[embodiment.primary_camera.key]
+    images = {channel.topic for channel in bag.counts() if image_kind(channel.type)}
+    return max((topics[topic] for topic in images), default=0)
 
 
 # -- one episode
@@ -152,9 +151,7 @@ class _EpisodeReading:
         self._table, self._number = table, number
         self._segment = table.segments[number] if table else None
         self._where = str(bag.path) if table is None else f"{bag.path}, episode {number}"
-        self._counts: Counter[str] = Counter()
-        for channel, count in bag.counts().items():
-            self._counts[channel.topic] += count
+        self._counts = bag.topics()
         self._tracks: dict[str, TopicTrack] = {}
         self._said: list[tuple[int, str]] = []  # instructions and when they were received
 
@@ -260,11 +257,9 @@ class _EpisodeReading:
         parts = [iter(self._bag.before(held, first_ns)), self._bag.records(within)]
         for topic in sorted(topics & table.keyframes.keys()):
             keyframes = table.keyframes[topic]
-            at = int(np.searchsorted(keyframes, first_ns, side="right")) - 1
-            begin = int(keyframes[at]) if at >= 0 else 0
+            begin = max((at for at in keyframes if at <= first_ns), default=0)
             # The last frames of video with B-frames need messages up to the next key frame.
-            later = keyframes[keyframes > last_ns]
-            end = int(later[0]) if len(later) else last_ns
+            end = min((at for at in keyframes if at > last_ns), default=last_ns)
             wanted = RecordFilter(frozenset({topic}), begin, end, again=True)
             parts.append(self._bag.records(wanted))
         return chain.from_iterable(parts)
