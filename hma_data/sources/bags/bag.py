@@ -330,7 +330,8 @@ def _split_stem(path: Path) -> tuple[str, str] | None:
 
 
 def _is_bag_name(name: str) -> bool:
-    return name.removesuffix(".zstd").endswith(SUFFIXES)
+    # A recorder that was killed leaves run.bag.active.
+    return name.removesuffix(".zstd").removesuffix(".active").endswith(SUFFIXES)
 
 
 def following_parts(path: Path) -> list[Path]:
