@@ -39,7 +39,7 @@ from hma_data.sources.bags.messages import (
 )
 from hma_data.sources.bags.topic_track import Field, TopicTrack, camera_stream, parse_key
 from hma_data.sources.common import checks
-from hma_data.sources.common.checks import Finding, StreamTimes, measure, skew
+from hma_data.sources.common.checks import Finding, measure, skew
 from hma_data.sources.common.inspection import Inspection, KeyInfo, Timing, TopicInfo
 from hma_data.sources.common.places import unfollowed
 from hma_data.sources.common.survey import Survey, sampled
@@ -241,16 +241,17 @@ class _BagInspection:
             topic: _Topic(TopicTrack(topic), count) for topic, count in sorted(bag.topics().items())
         }
         self._measure(budget)
-        self.keys = [key for topic in self._topics.values() for key in self._keys(topic)]
-        if self._frozen:
-            said = f"{', '.join(self._frozen[:8])}: header stamps never change; receive times are used"
-            survey.note(Finding("stamps", "warn", said, numbers={"topics": self._frozen}))
         self.clocks = {
             name: _clock(topic.track.times) for name, topic in self._topics.items() if len(topic.track)
         }
-        self._skew()
-        cameras = {key.topic.name for key in self.keys if key.kind == "camera" and key.topic}
-        self.keys = [self._timed(key, cameras) for key in self.keys]
+        found = {name: self._keys(topic) for name, topic in self._topics.items()}
+        if self._frozen:
+            said = f"{', '.join(self._frozen[:8])}: header stamps never change; receive times are used"
+            survey.note(Finding("stamps", "warn", said, numbers={"topics": self._frozen}))
+        cameras = [name for name, keys in found.items() if keys[0].kind == "camera"]
+        vectors = [name for name, keys in found.items() if any(key.kind == "vector" for key in keys)]
+        self._skew(cameras, vectors)
+        self.keys = [key for name, keys in found.items() for key in self._timed(name, keys, cameras)]
 
     def _measure(self, budget: _Budget) -> None:
         where = str(self.bag.path)
@@ -279,8 +280,8 @@ class _BagInspection:
             self._survey.note(Finding("readable", "warn", topic.fault, key=name))
         stated = track.channels[0]
         kind = track.kind
-        times = _clock(track.times).header
-        measured = measure(times) if name in LOG_TOPICS else self._times(track, times, bool(kind))
+        if name not in LOG_TOPICS:
+            self._times(track, bool(kind))
         found: list[KeyInfo] = []
         if not topic.fault:
             found = [self._camera(topic, kind)] if kind else _values(name, topic.sample)
@@ -294,38 +295,23 @@ class _BagInspection:
         found = found or [KeyInfo(name, "other", (), stated.type or stated.encoding)]
         for value in topic.values:
             value.hand_on(self._survey, self._name)
-        clock = track.times.clock()
-        stamped = clock.by_header and not topic.fault
-        about = TopicInfo(
-            name,
-            stated.type or stated.encoding,
-            delay_ms=clock.delay_s * 1e3 if stamped else None,
-            drift_ms=clock.drift_s * 1e3 if stamped else 0.0,
-            goes_back=stamped and track.times.order("header") is None,
-            receipt_goes_back=track.times.order("receive") is None,
-        )
-        hz, jitter_ms = measured.hz, measured.jitter_ms
-        return [replace(key, hz=hz, count=topic.count, jitter_ms=jitter_ms, topic=about) for key in found]
+        return found
 
-    def _times(self, track: TopicTrack, times: Floats, camera: bool) -> StreamTimes:
+    def _times(self, track: TopicTrack, camera: bool) -> None:
         """Hand the times to the survey; check what only messages with two times can show."""
         self._survey.made.add("stamps")
         self._frozen += [track.topic] if track.frozen else []
-        own = track.times
-        if own.stamps is not None:
-            apart = float(np.median(np.abs(own.seconds("header") - own.seconds("receive"))))
-            if apart > APART_S:
-                said = f"{track.topic}: header stamps are {apart:.3g} s from receive times"
-                self._survey.note(
-                    Finding("stamps", "warn", said, key=track.topic, numbers={"seconds": apart})
-                )
-        if own.order("header") is None:
-            remedy = own.set_back_error("header", str(self.bag.path)).remedy
-            return self._survey.times(self._name, track.topic, times, camera, remedy)
-        if late := 0 if own.stamps is None else int(np.sum(np.diff(own.stamps) < 0)):
+        times, remedy = track.times, ""
+        apart = abs(times.clock().delay_s)
+        if apart > APART_S:
+            said = f"{track.topic}: header stamps are {apart:.3g} s from receive times"
+            self._survey.note(Finding("stamps", "warn", said, key=track.topic, numbers={"seconds": apart}))
+        if times.order("header") is None:
+            remedy = times.set_back_error("header", str(self.bag.path)).remedy
+        elif late := 0 if times.stamps is None else int(np.sum(np.diff(times.stamps) < 0)):
             said = f"{track.topic}: {late} messages arrived out of order; their header stamps order them"
             self._survey.note(Finding("back", "info", said, key=track.topic, numbers={"count": late}))
-        return self._survey.times(self._name, track.topic, times, camera)
+        self._survey.times(self._name, track.topic, self.clocks[track.topic].header, camera, remedy)
 
     def _camera(self, topic: _Topic, kind: str) -> KeyInfo:
         name, track = topic.track.topic, topic.track
@@ -355,37 +341,41 @@ class _BagInspection:
             high=high,
         )
 
-    def _timed(self, key: KeyInfo, cameras: set[str]) -> KeyInfo:
-        """Return the key with the longest intervals of its topic, and its timing by the times of receipt."""
-        if key.topic is None:
-            return key
-        own = self.clocks[key.topic.name]
-        seen = [self.clocks[name] for name in cameras if name != key.topic.name]
-        seen = [] if key.topic.name in cameras else seen
-        received = measure(own.receive)
-        timing = Timing(
-            received.hz, received.jitter_ms, _gap_ms(own.receive, [clock.receive for clock in seen])
-        )
-        gap_ms = _gap_ms(np.sort(own.header), [clock.header for clock in seen])
+    def _timed(self, name: str, found: list[KeyInfo], cameras: list[str]) -> list[KeyInfo]:
+        """Return the keys of a topic with its timing by both clocks."""
+        topic = self._topics[name]
+        if name not in self.clocks:
+            return found
+        own, times, stated = self.clocks[name], topic.track.times, topic.track.channels[0]
+        seen = [] if name in cameras else [self.clocks[camera] for camera in cameras]
+        by_header, by_receipt, clock = measure(own.header), measure(own.receive), times.clock()
+        stamped = clock.by_header and not topic.fault
         # A topic is timed beside the first frame by receipt, which all topics share.
-        first = min((clock.receive[0] for clock in seen), default=own.receive[-1])
-        ends_before = float(first - own.receive[-1])
-        held_s = ends_before if ends_before > 0 else None
-        return replace(key, topic=replace(key.topic, gap_ms=gap_ms, held_s=held_s, by_receipt=timing))
+        held_s = float(min((one.receive[0] for one in seen), default=own.receive[-1]) - own.receive[-1])
+        about = TopicInfo(
+            name,
+            stated.type or stated.encoding,
+            gap_ms=_gap_ms(np.sort(own.header), [one.header for one in seen]),
+            delay_ms=clock.delay_s * 1e3 if stamped else None,
+            drift_ms=clock.drift_s * 1e3 if stamped else 0.0,
+            goes_back=stamped and times.order("header") is None,
+            receipt_goes_back=times.order("receive") is None,
+            held_s=held_s if held_s > 0 else None,
+            by_receipt=Timing(
+                by_receipt.hz, by_receipt.jitter_ms, _gap_ms(own.receive, [one.receive for one in seen])
+            ),
+        )
+        hz, jitter_ms = by_header.hz, by_header.jitter_ms
+        return [replace(key, hz=hz, count=topic.count, jitter_ms=jitter_ms, topic=about) for key in found]
 
-    def _skew(self) -> None:
+    def _skew(self, cameras: list[str], vectors: list[str]) -> None:
         """Measure the skew of each camera and vector stream from the frames of the first camera."""
-        topics = {
-            key.topic.name: key.kind for key in self.keys if key.topic and key.kind in ("camera", "vector")
-        }
-        cameras = [name for name, kind in topics.items() if kind == "camera"]
         if not cameras:
             return
         primary = self.clocks[cameras[0]].header
         period_s = float(np.median(np.diff(np.sort(primary)))) if len(primary) > 1 else 0.0
-        for name in topics:
-            if name != cameras[0]:
-                self._survey.skew(name, skew(self.clocks[name].header, primary), period_s)
+        for name in [*cameras[1:], *vectors]:
+            self._survey.skew(name, skew(self.clocks[name].header, primary), period_s)
 
 
 def _clock(times: MessageTimes) -> _Clock:

@@ -66,32 +66,20 @@ def _protobuf_decoder(channel: Channel) -> Decode:
     from google.protobuf import (  # type: ignore[import-untyped]
         descriptor_pb2,
         descriptor_pool,
-        duration_pb2,  # noqa: F401 (makes the default pool know the type)
         message_factory,
-        timestamp_pb2,  # noqa: F401
     )
 
-    files, pool = descriptor_pb2.FileDescriptorSet(), descriptor_pool.DescriptorPool()
-    files.ParseFromString(channel.schema)
-    missing = {item.name: item for item in files.file}
-
-    def add(name: str) -> None:
-        """Add a file after those that it depends on: a set may list them in any order."""
-        item = missing.pop(name, None)
-        if item is None and name.startswith(WELL_KNOWN):  # some writers leave out what protobuf brings along
+    files = list(descriptor_pb2.FileDescriptorSet.FromString(channel.schema).file)
+    needed = {name for item in files for name in item.dependency} - {item.name for item in files}
+    for name in needed:
+        if name.startswith(WELL_KNOWN):  # some writers leave out what protobuf brings along
+            # The import makes the default pool know the file.
             import_module(f"{name.removesuffix('.proto').replace('/', '.')}_pb2")
             item = descriptor_pb2.FileDescriptorProto()
             descriptor_pool.Default().FindFileByName(name).CopyToProto(item)
-        if item is None or name in added:
-            return
-        added.add(name)
-        for dependency in item.dependency:
-            add(dependency)
-        pool.Add(item)
-
-    added: set[str] = set()
-    for name in list(missing):
-        add(name)
+            files.append(item)
+    pool = descriptor_pool.DescriptorPool()
+    message_factory.GetMessages(files, pool)  # adds files to the pool after those that they depend on
     kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(channel.type))
     return lambda data: kind.FromString(bytes(data))
 

@@ -8,7 +8,6 @@ T samples of a key in an episode, A values a sample.
 """
 
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -98,8 +97,6 @@ class _Times:
     """The times of one key over the episodes."""
 
     met: dict[str, StreamTimes] = field(default_factory=dict)
-    camera: bool = False
-    back_remedy: str = ""
     skew: tuple[float, float, float] | None = None
 
 
@@ -123,9 +120,7 @@ class Survey:
         self._faults: dict[tuple[str, str], HMAError] = {}  # (episode, key or "") -> why
         self._numbers: dict[str, _Numbers] = {}
         self._times: dict[str, _Times] = {}
-        self._absent: dict[str, list[str]] = {}
-        self._odd: list[tuple[str, int, dict[str, int]]] = []
-        self._extra: list[Finding] = []
+        self._found: list[tuple[str, Finding]] = []  # with the name of the episode, or ""
         self._shown: dict[str, str] = {}  # camera -> the episode last looked at
 
     # -- what sources hand in
@@ -200,20 +195,23 @@ class Survey:
         """Note an episode, or a key of it, that cannot be read."""
         self._faults.setdefault((name, key), fault)
 
-    def note(self, finding: Finding) -> None:
-        """Add a finding that only this format can make."""
+    def note(self, finding: Finding, name: str = "") -> None:
+        """Add a finding of a recording, or of one episode; those that say the same become one."""
         self.made.add(finding.check)
-        self._extra.append(finding)
+        self._found.append((name, finding))
 
     def lengths(self, name: str, length: int, sizes: Mapping[str, int], wanted: Sequence[str]) -> None:
         """Note the rows of an episode's keys, and the keys that are missing."""
         self.made |= {"keys", "rows"}
         absent = [key for key in wanted if key not in sizes]
-        for key in absent:
-            self._absent.setdefault(key, []).append(name)
+        if absent:
+            self.note(
+                Finding("keys", "warn", f"{name}: has no {listed(absent)}", numbers={"keys": absent}), name
+            )
         odd = {key: sizes[key] for key in wanted if key in sizes and sizes[key] != length}
         if odd:
-            self._odd.append((name, length, odd))
+            said = listed([f"{key} has {size}" for key, size in odd.items()])
+            self.note(Finding("rows", "warn", f"{name}: of {length} frames, {said}", numbers=odd), name)
 
     def numbers(self, name: str, key: str, values: NDArray[Any], begin: int = 0) -> None:
         """Add a vector (T, …) of an episode, or the part of it that begins at step `begin`."""
@@ -259,9 +257,13 @@ class Survey:
         `back_remedy` is what helps where they go back.
         """
         self.made |= {"repeated", "back", "gaps"} | ({"frames"} if camera else set())
-        held = self._times.setdefault(key, _Times(camera=camera))
-        held.back_remedy = held.back_remedy or back_remedy
+        held = self._times.setdefault(key, _Times())
         found = held.met[name] = checks.measure(seconds)
+        for one in checks.time_findings(key, found, camera, "" if self.alone else name):
+            remedy = back_remedy if one.check == "back" else one.remedy
+            if one.check == "gaps" and camera and self.by_field:  # a bag may be divided there
+                remedy = f"no window crosses it; {divide_remedy(checks.pause_s(found.period_s))}"
+            self.note(replace(one, remedy=remedy), name)
         return found
 
     def skew(self, key: str, found: tuple[float, float, float] | None, period_s: float) -> None:
@@ -273,7 +275,7 @@ class Survey:
         if found and found[1] > 1e3 * max(period_s, own):
             said = f"{key}: p95 {found[1]:.1f} ms from the first camera's frames, max {found[2]:.1f} ms"
             numbers = dict(zip(("p50_ms", "p95_ms", "max_ms"), found, strict=True))
-            self._extra.append(
+            self.note(
                 Finding(
                     "skew",
                     "warn",
@@ -349,8 +351,8 @@ class Survey:
     def findings(self, keys: Sequence[KeyInfo]) -> tuple[Finding, ...]:
         """Return all findings, check by check."""
         found = [
-            *self._readable(keys), *_merged(self._extra), *self._keys(), *self._rows(), *self._stamps(),
-            *self._finite(), *self._constant(keys), *checks.picture_findings(self.looks),
+            *self._readable(keys), *_merged(self._found), *self._finite(), *self._constant(keys),
+            *checks.picture_findings(self.looks),
         ]  # fmt: skip
         order = list(CHECKS)
         return tuple(sorted(found, key=lambda one: order.index(one.check) if one.check in order else 99))
@@ -375,44 +377,11 @@ class Survey:
         if rest:
             said = f"{rest:,} more of {looked:,} episodes looked at cannot be read"
             yield Finding("readable", severity, said, numbers={"episodes": rest})
-        missing = any(one.check == "files" and one.severity == "warn" for one in self._extra)
+        missing = any(one.check == "files" and one.severity == "warn" for _, one in self._found)
         shown = any(look.images for look in self.looks.values())
         told = bool(groups) and severity == "error"  # no episode could be read at all
         if (faulty or missing) and not shown and not told and any(key.kind == "camera" for key in keys):
             yield Finding("readable", "error", "not one image of the episodes looked at can be read")
-
-    def _keys(self) -> Iterator[Finding]:
-        together: dict[tuple[str, ...], list[str]] = {}
-        for key, names in self._absent.items():
-            together.setdefault(tuple(names), []).append(key)
-        for episodes, keys in together.items():
-            more = f" (and {len(episodes) - 1:,} more episodes)" if len(episodes) > 1 else ""
-            said = f"{episodes[0]}: has no {listed(keys)}{more}"
-            yield Finding("keys", "warn", said, numbers={"keys": keys, "episodes": len(episodes)})
-
-    def _rows(self) -> Iterator[Finding]:
-        for name, length, odd in self._odd[:SHOWN]:
-            said = listed([f"{key} has {size}" for key, size in odd.items()])
-            yield Finding("rows", "warn", f"{name}: of {length} frames, {said}", numbers=odd)
-        if len(self._odd) > SHOWN:
-            said = f"{len(self._odd) - SHOWN} more episodes have keys of different length"
-            yield Finding("rows", "warn", said, numbers={"episodes": len(self._odd)})
-
-    def _stamps(self) -> Iterator[Finding]:
-        for key, held in self._times.items():
-            found = [
-                one
-                for name, times in held.met.items()
-                for one in checks.time_findings(key, times, held.camera, "" if self.alone else name)
-            ]
-            for check, count in Counter(one.check for one in found).items():
-                first = next(one for one in found if one.check == check)
-                more = f" (and in {count - 1} more episodes)" if count > 1 else ""
-                remedy = held.back_remedy if check == "back" else first.remedy
-                if check == "gaps" and held.camera and self.by_field:  # a bag may be divided there
-                    period = max(times.period_s for times in held.met.values())
-                    remedy = f"no window crosses it; {divide_remedy(checks.pause_s(period))}"
-                yield replace(first, message=first.message + more, remedy=remedy)
 
     def _finite(self) -> Iterator[Finding]:
         for key, held in self._numbers.items():
@@ -470,20 +439,30 @@ def alike(faults: Iterable[tuple[str, HMAError]]) -> list[tuple[list[str], HMAEr
     """
     groups: dict[tuple[str, str], tuple[dict[str, None], HMAError]] = {}
     for name, fault in faults:
-        kind = re.sub(r"\d[\d.,]*", "0", fault.fault), re.sub(r"\d[\d.,]*", "0", fault.remedy)
+        kind = _plain(fault.fault), _plain(fault.remedy)
         groups.setdefault(kind, ({}, fault))[0][name] = None
     found = [(list(names), first) for names, first in groups.values()]
     return sorted(found, key=lambda group: -len(group[0]))
 
 
-def _merged(found: list[Finding]) -> Iterator[Finding]:
-    """Yield one finding for each check and key: the first, with the number of the others."""
-    together: dict[tuple[str, str, str], list[Finding]] = {}
-    for one in found:
-        together.setdefault((one.check, one.severity, one.key or one.message), []).append(one)
-    for first, *more in together.values():
-        said = f"{first.message} (and {len(more)} more like it)" if more else first.message
-        yield replace(first, message=said)
+def _merged(found: list[tuple[str, Finding]]) -> Iterator[Finding]:
+    """Yield one finding for each check and key, or of those without key that say the same: the first.
+
+    Its message tells how many others there are.
+    """
+    together: dict[tuple[str, str, str], list[tuple[str, Finding]]] = {}
+    for name, one in found:
+        about = one.key or _plain(one.message.removeprefix(name))
+        together.setdefault((one.check, one.severity, about), []).append((name, one))
+    for (name, first), *more in together.values():
+        others = len({other for other, _ in more} - {name})
+        told = f"and in {others:,} more episodes" if others else f"and {len(more)} more like it"
+        yield replace(first, message=f"{first.message} ({told})") if more else first
+
+
+def _plain(text: str) -> str:
+    """Return a text with 0 for each number, so that texts of one kind are equal."""
+    return re.sub(r"\d[\d.,]*", "0", text)
 
 
 def sampled(count: int, wanted: int) -> list[int]:
