@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from hma_data.sources.common.inspection import KeyInfo
+from hma_data.sources.common.places import natural
 from hma_data.sources.hdf5.videos import FILE, is_video
 
 MAX_DIMS = 4096  # of a component
@@ -68,11 +69,6 @@ def _snake(key: str) -> str:
 
 def _last(key: str) -> str:
     return re.split(r"[/.]", key)[-1]
-
-
-def _natural(text: str) -> list[tuple[int, str]]:
-    """Return a sort key that puts image before image_2 before image_10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
 
 
 def shown(keys: Iterable[str], most: int = 12) -> str:
@@ -166,7 +162,7 @@ def cameras(keys: Iterable[KeyInfo]) -> Choice:
 
 
 def _ordered(found: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
-    return tuple(sorted(_one_of_twins(list(found)), key=lambda key: (_rank(key.key), _natural(key.key))))
+    return tuple(sorted(_one_of_twins(list(found)), key=lambda key: (_rank(key.key), natural(key.key))))
 
 
 def _is_camera(key: KeyInfo) -> bool:

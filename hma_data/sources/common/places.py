@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 from collections.abc import Collection
 from pathlib import Path
 from typing import BinaryIO, cast
@@ -51,6 +52,11 @@ def existing_path(uri: str) -> Path:
         fault = "does not exist, or its server does not answer" if web else "does not exist"
         raise SourceError(uri, fault, "check the URI, or source.uri in the embodiment's YAML")
     return path
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """Return a sort key that puts clip_2 before clip_10."""
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def leaves(path: Path, folder: Path) -> bool:

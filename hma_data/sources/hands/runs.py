@@ -8,7 +8,6 @@ a point, with `/next` for its value at the next labelled frame of the run, or `/
 N labelled frames of a video, n of a run, w values of a point (2, or 42 for landmarks).
 """
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import HandsLayout
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.common.places import local_path, nothing_there
+from hma_data.sources.common.places import local_path, natural, nothing_there
 from hma_data.sources.common.video_file import decoded_size, opened
 from hma_data.sources.hands import VIDEO_SUFFIXES
 
@@ -60,7 +59,7 @@ def videos_of(uri: str) -> dict[str, Video]:
         SourceError: there are none.
     """
     root = local_path(uri)
-    files = [root] if root.is_file() else sorted(root.rglob("*"), key=lambda path: _natural_order(str(path)))
+    files = [root] if root.is_file() else sorted(root.rglob("*"), key=lambda path: natural(str(path)))
     folder = root.parent if root.is_file() else root
     paths = {
         path.relative_to(folder).as_posix(): path
@@ -76,11 +75,6 @@ def videos_of(uri: str) -> dict[str, Video]:
         unique = (alias for alias in short[name] if uses[alias] == 1)
         videos[name] = Video(path, name, (name, str(PurePosixPath(name).with_suffix("")), *unique))
     return videos
-
-
-def _natural_order(name: str) -> list[tuple[int, int, str]]:
-    """Return a sort key that puts clip_2 before clip_10."""
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
 @dataclass(frozen=True)

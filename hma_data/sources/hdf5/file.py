@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.sources.common.places import local_path, nothing_there
+from hma_data.sources.common.places import local_path, natural, nothing_there
 from hma_data.storage.kinds import unreadable
 
 SUFFIXES = (".h5", ".hdf5", ".hdf")
@@ -245,7 +245,7 @@ def _stems(uri: str) -> dict[str, Path]:
     if path.is_file():
         return {_safe(path.stem): path}
     found: dict[str, Path] = {}
-    for file in sorted(path.rglob("*"), key=lambda item: _natural(str(item.relative_to(path)))):
+    for file in sorted(path.rglob("*"), key=lambda item: natural(str(item.relative_to(path)))):
         if file.suffix.lower() not in SUFFIXES or not file.is_file():
             continue
         stem = "/".join(map(_safe, file.relative_to(path).with_suffix("").parts))
@@ -265,7 +265,7 @@ def _episodes(handle: h5py.File, file: Path, pattern: str | None) -> dict[str, E
     fixed = next((i for i, part in enumerate(parts) if re.search(r"[*?\[]", part)), len(parts) - 1)
     found: dict[str, EpisodeGroup] = {}
     matching = dict(_matching(handle, parts))
-    for group in sorted(matching, key=_natural):
+    for group in sorted(matching, key=natural):
         name = "/".join(map(_safe, group.split("/")[fixed:]))
         if name in found:
             raise SourceError(file, f"two of its groups give an episode called {name!r}", "rename one")
@@ -283,15 +283,13 @@ def _guess_pattern(handle: h5py.File) -> str:
     groups = [name for name in handle if isinstance(inside(handle, name), h5py.Group)]
     if groups and len(groups) == len(handle) and all(_EPISODE_NAME.fullmatch(name) for name in groups):
         return "*"
-    found = _numbered(handle)
-    return found[0] if found else WHOLE_FILE
+    return _numbered(handle) or WHOLE_FILE
 
 
-def _numbered(group: h5py.Group, depth: int = 0) -> tuple[str, int] | None:
-    """Return the pattern of the groups that are episodes, and the rows of the shortest looked into; or None.
+def _numbered(group: h5py.Group, depth: int = 0) -> str | None:
+    """Return the pattern of the groups that are episodes: numbered, with images and actions in most.
 
-    They differ in a number, and most hold images and actions. Numbered cameras and arms are none: they do
-    not hold both, or are named as such, or what is as long lies beside them.
+    Numbered cameras and arms are none: they do not hold both, or are named as such.
     """
     inner = {name: item for name in group if (item := inside(group, name)) is not None}
     groups = {name: item for name, item in inner.items() if isinstance(item, h5py.Group)}
@@ -299,39 +297,27 @@ def _numbered(group: h5py.Group, depth: int = 0) -> tuple[str, int] | None:
         return None
     stem, count = Counter(map(_stem, groups)).most_common(1)[0]
     if "#" not in stem or count < 2:
-        sampled = list(groups)[:MAX_GROUPS_SAMPLED]
-        holders = {name: found for name in sampled if (found := _numbered(groups[name], depth + 1))}
-        return _below(inner, groups, holders)
-    family = sorted((name for name in groups if _stem(name) == stem), key=_natural)
+        return _below(groups, depth)
+    family = sorted((name for name in groups if _stem(name) == stem), key=natural)
     pattern = "*" if count == len(groups) else re.sub(r"\d+", "[0-9]*", family[0])
-    matched = {name for name in groups if fnmatchcase(name, pattern)}
-    if _is_part(stem, group) or matched != set(family):
+    if _is_part(stem, group) or {name for name in groups if fnmatchcase(name, pattern)} != set(family):
         return None
+    if deeper := _numbered(groups[family[0]], depth + 1):  # day_1/t000
+        return f"{pattern}/{deeper}"
     # Walking thousands of groups takes minutes on a slow disk, so a spread sample decides.
     spread = np.unique(np.linspace(0, count - 1, MAX_GROUPS_SAMPLED).astype(int))
-    looked = [family[i] for i in spread]
-    if found := _numbered(groups[family[0]], depth + 1):  # day_1/t000
-        return (f"{pattern}/{found[0]}", found[1]) if _are_short(inner, matched, found[1]) else None
-    rows = [length for name in looked if (length := _rows_of_episode(groups[name]))]
-    if len(rows) < 2 or 2 * len(rows) <= len(looked) or not _are_short(inner, matched, min(rows)):
-        return None
-    return pattern, min(rows)
+    episodes = sum(_is_episode(groups[family[i]]) for i in spread)
+    return pattern if episodes >= 2 and 2 * episodes > len(spread) else None
 
 
-def _below(
-    inner: dict[str, h5py.Group | h5py.Dataset],
-    groups: dict[str, h5py.Group],
-    holders: dict[str, tuple[str, int]],
-) -> tuple[str, int] | None:
+def _below(groups: dict[str, h5py.Group], depth: int) -> str | None:
     """Return the pattern by way of the one group that holds episodes, or of all where they do alike."""
-    if len({pattern for pattern, _ in holders.values()}) != 1:
+    sampled = list(groups)[:MAX_GROUPS_SAMPLED]
+    holders = {name: found for name in sampled if (found := _numbered(groups[name], depth + 1))}
+    patterns = set(holders.values())
+    if len(patterns) != 1 or 1 < len(holders) < len(sampled):
         return None
-    if 1 < len(holders) < min(len(groups), MAX_GROUPS_SAMPLED):
-        return None
-    name, (pattern, _) = next(iter(holders.items()))
-    least = min(rows for _, rows in holders.values())
-    apart, prefix = ({name}, name) if len(holders) == 1 else (set(groups), "*")
-    return (f"{prefix}/{pattern}", least) if _are_short(inner, apart, least) else None
+    return f"{'*' if len(holders) > 1 else next(iter(holders))}/{patterns.pop()}"
 
 
 def _stem(name: str) -> str:
@@ -344,24 +330,14 @@ def _is_part(stem: str, group: h5py.Group) -> bool:
     return bool(words and _PART.fullmatch(words[-1]))
 
 
-def _are_short(inner: dict[str, h5py.Group | h5py.Dataset], apart: set[str], rows: int) -> bool:
-    """Check that all but the members `apart` has fewer rows than an episode, so is nothing over its time."""
-    for name in inner.keys() - apart:
-        item = inner[name]
-        below = (found for _, found in walk(item)) if isinstance(item, h5py.Group) else [item]
-        if any(one.shape and one.shape[0] >= rows and one.dtype.kind not in "OSU" for one in below):
-            return False
-    return True
-
-
 def _is_coded(dtype: np.dtype[Any]) -> bool:
     """Check whether a value may be an encoded image, so is bytes and no text."""
     string = h5py.check_string_dtype(dtype)
     return dtype.kind in "OSV" and not (string and string.encoding == "utf-8")
 
 
-def _rows_of_episode(group: h5py.Group) -> int:
-    """Return the rows of what may be images, with numbers of as many rows, or one more or less; else 0."""
+def _is_episode(group: h5py.Group) -> bool:
+    """Check for what may be images, with numbers of as many rows, or one more or less."""
     images, values = [], []
     for _, item in walk(group):
         shape: tuple[int, ...] = item.shape or ()
@@ -371,7 +347,7 @@ def _rows_of_episode(group: h5py.Group) -> int:
             images.append(shape[0])
         elif dtype.kind == "f" and len(shape) == 2:
             values.append(shape[0])
-    return max((count for count in images for other in values if abs(count - other) <= 1), default=0)
+    return any(abs(count - other) <= 1 for count in images for other in values)
 
 
 def inside(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
@@ -399,11 +375,6 @@ def _matching(group: h5py.Group, parts: list[str]) -> Iterator[tuple[str, str]]:
             yield from ((f"{name}/{rest}", fault) for rest, fault in _matching(item, parts[1:]))
         elif isinstance(item, h5py.Group):
             yield name, ""
-
-
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Return a sort key that puts demo_2 before demo_10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _safe(name: str) -> str:

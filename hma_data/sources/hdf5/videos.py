@@ -28,7 +28,6 @@ from hma_data.sources.common.video_file import VideoFile
 from hma_data.storage.files import parse_json
 
 SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
-RECORDINGS = (".h5", ".hdf5", ".hdf", ".bag", ".mcap", ".db3", ".parquet", ".npz", ".zarr", ".csv")
 MAX_JSON = 16 << 20  # most bytes of the file of `layout.metadata`
 MAX_NAMES = 12  # names in an error
 FILE = "{file}"  # in a key: the HDF5 file's name without its ending
@@ -86,23 +85,13 @@ def video_path(file: Path, camera: Camera, layout: Hdf5Layout) -> Path:
 
 def videos_beside(file: Path) -> list[str]:
     """Return the video files below the folder of an HDF5 file, as a camera's key would name them."""
-    inside = list(islice(file.parent.rglob("*"), MAX_LISTED))
-    # The videos of another dataset in a folder below are none of this file.
-    others = {item.parent for item in inside if item.parent != file.parent and _is_recording(item)}
-    others |= {folder.parent for folder in others if folder.name == "meta"}
-    films = [item for item in inside if item.suffix.lower() in SUFFIXES and not others & {*item.parents}]
+    inside = islice(file.parent.rglob("*"), MAX_LISTED)
+    films = [item for item in inside if item.suffix.lower() in SUFFIXES]
     found = sorted(item.relative_to(file.parent) for item in films)
     if _is_alone(file):
         return [path.as_posix() for path in found]
     name = re.compile(rf"(?<![A-Za-z0-9]){re.escape(file.stem)}(?!\d)")  # run_1 is no part of run_10
     return [name.sub(FILE, path.as_posix()) for path in found]
-
-
-def _is_recording(item: Path) -> bool:
-    """Check whether a file belongs to a recording of its own, of any format."""
-    return (
-        item.name in ("info.json", "dataset_info.json", "metadata.yaml") or item.suffix.lower() in RECORDINGS
-    )
 
 
 def video_keys(file: Path) -> Iterator[KeyInfo]:

@@ -376,13 +376,11 @@ def test_numbered_groups_of_one_episode_are_none(tmp_path: Path, keys: list[str]
     assert open_source("hdf5").episode_ids(tmp_path / "a.h5") == ["a"]
 
 
-@pytest.mark.parametrize("stem", ["arm_{}", "robots/{}", "wrist_cam{}", "side_{}"])
+@pytest.mark.parametrize("stem", ["arm_{}", "robots/{}", "wrist_cam{}"])
 def test_numbered_parts_with_pictures_and_numbers_are_one_episode(tmp_path: Path, stem: str) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for number in range(3):
             fill(file.create_group(stem.format(number)))
-        if stem == "side_{}":
-            file["time"] = np.arange(T) / 20  # one for all sides
     assert open_source("hdf5").episode_ids(tmp_path / "a.h5") == ["a"]
 
 

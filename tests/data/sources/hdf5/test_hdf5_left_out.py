@@ -10,7 +10,6 @@ import pytest
 from hma_data.errors import EpisodeError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
-from tests.data.videos import encode
 
 ROWS = 12
 
@@ -116,15 +115,3 @@ def test_a_stated_number_that_fits_changes_nothing(tmp_path: Path) -> None:
         file["data/demo_0"].attrs["num_samples"] = ROWS
     episode = open_source("hdf5").read(str(path), "demo_0", robot())
     assert len(episode.actions[0].values) == ROWS and "flags" not in episode.metadata
-
-
-@pytest.mark.parametrize("own", ["meta/info.json", "b.h5"])
-def test_videos_of_another_dataset_below_are_not_listed(tmp_path: Path, own: str) -> None:
-    with h5py.File(tmp_path / "one.h5", "w") as file:
-        file["actions"] = np.zeros((ROWS, 2))
-    encode(tmp_path / "videos/front.mp4", range(ROWS))
-    encode(tmp_path / "other/videos/cam/file.mp4", range(ROWS))
-    (tmp_path / "other" / own).parent.mkdir(exist_ok=True)
-    (tmp_path / "other" / own).write_bytes(b"{}")
-    facts = open_source("hdf5").inspect(str(tmp_path / "one.h5")).facts
-    assert facts["videos beside it"] == "videos/front.mp4"
