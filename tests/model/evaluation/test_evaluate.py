@@ -17,7 +17,7 @@ from hma_data.shards.reader import ShardSet
 from hma_model.evaluation import actions, tables
 from hma_model.evaluation.actions import gaussian, shuffled, shuffled_actions, without_actions
 from hma_model.evaluation.evaluate import Settings, measure
-from hma_model.evaluation.intervals import NATURAL, SHARE, interval, over_datasets
+from hma_model.evaluation.intervals import interval, over_datasets
 from hma_model.evaluation.losses import (
     digit_frequencies,
     masked_val_loss,
@@ -250,12 +250,6 @@ def test_each_picture_is_decoded_once(data, model):
     assert tokenizer.decoded == truth + (1 + 3 + 1) * predicted  # true, three others, none
 
 
-def test_a_rollout_over_a_truth_that_is_known_is_the_same(model, batch):
-    one = rollout(model, Blocks(), batch, prompt=2)
-    other = rollout(model, Blocks(), batch, prompt=2, truth=one.truth)
-    assert (one.predicted == other.predicted).all() and other.truth is one.truth
-
-
 def test_a_rollout_longer_than_the_window_is_refused(model, batch):
     with pytest.raises(UsageError, match=r"2 \+ 3 frames do not fit windows of 4"):
         rollout(model, Blocks(), batch, frames=3, prompt=2)
@@ -390,14 +384,6 @@ def test_a_model_that_was_trained_without_actions_is_given_none(data, model):
     assert found["loss"] == pytest.approx(found["shuffled_loss"], abs=1e-5)
     assert found["loss"] != seeing["loss"]
     assert found["true"] == found["none"] == seeing["none"] and found["psnr_action_gain_last"] == 0
-
-
-def test_intervals_of_few_episodes_stay_within_what_is_possible():
-    values, episodes = np.array([0.9, 0.5]), [0, 1]
-    low, high = interval(values, episodes=episodes)
-    assert low < 0 and high > 1
-    assert interval(values, episodes=episodes, within=SHARE).tolist() == [0, 1]
-    assert interval(values, episodes=episodes, within=NATURAL).tolist() == [0, high]
 
 
 def test_no_interval_of_two_episodes_leaves_what_a_figure_can_be(tmp_path, model):

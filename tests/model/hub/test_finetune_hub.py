@@ -74,13 +74,6 @@ def test_a_revision_that_is_not_there_is_said_and_leaves_no_folder(published, le
     assert not (tmp_path / "new").exists()
 
 
-def test_of_a_folder_hub_by_its_uri_the_trunk_alone_comes_along(leg, tmp_path):
-    save(tmp_path / "model", {"arm": 2, "hand": 3})
-    hub.push(tmp_path / "model", (tmp_path / "hub/team/model").as_uri())
-    result = tune((tmp_path / "hub/team/model").as_uri(), leg, tmp_path / "run")
-    assert Checkpoint.open(result.checkpoint).embodiments == ("leg",)
-
-
 @pytest.mark.slow
 def test_the_command_finetunes_from_a_repository_and_the_run_goes_on_without_it(published, leg, tmp_path):
     cache = {"HF_ENDPOINT": published.url, "HF_HUB_CACHE": str(tmp_path / "c"), "HF_HUB_DISABLE_XET": "1"}

@@ -97,12 +97,6 @@ def test_a_repository_that_is_missing_without_a_code_is_made(server, source):
         hub.pull("team/none")
 
 
-def test_a_robot_pushed_again_unchanged_makes_no_commit_though_no_oid_is_told(published, source):
-    published.habits.tells_oids = False
-    hub.push(source, REPO, ["arm"])
-    assert kinds(published) == ["Add arm, hand"] and published.count("POST .*/commit/") == 0
-
-
 def test_what_a_hub_says_is_shown_but_never_the_token(server, source):
     said = json.dumps({"error": f"no room\nfor you, {TOKEN}"}).encode()
     server.fail("POST /api/repos/create", 400, body=said, times=9)

@@ -88,21 +88,6 @@ def test_a_licence_that_the_hub_refuses_is_told_before_anything_is_sent(server, 
 
 
 @pytest.mark.parametrize(
-    "request_", ["PUT /lfs/upload/", "POST .*/objects/batch", "POST /api/models/.*/commit/"]
-)
-def test_a_push_cut_for_good_leaves_the_repository_as_it_was(server, source, request_):
-    hub.push(source, REPO, ["arm"])
-    before = server.model(REPO).files
-    server.fail(request_, times=99, after=100)
-    with pytest.raises(HubError, match=r"connection was cut|out of reach"):
-        hub.push(source, REPO, ["hand"])
-    assert server.model(REPO).files == before
-    server.faults.clear()
-    hub.push(source, REPO, ["hand"])
-    assert set(HMA.from_pretrained(REPO).embodiments) == set(ROBOTS)
-
-
-@pytest.mark.parametrize(
     "fault", [{"status": 503}, {"status": 429, "headers": {"Retry-After": "7"}}, {"after": 10}],
     ids=["503", "429", "cut"],
 )  # fmt: skip

@@ -72,25 +72,6 @@ def test_logits_are_not_kept_in_training() -> None:
     assert model(small_batch(model.config, ["arm"]), "forward", seeded()).video_logits is None
 
 
-@pytest.mark.parametrize("objective", ["policy", "inverse", "full"])
-def test_action_loss_ignores_absent_chunks(objective: str) -> None:
-    model = small_model()
-    batch = small_batch(model.config, ["arm", "hand.v1"])
-    batch.action_mask[:, 2] = False
-    first = model(batch, objective, seeded()).action_loss
-    batch.actions[:, 2] += 100
-    assert torch.equal(first, model(batch, objective, seeded()).action_loss)
-    batch.actions[:, :2] += 100
-    assert not torch.equal(first, model(batch, objective, seeded()).action_loss)
-
-
-def test_policy_and_inverse_see_all_video() -> None:
-    model = small_model()
-    for objective in ("policy", "inverse"):
-        out = model(small_batch(model.config, ["arm"]), objective, seeded())
-        assert out.video_loss is None and not out.masked.any() and out.action_loss is not None
-
-
 @pytest.mark.parametrize("objective", ["forward", "policy"])
 def test_gradients_reach_exactly_the_stems_present(objective: str) -> None:
     model = small_model().train()
@@ -165,17 +146,6 @@ def test_every_parameter_of_every_combination_of_conditionings_learns(conditioni
         if parameter.grad is None or not parameter.grad.abs().sum() > 0
     ]
     assert not idle
-
-
-@pytest.mark.parametrize("conditioning", COMBINATIONS, ids="+".join)
-def test_every_combination_of_conditionings_is_causal(conditioning: tuple[str, ...]) -> None:
-    model = small_model(conditioning=conditioning, action_tokens=2)
-    batch, other = (small_batch(model.config, ["arm", "hand.v1"], seed=seed) for seed in (0, 1))
-    with torch.no_grad():
-        before = model.video_logits(batch.tokens, batch.actions, batch.embodiment)
-        batch.tokens[:, 3:], batch.actions[:, 2:] = other.tokens[:, 3:], other.actions[:, 2:]
-        after = model.video_logits(batch.tokens, batch.actions, batch.embodiment)
-    assert torch.equal(before[:, :3], after[:, :3]) and not torch.equal(before[:, 3], after[:, 3])
 
 
 @pytest.mark.parametrize("layout", ["ours", "released"])
@@ -264,12 +234,6 @@ def test_inverse_reads_the_frame_after_and_policy_does_not() -> None:
         one, two = (model.predict_actions(t, "arm", readout=readout) for t in (batch.tokens, changed))
         change = (one - two).abs().amax((0, 2))
         assert (change[:first] == 0).all() and change[first] > 0
-
-
-def test_continuous_loss_is_over_masked_patches() -> None:
-    model = small_model(kind="continuous")
-    out = model(small_batch(model.config, ["arm"]), "forward", seeded())
-    assert out.masked.shape == (1, 5, 4, 4) and not out.masked[:, 0].any() and torch.isfinite(out.loss)
 
 
 def test_masked_latents_are_not_seen() -> None:

@@ -77,17 +77,6 @@ def test_what_is_kept_whole_stays_as_it_is(nothing_more, changes, cache):
     assert torch.allclose(made, batch.latents[:, 1:2].expand_as(made), atol=1e-6)
 
 
-@pytest.mark.parametrize("changes", CHANGES, ids=str)
-def test_rollouts_with_and_without_the_cache_are_equal(changes):
-    model = _model(**changes).eval()
-    batch = _batch(model.config)
-    cached, whole = (
-        model.generate(batch.latents[:, :2], batch.actions, NAMES, 2, generator=seeded(), cache=cache)
-        for cache in (True, False)
-    )
-    assert torch.allclose(cached, whole, atol=1e-4)
-
-
 def test_a_predicted_past_keeps_the_frame_before(nothing_more):
     model = _model(1)
     batch = _batch(model.config)

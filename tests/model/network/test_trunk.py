@@ -82,22 +82,14 @@ def test_later_frames_and_actions_change_nothing_before_them(layout: dict) -> No
     assert (before[:, k:] - after[:, k:]).abs().amax((2, 3, 4, 5)).min() > 1e-4
 
 
-def test_a_chunk_first_acts_on_the_frame_after_it() -> None:
-    model = small_model()
+@pytest.mark.parametrize(("alignment", "first"), [("previous", 3), ("current", 2)])
+def test_a_chunk_acts_from_the_frame_on_that_its_alignment_names(alignment: str, first: int) -> None:
+    model = small_model(action_alignment=alignment)
     batch = small_batch(model.config, ["arm"])
     before = _logits(model, batch)
     batch.actions[:, 2] += 1
     change = (_logits(model, batch) - before).abs().amax((0, 2, 3, 4, 5))
-    assert change[:3].max() == 0 and change[3] > 1e-4
-
-
-def test_current_alignment_acts_on_the_frame_itself() -> None:
-    model = small_model(action_alignment="current")
-    batch = small_batch(model.config, ["arm"])
-    before = _logits(model, batch)
-    batch.actions[:, 2] += 1
-    change = (_logits(model, batch) - before).abs().amax((0, 2, 3, 4, 5))
-    assert change[:2].max() == 0 and change[2] > 1e-4
+    assert change[:first].max() == 0 and change[first] > 1e-4
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

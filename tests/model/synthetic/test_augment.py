@@ -475,15 +475,6 @@ def test_no_recording_is_called_scripted(one_sided: tuple[World, ShardSet], tmp_
             augment(tmp_path / "out", settings, world=world, shards=shards.folder)
 
 
-def test_a_robot_without_simulator_needs_shards(tmp_path: Path) -> None:
-    from tests.model.robots import make_model
-
-    world = object.__new__(World)
-    world.model, world._specs, world.precision = make_model({"arm": 2}), {}, "float32"
-    with pytest.raises(HMAError, match="arm: has no true simulator"):
-        augment(tmp_path / "out", Augmentation("arm"), world=world)
-
-
 def test_a_policy_that_plans_gets_the_judge(world, tmp_path, monkeypatch) -> None:
     class Planning(Still):
         def judged(self, judge: Any) -> None:

@@ -132,14 +132,6 @@ def test_waves_of_the_commands_belong_to_a_stem(base, leg, tmp_path):
     assert waves["leg"].weight.abs().max() > 0 and pulled.config.action_waves == 0
 
 
-def test_from_a_hub_and_back_into_it(base, leg, tmp_path):
-    hub.push(base.checkpoint, tmp_path / "hub" / "team" / "model")
-    result = tune(tmp_path / "hub" / "team" / "model", leg, tmp_path / "run")
-    hub.push(result.checkpoint, tmp_path / "hub" / "team" / "model", ["leg"])
-    pulled = hub.from_pretrained(tmp_path / "hub" / "team" / "model", ["leg", "arm"])
-    assert set(pulled.embodiments) == {"leg", "arm"}
-
-
 def test_a_known_robot_goes_on_with_its_stem_and_statistics(base, tmp_path):
     shards = make_shards(tmp_path / "arm", "arm", seed=9)
     result = tune(base.out, shards, tmp_path / "run", "steps=1", "lr=1e-12")

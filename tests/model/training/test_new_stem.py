@@ -61,12 +61,6 @@ def test_a_command_that_is_held_means_the_same_at_every_stride(steps, own_steps,
     assert torch.allclose(a, b, atol=1e-5)
 
 
-def test_each_command_goes_where_its_time_is():
-    weight = torch.arange(4.0).view(1, 4, 1)  # four steps of one dim
-    assert new_stem._resampled(weight, 4, 2).flatten().tolist() == [0 + 1, 2 + 3]
-    assert new_stem._resampled(weight + 1, 4, 8).flatten().tolist() == [0, 1, 0, 2, 0, 3, 0, 4]
-
-
 def test_the_stem_with_the_lowest_loss_is_taken(base, twin, tmp_path):
     opened, shards = Checkpoint.open(base.checkpoint), ShardSet(twin)
     model = checkpoint.load(base.checkpoint)

@@ -157,12 +157,6 @@ def torchrun(recipe, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_ranks_that_cannot_share_a_step_are_told(recipe, tmp_path):
-    said = errors(spread(recipe(batch_size=3, accumulate=1), tmp_path / "run", codes=(1, 1)))
-    assert len(said) == 1 and "3 windows a step cannot be shared evenly by 2 ranks" in said[0]
-
-
-@pytest.mark.slow
 def test_a_full_disk_on_the_first_rank_ends_all(recipe, tmp_path):
     work = partial(train_on_a_full_disk, recipe(), tmp_path / "run")
     said = errors(run_ranks(work, tmp_path / "said.txt", codes=(1, 1)))
@@ -192,18 +186,16 @@ def fail(rank: int) -> None:
     raise ShardError("here", "is gone")
 
 
-def test_a_rank_that_has_lost_the_others_finds_their_first_error():
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [(ShardError("here", "is gone"), "here: is gone"), (TypeError("no number"), "TypeError: no number")],
+)
+def test_a_rank_that_has_lost_the_others_finds_their_first_error(fault, said):
     store = dist.HashStore()
     assert read_error(store) is None
-    write_error(store, 1, ShardError("here", "is gone"))
-    write_error(store, 0, TypeError("another"))
-    assert str(read_error(store)) == "rank 1: here: is gone"
-
-
-def test_an_error_that_is_none_of_ours_is_written_with_its_kind():
-    store = dist.HashStore()
-    write_error(store, 0, TypeError("no number"))
-    assert str(read_error(store)) == "rank 0: TypeError: no number"
+    write_error(store, 1, fault)
+    write_error(store, 0, OSError("another"))
+    assert str(read_error(store)) == f"rank 1: {said}"
 
 
 def test_one_process_raises_its_own_error():

@@ -151,17 +151,6 @@ def test_the_folder_of_another_run_is_refused_with_what_differs(recipe, data, tm
     assert resolve(tmp_path / "run").name == "step-00000002"
 
 
-def test_shards_of_another_tokenizer_are_refused_in_the_folder_of_a_run(recipe, tmp_path):
-    from hma_data.tokenizers.base import TokenizerSpec
-    from tests.model.robots import SPEC
-
-    train(recipe(steps=2), out=tmp_path / "run", show=False)
-    spec = TokenizerSpec(**{**SPEC.to_json(), "name": "coded", "weights_sha256": "ab" * 32})
-    other = make_shards(tmp_path / "arm", "arm", spec=spec)
-    with pytest.raises((RecipeError, CheckpointError), match="data.arm"):
-        train(recipe(steps=2, data=[str(other)]), out=tmp_path / "run", show=False)
-
-
 def test_shards_of_two_tokenizers_are_refused_with_both_names(recipe, data, tmp_path):
     from hma_data.tokenizers.base import TokenizerSpec
     from tests.model.robots import SPEC
@@ -170,19 +159,6 @@ def test_shards_of_two_tokenizers_are_refused_with_both_names(recipe, data, tmp_
     other = make_shards(tmp_path / "hand", "hand", spec=spec)
     with pytest.raises(ShardError, match="tokenized by coded .* by raw"):
         train(recipe(data=[*data, str(other)]), out=tmp_path / "run", show=False)
-
-
-def test_a_run_may_go_on_with_other_workers(recipe, tmp_path):
-    whole = train(recipe(), out=tmp_path / "whole", show=False)
-
-    def kill(facts):
-        if facts["step"] == 4:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(recipe(), out=tmp_path / "cut", show=False, on_progress=kill)
-    again = train(recipe(workers=2), out=tmp_path / "cut", show=False)
-    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
 
 
 @pytest.mark.parametrize("ema", [0.0, 0.9])

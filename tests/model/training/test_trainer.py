@@ -12,7 +12,7 @@ from hma_model.training.loop import train
 from hma_model.training.optim import Average
 from hma_model.training.parallel import World
 from hma_model.training.run import Run
-from tests.model.runs import TINY, same, weights
+from tests.model.runs import TINY, weights
 
 
 def losses(recipe, out, **changes) -> list[float]:
@@ -122,19 +122,6 @@ def test_the_evaluation_is_that_of_the_averaged_weights(recipe, tmp_path):
     assert run.evaluate()["loss"] == pytest.approx(found, abs=1e-6)
 
 
-def test_a_killed_run_with_averages_goes_on_bit_for_bit(recipe, tmp_path):
-    whole = train(recipe(ema=0.9), out=tmp_path / "whole", show=False)
-
-    def kill(facts):
-        if facts["step"] == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(recipe(ema=0.9), out=tmp_path / "cut", show=False, on_progress=kill)
-    again = train(recipe(ema=0.9), out=tmp_path / "cut", show=False)
-    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
-
-
 # -- what a step says
 
 
@@ -186,17 +173,3 @@ def test_ranks_see_what_one_would_see_and_each_window_once(recipe, data, tmp_pat
         for number, batch in single.items():
             assert torch.equal(batch.tokens, shared[number].tokens)
             assert torch.equal(batch.frame, shared[number].frame)
-
-
-def test_ranks_draw_disjoint_windows_within_an_epoch(recipe, data, tmp_path):
-    given = recipe(data=data[:1], batch_size=2, accumulate=2)
-    sets = Run(given, tmp_path, torch.device("cpu")).sets
-    seen = []
-    for rank in range(2):
-        feed = TrainData(given, sets, World(rank, 2))
-        places = set()
-        for _ in range(6):
-            for _, batch in feed.step():
-                places |= set(zip(batch.episode.tolist(), batch.frame.tolist()))
-        seen.append(places)
-    assert seen[0] and not seen[0] & seen[1]
