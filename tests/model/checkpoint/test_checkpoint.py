@@ -3,13 +3,11 @@
 import hashlib
 import json
 import os
-import re
 import shutil
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 
 from hma_data.errors import CheckpointError
 from hma_model.checkpoint import io as checkpoint
@@ -28,10 +26,6 @@ def folder(tmp_path: Path) -> Path:
 
 def states(model) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in model.state_dict().items()}
-
-
-def edit_json(path: Path, **changes) -> None:
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
 def test_every_weight_comes_back_bit_for_bit(tmp_path):
@@ -84,68 +78,10 @@ def test_a_name_that_is_no_id_is_refused(folder, name):
         checkpoint.load(folder, [name])
 
 
-def test_a_stem_of_another_trunk_is_refused(folder, tmp_path):
-    save(tmp_path / "other", ROBOTS, seed=1)
-    shutil.rmtree(folder / "embodiments/arm")
-    shutil.copytree(tmp_path / "other/embodiments/arm", folder / "embodiments/arm")
-    with pytest.raises(CheckpointError, match="belongs to another trunk"):
-        checkpoint.load(folder, ["arm"])
-
-
-def test_a_trunk_put_in_place_of_the_own_is_refused(folder, tmp_path):
-    save(tmp_path / "other", ROBOTS, seed=1)
-    shutil.copy(tmp_path / "other/trunk.safetensors", folder / "trunk.safetensors")
-    with pytest.raises(CheckpointError, match="another trunk"):
-        checkpoint.load(folder)
-
-
-def test_a_changed_tokenizer_is_refused(folder):
-    edit_json(folder / "config.json", tokenizer={**SPEC.to_json(), "weights_sha256": "0" * 64})
-    with pytest.raises(CheckpointError, match="trained on another tokenizer"):
-        checkpoint.load(folder)
-
-
-def test_changed_statistics_are_refused(folder):
-    values = stats_of(2)
-    values["action"]["mean"][0] += 1e-6
-    (folder / "embodiments/arm/stats.json").write_text(json.dumps(values))
-    with pytest.raises(CheckpointError, match="other statistics"):
-        checkpoint.load(folder)
-
-
-def test_a_stem_of_another_push_than_its_card_is_refused(folder):
-    stem = folder / "embodiments/arm/stem.safetensors"
-    tensors, metadata = load_file(stem), read_metadata(stem)
-    tensors["input.weight"] += 1
-    save_file(tensors, stem, metadata)
-    with pytest.raises(CheckpointError, match=r"not the file that card\.json names"):
-        checkpoint.load(folder)
-
-
-@pytest.mark.parametrize(("version", "remedy"), [(2, "update"), (0, "save"), (None, "save"), ("1", "save")])
-def test_another_format_version_is_refused(folder, version, remedy):
-    edit_json(folder / "config.json", format_version=version)
-    with pytest.raises(CheckpointError, match=rf"format_version {version!r}.*{remedy}"):
-        checkpoint.load(folder)
-
-
-def test_a_checkpoint_of_another_library_is_refused(folder):
-    edit_json(folder / "config.json", library="diffusers")
-    with pytest.raises(CheckpointError, match="diffusers"):
-        checkpoint.load(folder)
-
-
 def test_a_tokenizer_other_than_the_models_is_refused_with_the_difference(folder):
     other = {**SPEC.to_json(), "image_size": 32}
     with pytest.raises(CheckpointError, match="image_size is 16 there and 32 here"):
         require_tokenizer(Checkpoint.open(folder).config, type(SPEC).from_json(other), folder)
-
-
-def test_truncated_weights_are_refused(folder):
-    stem = folder / "embodiments/arm/stem.safetensors"
-    stem.write_bytes(stem.read_bytes()[:-100])
-    with pytest.raises(CheckpointError, match="not whole safetensors"):
-        checkpoint.load(folder)
 
 
 def test_the_links_of_a_hub_cache_are_followed(folder, tmp_path):
@@ -219,11 +155,3 @@ def test_metrics_of_the_card_are_in_the_readme(folder):
 
 def test_the_config_comes_back(folder):
     assert Checkpoint.open(folder).config == CONFIG
-
-
-def test_a_hostile_card_stays_in_its_cell(folder):
-    edit_card(folder, "arm", robot="x | y\n\n# Title <script>alert(1)</script> [a](javascript:b)")
-    page = (folder / "README.md").read_text()
-    row = next(line for line in page.splitlines() if line.startswith("| `arm`"))
-    assert len(re.findall(r"(?<!\\)\|", row)) == 9
-    assert "Title" in row and not re.search(r"(?<!\\)[<\[]", row)

@@ -9,7 +9,7 @@ from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.io import Checkpoint
 from hma_model.hub import publish as hub
 from hma_model.training.loop import finetune
-from tests.hub_fixtures import REPO
+from tests.hub_state import REPO, ROBOTS
 from tests.model.processes import run_command
 from tests.model.robots import make_model, save
 from tests.model.shards import make_shards
@@ -27,25 +27,25 @@ def tune(source, leg, out, freeze=True):
     return finetune(str(source), [leg], out=out, freeze_trunk=freeze, overrides=SHORT, show=False)
 
 
-@pytest.mark.parametrize("freeze", [True, False])
-def test_of_a_repository_trunk_and_cards_are_fetched_for_a_new_robot(published, leg, tmp_path, freeze):
-    result = tune(REPO, leg, tmp_path / "run", freeze)
-    cards = {f"embodiments/{name}/card.json" for name in ("arm", "hand")}
-    assert set(published.served()) == {"config.json", "trunk.safetensors"} | cards
-    assert Checkpoint.open(result.checkpoint).embodiments == ("leg",)
+PARTS = {"stem.safetensors", "head.safetensors", "embodiment.yaml", "stats.json", "card.json"}
+ARM, CARDS = {f"embodiments/arm/{part}" for part in PARTS}, {f"embodiments/{n}/card.json" for n in ROBOTS}
 
 
-def test_a_robot_that_may_be_like_a_new_one_is_fetched_with_the_trunk(published, tmp_path):
-    result = tune(REPO, make_shards(tmp_path / "twin", "twin", dims=2, seed=3), tmp_path / "run", False)
-    stems = {name for name in published.served() if name.endswith("stem.safetensors")}
-    assert stems == {"embodiments/arm/stem.safetensors"}
-    assert Checkpoint.open(result.checkpoint).embodiments == ("twin",)
-
-
-def test_a_robot_that_the_repository_knows_is_fetched_with_the_trunk(published, tmp_path):
-    tune(REPO, make_shards(tmp_path / "arm", "arm", seed=5), tmp_path / "run")
-    served = {name for name in published.served() if name.startswith("embodiments/")}
-    assert served and all(name.startswith("embodiments/arm/") for name in served)
+@pytest.mark.parametrize(
+    ("name", "dims", "freeze", "parts"),
+    [
+        ("leg", 4, True, CARDS),
+        ("leg", 4, False, CARDS),
+        ("twin", 2, False, CARDS | ARM),  # may be like it
+        ("arm", 2, True, ARM),  # is known
+    ],
+)
+def test_the_trunk_is_fetched_with_what_concerns_the_robot(published, tmp_path, name, dims, freeze, parts):
+    result = tune(REPO, make_shards(tmp_path / name, name, dims=dims, seed=5), tmp_path / "run", freeze)
+    served = set(published.served())
+    assert {"config.json", "trunk.safetensors"} <= served
+    assert {one for one in served if one.startswith("embodiments/")} == parts
+    assert name in Checkpoint.open(result.checkpoint).embodiments
 
 
 def test_the_robot_joins_the_others_in_the_repository(published, leg, tmp_path):

@@ -1,98 +1,25 @@
-"""Damaged checkpoints and places that cannot be used: one clear error each, before anything is made."""
+"""Places that cannot be used, cards of strangers, and robots of different people on one trunk."""
 
+import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-from safetensors.numpy import load_file, save_file
+import torch
 
-from hma_data.errors import CheckpointError, HMAError, HubError
-from hma_data.storage.files import file_sha256
+from hma_data.errors import HMAError, HubError
 from hma_model.checkpoint import io as checkpoint
-from hma_model.checkpoint.folder import read_metadata
 from hma_model.hub import publish as hub
 from hma_model.hub.datasets import pull_data, push_data
-from hma_model.hub.listing import list_embodiments
-from tests.model.robots import save
+from hma_model.hub.listing import list_embodiments, survey
+from hma_model.network.model import HMA
+from tests.model.robots import make_model, save
 from tests.model.shards import make_shards
 
 pytest_plugins = ["tests.hub_fixtures"]
 
 
-def flip(path: Path, at: int = -5) -> None:
-    """Change one bit."""
-    content = bytearray(path.read_bytes())
-    content[at] ^= 4
-    path.write_bytes(content)
-
-
 def cut(path: Path, size: int) -> None:
     path.write_bytes(path.read_bytes()[:size])
-
-
-def replace(path: Path, old: str, new: str) -> None:
-    path.write_text(path.read_text().replace(old, new))
-
-
-def spoil(path: Path) -> None:
-    """Put a number into weights that is none, and their new digest into the card."""
-    tensors = load_file(path)
-    next(iter(tensors.values())).flat[0] = np.nan
-    before = file_sha256(path)
-    save_file(tensors, path, read_metadata(path))
-    replace(path.with_name("card.json"), before, file_sha256(path))
-
-
-ARM = "embodiments/arm/"
-DAMAGES = {
-    "a trunk cut short": ("trunk.safetensors", lambda path: cut(path, 1000)),
-    "an empty trunk": ("trunk.safetensors", lambda path: cut(path, 0)),
-    "no trunk": ("trunk.safetensors", Path.unlink),
-    "a bit of the head": (ARM + "head.safetensors", flip),
-    "a bit of the stem": (ARM + "stem.safetensors", flip),
-    "a bit of the stem's header": (ARM + "stem.safetensors", lambda path: flip(path, 12)),
-    "a bit of the header's length": (ARM + "stem.safetensors", lambda path: flip(path, 6)),
-    "a bit of the statistics": (ARM + "stats.json", flip),
-    "no head": (ARM + "head.safetensors", Path.unlink),
-    "an empty card": (ARM + "card.json", lambda path: cut(path, 0)),
-    "the card of another robot": (ARM + "card.json", lambda path: replace(path, '"id": "arm"', '"id": "x"')),
-    "a config cut short": ("config.json", lambda path: cut(path, 50)),
-    "YAML that is none": (ARM + "embodiment.yaml", lambda path: path.write_text("a: [1")),
-    "the YAML of another robot": (ARM + "embodiment.yaml", lambda path: replace(path, "id: arm", "id: hand")),
-    "YAML with another rate": (ARM + "embodiment.yaml", lambda path: replace(path, "hz: 10", "hz: 12")),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_checkpoint_is_neither_pushed_nor_pulled(folder, tmp_path, damage):
-    name, act = DAMAGES[damage]
-    act(folder / name)
-    of_card = damage.startswith("the card of")  # which the one who pulls can live with
-    pull = [] if of_card else [lambda: hub.pull(folder, out=tmp_path / "out")]
-    for act in (lambda: hub.push(folder, tmp_path / "hub"), *pull):
-        with pytest.raises(HMAError) as found:
-            act()
-        said = str(found.value)
-        assert "\n" not in said and found.value.remedy
-        assert Path(name).name in said or "stats.json" in said
-    assert not (tmp_path / "hub").exists()
-
-
-@pytest.mark.parametrize("part", ["stem.safetensors", "head.safetensors"])
-def test_weights_that_are_no_numbers_are_not_pushed(folder, tmp_path, part):
-    spoil(folder / ARM / part)
-    with pytest.raises(CheckpointError, match=rf"{part}: holds values in .* that are not finite"):
-        hub.push(folder, tmp_path / "hub")
-    assert not (tmp_path / "hub").exists()
-    assert hub.push(folder, tmp_path / "hub", ["hand"])
-
-
-def test_a_folder_without_a_checkpoint_is_not_pushed(tmp_path):
-    (tmp_path / "empty").mkdir()
-    for place in (tmp_path / "empty", tmp_path / "none"):
-        with pytest.raises(CheckpointError, match=r"no config\.json|no such folder"):
-            hub.push(place, tmp_path / "hub")
-    assert not (tmp_path / "hub").exists()
 
 
 @pytest.mark.parametrize("place", ["my hub/チーム/mö del", "a\nb", "%20 #x?y=1&z"])
@@ -150,3 +77,73 @@ def test_a_damaged_manifest_is_named_where_it_is(tmp_path):
     cut(shards / "manifest.json", 300)
     with pytest.raises(HMAError, match=rf"{shards}/manifest\.json: is damaged.*have it pushed again"):
         pull_data(shards, tmp_path / "out")
+
+
+def edit(path: Path, change) -> None:
+    values = json.loads(path.read_text())
+    change(values)
+    path.write_text(json.dumps(values))
+
+
+HOSTILE = (
+    "</td><script>alert(1)</script>| ![x](http://a.b/c) [y](javascript:1)\n\n# Title\n\n---\nlicense: mit"
+)
+
+
+def test_a_hostile_card_stays_text_in_its_cell(folder):
+    for key in ("robot", "license", "description"):
+        edit(folder / "embodiments/arm/card.json", lambda values, key=key: values.update({key: HOSTILE}))
+    edit(
+        folder / "embodiments/arm/card.json",
+        lambda v: v.update(metrics={HOSTILE: 1}, data=[HOSTILE], stride={}),
+    )
+    checkpoint.write_readme(folder)
+    page = (folder / "README.md").read_text()
+    rows = [row for row in page.splitlines() if row.startswith("| `arm`")]
+    assert len(rows) == 1 and rows[0].replace("\\|", "").count("|") == 9
+    assert "<script" not in page and "](http" not in page and "](javascript" not in page
+    assert [line for line in page.splitlines() if line.startswith("# ")] == ["# HMA world model"]
+    assert page.count("\n---\n") == 1 and "license: other" in page
+
+
+@pytest.mark.parametrize(
+    "values", [[], 7, {"metrics": [1], "data": 3, "files": "x", "license": {"a": []}}, {}]
+)
+def test_a_broken_card_of_somebody_else_stops_neither_list_nor_push(folder, tmp_path, values):
+    hub.push(folder, tmp_path / "hub", ["arm"])
+    (tmp_path / "hub/embodiments/arm/card.json").write_text(json.dumps(values))
+    hub.push(folder, tmp_path / "hub", ["hand"])
+    (facts,) = survey(tmp_path / "hub")
+    rows = {row["embodiment"]: row["problems"] for row in facts["embodiments"]}
+    assert rows["arm"] and not rows["hand"]
+    assert list(HMA.from_pretrained(str(tmp_path / "hub"), ["hand"]).embodiments) == ["hand"]
+
+
+def test_stems_trained_apart_generate_together_what_each_generates_alone(folder, tmp_path):
+    hub.push(folder, tmp_path / "hub", [])
+    for seed, (name, dims) in enumerate({"leg": 4, "gripper": 1, "base.v2": 3}.items()):
+        theirs = checkpoint.load(folder, [])
+        torch.manual_seed(seed)
+        theirs.add_embodiment(make_model({name: dims}, seed).embodiments[name])
+        with torch.no_grad():
+            for part in (theirs.stem(name), theirs.head(name)):
+                for parameter in part.parameters():
+                    parameter += 0.3 * torch.randn_like(parameter)
+        save(tmp_path / name, {name: dims}, model=theirs)
+        hub.push(tmp_path / name, tmp_path / "hub")
+    together = HMA.from_pretrained(str(tmp_path / "hub"))
+    made = []
+    for name, space in together.embodiments.items():
+        alone = HMA.from_pretrained(str(tmp_path / name))
+        assert list(alone.embodiments) == [name]
+        prompt = torch.randint(0, 64, (1, 2, 2, 3), generator=torch.Generator().manual_seed(1))
+        actions = torch.randn(1, 4, space.chunk_dim, generator=torch.Generator().manual_seed(2))
+        one, other = (
+            model.generate(prompt, actions, name, 2, generator=torch.Generator().manual_seed(3))
+            for model in (together, alone)
+        )
+        assert torch.equal(one, other)
+        seen = torch.cat([prompt, one], dim=1)
+        made.append(together.video_logits(seen, actions, name))
+        assert torch.equal(made[-1], alone.video_logits(seen, actions, name))
+    assert len(made) == 3 and not torch.equal(made[0], made[1])

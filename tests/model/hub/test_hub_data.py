@@ -138,21 +138,24 @@ def test_a_dataset_of_something_else_is_left_alone(server, shards):
         push_data(shards, REPO)
 
 
-def test_a_damaged_shard_is_not_published(server, shards):
-    path = shards / "train/shard-00000.parquet"
-    path.write_bytes(path.read_bytes()[:-1] + b"x")
-    with pytest.raises(
-        ShardError, match=r"train/shard-00000\.parquet: is not the file that manifest\.json names"
-    ):
-        push_data(shards, REPO)
-    assert server.log == []
+SHARD = "train/shard-00000.parquet"
 
 
-@pytest.mark.parametrize("name", ["embodiment.yaml", "episodes.parquet", "quarantine.jsonl", "manifest.json"])
-def test_a_set_with_another_file_than_its_manifest_names_is_not_published(server, shards, name):
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (SHARD, r"is not the file that manifest\.json names"),
+        *(
+            (one, ".*hma shards restat")
+            for one in ("embodiment.yaml", "episodes.parquet", "quarantine.jsonl")
+        ),
+        ("manifest.json", ".*hma shards restat"),
+    ],
+)
+def test_a_set_with_another_file_than_its_manifest_names_is_not_published(server, shards, name, said):
     path = shards / name
-    path.write_bytes(path.read_bytes() + b"\n")
-    with pytest.raises(ShardError, match=rf"{name}.*hma shards restat"):
+    path.write_bytes(path.read_bytes()[:-1] + (b"x" if name == SHARD else b"\n\n"))
+    with pytest.raises(ShardError, match=f"{name}.*{said}"):
         push_data(shards, REPO)
     assert server.log == []
 
@@ -166,41 +169,31 @@ def test_a_push_finds_that_another_robots_set_came_meanwhile(server, shards, tmp
     assert b"hand" in dataset(server).files["manifest.json"]
 
 
-@pytest.mark.parametrize("name", ["episodes.parquet", "embodiment.yaml", "quarantine.jsonl"])
-def test_a_small_file_that_is_not_the_manifests_is_refused_on_pulling(shards, tmp_path, name):
-    push_data(shards, tmp_path / "hub")
-    path = tmp_path / "hub" / name
-    path.write_bytes(path.read_bytes() + b"\n")
-    with pytest.raises(ShardError, match=rf"{name}: is not the file that manifest\.json names"):
-        pull_data(tmp_path / "hub", tmp_path / "out")
-    assert not (tmp_path / "out/manifest.json").exists()
+HOSTILE = {  # a file on the hub, what becomes of it, and what the error says
+    **{
+        name: (name, lambda content: content + b"\n", rf"{name}: is not the file that manifest\.json names")
+        for name in ("episodes.parquet", "embodiment.yaml", "quarantine.jsonl")
+    },
+    "a shard": (SHARD, lambda _: b"other", r"is not the shard that manifest\.json names"),
+    "a name elsewhere": (
+        "manifest.json", lambda content: content.replace(b"train/shard-00000", b"../../escaped"),
+        "is not the name of a shard",
+    ),
+    "a key twice": (
+        "manifest.json", lambda content: content.replace(b"{", b'{"shards": [],', 1),
+        r"manifest\.json: is damaged: key 'shards' is given twice",
+    ),
+}  # fmt: skip
 
 
-def test_a_shard_that_is_not_the_manifests_is_refused_on_pulling(server, shards, tmp_path):
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_hostile_set_is_refused_on_pulling(server, shards, tmp_path, case):
+    name, change, said = HOSTILE[case]
     push_data(shards, REPO)
-    dataset(server).commit({"train/shard-00000.parquet": b"other"})
-    with pytest.raises(ShardError, match="is not the shard that manifest.json names"):
+    dataset(server).commit({name: change(dataset(server).files[name])})
+    with pytest.raises(ShardError, match=said):
         pull_data(REPO, tmp_path / "out")
-    assert not (tmp_path / "out/manifest.json").exists()
-
-
-def test_a_manifest_that_names_files_elsewhere_is_refused(server, shards, tmp_path):
-    push_data(shards, REPO)
-    text = dataset(server).files["manifest.json"].decode()
-    dataset(server).commit({"manifest.json": text.replace("train/shard-00000", "../../escaped").encode()})
-    with pytest.raises(ShardError, match="is not the name of a shard"):
-        pull_data(REPO, tmp_path / "out")
-    assert not list(tmp_path.rglob("*escaped*"))
-
-
-def test_a_manifest_with_a_key_twice_is_refused(server, shards, tmp_path):
-    push_data(shards, REPO)
-    text = dataset(server).files["manifest.json"].decode()
-    dataset(server).commit({"manifest.json": text.replace("{", '{"shards": [],', 1).encode()})
-    with pytest.raises(ShardError, match=r"manifest\.json: is damaged: key 'shards' is given twice"):
-        pull_data(REPO, tmp_path / "out")
-    with pytest.raises(ShardError, match="is given twice"):
-        ShardSet(f"hf://datasets/{REPO}")
+    assert not (tmp_path / "out/manifest.json").exists() and not list(tmp_path.rglob("*escaped*"))
 
 
 def test_another_set_in_the_folder_is_not_overwritten(server, shards, tmp_path):
