@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from hma_data.registry.embodiment import Embodiment
@@ -18,6 +19,17 @@ SPEC = TokenizerSpec(
 CONFIG = HMAConfig(
     layers=1, width=16, heads=2, frames=4, grid=(2, 3), factored=(8, 8), tokenizer=SPEC.to_json()
 )
+
+
+class Blocks:
+    """A tokenizer of 16-pixel images whose cells have the grey of their id."""
+
+    spec = SPEC
+
+    def decode(self, tokens: np.ndarray) -> np.ndarray:
+        rows = np.repeat(tokens, 8, axis=1)
+        cells = np.repeat(rows, 6, axis=2)[:, :, :16]
+        return np.repeat((cells * 4).astype(np.uint8)[..., None], 3, axis=3)
 
 
 def yaml(name: str, dims: int = 2, stride: int = 2) -> str:

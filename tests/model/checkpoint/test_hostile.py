@@ -94,7 +94,7 @@ def fitted(edit: Edit) -> Edit:
 
 MODEL = [
     {"layers": 10**9}, {"width": 2**40, "heads": 8}, {"width": 2**19, "heads": 8},
-    {"factored": [10**6, 10**6]}, {"grid": [10**5, 10**5]}, {"frames": 10**6, "time_position": "learned"},
+    {"factored": [10**6, 10**6]}, {"grid": [10**5, 10**5]}, {"frames": 10**6, "layout": "released"},
     {"mlp_ratio": 1e300}, {"layers": 1.5}, {"layers": "9" * 999}, {"grid": None}, {"frames": 10**30},
     {"layers": [[]]}, {"kind": "continuous", "diffusion_width": 10**6, "grid": [2, 4]}, {"objectives": 7},
     {"conditioning": [{}]},

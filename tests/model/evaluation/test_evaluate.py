@@ -31,24 +31,13 @@ from hma_model.evaluation.suite import Part
 from hma_model.evaluation.tables import FIGURES, means
 from hma_model.evaluation.verdict import follows, verdict
 from hma_model.network.model import HMA
-from tests.model.robots import CONFIG, SPEC, make_model
+from tests.model.robots import CONFIG, SPEC, Blocks, make_model
 from tests.model.shards import make_shards
 
 
 def evaluate(model: HMA, tokenizer: Any, data: Any, **settings: Any) -> dict[str, Any]:
     """Return the figures of a model on a shard set."""
     return measure(model, tokenizer, data, Settings(**settings)).found
-
-
-class Blocks:
-    """A tokenizer of 16-pixel pictures whose cells have the grey of their id."""
-
-    spec = SPEC
-
-    def decode(self, tokens: np.ndarray) -> np.ndarray:
-        rows = np.repeat(tokens, 8, axis=1)
-        cells = np.repeat(rows, 6, axis=2)[:, :, :16]
-        return np.repeat((cells * 4).astype(np.uint8)[..., None], 3, axis=3)
 
 
 class Oracle(HMA):

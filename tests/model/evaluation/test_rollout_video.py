@@ -13,8 +13,7 @@ from hma_model.cli import main
 from hma_model.evaluation import rollout_video as module
 from hma_model.evaluation.rollout_video import lively_windows, rollout_video
 from hma_model.network.model import HMA
-from tests.model.evaluation.test_evaluate import Blocks
-from tests.model.robots import make_model, save
+from tests.model.robots import Blocks, make_model, save
 from tests.model.shards import make_shards
 
 LENGTH, PROMPT = 6, 2

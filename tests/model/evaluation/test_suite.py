@@ -22,8 +22,7 @@ from hma_model.evaluation.simulated import PERTURBATION, perturbed
 from hma_model.evaluation.suite import Settings, evaluate_all
 from hma_model.evaluation.tables import MEAN, absences, comparison, means, results
 from hma_model.evaluation.verdict import verdict
-from tests.model.evaluation.test_evaluate import Blocks
-from tests.model.robots import CONFIG, SPEC, make_model, save
+from tests.model.robots import CONFIG, SPEC, Blocks, make_model, save
 from tests.model.shards import make_shards
 
 SETTINGS = Settings(windows=3, draws=1)

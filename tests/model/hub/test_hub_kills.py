@@ -61,47 +61,68 @@ def parts(folder: Path, name: str) -> list[bytes]:
     return [(folder / "embodiments" / name / part).read_bytes() for part in PARTS]
 
 
-@pytest.mark.parametrize(
-    ("place", "begun", "most"),
-    [
-        ("folder", True, MOST),
-        *(
-            pytest.param(place, begun, most, marks=[pytest.mark.slow] if most == MOST else [])
-            for most in (SAMPLE, MOST)
-            for place, begun in (
-                ("folder", False),
-                ("file store", False),
-                ("file store", True),
-            )
-        ),
-    ],
-)
-def test_a_push_killed_anywhere_is_ended_by_the_same_command(versions, tmp_path, place, begun, most):
+class Killed(BaseException):
+    """Nothing comes after it."""
+
+
+def cut_in_memory(act: Callable[[], object], monkeypatch: pytest.MonkeyPatch, at: int) -> int:
+    """Run an act whose store does nothing from its change number `at` on; how many it did."""
+    done = 0
+    with monkeypatch.context() as patched:
+        for name in ("pipe_file", "put_file", "cp_file", "rm_file"):
+            plain = getattr(MemoryFileSystem, name)
+
+            def change(self: Any, *given: Any, plain: Any = plain, **options: Any) -> Any:
+                nonlocal done
+                if done == at:
+                    raise Killed
+                done += 1
+                return plain(self, *given, **options)
+
+            patched.setattr(MemoryFileSystem, name, change)
+        with suppress(Killed):
+            act()
+    return done
+
+
+PLACES = [(place, begun) for place in ("folder", "file store", "object store") for begun in (False, True)]
+PUSHES = [("folder", True, MOST), *((*one, SAMPLE) for one in PLACES if one != ("folder", True))]
+SLOW = [pytest.param(*one, MOST, marks=pytest.mark.slow) for one in PLACES if one != ("folder", True)]
+
+
+@pytest.mark.parametrize(("place", "begun", "most"), PUSHES + SLOW)
+def test_a_push_killed_anywhere_is_ended_by_the_same_command(
+    versions, tmp_path, monkeypatch, place, begun, most
+):
     old, new = versions
-    root, base = tmp_path / "hub", tmp_path / "base"
-    target = f"filestore://{root}" if place == "file store" else str(root)
-    base.mkdir()
-    if begun:
-        hub.push(old, base)
+    root, objects = tmp_path / "hub", fsspec.filesystem("memory").store
+    target = {"folder": str(root), "file store": f"filestore://{root}"}.get(place, "memory://hub/kills")
+    seen = target if place == "object store" else root
 
     def cut(at: int) -> int:
         shutil.rmtree(root, ignore_errors=True)
-        shutil.copytree(base, root)
+        objects.clear()
+        root.mkdir()
+        if begun:
+            hub.push(old, seen)
+        if place == "object store":
+            return cut_in_memory(lambda: hub.push(new, target), monkeypatch, at)
         return killed("push", (new, target), root, at)
 
     for at in moments(cut(MOST), most):
         assert cut(at) == at
+        got = tmp_path / f"got{at}"
         if begun:
-            assert parts(hub.pull(root, ["hand"]), "hand") == parts(old, "hand")
+            assert parts(hub.pull(seen, ["hand"], got), "hand") == parts(old, "hand")
         try:
-            assert parts(hub.pull(root, ["arm"]), "arm") in (parts(old, "arm"), parts(new, "arm"))
+            assert parts(hub.pull(seen, ["arm"], got), "arm") in (parts(old, "arm"), parts(new, "arm"))
         except (HubError, CheckpointError) as fault:
             assert not begun or "again" in str(fault.remedy), fault
         hub.push(new, target)
-        assert parts(hub.pull(root, ["arm"]), "arm") == parts(new, "arm")
-        assert "| `arm` |" in (root / "README.md").read_text()
-        left = [path.name for path in root.rglob("*") if ".part" in path.name]
-        assert not left
+        assert parts(hub.pull(seen, ["arm"], tmp_path / f"new{at}"), "arm") == parts(new, "arm")
+        assert place == "object store" or "| `arm` |" in (root / "README.md").read_text()
+        assert not [path for path in root.rglob("*") if ".part" in path.name]
+    objects.clear()
 
 
 @ALL_OR_SAMPLE
@@ -149,55 +170,3 @@ def test_a_pull_killed_anywhere_is_ended_by_the_same_command(versions, tmp_path,
         hub.pull(old, ["arm"], out)
         assert parts(out, "arm") == parts(old, "arm")
         assert not [path for path in out.rglob("*") if ".part" in path.name]
-
-
-class Killed(BaseException):
-    """Nothing comes after it."""
-
-
-def cut_in_memory(act: Callable[[], object], monkeypatch: pytest.MonkeyPatch, at: int) -> int:
-    """Run an act whose store does nothing from its change number `at` on; how many it did."""
-    done = 0
-    with monkeypatch.context() as patched:
-        for name in ("pipe_file", "put_file", "cp_file", "rm_file"):
-            plain = getattr(MemoryFileSystem, name)
-
-            def change(self: Any, *given: Any, plain: Any = plain, **options: Any) -> Any:
-                nonlocal done
-                if done == at:
-                    raise Killed
-                done += 1
-                return plain(self, *given, **options)
-
-            patched.setattr(MemoryFileSystem, name, change)
-        with suppress(Killed):
-            act()
-    return done
-
-
-@ALL_OR_SAMPLE
-@pytest.mark.parametrize("begun", [False, True])
-def test_a_push_to_an_object_store_killed_anywhere_is_ended_by_the_same_command(
-    versions, tmp_path, monkeypatch, begun, most
-):
-    old, new = versions
-    target, objects = "memory://hub/kills", fsspec.filesystem("memory").store
-
-    def cut(at: int) -> int:
-        objects.clear()
-        if begun:
-            hub.push(old, target)
-        return cut_in_memory(lambda: hub.push(new, target), monkeypatch, at)
-
-    for at in moments(cut(MOST), most):
-        assert cut(at) == at
-        got = tmp_path / f"got{at}"
-        if begun:
-            assert parts(hub.pull(target, ["hand"], got), "hand") == parts(old, "hand")
-        try:
-            assert parts(hub.pull(target, ["arm"], got), "arm") in (parts(old, "arm"), parts(new, "arm"))
-        except (HubError, CheckpointError) as fault:
-            assert not begun or "again" in str(fault.remedy)
-        hub.push(new, target)
-        assert parts(hub.pull(target, ["arm"], tmp_path / f"new{at}"), "arm") == parts(new, "arm")
-    objects.clear()

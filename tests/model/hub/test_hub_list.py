@@ -19,20 +19,15 @@ from hma_model.hub import publish as hub
 from hma_model.hub.listing import survey
 from hma_model.hub.sample import add_samples
 from tests.hub_server import connect, serve
-from tests.model.robots import SPEC, make_model, save
+from tests.model.robots import Blocks, make_model, save
 from tests.model.shards import make_shards
 
 ROBOTS = {"arm": 2, "hand": 3}
 
 
-class Flat:
-    """A tokenizer of 16-pixel pictures in six blocks; the token is the block's grey."""
-
-    spec = SPEC
-
-    def decode(self, tokens):
-        blocks = np.repeat(np.repeat((tokens * 4).astype(np.uint8), 8, axis=1), 6, axis=2)[:, :, :16]
-        return np.repeat(blocks[..., None], 3, axis=3)
+@pytest.fixture
+def painted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Blocks())
 
 
 @pytest.fixture
@@ -137,8 +132,7 @@ def test_a_released_repository_is_listed_without_its_weights_being_sent(shelf, t
 # -- the sample picture
 
 
-def test_a_sample_shows_truth_and_predictions_over_time(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Flat())
+def test_a_sample_shows_truth_and_predictions_over_time(folder, tmp_path, painted):
     path, film = add_samples(folder, [make_shards(tmp_path / "shards", "arm")])
     picture = np.asarray(Image.open(path))
     height, width = picture.shape[:2]
@@ -148,8 +142,7 @@ def test_a_sample_shows_truth_and_predictions_over_time(folder, tmp_path, monkey
         assert opened.size[0] > 3 * 192
 
 
-def test_the_picture_is_pushed_with_its_embodiment_and_shown_in_the_card(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Flat())
+def test_the_picture_is_pushed_with_its_embodiment_and_shown_in_the_card(folder, tmp_path, painted):
     add_samples(folder, [make_shards(tmp_path / "shards", "arm")])
     hub.push(folder, tmp_path / "hub")
     page = (tmp_path / "hub/README.md").read_text()
@@ -158,8 +151,7 @@ def test_the_picture_is_pushed_with_its_embodiment_and_shown_in_the_card(folder,
     assert (home / "sample.png").is_file() and (home / "sample.gif").is_file()
 
 
-def test_new_weights_take_the_film_of_older_ones_from_the_hub(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Flat())
+def test_new_weights_take_the_film_of_older_ones_from_the_hub(folder, tmp_path, painted):
     bare = shutil.copytree(folder, tmp_path / "bare")
     add_samples(folder, [make_shards(tmp_path / "shards", "arm")])
     hub.push(folder, tmp_path / "hub")
@@ -190,16 +182,14 @@ def test_weights_of_ones_own_are_named_where_a_model_is_listed(tmp_path):
     assert 'get_tokenizer("fsq-lab")' in usual
 
 
-def test_the_command_makes_the_picture_on_pushing(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Flat())
+def test_the_command_makes_the_picture_on_pushing(folder, tmp_path, painted):
     shards = make_shards(tmp_path / "shards", "hand", dims=3)
     call = ["hub", "push", str(folder), str(tmp_path / "hub"), "--sample", str(shards)]
     assert CliRunner().invoke(app, call).exit_code == 0
     assert (tmp_path / "hub/embodiments/hand/sample.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_a_runs_own_shards_make_the_film_while_they_are_there(folder, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Flat())
+def test_a_runs_own_shards_make_the_film_while_they_are_there(folder, tmp_path, painted, capsys):
     run = tmp_path / "run"
     (run / "checkpoints").mkdir(parents=True)
     folder.rename(run / "checkpoints" / "step-00000001")

@@ -20,62 +20,32 @@ def actor(*objectives: str) -> World:
     return World(tiny_model(ROBOT, *objectives), get_tokenizer("fsq-8"), temperature=0.0)
 
 
-def test_it_actions_what_the_history_of_images_and_actions_says() -> None:
+@pytest.mark.parametrize("memory", [None, 1, 3])
+def test_it_does_what_the_history_of_images_and_actions_says_or_its_newest_part(memory: int | None) -> None:
     world = actor("policy")
     arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
-    policy, stride = Acting(world, arena.scenes), arena.scenes.stride
-    frames = [np.stack([prompt.frames for prompt in arena.prompts])]
-    chunks = [np.stack([prompt.chunks for prompt in arena.prompts])]
-    begin("it", policy, arena)
-    for _ in range(4):
-        told = torch.from_numpy(np.concatenate([*chunks, np.zeros_like(chunks[0][:, :1])], axis=1))
-        shown = np.concatenate(frames, axis=1)
-        tokens = np.stack([world.tokenizer.encode(one) for one in shown]).astype(np.int64)
-        first = max(0, tokens.shape[1] - 20)
-        known = torch.ones(told.shape[:2], dtype=torch.bool)
-        wanted = world.model.predict_actions(
-            torch.from_numpy(tokens)[:, first:], ROBOT, told[:, first:], known[:, first:]
-        )[:, -1].numpy()
-        spec = world.action_spec(ROBOT)
-        low, high = spec.low, spec.high
-        given = []
-        for _ in range(stride):
-            given.append(checked("it", policy, arena))
-            arena.step(given[-1])
-        made = np.stack(given, axis=1)
-        if spec.seen is not None:
-            wanted = np.clip(wanted.reshape(made.shape), low, high)
-        np.testing.assert_allclose(made.reshape(2, -1), wanted.reshape(2, -1), atol=1e-3)
-        frames.append(arena.images[:, None])
-        chunks.append(made.reshape(2, 1, -1))
-    assert not np.allclose(given[0], given[0][:1])  # the scenes differ, and so do the actions
-
-
-@pytest.mark.parametrize("memory", [1, 3])
-def test_with_a_short_memory_it_goes_by_the_newest_images_alone(memory: int) -> None:
-    world = actor("policy")
-    arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 128)
-    policy, stride = Acting(world, arena.scenes, memory=memory), arena.scenes.stride
+    own = {} if memory is None else {"memory": memory}
+    policy, stride, spec = Acting(world, arena.scenes, **own), arena.scenes.stride, world.action_spec(ROBOT)
     frames = np.stack([prompt.frames for prompt in arena.prompts])
     chunks = np.stack([prompt.chunks for prompt in arena.prompts])
     begin("it", policy, arena)
-    for _ in range(3):
-        tokens = np.stack([world.tokenizer.encode(one[-memory:]) for one in frames]).astype(np.int64)
-        told = np.concatenate([chunks, np.zeros_like(chunks[:, :1])], axis=1)[:, -memory:]
+    for _ in range(4):
+        first = -(memory or 20)
+        tokens = np.stack([world.tokenizer.encode(one[first:]) for one in frames]).astype(np.int64)
+        told = np.concatenate([chunks, np.zeros_like(chunks[:, :1])], axis=1)[:, first:]
         known = torch.ones(told.shape[:2], dtype=torch.bool)
         wanted = world.model.predict_actions(torch.from_numpy(tokens), ROBOT, torch.from_numpy(told), known)
         given = []
         for _ in range(stride):
             given.append(checked("it", policy, arena))
             arena.step(given[-1])
-        made = np.stack(given, axis=1).reshape(2, -1)
-        spec = world.action_spec(ROBOT)
-        low, high = np.tile(spec.low, stride), np.tile(spec.high, stride)
-        said = wanted[:, -1].numpy()
-        said = np.clip(said, low, high) if spec.seen is not None else said
+        made = np.stack(given, axis=1)
+        said = wanted[:, -1].numpy().reshape(made.shape)
+        said = said if spec.seen is None else np.clip(said, spec.low, spec.high)
         np.testing.assert_allclose(made, said, atol=1e-3)
         frames = np.concatenate([frames, arena.images[:, None]], axis=1)
-        chunks = np.concatenate([chunks, made[:, None]], axis=1)
+        chunks = np.concatenate([chunks, made.reshape(2, 1, -1)], axis=1)
+    assert not np.allclose(given[0], given[0][:1])  # the scenes differ, and so do the actions
 
 
 def test_what_it_imagines_ahead_is_forgotten() -> None:

@@ -18,7 +18,7 @@ from tests.command import fails, hma
 from tests.conftest import contents as files
 from tests.model.processes import run_command
 from tests.model.robots import SPEC
-from tests.model.runs import TINY, same, weights
+from tests.model.runs import TINY, kill_at, same, weights
 from tests.model.shards import make_shards
 
 SHORT = [
@@ -42,12 +42,24 @@ def tune(base, leg, out, *changes, freeze=True, **options) -> TrainResult:
     return finetune(base, [leg], out=out, freeze_trunk=freeze, overrides=overrides, show=False, **options)
 
 
-def test_a_frozen_trunk_and_the_other_robots_stay_byte_for_byte(base, leg, tmp_path):
-    result = tune(base.out, leg, tmp_path / "run")
+@pytest.fixture(scope="module", params=[True, False], ids=["frozen", "tuned"])
+def tuned(tiny_run, request, tmp_path_factory) -> tuple[bool, TrainResult]:
+    """Four steps on a new robot; whether the trunk was frozen."""
+    folder = tmp_path_factory.mktemp("tuned")
+    leg, before = make_shards(folder / "leg", "leg", dims=4, seed=2), files(tiny_run.out)
+    result = tune(tiny_run.out, leg, folder / "run", freeze=request.param)
+    assert files(tiny_run.out) == before
+    return request.param, result
+
+
+def test_a_frozen_trunk_and_the_other_robots_stay_and_a_tuned_one_leaves_them_behind(base, tuned):
+    frozen, result = tuned
+    opened, source = Checkpoint.open(result.checkpoint), Checkpoint.open(base.checkpoint)
+    assert opened.embodiments == (("arm", "hand", "leg") if frozen else ("leg",))
+    assert (opened.trunk_sha256 == source.trunk_sha256) == frozen
     before, after = files(base.checkpoint), files(result.checkpoint)
     kept = [name for name in before if name.startswith(("embodiments/", "trunk", "config"))]
-    assert len(kept) == 12 and all(before[name] == after[name] for name in kept)
-    assert Checkpoint.open(result.checkpoint).embodiments == ("arm", "hand", "leg")
+    assert len(kept) == 12 and all(before[name] == after.get(name) for name in kept) == frozen
     checkpoint.load(result.checkpoint)
 
 
@@ -59,30 +71,15 @@ def test_the_new_stem_learns_while_the_trunk_is_frozen(base, leg, tmp_path):
     assert not any(name.startswith("training") and "trunk" in name for name in a)
 
 
-def test_a_tuned_trunk_leaves_the_other_robots_behind(base, leg, tmp_path):
-    result = tune(base.out, leg, tmp_path / "run", freeze=False)
+def test_the_new_robots_statistics_and_card_are_there_and_the_network_is_the_checkpoints(tuned):
+    frozen, result = tuned
     opened = Checkpoint.open(result.checkpoint)
-    assert opened.embodiments == ("leg",)
-    assert opened.trunk_sha256 != Checkpoint.open(base.checkpoint).trunk_sha256
-    assert opened.card("leg")["training"]["trunk"] == "tuned"
-
-
-def test_the_source_is_not_touched(base, leg, tmp_path):
-    before = files(base.out)
-    tune(base.out, leg, tmp_path / "run", freeze=False)
-    assert files(base.out) == before
-
-
-def test_the_new_robots_yaml_statistics_and_card_are_there(base, leg, tmp_path):
-    opened = Checkpoint.open(tune(base.out, leg, tmp_path / "run").checkpoint)
     assert opened.embodiment("leg").action_dim == 4
     assert len(opened.stats("leg")["action"]["mean"]) == 4
-    card = opened.card("leg")
-    assert card["training"]["from_trunk_sha256"] == opened.trunk_sha256 and card["metrics"]["val_loss"] > 0
-
-
-def test_the_network_and_the_window_are_the_checkpoints(base, leg, tmp_path):
-    config = Checkpoint.open(tune(base.out, leg, tmp_path / "run", freeze=False).checkpoint).config
+    card, source = opened.card("leg"), opened.card("leg")["training"]
+    assert (source["from_trunk_sha256"] == opened.trunk_sha256) == frozen and card["metrics"]["val_loss"] > 0
+    assert source["trunk"] == ("frozen" if frozen else "tuned")
+    config = opened.config
     assert (config.width, config.mup, config.frames) == (16, True, TINY["frames"])
 
 
@@ -140,42 +137,42 @@ def test_a_known_robot_goes_on_with_its_stem_and_statistics(base, tmp_path):
         assert torch.allclose(a[name].float(), b[name].float(), atol=1e-9), name
 
 
-def test_a_known_robot_with_other_actions_is_refused(base, tmp_path):
-    shards = make_shards(tmp_path / "arm", "arm", dims=5)
-    with pytest.raises(CheckpointError, match="has arm with action_dim 2, the shards have 5"):
-        tune(base.out, shards, tmp_path / "run")
+CODED = TokenizerSpec(**{**SPEC.to_json(), "name": "coded", "weights_sha256": "ab" * 32})
 
 
-def test_another_tokenizer_is_refused_with_both_names(base, tmp_path):
-    spec = TokenizerSpec(**{**SPEC.to_json(), "name": "coded", "weights_sha256": "ab" * 32})
-    shards = make_shards(tmp_path / "leg", "leg", dims=4, spec=spec)
-    with pytest.raises(CheckpointError, match="tokenizer 'raw', this is 'coded'"):
-        tune(base.out, shards, tmp_path / "run")
-
-
-def test_another_network_is_refused(base, leg, tmp_path):
-    with pytest.raises(RecipeError, match=r"model\.width.*is 32, .* has 16"):
-        tune(base.out, leg, tmp_path / "run", "model.width=32")
-    with pytest.raises(RecipeError, match=r"digits: gives digits of \(64,\), the checkpoint has \(8, 8\)"):
-        tune(base.out, leg, tmp_path / "run", "digits=64")
-    assert tune(base.out, leg, tmp_path / "same", "digits=8").step == 4
+@pytest.mark.parametrize(
+    ("name", "shards", "changes", "fault", "said"),
+    [
+        ("arm", {"dims": 5}, (), CheckpointError, "has arm with action_dim 2, the shards have 5"),
+        ("leg", {"spec": CODED}, (), CheckpointError, "tokenizer 'raw', this is 'coded'"),
+        ("leg", {}, ("model.width=32",), RecipeError, r"model\.width.*is 32, .* has 16"),
+        ("leg", {}, ("digits=64",), RecipeError, r"gives digits of \(64,\), the checkpoint has \(8, 8\)"),
+        ("leg", {}, ("model.layers=3",), RecipeError, r"model\.layers"),
+        ("leg", {}, ("mixture.weights.lag=2",), RecipeError, r"mixture\.weights"),
+        ("leg", {}, ("batch_size=900",), RecipeError, "900 windows a step"),
+    ],
+)
+def test_what_does_not_fit_the_checkpoint_is_refused_and_leaves_no_folder(
+    base, tmp_path, name, shards, changes, fault, said
+):
+    with pytest.raises(fault, match=said):
+        tune(base.out, make_shards(tmp_path / name, name, **shards), tmp_path / "new/run", *changes)
+    assert not (tmp_path / "new").exists()
 
 
 def test_how_it_is_trained_may_differ(base, leg, tmp_path):
-    assert tune(base.out, leg, tmp_path / "run", "model.label_smoothing=0.1", "model.width=16").step == 4
+    assert (
+        tune(base.out, leg, tmp_path / "run", "model.label_smoothing=0.1", "model.width=16", "digits=8").step
+        == 4
+    )
 
 
 def test_a_killed_finetuning_goes_on_bit_for_bit_though_its_source_is_gone(base, leg, tmp_path):
     whole = tune(base.out, leg, tmp_path / "whole", freeze=False)
     source = tmp_path / "hub"
     hub.push(base.checkpoint, source)
-
-    def kill(facts):
-        if facts["step"] == 3:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        tune(source, leg, tmp_path / "cut", freeze=False, on_progress=kill)
+        tune(source, leg, tmp_path / "cut", freeze=False, on_progress=kill_at(3))
     kept = source.rename(tmp_path / "elsewhere")
     again = tune(source, leg, tmp_path / "cut", freeze=False)
     assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
@@ -232,13 +229,6 @@ def test_a_damaged_source_is_named_and_leaves_no_folder(base, leg, tmp_path):
     with pytest.raises(CheckpointError, match=rf"{trunk}: is another trunk"):
         tune(damaged, leg, tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("change", ["model.layers=3", "mixture.weights.lag=2", "batch_size=900"])
-def test_a_run_that_cannot_begin_leaves_no_folder(base, leg, tmp_path, change):
-    with pytest.raises(RecipeError):
-        tune(base.out, leg, tmp_path / "new/run", change)
-    assert not (tmp_path / "new").exists()
 
 
 def test_a_path_that_looks_like_a_repository_is_told_to_be_neither(leg, tmp_path, monkeypatch):

@@ -18,7 +18,7 @@ from hma_model.training.loop import train
 from hma_model.training.parallel import World
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import errors
-from tests.model.runs import TINY, same
+from tests.model.runs import TINY, same, train_until
 from tests.model.shards import make_shards
 from tests.model.training.test_parallel import spread
 
@@ -78,13 +78,7 @@ def test_steps_left_out_are_counted_everywhere_and_go_on_being_counted(tmp_path,
     whole = train(skipping, out=tmp_path / "whole", show=False)
     bad = [step for step, loss, _ in taken(tmp_path / "whole") if loss is None]
     assert 1 < whole.skipped == len(bad) == taken(tmp_path / "whole")[-1][2] < 16
-
-    def kill(facts):
-        if facts["step"] == bad[0] + 1:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(skipping, out=tmp_path / "cut", show=False, on_progress=kill)
+    train_until(skipping, tmp_path / "cut", bad[0] + 1)
     capsys.readouterr()
     again = train(skipping, out=tmp_path / "cut")
     assert taken(tmp_path / "cut") == taken(tmp_path / "whole") and again.skipped == whole.skipped

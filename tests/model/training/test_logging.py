@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import numpy as np
 import pytest
 from PIL import Image
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
@@ -17,33 +16,21 @@ from tensorboard.compat.tensorflow_stub.errors import OutOfRangeError
 from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import PyRecordReader_New
 
 from hma_data.errors import MissingDependencyError, OutputError
-from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint.folder import resolve
 from hma_model.training import logging as runlog
 from hma_model.training.logging import RunLog, read_metrics
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
 from hma_model.training.report import write_report
-from tests.model.runs import TINY
+from tests.model.robots import Blocks
+from tests.model.runs import TINY, train_until
 
 SEEN = {"report": True, "pictures": 2, "track": ["tensorboard"]}
 
 
-class Painter:
-    """Decodes a token to a patch of its grey."""
-
-    spec = TokenizerSpec(
-        name="raw", version=1, kind="discrete", image_size=16, grid=(2, 3), vocab_size=64, factored=(8, 8)
-    )
-
-    def decode(self, tokens):
-        grey = (tokens * 4).astype(np.uint8)
-        return np.repeat(np.repeat(np.repeat(grey[..., None], 3, -1), 8, 1), 6, 2)
-
-
 @pytest.fixture
 def painter(monkeypatch):
-    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Painter())
+    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Blocks())
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +38,7 @@ def seen(data, tmp_path_factory) -> Path:
     """The folder of a short run with everything to see."""
     out = tmp_path_factory.mktemp("seen") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Painter())
+        patch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Blocks())
         train(make_recipe({**TINY, **SEEN, "data": data}), out=out, show=False)
     return out
 
@@ -84,7 +71,9 @@ def test_event_files_have_a_version_every_step_and_every_evaluation(run):
     (path,) = (run / "tensorboard").iterdir()
     first, *rest = events(path)
     assert first.file_version == "brain.Event:2"
-    assert len(values(rest, "train/loss")) == 6 and len(values(rest, "eval/loss")) == 2
+    losses = [line["loss"] for line in read_metrics(run) if line["kind"] == "train"]
+    assert values(rest, "train/loss") == pytest.approx(losses, rel=1e-6)
+    assert len(losses) == 6 and len(values(rest, "eval/loss")) == 2
     assert len(values(rest, "train_loss/arm")) == 6
     images = [v.image for event in rest for v in event.summary.value if v.HasField("image")]
     assert len(images) == 4
@@ -93,21 +82,9 @@ def test_event_files_have_a_version_every_step_and_every_evaluation(run):
             assert opened.size == (image.width, image.height)
 
 
-def test_figures_in_event_files_are_those_of_the_metrics(run):
-    (path,) = (run / "tensorboard").iterdir()
-    losses = [line["loss"] for line in read_metrics(run) if line["kind"] == "train"]
-    assert values(events(path), "train/loss") == pytest.approx(losses, rel=1e-6)
-
-
 def test_a_resumed_run_supersedes_what_was_written_beyond_its_step(data, tmp_path):
     given = {**TINY, "data": data, "track": ["tensorboard"]}
-
-    def kill(facts):
-        if facts["step"] == 5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(make_recipe(given), out=tmp_path / "run", show=False, on_progress=kill)
+    train_until(make_recipe(given), tmp_path / "run", 5)
     train(make_recipe(given), out=tmp_path / "run", show=False)
     first, second = sorted((tmp_path / "run" / "tensorboard").iterdir())
     assert len(values(events(first), "train/loss")) == 5

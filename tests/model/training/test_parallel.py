@@ -23,7 +23,7 @@ from hma_model.training.loop import train
 from hma_model.training.parallel import ParallelModel, World, join, read_error, report_once, write_error
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import ROOT, errors, run_ranks
-from tests.model.runs import TINY, weights
+from tests.model.runs import TINY, train_until, weights
 
 
 @pytest.fixture(scope="module")
@@ -71,17 +71,6 @@ def alive(pid: int) -> bool:
 
 def curve(out: Path) -> list[float]:
     return [line["loss"] for line in read_metrics(out) if line["kind"] == "train"]
-
-
-def train_until(recipe, out: Path, step: int) -> None:
-    """Train and be killed after a step."""
-
-    def kill(facts) -> None:
-        if facts["step"] == step:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(recipe, out=out, show=False, on_progress=kill)
 
 
 def close(one: Path, other: Path) -> None:

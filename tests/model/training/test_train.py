@@ -27,20 +27,8 @@ from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
 from hma_model.training.resume import seed_for
 from hma_model.training.runtime import own_folder
-from tests.model.runs import TINY, same
+from tests.model.runs import TINY, same, train_until
 from tests.model.shards import make_shards
-
-
-class StopAt(Exception):
-    """Stands for a kill."""
-
-
-def kill_at(step: int):
-    def kill(facts) -> None:
-        if facts["step"] == step:
-            raise StopAt
-
-    return kill
 
 
 @pytest.mark.slow
@@ -90,8 +78,7 @@ def test_a_killed_run_goes_on_bit_for_bit(recipe, tmp_path, cut):
         "objectives": {"forward": 1, "full": 1},
     }
     whole = train(recipe(**changes), out=tmp_path / "whole", show=False)
-    with pytest.raises(StopAt):
-        train(recipe(**changes), out=tmp_path / "cut", show=False, on_progress=kill_at(killed_after))
+    train_until(recipe(**changes), tmp_path / "cut", killed_after)
     again = train(recipe(**changes, **later), out=tmp_path / "cut", show=False)
     assert again.losses == whole.losses and [step for step, _ in again.losses] == list(range(1, 7))
     assert same(whole.checkpoint, again.checkpoint)
@@ -140,8 +127,7 @@ def test_force_goes_on_with_a_changed_recipe(recipe, tmp_path):
 
 def test_moved_shards_are_the_same_shards(recipe, tmp_path):
     shards = make_shards(tmp_path / "arm", "arm")
-    with pytest.raises(StopAt):
-        train(recipe(data=[str(shards)]), out=tmp_path / "run", show=False, on_progress=kill_at(3))
+    train_until(recipe(data=[str(shards)]), tmp_path / "run", 3)
     shards.rename(tmp_path / "elsewhere")
     assert train(recipe(data=[str(tmp_path / "elsewhere")]), out=tmp_path / "run", show=False).step == 6
 
@@ -158,9 +144,7 @@ def test_a_budget_of_cpu_seconds_ends_the_run_and_bends_the_rate(recipe, tmp_pat
     monkeypatch.setattr(time, "process_time", lambda: float(next(clock)))
     given = {"steps": 1000, "cpu_seconds": 5.0, "warmup": 0, "schedule": "cosine", "lr_end": 0.0}
     made = recipe(**given, checkpoint_every=2, eval_every=0)
-
-    with pytest.raises(StopAt):
-        train(made, out=tmp_path / "run", show=False, on_progress=kill_at(3))
+    train_until(made, tmp_path / "run", 3)
     result = train(made, out=tmp_path / "run", show=False)
     assert (result.step, result.interrupted) == (5, False)
     rates = [line["lr"] for line in read_metrics(result.out) if line["kind"] == "train"]

@@ -12,8 +12,7 @@ from hma_data.shards.reader import ShardSet
 from hma_model.cli import main
 from hma_model.training import view as module
 from tests.data.inspection.test_view import pictures, read, seconds
-from tests.model.evaluation.test_evaluate import Blocks
-from tests.model.robots import save
+from tests.model.robots import Blocks, save
 from tests.model.shards import make_shards
 
 
