@@ -8,7 +8,6 @@ import pytest
 
 from hma_data.errors import HMAError, UsageError
 from recipes.bench import drift
-from tests.model import embedded
 
 BATCH, FRAMES = 3, 50
 FRAME_NUMBERS = drift.looked_at(FRAMES, False)[1]
@@ -114,8 +113,7 @@ def test_ways_of_sampling_are_told_apart_by_the_words_that_differ() -> None:
 
 
 @pytest.mark.slow
-def test_rollouts_are_measured_and_drawn_and_repeat_themselves(tmp_path, monkeypatch) -> None:
-    embedded.embedded(tmp_path / "made", monkeypatch)
+def test_rollouts_are_measured_and_drawn_and_repeat_themselves(tmp_path) -> None:
     robot = next(iter(drift_robots()))
     changes = {"robots": robot, "frames": 12, "rollouts": 2, "sampling": "unmask_steps=1/temperature=1.0"}
     settings = drift.BENCH.defaults | changes | {"sheet": str(tmp_path / "sheet.png")}

@@ -16,7 +16,6 @@ from hma_model.demo.results import Demo
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.rollout_video import RolloutVideo
 from hma_model.evaluation.verdict import verdict
-from tests.model.embedded import embedded
 
 
 @pytest.mark.slow
@@ -25,7 +24,6 @@ def test_a_demo_that_was_cut_goes_on_by_the_same_command(tmp_path, monkeypatch) 
         raise KeyboardInterrupt
 
     out = tmp_path / "demo"
-    embedded(tmp_path / "embedded", monkeypatch)
     monkeypatch.setattr(demos, "usable_cores", lambda: 1)
     monkeypatch.setattr(demos, "WINDOWS", 2)
     monkeypatch.setattr(demos, "LONGEST", 6)

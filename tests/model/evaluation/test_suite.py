@@ -295,13 +295,10 @@ def test_recorded_pictures_are_of_the_camera_that_the_window_takes(cameras: str,
 @pytest.mark.slow
 def test_the_state_of_a_laboratory_robot_is_read_beside_the_probes_error() -> None:
     from hma_data.tokenizers.base import get_tokenizer
-    from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
     from hma_model.evaluation.simulated import measure_state
     from hma_model.network.model import HMA
 
-    if not EMBEDDED.is_dir():
-        pytest.skip("the package has no embedded model")
-    robot = "rails_03" if "rails_03" in Checkpoint.open("embedded").embodiments else "planar_arm"
+    robot = "rails_03"
     model = HMA.from_pretrained("embedded", embodiments=[robot]).eval()
     tokenizer = get_tokenizer(str(model.config.tokenizer["name"]))
     found = measure_state(model, tokenizer, robot, frames=6, prompt=2, episodes=4)

@@ -1,29 +1,20 @@
-"""The checkpoint that comes along with the package: found by its name, and refused when damaged."""
-
-from pathlib import Path
-
-import pytest
+"""The checkpoint that comes along with the package, by its name."""
 
 from hma_data.lab.family import HELD_OUT
 from hma_model.checkpoint import folder
 from hma_model.cli import main
 from hma_model.network.model import HMA
-from tests.model.embedded import embedded
 from tests.model.shards import make_shards
 
 
-@pytest.fixture
-def checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return embedded(tmp_path / "made", monkeypatch)
-
-
-def test_it_is_loaded_by_its_name(checkpoint: Path) -> None:
+def test_it_is_loaded_by_its_name() -> None:
     model = HMA.from_pretrained("embedded")
-    assert sorted(model.embodiments) == sorted(path.name for path in (checkpoint / "embodiments").iterdir())
+    assert sorted(model.embodiments) == sorted(
+        path.name for path in (folder.EMBEDDED / "embodiments").iterdir()
+    )
 
 
-def test_for_a_robot_that_it_lacks_the_command_that_adds_one_is_named(checkpoint, tmp_path, capsys) -> None:
+def test_for_a_robot_that_it_lacks_the_command_that_adds_one_is_named(tmp_path, capsys) -> None:
     shards = make_shards(tmp_path / "shards", "my_arm")
     assert main(["evaluate", "embedded", str(shards)]) == 1
     said = capsys.readouterr().err
