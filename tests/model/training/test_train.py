@@ -22,6 +22,7 @@ from hma_data.errors import (
 )
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint import io as checkpoint
+from hma_model.network.model import HMA
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
@@ -137,6 +138,32 @@ def test_when_every_checkpoint_is_damaged_nothing_is_overwritten(recipe, tmp_pat
     (result.checkpoint / "training/optimizer.safetensors").write_bytes(b"")
     with pytest.raises(CheckpointError, match=r"optimizer.safetensors: .*no checkpoint here can be read"):
         train(recipe(keep_last=1), out=tmp_path / "run", show=False)
+
+
+@pytest.fixture
+def poisoned(monkeypatch):
+    """The loss of window 1 of the third batch is not a number."""
+    plain, calls = HMA.forward, []
+
+    def forward(self, batch, objective=None, generator=None):
+        output = plain(self, batch, objective, generator)
+        if self.training:
+            calls.append(batch)
+            if len(calls) == 3:
+                output.per_sample[1] = float("nan")
+                output.loss = output.loss * float("nan")
+        return output
+
+    monkeypatch.setattr(HMA, "forward", forward)
+    return calls
+
+
+def test_a_loss_that_is_no_number_can_be_skipped_and_is_counted(recipe, tmp_path, poisoned):
+    result = train(recipe(nonfinite="skip"), out=tmp_path / "run", show=False)
+    assert (result.step, result.skipped) == (6, 1)
+    assert all(
+        torch.isfinite(value).all() for value in checkpoint.load(result.checkpoint).state_dict().values()
+    )
 
 
 def test_a_budget_of_cpu_seconds_ends_the_run_and_bends_the_rate(recipe, tmp_path, monkeypatch):
