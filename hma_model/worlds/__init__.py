@@ -1,4 +1,4 @@
-"""EpisodeSession a world model: sessions in images and actions, and gymnasium environments of them.
+"""Offer a world model: sessions in images and actions, and gymnasium environments of them.
 
 In come a checkpoint, a prompt and actions, out come images.
 `hma_model.simulate` registers the environments.

@@ -8,6 +8,7 @@
 S pixels a side, V views side by side, A action dims, T images of an episode, N environments.
 """
 
+import copy
 import os
 import warnings
 from collections.abc import Sequence
@@ -16,7 +17,6 @@ from typing import Any, Protocol
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -48,69 +48,40 @@ class Judge(Protocol):
         ...
 
 
-class EpisodeSession:
-    """One session as episodes: actions gather to chunks, images become observations and rewards."""
-
-    def __init__(self, env: "_Environment") -> None:
-        self.env = env
-        self.world = env.world
-        self.session: int | None = None
-        self.image: Image = np.zeros(self.world.image_shape, np.uint8)
-
-    def begin(self, rng: np.random.Generator, prompt: Any = None) -> Image:
-        """Start an episode, and return its first observation."""
-        start = self.env.start(rng, prompt)
-        seed = int(rng.integers(2**31))
-        if self.session is None:
-            self.session = self.world.open(self.env.embodiment, *start, seed=seed)
-        else:
-            self.world.reset(self.session, *start, seed=seed)
-        self.image = self.world.image(self.session)
-        self.steps = 0
-        self.frames = 0
-        self.waiting: list[Floats] = []
-        self.past = [self.image]  # kept for a judge only
-        self.chunks: list[Floats] = []
-        return self.env.seen(self.image)
-
-    def take(self, action: Any) -> dict[int, Floats]:
-        """Take an action; return the session's chunk once it is whole."""
-        if self.session is None:
-            raise HMAError("step", "there is no episode", "call reset() first")
-        self.waiting += list(self.env.checked(action))
-        if len(self.waiting) < self.env.action_spec.stride:
-            return {}
-        chunk = np.stack(self.waiting)
-        self.waiting = []
-        if self.env.judge is not None:
-            self.chunks.append(chunk)
-        return {self.session: chunk}
-
-    def finish(self, made: dict[int, Image]) -> tuple[Image, float, bool, bool, dict[str, Any]]:
-        """End a step: return observation, reward, whether it is terminated or truncated, and facts."""
-        assert self.session is not None
-        self.steps += 1
-        reward = 0.0
-        terminated = False
-        if self.session in made:
-            self.image = made[self.session]
-            self.frames += 1
-            if self.env.judge is not None:
-                self.past.append(self.image)
-                reward, terminated = self.env.judge(np.stack(self.past), np.stack(self.chunks))
-        truncated = self.env.horizon is not None and self.steps >= self.env.horizon
-        facts = {"frames": self.frames}
-        return self.env.seen(self.image), float(reward), bool(terminated), truncated, facts
-
-    def close(self) -> None:
-        """End the session."""
-        if self.session is not None:
-            self.world.close(self.session)
-            self.session = None
+def _known(options: dict[str, Any] | None, *keys: str) -> dict[str, Any]:
+    """Return the options of a reset; raise HMAError for one that would have no effect."""
+    options = options or {}
+    if other := next((key for key in options if key not in keys), None):
+        raise HMAError("reset", f"there is no option {other!r}", f"it takes {' and '.join(keys)}")
+    return options
 
 
-class _Environment:
-    """The common base of `WorldModelEnv` and `WorldModelVectorEnv`; its arguments are described there."""
+class WorldModelEnv(gymnasium.Env[Image, Floats]):
+    """One robot in a world model, as a gymnasium environment.
+
+    An observation is the newest image (S, V·S, 3) uint8. Actions outside the range seen in training cause
+    one warning. An action of NaN is an unknown action, which the model was trained to do without.
+
+    Args:
+        checkpoint: as `load_world` takes it.
+        embodiment: an id of the checkpoint.
+        prompt: what every episode starts from, as `read_prompt` takes it; `reset(options={"prompt": …})`
+            takes another for one episode. By default one of those that come along is drawn.
+        control: "frame": steps at the control rate; an action is an action (A,), and the image changes
+            after every `stride` of them. "chunk": steps at the rate of the model's frames; an action is
+            (stride, A).
+        horizon: steps after which an episode is truncated; None for never.
+        judge: gives the reward and ends episodes, see `Judge`; without one the reward is 0.
+        render_mode: "rgb_array" or None.
+        clip: clip actions to the range seen in training.
+        size: side in pixels of the observations; None for that of the model's images.
+        world: a world to open the session in, instead of a checkpoint.
+        device: of the network.
+        settings: of `World`: unmask_steps, temperature, order, sample_steps, compile, precision.
+
+    Raises:
+        HMAError: the checkpoint lacks the embodiment, or an argument is wrong.
+    """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
@@ -163,19 +134,83 @@ class _Environment:
         self.action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(low, high, dtype=np.float32)
         self.observation_space: gymnasium.Space[Any] = gymnasium.spaces.Box(0, 255, shape, np.uint8)
         self._read: dict[int | None, Prompt] = {}
-        self._warned = False  # that actions are outside the range of training
-        self.drive = EpisodeSession(self)
+        self._warned: set[str] = set()  # of what; a vector's environments share it, and the prompts
+        self.session: int | None = None
+        self.image: Image = np.zeros(world.image_shape, np.uint8)
 
-    def start(self, rng: np.random.Generator, prompt: Any = None) -> Prompt:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Image, dict[str, Any]]:
+        """Start an episode; `options["prompt"]` is what it starts from, as `read_prompt` takes it."""
+        given = _known(options, "prompt")
+        super().reset(seed=seed)
+        start = self._start(given.get("prompt"))
+        drawn = int(self.np_random.integers(2**31))
+        if self.session is None:
+            self.session = self.world.open(self.embodiment, *start, seed=drawn)
+        else:
+            self.world.reset(self.session, *start, seed=drawn)
+        self.image = self.world.image(self.session)
+        self._steps = 0
+        self._frames = 0
+        self._waiting: list[Floats] = []  # actions since the newest image
+        self._past = [self.image]  # kept for a judge only
+        self._chunks: list[Floats] = []
+        return self._seen(self.image), {"frames": 0}
+
+    def step(self, action: Floats) -> tuple[Image, float, bool, bool, dict[str, Any]]:
+        """Send an action, or a chunk; between chunks the last image is shown."""
+        return self.finish(self.world.step(self.take(action)))
+
+    def take(self, action: Any) -> dict[int, Floats]:
+        """Take an action; return the session's chunk for the world once it is whole."""
+        if self.session is None:
+            raise HMAError("step", "there is no episode", "call reset() first")
+        self._waiting += list(self._checked(action))
+        if len(self._waiting) < self.action_spec.stride:
+            return {}
+        chunk = np.stack(self._waiting)
+        self._waiting = []
+        if self.judge is not None:
+            self._chunks.append(chunk)
+        return {self.session: chunk}
+
+    def finish(self, made: dict[int, Image]) -> tuple[Image, float, bool, bool, dict[str, Any]]:
+        """End a step with the images that a pass of the world made, perhaps none of this session."""
+        assert self.session is not None
+        self._steps += 1
+        reward = 0.0
+        terminated = False
+        if self.session in made:
+            self.image = made[self.session]
+            self._frames += 1
+            if self.judge is not None:
+                self._past.append(self.image)
+                reward, terminated = self.judge(np.stack(self._past), np.stack(self._chunks))
+        truncated = self.horizon is not None and self._steps >= self.horizon
+        facts = {"frames": self._frames}
+        return self._seen(self.image), float(reward), bool(terminated), truncated, facts
+
+    def render(self) -> Image | None:
+        """Return the newest image (S, V·S, 3) as the model makes it."""
+        return self.image if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """End the session."""
+        if self.session is not None:
+            self.world.close(self.session)
+            self.session = None
+
+    def _start(self, prompt: Any) -> Prompt:
         """Return the prompt of an episode: the reset's, else the environment's, else a drawn one."""
         if prompt is not None:
             return read_prompt(self.world.model, self.embodiment, prompt)
-        seed = int(rng.integers(PROMPTS)) if self.prompt is None else None
+        seed = int(self.np_random.integers(PROMPTS)) if self.prompt is None else None
         if seed not in self._read:
             self._read[seed] = read_prompt(self.world.model, self.embodiment, self.prompt, seed=seed or 0)
         return self._read[seed]
 
-    def checked(self, action: Any) -> Floats:
+    def _checked(self, action: Any) -> Floats:
         """Return an action as actions (n, A): checked, clipped if wanted; warn once of a strange range."""
         if self.control == "frame":
             values = self.action_spec.one(action)[None]
@@ -187,73 +222,17 @@ class _Environment:
         if outside and self.clip:
             return self.action_spec.clip(values)
         if outside and not self._warned:
-            self._warned = True
+            self._warned.add("outside")
             said = f"{outside}, so what the model shows is a guess; clip=True clips actions to it"
             warnings.warn(f"{said}. This is said once", OutsideRangeWarning, stacklevel=4)
         return values
 
-    def seen(self, image: Image) -> Image:
+    def _seen(self, image: Image) -> Image:
         """Return an image as it is observed; a copy, which its receiver may change."""
         return image.copy() if self.size is None else resize(image[None], self.size)[0]
 
 
-def _known(options: dict[str, Any] | None, *keys: str) -> dict[str, Any]:
-    """Return the options of a reset; raise HMAError for one that would have no effect."""
-    options = options or {}
-    if other := next((key for key in options if key not in keys), None):
-        raise HMAError("reset", f"there is no option {other!r}", f"it takes {' and '.join(keys)}")
-    return options
-
-
-class WorldModelEnv(_Environment, gymnasium.Env[Image, Floats]):
-    """One robot in a world model, as a gymnasium environment.
-
-    An observation is the newest image (S, V·S, 3) uint8. Actions outside the range seen in training cause
-    one warning. An action of NaN is an unknown action, which the model was trained to do without.
-
-    Args:
-        checkpoint: as `load_world` takes it.
-        embodiment: an id of the checkpoint.
-        prompt: what every episode starts from, as `read_prompt` takes it; `reset(options={"prompt": …})`
-            takes another for one episode. By default one of those that come along is drawn.
-        control: "frame": steps at the control rate; an action is an action (A,), and the image changes
-            after every `stride` of them. "chunk": steps at the rate of the model's frames; an action is
-            (stride, A).
-        horizon: steps after which an episode is truncated; None for never.
-        judge: gives the reward and ends episodes, see `Judge`; without one the reward is 0.
-        render_mode: "rgb_array" or None.
-        clip: clip actions to the range seen in training.
-        size: side in pixels of the observations; None for that of the model's images.
-        world: a world to open the session in, instead of a checkpoint.
-        device: of the network.
-        settings: of `World`: unmask_steps, temperature, order, sample_steps, compile, precision.
-
-    Raises:
-        HMAError: the checkpoint lacks the embodiment, or an argument is wrong.
-    """
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Image, dict[str, Any]]:
-        """Start an episode; `options["prompt"]` is what it starts from, as `read_prompt` takes it."""
-        given = _known(options, "prompt")
-        super().reset(seed=seed)
-        return self.drive.begin(self.np_random, given.get("prompt")), {"frames": 0}
-
-    def step(self, action: Floats) -> tuple[Image, float, bool, bool, dict[str, Any]]:
-        """Send an action, or a chunk; between chunks the last image is shown."""
-        return self.drive.finish(self.world.step(self.drive.take(action)))
-
-    def render(self) -> Image | None:
-        """Return the newest image (S, V·S, 3) as the model makes it."""
-        return self.drive.image if self.render_mode == "rgb_array" else None
-
-    def close(self) -> None:
-        """End the session."""
-        self.drive.close()
-
-
-class WorldModelVectorEnv(_Environment, VectorEnv[Image, Floats, NDArray[Any]]):
+class WorldModelVectorEnv(VectorEnv[Image, Floats, NDArray[Any]]):
     """N robots in a world model, whose sessions step in one pass and begin and end independently.
 
     Args:
@@ -269,16 +248,19 @@ class WorldModelVectorEnv(_Environment, VectorEnv[Image, Floats, NDArray[Any]]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **settings: Any,
     ) -> None:
-        super().__init__(*others, **settings)
+        first = WorldModelEnv(*others, **settings)
+        # copies made before any session is open: they share the world, its prompts and the warnings
+        self.envs = [first, *(copy.copy(first) for _ in range(num_envs - 1))]
+        self.world = first.world
+        self.embodiment = first.embodiment
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata["autoreset_mode"] = self.autoreset_mode
-        self.single_action_space = self.action_space
-        self.single_observation_space = self.observation_space
+        self.render_mode = first.render_mode
+        self.metadata = first.metadata | {"autoreset_mode": self.autoreset_mode}
+        self.single_action_space = first.action_space
+        self.single_observation_space = first.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.drives = [self.drive, *(EpisodeSession(self) for _ in range(num_envs - 1))]
-        self.random = [seeding.np_random()[0] for _ in range(num_envs)]
         self.observations = np.zeros(self.observation_space.shape or (), np.uint8)
         self.ended: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
 
@@ -295,10 +277,9 @@ class WorldModelVectorEnv(_Environment, VectorEnv[Image, Floats, NDArray[Any]]):
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
         chosen = np.asarray(options.get("reset_mask", np.ones(self.num_envs)), np.bool_)
         infos: dict[str, Any] = {}
+        prompt = {key: value for key, value in options.items() if key == "prompt"}
         for i in np.flatnonzero(chosen):
-            if seeds is not None and seeds[i] is not None:
-                self.random[i] = seeding.np_random(seeds[i])[0]
-            infos = self._begin(i, infos, options.get("prompt"))
+            infos = self._begin(i, infos, None if seeds is None else seeds[i], prompt)
         self.ended[chosen] = False
         return self.observations.copy(), infos
 
@@ -312,12 +293,12 @@ class WorldModelVectorEnv(_Environment, VectorEnv[Image, Floats, NDArray[Any]]):
         terminated, truncated = (np.zeros(self.num_envs, np.bool_) for _ in range(2))
         infos: dict[str, Any] = {}
         going = np.flatnonzero(~again)
-        chunks = [self.drives[i].take(actions[i]) for i in going]
+        chunks = [self.envs[i].take(actions[i]) for i in going]
         made = self.world.step({session: chunk for part in chunks for session, chunk in part.items()})
         for i in np.flatnonzero(again):
             infos = self._begin(i, infos)
         for i in going:
-            seen, rewards[i], terminated[i], truncated[i], facts = self.drives[i].finish(made)
+            seen, rewards[i], terminated[i], truncated[i], facts = self.envs[i].finish(made)
             self.observations[i] = seen
             if self.autoreset_mode == AutoresetMode.SAME_STEP and (terminated[i] or truncated[i]):
                 infos = self._add_info(infos, {"final_obs": seen, "final_info": facts}, i)
@@ -329,13 +310,19 @@ class WorldModelVectorEnv(_Environment, VectorEnv[Image, Floats, NDArray[Any]]):
 
     def render(self) -> tuple[Image, ...] | None:
         """Return the newest image of each environment."""
-        return tuple(drive.image for drive in self.drives) if self.render_mode == "rgb_array" else None
+        return tuple(env.image for env in self.envs) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the sessions."""
-        for drive in self.drives:
-            drive.close()
+        for env in self.envs:
+            env.close()
 
-    def _begin(self, i: int, infos: dict[str, Any], prompt: Any = None) -> dict[str, Any]:
-        self.observations[i] = self.drives[i].begin(self.random[i], prompt)
-        return self._add_info(infos, {"frames": 0}, i)
+    def _begin(
+        self,
+        i: int,
+        infos: dict[str, Any],
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> dict[str, Any]:
+        self.observations[i], facts = self.envs[i].reset(seed=seed, options=options)
+        return self._add_info(infos, facts, i)

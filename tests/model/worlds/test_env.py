@@ -74,7 +74,7 @@ def test_steps_show_what_the_world_shows(world: World, window: tuple[Any, Any], 
     )
     first, _ = env.reset(seed=3)
     chunks = actions(2, 4)
-    session = world.open(PUSH, *window, seed=world._sessions[env.drive.session].seed)  # type: ignore[index]
+    session = world.open(PUSH, *window, seed=world._sessions[env.session].seed)  # type: ignore[index]
     assert np.array_equal(first, world.image(session))
     made = [world.step({session: chunk})[session] for chunk in chunks]
     seen = [env.step(action) for action in (chunks if control == "chunk" else chunks.reshape(-1, 2))]
@@ -214,7 +214,7 @@ def test_actions_outside_the_training_range_warn_once_and_are_clipped_only_if_as
 def test_an_unknown_action_is_nan(world: World, window: tuple[Any, Any]) -> None:
     env = WorldModelEnv(embodiment=PUSH, world=world, prompt=prompt(window))
     env.reset(seed=0)
-    session = world.open(PUSH, *window, seed=world._sessions[env.drive.session].seed)  # type: ignore[index]
+    session = world.open(PUSH, *window, seed=world._sessions[env.session].seed)  # type: ignore[index]
     one = np.array([300.0, 200.0])
     for action in (one, one, np.full(2, np.nan), one):
         image, *_ = env.step(action)
