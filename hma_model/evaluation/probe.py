@@ -1,9 +1,7 @@
 """Read the state of a laboratory robot off pictures, and measure how whole they are.
 
-A probe has about 3,600 weights: convolutions make one map a part, the softmax of a map is a distribution over
-the picture, and its mean is the part's place (Sun et al. 2018, integral regression). A linear layer, at first
-the identity, corrects the places from one another. It learns from true pictures as the tokenizer shows them,
-with slight noise, and from episodes that nothing is measured on. Its own error is that on other episodes.
+A probe is a small network (`hma_model.evaluation.state_reader`). It learns from episodes that nothing is
+measured on; its own error is that on other episodes.
 The T of a pusher is found by its shape (`hma_model.evaluation.tee`).
 
 A picture may lose a limb and still have small errors of its pixels. `wholeness` therefore counts the pixels
@@ -14,15 +12,23 @@ N pictures of S pixels a side, P parts. Places are px of a picture of 128 by 128
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
-from hma_data.episodes.images import opencv, prepare
+from hma_data.episodes.images import prepare
 from hma_data.lab import simulator, truth
+from hma_model.evaluation.state_reader import (
+    INPUT_SIDE,
+    UNREADABLE_SHARE,
+    PlaceNetwork,
+    outputs,
+    resized,
+    trained,
+)
 from hma_model.evaluation.tee import TeeFinder
 
 if TYPE_CHECKING:
@@ -31,52 +37,13 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Images = NDArray[np.uint8]
 
-INPUT_SIDE, MAP_SIDE = 64, 32  # pixels of the images that a probe sees, and cells of its maps
-CHANNELS, SHARPNESS = 16, 4.0
-TRAINING_STEPS, BATCH_SIZE, LEARNING_RATE = 400, 32, 1e-2
-NOISE = 0.03  # in images of -1 to 1
+TRAINING_STEPS, LEARNING_RATE = 400, 1e-2
 EPISODES, HELD_OUT_EPISODES = 40, 8  # simulated, and of them those that the probe's error is measured on
 EPISODE_FRAMES, FRAME_STRIDE = 60, 2  # of an episode; one in so many is kept
 FIRST_EPISODE = 1_000_000  # the number of a probe's first episode; those that are measured count from 0
 LEAST_SPREAD_PX = 1.0  # a part that moves less is no part of the state
-UNREADABLE_SHARE = 0.5  # of a part's spread; a probe with a larger error does not read it
 COLOUR_DISTANCE = 45.0  # of RGB, up to which two colours are one
 LEAST_PIXELS = 3  # of a part that is seen
-
-
-def feature_maps(count: int, kernel: int) -> nn.Sequential:
-    """Return layers from pictures (N, 3, 64, 64) to maps (N, count, MAP_SIDE, MAP_SIDE)."""
-    return nn.Sequential(
-        nn.Conv2d(3, CHANNELS, 5, stride=2, padding=2),
-        nn.GELU(),
-        nn.Conv2d(CHANNELS, CHANNELS, 3, padding=2, dilation=2),
-        nn.GELU(),
-        nn.Conv2d(CHANNELS, count, kernel, padding=kernel // 2),
-    )
-
-
-def map_grid() -> Tensor:
-    """Return the places (MAPS², 2) of a map's cells, x and y from -1 to 1."""
-    line = (torch.arange(MAP_SIDE) + 0.5) * (2 / MAP_SIDE) - 1
-    return torch.stack(torch.meshgrid(line, line, indexing="xy"), -1).view(-1, 2)
-
-
-class PlaceNetwork(nn.Module):
-    """A network that finds parts in pictures (N, 3, 64, 64); pixels and places (N, P, 2) are -1 to 1."""
-
-    def __init__(self, parts: int) -> None:
-        super().__init__()
-        self.maps = feature_maps(parts, kernel=1)
-        self.correct = nn.Linear(2 * parts, 2 * parts)
-        # at first the places stay as they are read; training learns only what to correct
-        nn.init.eye_(self.correct.weight)
-        nn.init.zeros_(self.correct.bias)
-        self.register_buffer("grid", map_grid())
-
-    def forward(self, pictures: Tensor) -> Tensor:
-        chance = (self.maps(pictures).flatten(2) * SHARPNESS).softmax(-1)
-        places = chance @ self.grid
-        return self.correct(places.flatten(1)).view_as(places)
 
 
 @dataclass(frozen=True)
@@ -84,7 +51,7 @@ class Probe:
     """A probe of one robot's pictures.
 
     Attributes:
-        network: a trained `PlaceNetwork`.
+        network: a trained `PlaceNetwork`; places are -1 to 1.
         driven: how many of the parts are the robot's own.
         error: (P,) mean distance in px from the true places on held-out true pictures.
         spread: (P,) mean distance in px of the true places from their median.
@@ -116,12 +83,10 @@ class Probe:
         """Return the numbers of the readable parts that lie loose."""
         return self.driven + np.flatnonzero(self.readable[self.driven :])
 
-    @torch.no_grad()
     def read(self, pictures: Images) -> Floats:
         """Return the places (…, P, 2) of the parts in pictures (…, S, S, 3)."""
         flat = resized(pictures.reshape(-1, *pictures.shape[-3:]))
-        found = torch.cat([self.network(pixels(part)) for part in np.array_split(flat, len(flat) // 64 + 1)])
-        places: Floats = (found.double().numpy() + 1) * (truth.SIZE / 2)
+        places = (outputs(self.network, flat).reshape(len(flat), -1, 2) + 1) * (truth.SIZE / 2)
         if self.tee is not None:
             for row, mask in enumerate(self._colored(flat)[..., -1]):
                 seen = self.tee.find(mask)
@@ -243,7 +208,10 @@ def fit(
     """
     used = round(len(pictures) * (1 - held_out))
     small = resized(pictures)
-    network = _trained(small[:used], parts[:used], seed, steps, tell)
+    targets = (parts[:used] / (truth.SIZE / 2) - 1).reshape(used, -1)
+    network = trained(
+        partial(PlaceNetwork, parts.shape[1]), small[:used], targets, seed, steps, LEARNING_RATE, 0.02, tell
+    )
     spread = np.linalg.norm(parts - np.median(parts, axis=0), axis=-1).mean(axis=0)
     background = np.median(small[:used], axis=0).astype(np.float32)
     within = parts if tee is None else tee.within(parts)
@@ -253,54 +221,8 @@ def fit(
     return replace(untested, error=error)
 
 
-def _trained(small: Images, parts: Floats, seed: int, steps: int, tell: Callable[[str], None]) -> nn.Module:
-    with torch.random.fork_rng(devices=[]):  # the caller's random numbers go on as if nothing was drawn
-        torch.manual_seed(seed)
-        network = PlaceNetwork(parts.shape[1])
-    targets = torch.tensor(parts / (truth.SIZE / 2) - 1, dtype=torch.float32)
-
-    def tell_step(step: int) -> None:
-        tell(f"training the probe: step {step} of {steps}")
-
-    train(network, pixels(small), targets, seed, steps, LEARNING_RATE, 0.02, tell_step)
-    return network.eval()
-
-
-def train(
-    network: nn.Module, inputs: Tensor, targets: Tensor, seed: int, steps: int, rate: float, beta: float,
-    tell: Callable[[int], None] = lambda step: None,
-) -> None:  # fmt: skip
-    """Train a network from noisy pictures (N, 3, 64, 64) to targets (N, …), by a loss of that beta."""
-    generator = torch.Generator().manual_seed(seed)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
-    for step in range(steps):
-        chosen = torch.randint(0, len(inputs), (BATCH_SIZE,), generator=generator)
-        noisy = inputs[chosen] + NOISE * torch.randn(
-            BATCH_SIZE, 3, INPUT_SIDE, INPUT_SIDE, generator=generator
-        )
-        loss = nn.functional.smooth_l1_loss(network(noisy), targets[chosen], beta=beta)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        tell(step + 1)
-
-
 def _colors(small: Images, parts: Floats) -> Floats:
     """Return the (P, 3) median colours of pictures at places within the parts."""
     x, y = np.clip(parts * (INPUT_SIDE / truth.SIZE), 0, INPUT_SIDE - 1).astype(int).transpose(2, 0, 1)
     found: Floats = np.median(small[np.arange(len(small))[:, None], y, x], axis=0).astype(np.float32)
     return found
-
-
-def resized(pictures: Images) -> Images:
-    """Return pictures (N, 64, 64, 3)."""
-    cv2 = opencv()
-    return np.stack(
-        [cv2.resize(one, (INPUT_SIDE, INPUT_SIDE), interpolation=cv2.INTER_AREA) for one in pictures]
-    )
-
-
-def pixels(small: Images) -> Tensor:
-    return torch.from_numpy(small).permute(0, 3, 1, 2).float() / 127.5 - 1

@@ -14,11 +14,10 @@ N pictures or windows, T frames, P predicted frames, S values of a state.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -28,16 +27,8 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded
 from hma_model.evaluation.losses import episodes_of
-from hma_model.evaluation.probe import (
-    SHARPNESS,
-    UNREADABLE_SHARE,
-    feature_maps,
-    map_grid,
-    pixels,
-    resized,
-    shown_episodes,
-    train,
-)
+from hma_model.evaluation.probe import shown_episodes
+from hma_model.evaluation.state_reader import UNREADABLE_SHARE, StateNetwork, outputs, resized, trained
 from hma_model.generation.decode import decode
 
 if TYPE_CHECKING:
@@ -47,31 +38,10 @@ Floats = NDArray[np.float64]
 Images = NDArray[np.uint8]
 Tell = Callable[[str], None]
 
-POINTS, HIDDEN_WIDTH = 16, 128
 TRAINING_STEPS, LEARNING_RATE = 600, 4e-3
 IMAGE_LIMIT, EPISODES_NEEDED = 1500, 5  # most pictures to learn from, fewest episodes
 HELD_OUT_SHARE = 0.2  # share of the pictures, the last ones, on which the reader's error is measured
 LEAST_STD = 1e-6  # a value whose standard deviation is smaller never changes
-
-
-class StateNetwork(nn.Module):
-    """A network that reads states (N, S), in standard deviations from their mean, off pictures.
-
-    Maps become points, the means of their softmax (Levine et al. 2016), and heights, their largest values.
-    """
-
-    def __init__(self, values: int) -> None:
-        super().__init__()
-        self.maps = feature_maps(POINTS, kernel=3)
-        self.head = nn.Sequential(
-            nn.Linear(3 * POINTS, HIDDEN_WIDTH), nn.GELU(), nn.Linear(HIDDEN_WIDTH, values)
-        )
-        self.register_buffer("grid", map_grid())
-
-    def forward(self, pictures: Tensor) -> Tensor:
-        maps = self.maps(pictures).flatten(2)
-        points = (maps * SHARPNESS).softmax(-1) @ self.grid
-        return self.head(torch.cat([points.flatten(1), maps.amax(-1)], dim=1))
 
 
 @dataclass(frozen=True)
@@ -99,7 +69,7 @@ class Reader:
 
     def errors(self, pictures: Images, states: Floats) -> Floats:
         """Return (…, S), how far from states (…, S) it reads pictures (…, H, W, 3), in std."""
-        found = _read(self.network, resized(pictures.reshape(-1, *pictures.shape[-3:])))
+        found = outputs(self.network, resized(pictures.reshape(-1, *pictures.shape[-3:])))
         true = (states - self.mean) / np.maximum(self.std, LEAST_STD)
         return np.abs(found.reshape(states.shape) - true)
 
@@ -110,7 +80,7 @@ class Reader:
         """
         states = np.tile(self.mean, (len(pictures), 1))
         own = self.readable
-        states[:, own] += _read(self.network, resized(pictures))[:, own] * self.std[own]
+        states[:, own] += outputs(self.network, resized(pictures))[:, own] * self.std[own]
         return np.clip(states, self.low, self.high)
 
 
@@ -133,26 +103,12 @@ def learn(
     used, small = round(len(pictures) * (1 - HELD_OUT_SHARE)), resized(pictures)
     mean, std = states[:used].mean(axis=0), states[:used].std(axis=0)
     scaled = (states - mean) / np.maximum(std, LEAST_STD)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        network = StateNetwork(states.shape[1])
-    targets = torch.tensor(scaled[:used], dtype=torch.float32)
-
-    def tell_step(step: int) -> None:
-        tell(f"learning to read the state: step {step} of {steps}")
-
-    train(network, pixels(small[:used]), targets, seed, steps, LEARNING_RATE, 0.1, tell_step)
+    make = partial(StateNetwork, states.shape[1])
+    network = trained(make, small[:used], scaled[:used], seed, steps, LEARNING_RATE, 0.1, tell)
     other = scaled[used:]
-    error = np.abs(_read(network.eval(), small[used:]) - other).mean(axis=0)
+    error = np.abs(outputs(network, small[used:]) - other).mean(axis=0)
     spread = np.abs(other - np.median(other, axis=0)).mean(axis=0)
     return Reader(network, mean, std, states[:used].min(axis=0), states[:used].max(axis=0), error, spread)
-
-
-@torch.no_grad()
-def _read(network: nn.Module, small: Images) -> Floats:
-    parts = np.array_split(small, len(small) // 64 + 1)
-    found: Floats = torch.cat([network(pixels(part)) for part in parts]).double().numpy()
-    return found
 
 
 def measure_recorded_state(

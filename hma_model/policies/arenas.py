@@ -6,12 +6,12 @@ every `stride` of them, as the environments of the world model show it.
 N scenes, S pixels a side, A action dims, K = stride · A, P parts, T chunks of an episode.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import resize
@@ -19,7 +19,8 @@ from hma_data.errors import HMAError
 from hma_data.lab import FAMILY, truth
 from hma_data.lab.scripted import PUSHER, SeenState, State, seen_state, state_of
 from hma_data.lab.simulator import LabSimulator, simulated
-from hma_model.generation.commands import described
+from hma_model.generation.commands import OutsideRangeWarning, described
+from hma_model.worlds.env import WorldModelVectorEnv
 from hma_model.worlds.images import Prompt
 from hma_model.worlds.scenes import Dimension, LabRobot, LabScene
 
@@ -221,14 +222,13 @@ class ModelArena:
         self._told = true.told
         self._probe = probe
         self.prompts: Sequence[Prompt] = [Prompt(world.shown(one.frames), one.chunks) for one in true.prompts]
-        self._sessions: list[int] = []
-        for number, prompt in zip(self.scenes.numbers, true.prompts, strict=True):
-            # As the environment draws it: a reset with this seed gives the same frames there.
-            seed = int(np_random(self.scenes.seed + number)[0].integers(2**31))
-            self._sessions.append(world.open(self.scenes.name, *prompt, seed=seed))
-        self.images: Image = np.stack([world.image(session) for session in self._sessions])
+        self._envs = WorldModelVectorEnv(
+            len(true.prompts), embodiment=self.scenes.name, horizon=None, world=world
+        )
+        for env, number, prompt in zip(self._envs.envs, self.scenes.numbers, true.prompts, strict=True):
+            env.reset(seed=self.scenes.seed + number, options={"prompt": prompt._asdict()})
+        self.images: Image = np.stack([env.image for env in self._envs.envs])
         self._steps = 0
-        self._waiting: list[Floats] = []  # actions (N, A) since the newest images
         self._seen: list[SeenState] | None = None
 
     def outside(self, actions: Floats) -> str:
@@ -237,7 +237,7 @@ class ModelArena:
 
     @property
     def fresh(self) -> bool:
-        return not self._waiting
+        return self._steps % self.scenes.stride == 0
 
     def states(self) -> list[State]:
         """Return what the probe reads off the images, moved by the actions since the last one.
@@ -263,12 +263,9 @@ class ModelArena:
 
     def step(self, actions: Floats) -> None:
         self._steps += 1
-        self._waiting.append(actions)
-        if len(self._waiting) == self.scenes.stride:
-            chunks = np.stack(self._waiting, axis=1)
-            made = self._world.step(dict(zip(self._sessions, chunks, strict=True)))
-            self.images = np.stack([made[session] for session in self._sessions])
-            self._waiting = []
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", OutsideRangeWarning)  # `run` says which policy leaves the range
+            self.images, *_ = self._envs.step(actions)
         if self._seen is None or self._probe is None:
             return
         places = self._probe.read(self.images) if self.fresh else None
@@ -285,7 +282,10 @@ class ModelArena:
         """Return how unsure the model was of the newest frames (N,), if its world measures it."""
         return np.array([self._world.uncertainty.get(session, 0.0) for session in self._sessions])
 
+    @property
+    def _sessions(self) -> list[int]:
+        return [env.session for env in self._envs.envs if env.session is not None]
+
     def close(self) -> None:
         """End the sessions."""
-        for session in self._sessions:
-            self._world.close(session)
+        self._envs.close()
