@@ -5,7 +5,7 @@ import pytest
 
 from hma_data.lab import pusht, truth
 from hma_data.lab.simulator import LabSimulator
-from hma_model.evaluation.tee import TeeFinder
+from hma_model.evaluation.probe import TeeFinder
 
 
 @pytest.mark.parametrize("robot", truth.PUSHERS)
