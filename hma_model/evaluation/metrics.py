@@ -31,19 +31,19 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Values = NDArray[Any]
 SSIM_WINDOW = 7
+WHITE = 255.0  # the span of the values of images
 PSNR_LIMIT = 60.0  # dB; where the PSNR of equal images, and with it a mean over frames, would be infinite
 # what values can be, so that no interval of few episodes leaves it
 PSNR_RANGE, PSNR_GAIN_RANGE = (0.0, PSNR_LIMIT), (-PSNR_LIMIT, PSNR_LIMIT)
 SSIM_RANGE = (-1.0, 1.0)
 
 
-def psnr(truth: Values, pictures: Values, data_range: float = 255.0, limit: float = math.inf) -> Floats:
+def psnr(truth: Values, pictures: Values, limit: float = math.inf) -> Floats:
     """Return the peak signal-to-noise ratio of each image in dB.
 
     Args:
         truth: (…, H, W, C).
         pictures: as truth.
-        data_range: the span of the values, 255 for uint8.
         limit: the ratio of equal images, which would be infinite.
 
     Returns:
@@ -52,10 +52,10 @@ def psnr(truth: Values, pictures: Values, data_range: float = 255.0, limit: floa
     _require_pair(truth, pictures)
     error = np.square(np.subtract(truth, pictures, dtype=np.float64)).mean(axis=(-3, -2, -1))
     with np.errstate(divide="ignore"):
-        return np.minimum(10 * np.log10(data_range**2 / error), limit)
+        return np.minimum(10 * np.log10(WHITE**2 / error), limit)
 
 
-def ssim(truth: Values, pictures: Values, data_range: float = 255.0) -> Floats:
+def ssim(truth: Values, pictures: Values) -> Floats:
     """Return the structural similarity of each image (Wang et al. 2004), averaged over its channels.
 
     The settings are those of the paper's evaluation: a uniform 7x7 window, sample covariance, K1 0.01 and
@@ -64,7 +64,6 @@ def ssim(truth: Values, pictures: Values, data_range: float = 255.0) -> Floats:
     Args:
         truth: (…, H, W, C), each side at least 7.
         pictures: as truth.
-        data_range: the span of the values.
 
     Returns:
         (…,), 1 if the two are equal.
@@ -75,10 +74,10 @@ def ssim(truth: Values, pictures: Values, data_range: float = 255.0) -> Floats:
         raise UsageError("ssim", f"images of {height}x{width} are smaller than its 7x7 window")
     # one image after the other, so that the arrays of a pair fit a processor's cache
     flat = (values.reshape(-1, height, width, channels).astype(np.float64) for values in (truth, pictures))
-    return np.array([_similarity(x, y, data_range) for x, y in zip(*flat)]).reshape(lead)
+    return np.array([_similarity(x, y) for x, y in zip(*flat)]).reshape(lead)
 
 
-def _similarity(truth: Floats, picture: Floats, data_range: float) -> float:
+def _similarity(truth: Floats, picture: Floats) -> float:
     mean_x = _window_means(truth)
     mean_y = _window_means(picture)
     count = SSIM_WINDOW**2
@@ -86,8 +85,8 @@ def _similarity(truth: Floats, picture: Floats, data_range: float) -> float:
     var_x = unbias * (_window_means(truth * truth) - mean_x * mean_x)
     var_y = unbias * (_window_means(picture * picture) - mean_y * mean_y)
     covariance = unbias * (_window_means(truth * picture) - mean_x * mean_y)
-    c1 = (0.01 * data_range) ** 2
-    c2 = (0.03 * data_range) ** 2
+    c1 = (0.01 * WHITE) ** 2
+    c2 = (0.03 * WHITE) ** 2
     above = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     below = (mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2)
     return float((above / below).mean())

@@ -66,13 +66,13 @@ _COUNTS = {"num_layers": 1000, "diffloss_d": 1000, "num_factored_vocabs": 64} | 
 
 
 def config_from_released(
-    config: Mapping[str, Any], case: Mapping[str, Any] | None = None, where: object = "config.json"
+    config: Mapping[str, Any], grid: tuple[int, int] | None = None, where: object = "config.json"
 ) -> HMAConfig:
     """Convert a released `config.json` to our configuration.
 
     Args:
         config: the released configuration.
-        case: may give `grid`, the tokenizer's (h, w), if a frame is not square.
+        grid: the tokenizer's (h, w), if a frame is not square.
         where: the file, for the errors.
     """
     continuous = bool(config.get("Diffusion", config.get("image_vocab_size", 0) is None))
@@ -87,7 +87,7 @@ def config_from_released(
                 )
         if not values.get("proj_bias", True):
             raise CheckpointError(_WHERE, "is without proj_bias, unlike any release", _REMEDY)
-        shared = _shared(values, (case or {}).get("grid"))
+        shared = _shared(values, grid)
         own = _continuous(values) if continuous else _discrete(values)
         return HMAConfig(**_LAYOUT, **shared, **own)
     except CheckpointError as error:

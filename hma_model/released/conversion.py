@@ -72,7 +72,7 @@ def import_released(
     for prefix in _PREFIXES:
         if all(name.startswith(prefix) for name in state):
             state = {name.removeprefix(prefix): value for name, value in state.items()}
-    config = config_from_released(values, {"grid": grid} if grid else None, folder / CONFIG)
+    config = config_from_released(values, grid, folder / CONFIG)
     config = config.replace(tokenizer=_tokenizer_spec(config, tokenizer, folder).to_json())
     _check_fit(weights, state, config, values)
     for name, tensor in state.items():

@@ -242,11 +242,6 @@ class Recipe(_Settings):
         return {name: (enough or allowed[-1:] or [1])[0]}
 
 
-def network_values(config: HMAConfig) -> dict[str, Any]:
-    """Return the values of a recipe's `model` that make a network like this one, for any tokenizer."""
-    return {key: value for key, value in config.to_json().items() if key not in _DERIVED}
-
-
 def load_recipe(name_or_path: StrPath, overrides: Sequence[str] = ()) -> Recipe:
     """Read the recipe of a YAML file, with overrides.
 
