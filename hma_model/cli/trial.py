@@ -58,25 +58,26 @@ def try_recording(
     cpu_seconds = round(60 * minutes * usable_cores())
     done: list[list[str]] = []
 
-    def step(*words: object) -> None:
-        done.append([str(word) for word in words])
-        _run(done[-1])
+    def step(*words: object, there: bool = False) -> None:
+        done.append([str(word) for word in words])  # the page names what an earlier run has made too
+        if not there:
+            _run(done[-1])
 
     if embodiment is None:
         yaml = folder / "robot.yaml"
         step("inspect", data, "--fail-on", "never")
-        if not yaml.is_file():
-            step("registry", "infer", data, "--id", name, "--out", yaml)
+        step("registry", "infer", data, "--id", name, "--out", yaml, there=yaml.is_file())
         _answer(yaml, answer or [])
         embodiment = str(yaml)
     chosen = [word for name in only or () for word in ("--only", name)]
     step("convert", data, "-e", embodiment, "--tokenizer", TOKENIZER, *chosen, "--out", shards)
     time_limit = (f"cpu_seconds={cpu_seconds}", f"steps={UNLIMITED_STEPS}")
-    step("finetune", shards, "--from", BUNDLED, *time_limit, "--out", run)
+    again = ("--force",) if run.is_dir() else ()  # with more --minutes, a run goes on
+    step("finetune", shards, "--from", BUNDLED, *time_limit, "--out", run, *again)
     step("evaluate", run, shards, "--windows", 24, "--out", folder / "evaluation")
-    if not film.is_file():
-        frames = ("--prompt", PROMPT, "--frames", _film_frames(shards))
-        step("generate", run, shards, *frames, "--unmask-steps", 8, "--out", film)
+    frames = ("--prompt", PROMPT, "--frames", _film_frames(shards))
+    shown = film.is_file() and film.stat().st_mtime > (run / "checkpoints").stat().st_mtime
+    step("generate", run, shards, *frames, "--unmask-steps", 8, "--out", film, there=shown)
     print(f"open {_write_page(folder, shards, film, done)}")
 
 
