@@ -280,8 +280,16 @@ def _video_loss(
     rows = masked.flatten().nonzero().squeeze(1)  # on the generator's device, so no wait for an accelerator
     sample = (rows // masked[0].numel()).to(features.device)
     rows = rows.to(features.device)
-    chosen, targets = features.flatten(0, 2)[rows], groups.sort(frames).flatten(0, 2)[rows]
-    near = None if before is None else before.flatten(0, 2)[rows]
+    whole = len(rows) == masked.numel()  # then nothing is picked out, which would cost as much as a block
+    chosen, targets, near = (
+        values if values is None or whole else values[rows]
+        for values in (
+            features.flatten(0, 2),
+            groups.sort(frames).flatten(0, 2),
+            None if before is None else before.flatten(0, 2),
+        )
+    )
+    assert chosen is not None and targets is not None
     if model.config.kind == "discrete":
         losses = model.token_readout.loss(chosen, to_digits(targets, model.config.digits), near)
     else:

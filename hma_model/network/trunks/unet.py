@@ -163,7 +163,9 @@ class UNet(nn.Module):
         if not index.shape[1]:
             return torch.zeros_like(x)
         b, t = index.shape[:2]
-        unseen = self.unseen * ~seen.unsqueeze(-1)  # (B or 1, t, A, D)
+        if torch.is_autocast_enabled(x.device.type):  # else the products alone would be in less precision
+            frames = frames.to(torch.get_autocast_dtype(x.device.type))
+        unseen = (self.unseen * ~seen.unsqueeze(-1)).to(frames.dtype)  # (B or 1, t, A, D)
         stacked = frames[index].add(unseen.unsqueeze(3)).flatten(0, 1)  # (M, A, S, D)
         condition = self.condition(of_actions[index].flatten(2).flatten(0, 1))
         features = self._spread(stacked, condition).unflatten(0, (b, t))
@@ -204,7 +206,8 @@ class UNet(nn.Module):
         """Return features (M, S, D) of the frames (M, A, S, D) that each frame sees."""
         views = self.config.views
         seen = stacked.unflatten(2, (views, -1)).permute(0, 3, 1, 2, 4).flatten(2)  # (M, h*w, A * views * D)
-        x = self.ages(seen).transpose(1, 2).unflatten(2, self.grid) + self.position
+        x = self.ages(seen).transpose(1, 2).unflatten(2, self.grid)
+        x = x + self.position.to(x.dtype)
         layers, kept = self.config.layers, []
         for level in range(self.depth + 1):
             for block in self.blocks[level * layers : (level + 1) * layers]:
