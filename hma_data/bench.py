@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 BENCHES: dict[str, str] = {  # name -> module of recipes/bench:object
     "convert": "convert:BENCH",
     "drift": "drift:BENCH",
+    "holds": "holds:BENCH",
     "generate": "generation:GENERATE",
     "lerobot": "sources:LEROBOT",
     "loader": "loader:BENCH",

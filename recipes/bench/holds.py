@@ -1,0 +1,237 @@
+"""Measure whether objects stay what they are in a model that is driven in closed loop (`hma bench holds`).
+
+The simulator makes true episodes; the model continues each from its first frames under the same actions.
+Objects are told by their colours, in the truth and in the model alike. A row gives, at a number of frames:
+
+    left        pixels of loose objects, as a share of the true ones; 1 keeps them, 0 has melted them
+    limbs       the same of the robot's own parts
+    shape       overlap (intersection over union) with the true object after the best shift and turn
+    off         distance of a pushed object's centre from the true one, as a share of how far that moved
+    overlap     overlap as it lies, of objects that moved; `repeat`, that of the first frame repeated
+    static_db   PSNR of the pixels that never change in the truth
+
+Figures are means over rollouts; those of moved objects over the objects that moved at least 8 of 128 px, of
+which `moved` says the number. `repeat`, `shape` and the like are blank where nothing moved.
+
+B rollouts, T frames, S pixels a side, P parts.
+"""
+
+import sys
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.bench import Bench
+from hma_data.errors import UsageError
+from hma_data.lab import truth
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.network.model import HMA
+
+Images = NDArray[np.uint8]
+Masks = NDArray[np.bool_]
+
+MARKS = (1, 6, 20, 60, 100, 300, 1000, 3000)  # frames at which figures are given, and the last
+NEAR = 60.0  # distance of RGB within which a pixel has an object's colour
+MOVED = 8.0  # px of 128 from which an object has moved
+FEWEST = 12  # pixels of an object below which it is hidden, and not judged
+TURNS = 36  # angles of the search for the best overlap
+SHOWN = (0, 1, 3, 6, 10, 20, 40, 60, 100, 200, 300)  # frames of a sheet; 0 is the prompt's last
+
+
+@dataclass(frozen=True)
+class Found:
+    """The rollouts of a robot.
+
+    Attributes:
+        true, made: (B, T, S, S, 3) from the prompt's last frame on.
+        parts: (B, T, P, 2) true places in px of 128.
+        driven: how many of the parts, the first ones, are the robot's own.
+    """
+
+    robot: str
+    true: Images
+    made: Images
+    parts: NDArray[np.float64]
+    driven: int
+
+
+def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return a row for each robot and mark; raise UsageError for a wrong setting."""
+    robots = [name.strip() for name in settings["robots"].split(",")]
+    for robot in robots:
+        truth.embodiment(robot)
+    if min(settings["frames"], settings["rollouts"], settings["prompt"]) < 1:
+        raise UsageError("bench holds", "frames, rollouts and prompt are at least 1", "give larger ones")
+    from hma_data.tokenizers.base import get_tokenizer
+    from hma_model.checkpoint.folder import require_tokenizer
+    from hma_model.network.model import HMA
+    from hma_model.training.runtime import choose_device
+
+    device = str(choose_device(settings["device"]))
+    model = HMA.from_pretrained(settings["checkpoint"], embodiments=robots, device=device).eval()
+    tokenizer = get_tokenizer(str(model.config.tokenizer["name"]), device=device)
+    require_tokenizer(model.config, tokenizer.spec, settings["checkpoint"])
+    found = [measure(model, tokenizer, robot, settings) for robot in robots]
+    if settings["sheet"]:
+        draw(found, Path(settings["sheet"]))
+    marks = sorted({mark for mark in (*MARKS, settings["frames"]) if mark <= settings["frames"]})
+    return [_row(one, mark) for one in found for mark in marks]
+
+
+def measure(model: "HMA", tokenizer: "Tokenizer", robot: str, settings: dict[str, Any]) -> Found:
+    """Simulate a robot's episodes, and continue them in the model."""
+    import torch
+
+    from hma_data.episodes.images import prepare
+    from hma_model.generation.decode import decode
+    from hma_model.generation.rollout import Rollout
+
+    begun, prompt, seed = time.monotonic(), settings["prompt"], settings["seed"]
+    stride, length = model.embodiments[robot].stride, prompt + settings["frames"]
+    simulated = partial(truth.episode, robot, length, stride, seed, wander=settings["driver"] == "wander")
+    episodes = [simulated(number) for number in range(settings["rollouts"])]
+    size, (camera, *_) = tokenizer.spec.image_size, truth.embodiment(robot).cameras
+    seen = np.stack([prepare(one.pictures, camera, size, tokenizer.spec.resize_filter) for one in episodes])
+    given = np.stack([tokenizer.encode(images[:prompt]) for images in seen])
+    kind = np.int64 if model.config.kind == "discrete" else np.float32
+    known = torch.from_numpy(given.astype(kind)).to(model.device)
+    actions = torch.from_numpy(np.stack([one.chunks for one in episodes])).to(model.device)
+    rollout = Rollout(model, robot, len(known), generator=torch.Generator().manual_seed(seed))
+    rollout.prompt(known, actions)
+    made = [known[:, -1]]
+    made += [rollout.step(actions[:, prompt - 1 + frame]) for frame in range(settings["frames"])]
+    images = decode(tokenizer, torch.stack([frame.cpu() for frame in made], dim=1))
+    print(f"{robot}: {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
+    parts = np.stack([one.parts for one in episodes])[:, prompt - 1 :]
+    return Found(robot, seen[:, prompt - 1 :], images, parts, episodes[0].driven)
+
+
+# -- figures
+
+
+def colors_of(found: Found) -> NDArray[np.float64]:
+    """Return the colour (P, 3) of each part: the commonest at its place in the true frames."""
+    side, count = found.true.shape[2], found.parts.shape[2]
+    places = np.clip((found.parts * side / truth.SIZE).astype(int), 0, side - 1)
+    b, t = np.ogrid[: found.true.shape[0], : found.true.shape[1]]
+    taken = [found.true[b, t, places[:, :, p, 1], places[:, :, p, 0]].reshape(-1, 3) for p in range(count)]
+    return np.stack([np.median(pixels, axis=0) for pixels in taken])
+
+
+def masks_of(images: Images, colors: NDArray[np.float64]) -> Masks:
+    """Return the pixels (C, …, S, S) that have each of the colours (C, 3) and no other one rather."""
+    far = np.stack([np.linalg.norm(images.astype(np.float32) - color, axis=-1) for color in colors])
+    return (far < NEAR) & (far == far.min(axis=0))
+
+
+def _row(found: Found, mark: int) -> dict[str, Any]:
+    colors = colors_of(found)
+    own, loose = colors[: found.driven], np.unique(colors[found.driven :], axis=0)
+    palette = np.concatenate([loose, np.unique(own, axis=0)])
+    first, true, made = (
+        masks_of(x, palette) for x in (found.true[:, 0], found.true[:, mark], found.made[:, mark])
+    )
+    areas, kept = true.sum((-1, -2)), made.sum((-1, -2))
+    seen = areas >= FEWEST
+    shares = np.where(seen, kept / np.maximum(areas, 1), np.nan)
+    moved, shapes, offs, overlaps, repeats = 0, [], [], [], []
+    for color, rollout in zip(*np.nonzero(seen[: len(loose)]), strict=True):
+        was, now, got = first[color, rollout], true[color, rollout], made[color, rollout]
+        if was.sum() < FEWEST:
+            continue
+        shapes.append(best_overlap(now, got))
+        way = np.linalg.norm(_centre(now) - _centre(was)) * truth.SIZE / len(now)
+        if way < MOVED:
+            continue
+        moved += 1
+        overlaps.append(overlap(now, got))
+        repeats.append(overlap(now, was))
+        if got.any():
+            offs.append(float(np.linalg.norm(_centre(got) - _centre(now)) * truth.SIZE / len(now) / way))
+    still = (found.true == found.true[:, :1]).all(axis=(1, -1))
+    error = (found.made[:, mark].astype(np.float64) - found.true[:, 0])[still]
+    noise = float(np.square(error).mean()) if error.size else np.nan
+    return {
+        "robot": found.robot,
+        "frame": mark,
+        "left": _mean(shares[: len(loose)]),
+        "limbs": _mean(shares[len(loose) :]),
+        "shape": _mean(shapes),
+        "off": _mean(offs),
+        "overlap": _mean(overlaps),
+        "repeat": _mean(repeats),
+        "moved": moved,
+        "static_db": round(min(10 * np.log10(255**2 / max(noise, 1e-9)), 99.0), 1)
+        if noise == noise
+        else None,
+    }
+
+
+def best_overlap(true: Masks, made: Masks) -> float:
+    """Return the overlap of an object with the true one (S, S) after the best shift and turn."""
+    if not made.any():
+        return 0.0
+    middle, shift = _centre(made), _centre(true) - _centre(made)
+    best = 0.0
+    for turn in range(TURNS):
+        matrix = cv2.getRotationMatrix2D((float(middle[0]), float(middle[1])), turn * 360 / TURNS, 1.0)
+        matrix[:, 2] += shift
+        turned = cv2.warpAffine(made.astype(np.float32), matrix, made.shape[::-1]) > 0.5
+        best = max(best, overlap(true, turned))
+    return best
+
+
+def overlap(one: Masks, other: Masks) -> float:
+    """Return the pixels that two objects share, of those that either has."""
+    return float((one & other).sum() / max((one | other).sum(), 1))
+
+
+def _centre(mask: Masks) -> NDArray[np.float64]:
+    return np.array([axis.mean() for axis in np.nonzero(mask)[::-1]])
+
+
+def _mean(values: Any) -> float | None:
+    kept = np.asarray(values, dtype=np.float64)
+    kept = kept[np.isfinite(kept)]
+    return round(float(kept.mean()), 3) if kept.size else None
+
+
+# -- sheet
+
+
+def draw(found: list[Found], path: Path) -> None:
+    """Write a PNG: for two rollouts a robot the truth, and below it the model, at the frames of SHOWN."""
+    from hma_data.episodes.sheets import grid, write_png
+
+    lines, labels = [], []
+    for one in found:
+        columns = [frame for frame in SHOWN if frame < one.true.shape[1]]
+        for number in range(min(2, len(one.true))):
+            lines += [list(one.true[number, columns]), list(one.made[number, columns])]
+            labels += [f"{one.robot}, truth at frames {', '.join(map(str, columns))}", f"{one.robot}, model"]
+    write_png(path, grid(lines, labels))
+
+
+BENCH = Bench(
+    "objects in closed loop: what is left of them, whether they keep their shape, how far they are off",
+    {
+        "checkpoint": "embedded",
+        "robots": "pusht_fast,arm2_07,mover_10",
+        "frames": 60,
+        "rollouts": 12,  # of each robot
+        "driver": "own",  # of the pushers: own pushes the T to its goal; wander moves at random
+        "prompt": 3,  # true frames
+        "device": "auto",
+        "seed": 4949,
+        "sheet": "",  # a PNG to write
+    },
+    run,
+)
