@@ -23,7 +23,7 @@ STATISTICS = "normalizer."  # the beginning of their names in a stem
 LARGEST_COUNT = 1_000_000  # upper limit of every count in a configuration
 _COUNTS = (
     *("layers", "width", "heads", "frames", "channels", "patch", "action_tokens", "grid", "views"),
-    *("factored", "diffusion_depth", "diffusion_width", "diffusion_sample_steps"),
+    *("levels", "factored", "diffusion_depth", "diffusion_width", "diffusion_sample_steps"),
 )
 _REMEDY = "pull the checkpoint again; if it stays so, do not use it"
 
@@ -119,14 +119,19 @@ def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: 
     values = sum(tensor.numel() for tensor in state.values())
     width, hidden = config.width, config.mlp_ratio * config.width
     needed = {
-        "layers": config.layers * width * max(width, hidden),
         "grid": config.tokens_per_frame * width,
         "frames": config.frames * width if config.released else 0,
     }
+    if config.trunk == "unet":
+        needed["levels"] = config.layers * sum(18 * channels**2 for channels in config.levels)
+        del needed["grid"]  # its places have the channels of the finest resolution
+    else:
+        needed["layers"] = config.layers * width * max(width, hidden)
     if config.kind == "discrete":
         needed["factored"] = sum(config.digits) * width
     else:
-        needed["diffusion_depth"] = config.diffusion_depth * config.diffusion_width**2
+        if config.video_loss == "diffusion":
+            needed["diffusion_depth"] = config.diffusion_depth * config.diffusion_width**2
         needed["channels"] = config.patch_dim * width
     for key, count in needed.items():
         if not count <= values:
