@@ -96,7 +96,7 @@ def parameter_groups(
         decays, scaled, sharded = name not in plain, name in matrices, isinstance(parameter, DTensor)
         factor = multiplier if scaled else 1.0
         rate, decay = lr / factor, weight_decay * factor if decays else 0.0
-        muon = muon_lr is not None and name.startswith("trunk.blocks.") and parameter.ndim == 2
+        muon = muon_lr is not None and name.startswith("trunk.blocks.") and parameter.ndim >= 2
         if muon_lr is not None and muon:
             rate = muon_lr
         fresh = {"params": [], "names": [], "lr": rate, "base_lr": rate, "weight_decay": decay, "muon": muon}
