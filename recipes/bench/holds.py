@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from hma_data.bench import Bench
 from hma_data.errors import UsageError
 from hma_data.lab import truth
+from hma_data.lab.simulator import embodiment
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -67,7 +68,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row for each robot and mark; raise UsageError for a wrong setting."""
     robots = [name.strip() for name in settings["robots"].split(",")]
     for robot in robots:
-        truth.embodiment(robot)
+        embodiment(robot)
     if min(settings["frames"], settings["rollouts"], settings["prompt"]) < 1:
         raise UsageError("bench holds", "frames, rollouts and prompt are at least 1", "give larger ones")
     from hma_data.tokenizers.base import get_tokenizer
@@ -98,7 +99,7 @@ def measure(model: "HMA", tokenizer: "Tokenizer", robot: str, settings: dict[str
     stride, length = model.embodiments[robot].stride, prompt + settings["frames"]
     simulated = partial(truth.episode, robot, length, stride, seed, wander=settings["driver"] == "wander")
     episodes = [simulated(number) for number in range(settings["rollouts"])]
-    size, (camera, *_) = tokenizer.spec.image_size, truth.embodiment(robot).cameras
+    size, (camera, *_) = tokenizer.spec.image_size, embodiment(robot).cameras
     seen = np.stack([prepare(one.pictures, camera, size, tokenizer.spec.resize_filter) for one in episodes])
     given = np.stack([tokenizer.encode(images[:prompt]) for images in seen])
     kind = np.int64 if model.config.kind == "discrete" else np.float32
