@@ -230,7 +230,7 @@ SHIPPED = sorted(path.stem for path in (shipped("recipes") / "train").glob("*.ya
 
 def test_every_kind_of_recipe_is_shipped():
     sizes = {f"{kind}_{size}" for kind in ("discrete", "continuous") for size in ("tiny", "base", "xl")}
-    assert set(SHIPPED) == sizes | {"pretrain40", "finetune", "finetune_tiny", "unet_tiny", "world"}
+    assert set(SHIPPED) == sizes | {"pretrain40", "finetune", "finetune_tiny", "unet_tiny", "world", "world_unet"}
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -242,7 +242,7 @@ def test_every_shipped_recipe_validates_and_makes_a_network(name):
             name="svd-vae", version=1, kind="continuous", image_size=256, grid=(32, 32), channels=4,
             dtype="float16", latent_scale=0.18215,
         )  # fmt: skip
-    elif name in ("world", "unet_tiny"):
+    elif name in ("world", "unet_tiny", "world_unet"):
         spec = get_tokenizer("fsq-lab" if name == "world" else "raw-128").spec
     config = recipe.network(spec)
     assert config.kind == spec.kind and config.frames == recipe.frames
