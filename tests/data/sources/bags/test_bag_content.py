@@ -132,11 +132,6 @@ def test_a_jpeg_that_is_called_h264_is_read_as_a_jpeg(tmp_path: Path) -> None:
     assert pairs(ros2.write(tmp_path / "run", messages), robot()) == IN_ORDER
 
 
-def test_b_slices_are_told() -> None:
-    assert any(has_b_slices(data) for _, data in packets("h264 with B-frames"))
-    assert not any(has_b_slices(data) for _, data in packets("h264"))
-
-
 # -- mosaics
 
 PATTERNS = {"rggb": (0, 0), "bggr": (1, 1), "gbrg": (1, 0), "grbg": (0, 1)}  # where the red pixel is

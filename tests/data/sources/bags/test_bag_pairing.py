@@ -14,7 +14,7 @@ from hma_data.errors import EpisodeError
 from hma_data.inspection.infer import infer
 from hma_data.inspection.inspect import examine
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.bags.clocks import SECOND_NS, Clock, apart, sorted_by
+from hma_data.sources.bags.clocks import SECOND_NS, sorted_by
 from hma_data.storage.yaml_io import parse_yaml
 from tests.data import ros2
 from tests.data.bag_files import SOURCE
@@ -180,12 +180,6 @@ def test_parts_stored_in_another_order_are_sorted() -> None:
     times = np.concatenate([np.arange(20, 40), np.arange(20)]) * PERIOD_NS
     assert sorted_by(times, np.repeat([0, 1], 20)).tolist() == [*range(20, 40), *range(20)]
     assert sorted_by(times, np.zeros(40, np.int64)) is None
-
-
-def test_clocks_are_compared_with_each_other_not_with_receipt() -> None:
-    camera, joints = Clock("/cam", True, 30.0, 0.01), Clock("/joints", True, 30.02, 0.0)
-    assert apart(camera, joints, 0.1) == ""
-    assert "0.5 s" in apart(camera, Clock("/joints", True, 29.5, 0.0), 0.1)
 
 
 # -- what infer proposes
