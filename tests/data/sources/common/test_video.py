@@ -39,22 +39,12 @@ def test_every_frame_equals_decoding_in_order(video: Path) -> None:
     assert np.array_equal(VideoFile(video).frames(range(LENGTH)), in_order(video))
 
 
-def test_each_index_shows_its_own_number(video: Path) -> None:
-    file = VideoFile(video)
-    for indices in ([0, 1, 2], [5, 12, 33], [39], [0], [20, 3, 20]):
-        assert [number_of(frame) for frame in file.frames(indices)] == indices
-
-
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(calls=st.lists(st.lists(st.integers(0, LENGTH - 1), max_size=6), min_size=1, max_size=5))
 def test_any_order_of_calls_gives_the_frames_asked_for(video: Path, calls: list[list[int]]) -> None:
     file = VideoFile(video)
     for indices in calls:
         assert [number_of(frame) for frame in file.frames(indices)] == indices
-
-
-def test_times_are_those_of_the_packets(video: Path) -> None:
-    np.testing.assert_allclose(VideoFile(video).timestamps, np.arange(LENGTH) / 10, atol=1e-4)
 
 
 def test_rising_batches_decode_each_frame_once(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,13 +83,6 @@ assert mine == [4, 5, 31]
 
 def test_a_forked_child_and_its_parent_read_the_same_file(video: Path) -> None:
     run_fresh(FORKING, video)
-
-
-def test_a_closed_file_opens_again(video: Path) -> None:
-    file = VideoFile(video)
-    file.frames([30])
-    file.close()
-    assert number_of(file.frames([2])[0]) == 2
 
 
 def test_no_indices_give_no_pictures(video: Path) -> None:

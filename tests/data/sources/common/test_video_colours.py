@@ -158,11 +158,6 @@ def test_rgb_has_no_matrix(tmp_path: Path, kind: str, matrix: int) -> None:
     assert np.array_equal(VideoFile(path).frames([0])[0], picture)
 
 
-def test_a_video_that_states_no_colours_is_converted_as_before(tmp_path: Path) -> None:
-    path = film(tmp_path / "v.mp4", UNSTATED, False)
-    assert np.array_equal(VideoFile(path).frames([0])[0], frame_of(path).to_ndarray(format="rgb24"))
-
-
 @pytest.mark.parametrize("order", [(BT709, SMPTE170M), (SMPTE170M, BT709), (BT709, BT2020)])
 def test_colours_may_change_within_a_video(tmp_path: Path, order: tuple[int, int]) -> None:
     films = [film(tmp_path / f"{matrix}.mp4", matrix, False) for matrix in order]

@@ -1,6 +1,5 @@
 """Containers and codecs as they are met, and containers that lie: any frame equals decoding in order."""
 
-import os
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -10,7 +9,6 @@ import av
 import numpy as np
 import pytest
 
-from hma_data.cpu import take_ordinary_priority
 from hma_data.errors import EpisodeError
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
@@ -142,19 +140,6 @@ def test_a_lying_container_that_gives_fewer_frames_is_refused(tmp_path, monkeypa
         VideoFile(path).frames([3])
 
 
-def test_frames_that_were_never_reordered_are_not_counted(tmp_path: Path) -> None:
-    table = frame_table(make(tmp_path / "v.mp4", *X264, gop=2))  # x264 announces B-frames, and makes none
-    assert not table.counted and (np.arange(N) - table.keys).max() == 1
-
-
-def test_a_group_is_decoded_no_further_back_than_its_keyframe(tmp_path, monkeypatch) -> None:
-    file, seen = VideoFile(make(tmp_path / "v.mp4", *AV1, gop=2)), []
-    inner = VideoFile._index_of
-    monkeypatch.setattr(VideoFile, "_index_of", lambda self, frame: seen.append(1) or inner(self, frame))
-    file.frames(range(0, N, 5))
-    assert len(seen) <= 2 * len(range(0, N, 5))
-
-
 def test_frames_made_from_a_damaged_one_are_refused_up_to_the_next_keyframe(tmp_path: Path) -> None:
     whole = make(tmp_path / "whole.mp4", "libx264", {"crf": "4", "bf": "0"}, gop=13)
     intact = VideoFile(whole).frames(range(N))
@@ -181,15 +166,16 @@ def test_frames_made_from_a_damaged_one_are_refused_up_to_the_next_keyframe(tmp_
         VideoFile(path).frames([silent[0]])
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="no schedulers to choose from")
-def test_encoding_av1_leaves_the_process_its_turn_among_others(tmp_path: Path) -> None:
-    make(tmp_path / "v.mp4", *AV1, gop=2)
-    take_ordinary_priority()
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER
-
-
 def test_a_file_that_is_no_video_is_told_in_words(tmp_path: Path) -> None:
     (tmp_path / "v.mp4").write_bytes(b"\0" * 5000)
     said = "v.mp4: cannot be decoded as video: Invalid data found when processing input — the file may be"
     with pytest.raises(EpisodeError, match=said):
         VideoFile(tmp_path / "v.mp4")
+
+
+def test_a_group_is_decoded_no_further_back_than_its_keyframe(tmp_path, monkeypatch) -> None:
+    file, seen = VideoFile(make(tmp_path / "v.mp4", *AV1, gop=2)), []
+    inner = VideoFile._index_of
+    monkeypatch.setattr(VideoFile, "_index_of", lambda self, frame: seen.append(1) or inner(self, frame))
+    file.frames(range(0, N, 5))
+    assert len(seen) <= 2 * len(range(0, N, 5))

@@ -22,7 +22,6 @@ from hma_data.sources.hands.runs import (
     POINTS,
     Header,
     cut_into_runs,
-    find_spans,
     labels_from_rows,
     layout_of,
     values_of,
@@ -167,17 +166,6 @@ def test_labels_of_pictures_of_another_size(folder: Path) -> None:
 # -- runs
 
 
-def test_a_frame_without_a_needed_hand_ends_a_run(folder: Path) -> None:
-    table = made.rows("a", LENGTH, lambda side, i: (side, i) != ("right", 13))
-    made.write_table(folder / "hands.parquet", table)
-    robot = made.hand_video("landmarks", min_frames="4")
-    check_run(folder, robot, "a.mp4#0", range(13))
-    check_run(folder, robot, "a.mp4#1", range(14, LENGTH))
-    longest = open_source("hands").read(str(folder), "a.mp4", robot)
-    assert longest.metadata["run"] == 1 and longest.metadata["runs"] == 2
-    assert longest.metadata["without_hands"] == 1 and longest.metadata["dropped"] == 3
-
-
 def test_hold_keeps_the_last_place_for_so_many_frames(folder: Path) -> None:
     table = made.rows("a", LENGTH, lambda side, i: side == "left" or i not in (0, 10, 11, 20, 21, 22, 23))
     made.write_table(folder / "hands.csv", table)
@@ -198,21 +186,6 @@ def test_nan_says_that_there_is_no_hand(folder: Path) -> None:
     robot = made.hand_video("landmarks", min_frames="5")
     check_run(folder, robot, "a.mp4#0", range(10))
     check_run(folder, robot, "a.mp4#1", range(11, LENGTH))
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.integers(1, 4), st.booleans()), min_size=1, max_size=40), st.integers(1, 4))
-def test_every_usable_label_is_in_exactly_one_stretch(steps: list[tuple[int, bool]], widest: int) -> None:
-    frames = np.cumsum([step for step, _ in steps])
-    there = np.array([usable for _, usable in steps])
-    spans = find_spans(frames, there, widest)
-    stretches: list[list[int]] = []
-    for i, usable in enumerate(there):
-        if usable and stretches and stretches[-1][-1] == i - 1 and frames[i] - frames[i - 1] <= widest:
-            stretches[-1].append(i)
-        elif usable:
-            stretches.append([i])
-    assert [list(range(*span)) for span in spans] == stretches
 
 
 @settings(max_examples=60, deadline=None)
@@ -274,15 +247,6 @@ def test_labels_of_every_third_frame_run_on_and_a_missing_one_ends_the_run() -> 
     labels = labels_from_rows(frames, np.zeros(7, int), np.ones(7), {"center": np.full((7, 2), 0.5)})
     runs = cut_into_runs(labels, ("left/center",), HandsLayout(min_frames=1), VIDEO, "v")
     assert [runs.labels.frames[slice(*span)].tolist() for span in runs.spans] == [[3, 6, 9], [15, 18, 21, 24]]
-
-
-def test_irregular_labels_end_a_run_after_so_many_seconds() -> None:
-    frames = np.array([0, 14, 20, 95, 101])
-    labels = labels_from_rows(
-        frames, np.zeros(5, int), np.ones(5), {"center": np.full((5, 2), 0.5)}, irregular=True
-    )
-    runs = cut_into_runs(labels, ("left/center",), HandsLayout(min_frames=1), VIDEO, "v")
-    assert [runs.labels.frames[slice(*span)].tolist() for span in runs.spans] == [[0, 14, 20], [95, 101]]
 
 
 # -- clocks

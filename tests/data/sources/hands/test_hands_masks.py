@@ -13,7 +13,7 @@ from hma_data.conversion.plan import Settings
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.sheets import write_mp4
-from hma_data.errors import RegistryError, SourceError
+from hma_data.errors import SourceError
 from hma_data.inspection.infer import infer
 from hma_data.loading.dataset import WindowDataset
 from hma_data.registry.components import HandsLayout
@@ -81,23 +81,12 @@ def test_on_a_grid_of_its_own_what_lies_beside_a_missing_hand_is_not_known(folde
     np.testing.assert_allclose(clip.known_states[:, 0], 0.1 + 0.01 * frame[clip.state_known], atol=1e-5)
 
 
-def test_masked_after_being_held(folder: Path) -> None:
-    clip = read(folder, made.hand_video("landmarks", missing="mask", max_hold="2", action=""))
-    assert unknown(clip.action_known) == [12]
-    assert clip.flags["held_frames"] == 2 and clip.flags["masked_frames"] == 1
-
-
 def test_a_video_with_too_few_hands_gives_no_masked_episode(folder: Path) -> None:
     source = open_source("hands")
     enough = made.hand_video("landmarks", missing="mask", min_frames="26")
     assert len(source.index(str(folder), enough)) == 1
     with pytest.raises(SourceError, match="has no run of 27 frames"):
         source.index(str(folder), made.hand_video("landmarks", missing="mask", min_frames="27"))
-
-
-def test_another_word_than_split_hold_and_mask_is_refused(folder: Path) -> None:
-    with pytest.raises(RegistryError, match="layout.missing: .*'skip'.*'split', 'hold' or 'mask'"):
-        read(folder, made.hand_video("landmarks", missing="skip"))
 
 
 @settings(max_examples=60, deadline=None)

@@ -56,20 +56,10 @@ def test_values_and_pictures_equal_h5py(demos: Path) -> None:
     np.testing.assert_allclose(stream.timestamps, np.arange(16) / 20)
 
 
-def test_demos_are_in_natural_order(demos: Path) -> None:
-    assert open_source("hdf5").episode_ids(str(demos)) == [f"demo_{i}" for i in range(12)]
-
-
 def test_masks_are_the_splits(demos: Path) -> None:
     refs = open_source("hdf5").index(str(demos), embodiment())
     assert [ref.split for ref in refs] == ["train"] * 10 + ["val"] * 2
     assert [ref.frames for ref in refs] == [T + i for i in range(12)]
-
-
-def test_without_both_masks_there_is_no_split(demos: Path) -> None:
-    with h5py.File(demos, "a") as file:
-        del file["mask/valid"]
-    assert {ref.split for ref in open_source("hdf5").index(str(demos))} == {None}
 
 
 def test_a_named_mask_chooses_the_episodes(demos: Path) -> None:
@@ -466,11 +456,6 @@ def test_inspect_lists_keys_rate_and_lengths(demos: Path) -> None:
     assert (keys["actions"].kind, keys["actions"].shape) == ("vector", (3,))
     assert found.problems == ()
     assert json.loads(json.dumps(found.to_json()))["episodes"] == 12
-
-
-def test_inspect_sees_encoded_pictures(aloha: Path) -> None:
-    info = next(key for key in open_source("hdf5").inspect(str(aloha)).keys if key.kind == "camera")
-    assert info.shape == (H, W, 3) and info.codec in ("jpeg", "raw")
 
 
 def test_inspect_tells_what_looks_wrong(demos: Path) -> None:

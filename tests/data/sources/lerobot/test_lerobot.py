@@ -117,14 +117,6 @@ def test_every_frame_goes_with_its_action(whole: Path) -> None:
             assert shown == [10 * episode + i for i in range(length)], camera
 
 
-def test_strided_frames_are_those_asked_for(whole: Path) -> None:
-    episode = open_source("lerobot").read(str(whole), "episode_000002", embodiment())
-    for camera in ("cam", "still"):
-        frames = episode.streams[camera].frames([0, 4, 14])
-        assert frames.shape == (3, HEIGHT, WIDTH, 3) and frames.dtype == np.uint8
-        assert [number_of(frame) for frame in frames] == [20, 24, 34]
-
-
 def test_task_and_success_are_the_episodes_own(whole: Path) -> None:
     source = open_source("lerobot")
     read = [source.read(str(whole), f"episode_{i:06d}", embodiment()) for i in range(3)]
@@ -181,30 +173,6 @@ def test_pictures_named_by_path_are_read(copy: Callable[[str], Path]) -> None:
     )
     with pytest.raises(EpisodeError, match="outside the dataset"):
         open_source("lerobot").read(str(folder), "episode_000000", embodiment()).streams["still"].frames([0])
-
-
-def test_a_dataset_of_the_hub_is_read_from_its_cache(originals, tmp_path, monkeypatch) -> None:
-    from huggingface_hub import constants
-
-    home, commit = tmp_path / "datasets--team--arm", "a" * 40
-    (home / "refs").mkdir(parents=True)
-    (home / "refs/main").write_text(commit)
-    for i, file in enumerate(sorted(originals["v3"].rglob("*.*"))):
-        if file.is_file():  # the cache holds links to blobs
-            link = home / "snapshots" / commit / file.relative_to(originals["v3"])
-            link.parent.mkdir(parents=True, exist_ok=True)
-            (home / "blobs").mkdir(exist_ok=True)
-            shutil.copy(file, home / f"blobs/{i}")
-            link.symlink_to(home / f"blobs/{i}")
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
-    source = open_source("lerobot")
-    for uri in ("hf://datasets/team/arm", "team/arm"):
-        assert [ref.frames for ref in source.index(uri, embodiment())] == list(LENGTHS)
-        episode = source.read(uri, "episode_000001", embodiment())
-        assert number_of(episode.streams["cam"].frames([3])[0]) == 13
-    with pytest.raises(SourceError, match="cannot be fetched from the Hub"):
-        source.index("hf://datasets/team/other")
 
 
 # -- what is refused

@@ -20,7 +20,6 @@ from hma_data.inspection.infer import infer
 from hma_data.inspection.inspect import examine
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
-from hma_data.sources.common.video_file import frame_table
 from hma_data.storage.yaml_io import parse_yaml
 
 FPS, HEIGHT, WIDTH = 10, 64, 96
@@ -175,14 +174,6 @@ def test_every_picture_is_equal_byte_for_byte(written: Path, items: list[Any]) -
             np.testing.assert_array_equal(mine, as_picture(item[camera.key]), str((episode.id, row)))
 
 
-def test_files_are_laid_out_as_meant(written: Path, request: pytest.FixtureRequest) -> None:
-    name = request.node.callspec.params["written"]
-    files = [len(list(written.rglob(f"{CAM}/**/*.mp4"))), len(list((written / "data").rglob("*.parquet")))]
-    assert frame_table(next(written.rglob("*.mp4"))).codec == name.partition(" ")[0]
-    assert files == [1, 1] if "one" in name else min(files) > 1, str(files)
-    assert len(list((written / "data").iterdir())) == (files[1] + 1) // 2
-
-
 def test_it_is_inspected_without_a_problem(written: Path) -> None:
     found = open_source("lerobot").inspect(str(written))
     assert (found.episodes, found.lengths, found.hz, found.problems) == (5, LENGTHS, FPS, ())
@@ -245,18 +236,6 @@ def test_episodes_deleted_by_lerobot_leave_the_others_equal(tmp_path: Path) -> N
             np.testing.assert_array_equal(episode.actions[0].values[row], wanted)
             np.testing.assert_array_equal(frames[row], as_picture(kept[at][CAM]))
             at += 1
-
-
-@SLOW
-def test_metadata_spread_over_many_row_groups_is_whole(tmp_path: Path) -> None:
-    features = {"action": FEATURES["action"], STILL: FEATURES[STILL]}
-    root = write(tmp_path / "set", features, many_files, metadata_buffer_size=1)
-    groups = [pq.ParquetFile(path).num_row_groups for path in (root / "meta/episodes").rglob("*.parquet")]
-    assert sum(groups) > 1
-    robot = arm(cameras=[{"name": "still", "key": STILL}], state=None)
-    for item, episode, row in rows_of(list(theirs(root)), robot, root):
-        np.testing.assert_array_equal(episode.streams["still"].frames([row])[0], as_picture(item[STILL]))
-        np.testing.assert_array_equal(episode.actions[0].values[row], item["action"].numpy())
 
 
 # -- sets as other writers leave them: lerobot's own, altered

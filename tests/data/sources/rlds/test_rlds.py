@@ -8,7 +8,6 @@ import zlib
 from pathlib import Path
 
 import cv2
-import fsspec
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -19,7 +18,7 @@ from hma_data.errors import EpisodeError, HMAError, MissingDependencyError, Sour
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.sources.detect import detect
-from hma_data.sources.rlds.example import Example, varints
+from hma_data.sources.rlds.example import Example
 from tests.data import rlds_files
 from tests.data.rlds_files import (
     PROTO,
@@ -179,18 +178,6 @@ def test_unpacked_lists_are_read_like_packed_ones():
     assert example.numbers("x").tolist() == [1.5, -2.0]
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.integers(-(2**63), 2**63 - 1), min_size=1, max_size=40), st.text(max_size=9))
-def test_integers_and_names_survive_the_wire(values, name):
-    assert Example(encode({name: values}), "e").numbers(name).tolist() == values
-
-
-def test_varints_cut_off_or_too_long_are_refused():
-    for data in (b"\x01\x80", b"\x80" * 10 + b"\x01"):
-        with pytest.raises(ValueError, match="varint"):
-            varints(np.frombuffer(data, np.uint8))
-
-
 @pytest.mark.parametrize("key", [None, "observation/instruction"])
 def test_an_instruction_kept_as_letter_codes(tmp_path, key):
     steps = STEPS | {
@@ -236,11 +223,6 @@ def test_ids_run_over_the_shards_of_a_split_whatever_the_template(tmp_path):
     info["splits"][0]["filepathTemplate"] = "{SPLIT}/part.{FILEFORMAT}-{SHARD_INDEX}"
     (moved / "dataset_info.json").write_text(json.dumps(info))
     assert read(moved, "train/000004").instruction == "lift é 4"
-
-
-def test_without_dataset_info_the_records_are_counted(tmp_path):
-    folder = toy(tmp_path / "d", info=False)
-    assert RLDS.episode_ids(str(folder)) == ["train/000000", "train/000001", "train/000002"]
 
 
 def test_the_sources_own_splits(tmp_path):
@@ -317,17 +299,6 @@ def test_a_renamed_dataset_is_found_by_its_files(tmp_path):
     shard = next(folder.glob("*.tfrecord*"))
     shard.rename(folder / shard.name.replace("toy", "other_name"))
     assert read(folder, "train/000001").instruction == "lift é 1"
-
-
-def test_a_remote_folder_reads_like_a_local_one(tmp_path):
-    folder = toy(tmp_path / "d")
-    uri = f"memory://{tmp_path.name}"
-    for path in folder.iterdir():
-        fsspec.filesystem("memory").pipe(f"{uri}/{path.name}", path.read_bytes())
-    local, remote = read(folder, "train/000001"), read(uri, "train/000001")
-    np.testing.assert_array_equal(remote.actions[0].values, local.actions[0].values)
-    np.testing.assert_array_equal(remote.streams["primary"].frames([2]), local.streams["primary"].frames([2]))
-    assert [ref.id for ref in RLDS.index(uri)] == RLDS.episode_ids(str(folder))
 
 
 def test_features_json_of_older_tfds(tmp_path):

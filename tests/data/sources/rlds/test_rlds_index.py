@@ -1,7 +1,6 @@
 """Where the records of a file lie, and remote files read a range at a time."""
 
 import json
-import os
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -12,16 +11,14 @@ import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
+from hma_data.errors import MissingDependencyError, SourceError
 from hma_data.sources.base import open_source
-from hma_data.sources.rlds import records
 from hma_data.sources.rlds.folder import open_folder
 from hma_data.storage import fetch as fetching
 from tests.data import rlds_files
-from tests.data.rlds_files import encode, tensor
+from tests.data.rlds_files import tensor
 
 RLDS = open_source("rlds")
-FILES = fsspec.filesystem("file")
 STEPS = {"a": tensor((2,)), "pad": tensor((4000,))}
 
 
@@ -41,30 +38,8 @@ def shard(folder: Path) -> Path:
     return next(folder.glob("*.tfrecord*"))
 
 
-def reopened(path: Path) -> records.RecordFile:
-    """As another process would open it."""
-    records._opened.cache_clear()
-    return records.open_records(FILES, str(path))
-
-
 def number(folder: Path | str, name: str) -> float:
     return float(open_folder(str(folder)).example(name)[0].numbers("steps/a")[0])
-
-
-# -- damage
-
-
-def test_damaged_data_are_an_error(tmp_path):
-    path = shard(dataset(tmp_path / "d"))
-    offset = int(reopened(path).framing().offsets[50])
-    content = bytearray(path.read_bytes())
-    content[offset + 3] ^= 1
-    stamp = path.stat()
-    path.write_bytes(content)
-    os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
-    with pytest.raises(EpisodeError, match="checksum"):
-        reopened(path).read(50, "train/000050")
-    assert reopened(path).read(51, "e") == encode(record(51))
 
 
 # -- links
@@ -178,12 +153,6 @@ def test_a_server_without_ranges_is_named(served):
         number(uri, "train/000002")
 
 
-def test_a_server_that_is_not_there_is_one_error(monkeypatch):
-    monkeypatch.setattr(fetching, "WAITS_S", (0.0, 0.0, 0.0))
-    with pytest.raises(SourceError):
-        RLDS.index("http://127.0.0.1:9/nothing")
-
-
 @pytest.fixture
 def memory(tmp_path):
     """A dataset on fsspec's file system in memory."""
@@ -192,21 +161,6 @@ def memory(tmp_path):
     for path in folder.iterdir():
         files.pipe(f"{root}/{path.name}", path.read_bytes())
     return f"memory:/{root}"
-
-
-def test_a_connection_that_breaks_is_tried_again(memory, monkeypatch):
-    true, broken = MemoryFileSystem.cat_file, []
-
-    def cat_file(self, path, start=None, end=None, **options):
-        if len(broken) < 3 and "tfrecord" in path:
-            broken.append(path)
-            raise ConnectionResetError("reset by peer")
-        return true(self, path, start, end, **options)
-
-    monkeypatch.setattr(MemoryFileSystem, "cat_file", cat_file)
-    monkeypatch.setattr(fetching, "WAITS_S", (0.0, 0.0, 0.0))
-    assert number(memory, "train/000007") == 7
-    assert len(broken) == 3
 
 
 def test_no_permission_is_not_tried_again(memory, monkeypatch):
@@ -231,15 +185,6 @@ def test_a_folder_that_may_not_be_read_is_not_called_missing(memory, monkeypatch
     with pytest.raises(SourceError, match=r"forbidden.*your access") as found:
         open_folder(f"{memory}/inside")
     assert "SECRET" not in f"{found.value}{found.value.__cause__}"
-
-
-def test_a_remote_file_cut_short_is_an_episode_error(memory):
-    files = fsspec.filesystem("memory")
-    path = memory.removeprefix("memory:/") + "/toy-train.tfrecord-00001-of-00003"
-    files.pipe(path, files.cat(path)[:-5])
-    assert number(memory, "train/000006") == 6
-    with pytest.raises(EpisodeError, match="cut off"):
-        number(memory, "train/000007")
 
 
 @pytest.mark.parametrize(
