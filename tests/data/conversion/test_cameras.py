@@ -12,7 +12,6 @@ import pytest
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
-from hma_data.conversion.rewrite import merge, split
 from hma_data.episodes.images import describe_resize
 from hma_data.errors import RegistryError
 from hma_data.registry.components import Camera
@@ -111,20 +110,6 @@ def test_a_camera_that_an_episode_lacks_is_named(tmp_path: Path) -> None:
 def test_an_unknown_camera_is_refused(recording: Path, tmp_path: Path) -> None:
     with pytest.raises(RegistryError, match="nose.*top, wrist, side"):
         convert(arm(), recording, BlockTokenizer(), tmp_path / "x", settings=Settings(cameras=("nose",)))
-
-
-def test_merged_split_and_extended_sets_keep_every_camera(made, recording, tmp_path) -> None:
-    merge([made, made], tmp_path / "twice")
-    split(tmp_path / "twice", tmp_path / "again", val_fraction=0.5)
-    for limit in (2, None):
-        settings = replace(EVERY, limit=limit)
-        convert(arm(), recording, BlockTokenizer(), tmp_path / "grown", settings=settings, extend=True)
-    for folder, times in (("twice", 2), ("again", 2), ("grown", 1)):
-        assert verify(tmp_path / folder) == []
-        for camera in SIZES:
-            ours = frames(tmp_path / folder, camera)
-            for one, other in zip(ours, frames(made, camera) * times, strict=True):
-                np.testing.assert_array_equal(one, other)
 
 
 def test_a_damaged_token_of_a_further_camera_is_found(recording: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from hma_data.conversion.engines import Attempt, Ledger, Limits, Report, Retry, Step
+from hma_data.conversion.engines import Attempt, Limits, Report, Retry, Step
 from hma_data.conversion.engines.local import run, serve
 from hma_data.errors import HMAError, TokenizerError
 
@@ -207,16 +207,3 @@ def test_a_worker_that_nobody_hears_any_more_ends_without_a_word() -> None:
         process.join(60)
         process.kill()  # where it did not end
     assert process.exitcode == 1 and said == [""]
-
-
-def test_the_ledger_leaves_a_unit_that_was_killed_twice_for_when_nothing_else_runs() -> None:
-    ledger = Ledger(["x", "y"], Limits(kills=5), print_nothing)
-    first, second = ledger.take(), ledger.take()
-    assert first and second
-    ledger.lost(0, "killed", "", "ended by SIGKILL")
-    assert ledger.take() is not None
-    ledger.lost(0, "killed", "", "ended by SIGKILL")
-    assert ledger.take() is None, "y still runs"
-    ledger.finished(1)
-    taken = ledger.take()
-    assert taken and taken[0] == 0 and taken[2].number == 2

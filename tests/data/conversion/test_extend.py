@@ -6,10 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import h5py
-import pyarrow.parquet as pq
 import pytest
 
-from hma_data.conversion.extend import content_of
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.report import Summary
@@ -17,9 +15,8 @@ from hma_data.conversion.rewrite import merge
 from hma_data.errors import OutputError
 from hma_data.inspection.inspect import examine
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import EPISODES, Manifest
+from hma_data.shards.manifest import Manifest
 from hma_data.shards.verify import verify
-from hma_data.sources.base import open_source
 from hma_model.hub.datasets import push_data
 from tests.conftest import BlockTokenizer, write_toy
 from tests.conftest import convert_toy as run
@@ -170,15 +167,6 @@ def test_doctor_tells_a_set_that_is_not_finished_from_a_recording(toy_arm, recor
     (tmp_path / "out" / "manifest.json").unlink()
     (found,) = examine(str(tmp_path / "out"))
     assert found.check == "integrity" and "its conversion has not finished" in found.message
-
-
-def test_what_a_worker_notes_is_what_is_found_later(toy_arm, recording, tmp_path) -> None:
-    run(toy_arm, recording, tmp_path / "out")
-    facts = Manifest.load(tmp_path / "out").plan
-    rows = pq.read_table(tmp_path / "out" / EPISODES).to_pylist()
-    source = open_source("hdf5")
-    found = {row["id"]: content_of(source, str(recording), row["id"], toy_arm, facts) for row in rows}
-    assert found == {row["id"]: row["content"] for row in rows} and len(set(found.values())) == 3
 
 
 @pytest.mark.parametrize(("make", "robot"), [(make_v3, lerobot_robot), (toy, rlds_robot)])

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from hma_data.conversion import worker as shard_work
-from hma_data.conversion.engines import Limits
 from hma_data.conversion.job import convert
 from hma_data.errors import HMAError, OutputError
 from hma_data.registry.embodiment import Embodiment
@@ -143,45 +142,6 @@ def test_a_lock_left_by_a_killed_job_is_no_lock(toy_arm, toy_recording, tmp_path
     assert contents(out) == whole
 
 
-# -- extension
-
-
-def test_added_episodes_become_new_shards_and_the_old_stay(toy_arm: Embodiment, tmp_path: Path) -> None:
-    recording, out = tmp_path / "recorded", tmp_path / "out"
-    recording.mkdir()
-    write_toy(recording / "monday.hdf5", range(20, 26))
-    run(toy_arm, recording, out)
-    before = contents(out)
-    write_toy(recording / "tuesday.hdf5", range(20, 26))
-    with pytest.raises(OutputError, match="--extend adds the episodes that are new"):
-        run(toy_arm, recording, out)
-    assert contents(out) == before
-    summary = run(toy_arm, recording, out, extend=True)
-    after = contents(out)
-    assert verify(out) == []
-    assert {name: data for name, data in after.items() if name in before and "shard-" in name} == {
-        name: data for name, data in before.items() if "shard-" in name
-    }
-    splits = summary.manifest.splits
-    assert splits["train"]["episodes"] + splits["val"]["episodes"] == 12
-    assert run(toy_arm, recording, out).made_shards == 0, "what was extended is continued as it is"
-    assert run(toy_arm, recording, out, extend=True).made_shards == 0
-    assert contents(out) == after
-
-
-def test_an_episode_recorded_anew_cannot_extend(toy_arm: Embodiment, tmp_path: Path) -> None:
-    recording, out = tmp_path / "toy.hdf5", tmp_path / "out"
-    write_toy(recording, [20, 21, 22])
-    run(toy_arm, recording, out)
-    write_toy(recording, [20, 25, 22, 23])
-    before = contents(out)
-    with pytest.raises(OutputError, match="of its episodes were recorded anew"):
-        run(toy_arm, recording, out, extend=True)
-    with pytest.raises(OutputError, match="cannot be extended; different: embodiment"):
-        run(toy_arm.model_copy(update={"id": "other"}), recording, out, extend=True)
-    assert contents(out) == before
-
-
 # -- faults
 
 
@@ -271,6 +231,14 @@ def test_an_episode_that_breaks_off_in_the_middle_leaves_nothing_of_itself(
     assert summary.manifest.splits["train"]["episodes"] + summary.manifest.splits["val"]["episodes"] == 11
 
 
-def test_limits_are_kept_apart_from_errors_of_the_job(toy_arm, toy_recording, tmp_path) -> None:
-    with pytest.raises(HMAError, match="tokenizer"):
-        convert(toy_arm, str(toy_recording), "no-such", tmp_path / "o", workers=1, limits=Limits(quiet_s=1))
+def test_an_episode_recorded_anew_cannot_extend(toy_arm: Embodiment, tmp_path: Path) -> None:
+    recording, out = tmp_path / "toy.hdf5", tmp_path / "out"
+    write_toy(recording, [20, 21, 22])
+    run(toy_arm, recording, out)
+    write_toy(recording, [20, 25, 22, 23])
+    before = contents(out)
+    with pytest.raises(OutputError, match="of its episodes were recorded anew"):
+        run(toy_arm, recording, out, extend=True)
+    with pytest.raises(OutputError, match="cannot be extended; different: embodiment"):
+        run(toy_arm.model_copy(update={"id": "other"}), recording, out, extend=True)
+    assert contents(out) == before

@@ -14,7 +14,7 @@ from hma_data.conversion.plan import (
     make_plan,
     shard_size,
 )
-from hma_data.errors import RegistryError, SourceError
+from hma_data.errors import SourceError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import EpisodeRef
 from tests.conftest import BlockTokenizer
@@ -95,11 +95,6 @@ def test_no_episodes_or_two_with_one_id_are_refused(toy_arm: Embodiment) -> None
         plan([], toy_arm)
     with pytest.raises(SourceError, match="two episodes"):
         plan([EpisodeRef("x", 1), EpisodeRef("x", 1)], toy_arm)
-
-
-def test_an_unknown_camera_is_refused_with_the_known_ones(toy_arm: Embodiment) -> None:
-    with pytest.raises(RegistryError, match="top, side"):
-        plan(refs(5), toy_arm, Settings(cameras=("wrist",)))
 
 
 def test_episodes_cut_from_one_recording_share_a_split() -> None:

@@ -21,7 +21,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import flag_pauses
 from hma_data.shards.verify import verify
 from tests.command import hma
-from tests.conftest import ARM_YAML, BlockTokenizer, contents, write_toy
+from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 from tests.data import bag_files
 from tests.data.episodes.test_align import STEADY, embodiment, episode
 
@@ -183,17 +183,6 @@ def test_hma_convert_prints_one_line_and_again_when_it_keeps_all_shards(tmp_path
     assert "such as demo_0 with 5 Hz" in told["warning"] and told["flags"] == {"off_rate_frames": 90}
 
 
-def test_the_same_bytes_come_out_however_the_job_is_run(tmp_path: Path) -> None:
-    path = timed(tmp_path, [5, 10, 5, 20])
-    made(path, tmp_path / "whole")
-    made(path, tmp_path / "out")
-    next((tmp_path / "out" / "train").iterdir()).unlink()
-    (tmp_path / "out" / "manifest.json").unlink()
-    again = made(path, tmp_path / "out")
-    assert again.kept_shards and again.made_shards == 1
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
-
-
 def test_a_bag_is_measured_by_its_primary_camera(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     bag_files.write_mcap(tmp_path / "run" / "run.mcap", bag_files.make_recording(20), bag_files.as_cdr())
@@ -216,10 +205,3 @@ def test_a_rate_that_nobody_states_is_not_compared() -> None:
     robot = embodiment()
     unstated = Embodiment.from_values(robot.to_dict() | {"frequency_hz": None, "stride": 2}, "unstated")
     assert rate_flags(to_clip(run, unstated), unstated) == {}
-
-
-def test_sets_without_the_flag_have_no_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hma_data.conversion.worker.rate_flags", lambda clip, robot: {})
-    made(timed(tmp_path, [5, 5]), tmp_path / "out")
-    assert ShardSet(tmp_path / "out").episodes["flags"].to_pylist() == ["", ""]
-    assert rate_findings(tmp_path / "out") == []

@@ -1,36 +1,12 @@
 """Records give back the objects they were made of."""
 
-import copy
 import pickle
 
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from hma_data.sources.base import EpisodeRef
 from hma_data.storage.records import Records
-
-REFS = st.lists(
-    st.builds(
-        EpisodeRef,
-        st.text(max_size=5),
-        st.integers(0, 9),
-        st.none() | st.text(max_size=2),
-        st.text(max_size=3),
-    ),
-    max_size=9,
-)
-
-
-@settings(max_examples=25, deadline=None)
-@given(REFS, st.integers(-10, 10), st.integers(-10, 10), st.sampled_from([None, 1, 2, -1]))
-def test_a_sequence_of_records_is_the_list_it_was_made_of(items, start, stop, step) -> None:
-    records = Records.of(EpisodeRef, items)
-    assert list(records) == items and len(records) == len(items)
-    assert list(records[start:stop:step]) == items[start:stop:step]
-    assert [records[i] for i in range(-len(items), len(items))] == items + items
-    assert copy.deepcopy(records[start:stop]) == records[start:stop]  # as a worker process gets it
 
 
 def test_a_part_is_sent_without_the_rest() -> None:

@@ -14,7 +14,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from hma_data.conversion.output import PLAN
 from hma_data.conversion.rewrite import merge, restat
-from hma_data.errors import MissingDependencyError, OutputError, ShardError, StorageAwayError, StorageError
+from hma_data.errors import OutputError, ShardError, StorageAwayError, StorageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.verify import verify
 from hma_data.storage import remote as store
@@ -76,15 +76,6 @@ def test_overwrite_starts_anew_and_foreign_files_are_never_touched(
     with pytest.raises(OutputError, match=r"is not a shard set: it holds notes\.txt"):
         run(toy_arm, toy_recording, out.with_name("other"), overwrite=True)
     assert files(out.with_name("other")) == {"notes.txt": b"mine"}
-
-
-def test_an_edited_stride_reaches_a_finished_set_of_a_store(toy_arm, toy_recording, out, tmp_path) -> None:
-    run(toy_arm, toy_recording, out)
-    other = Embodiment.from_values(toy_arm.to_dict() | {"target_hz": 1}, "other")
-    summary = run(other, toy_recording, out)
-    assert summary.changed == "stride 2 → 10: the model now sees 1 Hz" and not summary.made_shards
-    run(other, toy_recording, tmp_path / "whole")
-    assert files(out) == files(tmp_path / "whole")
 
 
 def test_a_manifest_is_restored_in_place(toy_arm, toy_recording, out, whole) -> None:
@@ -152,14 +143,6 @@ def test_a_store_that_refuses_is_one_error(toy_arm, toy_recording, out, monkeypa
     monkeypatch.setattr(MemoryFileSystem, "pipe_file", refuse)
     with pytest.raises(StorageError, match="403 Forbidden — check the credentials, and what they allow"):
         run(toy_arm, toy_recording, out)
-
-
-def test_a_driver_that_is_not_installed_is_named(toy_arm, toy_recording, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "adlfs", None)
-    with pytest.raises(
-        MissingDependencyError, match="az://box/set: needs the package of az:// — pip install"
-    ):
-        run(toy_arm, toy_recording, Path("az://box/set"))
 
 
 # -- several jobs
