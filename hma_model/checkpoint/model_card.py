@@ -67,6 +67,7 @@ def render(
             if isinstance(evaluation := card.get("evaluation"), Mapping) and evaluation.get("verdict")
         ],
         model=_lines(model),
+        levels="-".join(map(line, model.get("levels", ()))) if model.get("trunk") == "unet" else "",
         views=model.get("views", 1),
         tokenizer=_lines(tokenizer),
         grid="×".join(str(side) for side in model.get("grid", ())),

@@ -102,6 +102,22 @@ class PackedMLP(nn.Module):
         return cast(Tensor, self.fc2(self.fc1(norm(x))))
 
 
+class LowConv(nn.Module):
+    """A copy of a convolution whose product is in bfloat16, on weights laid out with the channels last."""
+
+    def __init__(self, conv: nn.Conv2d) -> None:
+        super().__init__()
+        self.stride, self.padding = conv.stride, cast(tuple[int, int], conv.padding)
+        weight = conv.weight.detach().to(torch.bfloat16)
+        self.weight = weight.contiguous(memory_format=torch.channels_last)
+        self.bias = None if conv.bias is None else conv.bias.detach().to(torch.bfloat16)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (M, C, h, w) to float32."""
+        x = x.to(torch.bfloat16).contiguous(memory_format=torch.channels_last)
+        return nn.functional.conv2d(x, self.weight, self.bias, self.stride, self.padding).float()
+
+
 def packed[M: nn.Module](module: M, dtype: torch.dtype = torch.float32) -> M:
     """Return a copy of a module for generation, its linear maps packed; all else is shared with it.
 
@@ -116,6 +132,8 @@ def packed[M: nn.Module](module: M, dtype: torch.dtype = torch.float32) -> M:
 def _pack(module: nn.Module | None, dtype: torch.dtype) -> nn.Module | None:
     if isinstance(module, nn.Linear):
         return _linear(module, dtype)
+    if isinstance(module, nn.Conv2d) and dtype == torch.bfloat16:
+        return LowConv(module)
     if isinstance(module, MLP):
         return PackedMLP(module, dtype)
     return None if module is None else packed(module, dtype)

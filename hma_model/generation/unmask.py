@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.config import HMAConfig
-from hma_model.network.head import LatentReadout, TokenReadout, uniform
+from hma_model.network.head import LatentReadout, RegressionReadout, TokenReadout, uniform
 
 # The likeliest tokens leave out what is small and moves, because each of its places is unlikely: a pusher's
 # disc is gone after a frame. Draws by the trained frequencies scatter specks over the picture.
@@ -179,10 +179,15 @@ class PatchFrame:
 
     @property
     def uncertainty(self) -> Tensor:
-        """Return the standard deviation (B,) of what might have been drawn for a value, in scaled latents."""
+        """Return the standard deviation (B,) of what might have been drawn for a value, in scaled latents.
+
+        It is NaN of a readout that draws nothing.
+        """
         return (self.variance / self.values.shape[1]).sqrt()
 
-    def unmask(self, readout: LatentReadout, features: Tensor, position: Tensor, count: int) -> None:
+    def unmask(
+        self, readout: LatentReadout | RegressionReadout, features: Tensor, position: Tensor, count: int
+    ) -> None:
         """Draw `count` more patches from features (B, S, D) of frames at times (1 or B, 1)."""
         chosen = _top(self.rank, self.masked, count)
         before = None if self.before is None else self.before.unsqueeze(1)
@@ -195,7 +200,9 @@ class PatchFrame:
             return drawn.view(len(generators), chosen.shape[1], -1)
 
         patches = draw(self.generators)
-        if way.measure:  # half the squared difference of two draws is their variance
+        if not readout.draws:
+            self.variance = torch.full_like(self.variance, torch.nan)
+        elif way.measure:  # half the squared difference of two draws is their variance
             copies = [torch.Generator(one.device) for one in self.generators]
             for own, copied in zip(self.generators, copies, strict=True):
                 copied.set_state(own.get_state())  # measuring takes none of the rollout's numbers

@@ -215,6 +215,8 @@ class LatentReadout(nn.Module):
     With `copy_previous` the head draws only what a patch has more than it keeps of the frame before.
     """
 
+    draws = True
+
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         self.proj = Linear(config.width, config.width)
@@ -276,6 +278,8 @@ class RegressionReadout(nn.Module):
     It draws nothing. Pixels are rounded to whole numbers as they are stored, so that what does not move stays
     exactly what it was, for any number of frames.
     """
+
+    draws = False  # so how sure it is cannot be measured
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()

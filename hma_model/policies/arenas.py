@@ -279,8 +279,8 @@ class ModelArena:
         return np.stack([self._world.stored(session) for session in self._sessions])
 
     def uncertainty(self) -> NDArray[np.float64]:
-        """Return how unsure the model was of the newest frames (N,), if its world measures it."""
-        return np.array([self._world.uncertainty.get(session, 0.0) for session in self._sessions])
+        """Return how unsure the model was of the newest frames (N,); NaN where it is not measured."""
+        return np.array([self._world.uncertainty.get(session, np.nan) for session in self._sessions])
 
     @property
     def _sessions(self) -> list[int]:

@@ -112,7 +112,8 @@ class SyntheticBatch:
     Of a policy's episodes P is one: the actions before it are none of its own.
 
     Attributes:
-        uncertainty: (n,) how unsure the model was of the generated frames, their mean; see `Rollout`.
+        uncertainty: (n,) how unsure the model was of the generated frames, their mean; see `Rollout`. NaN if
+            it is not measured.
         success: (n,) as judged; all True without a judge.
         groups: (n,) ids of the real episodes that they begin with.
     """
@@ -435,11 +436,13 @@ def _chosen(
 ) -> list[SyntheticEpisode]:
     """Return the episodes of which the model was least unsure, without those that are judged failures.
 
-    `measure` is the name of the flag that says how unsure it was.
+    `measure` is the name of the flag that says how unsure it was. Where that is not measured, no episode is
+    surer than another: all are kept, without the flag.
     """
     unsure = np.concatenate([batch.uncertainty for batch in batches])
     success = np.concatenate([batch.success for batch in batches])
-    chosen = np.zeros(len(unsure), np.bool_)
+    measured = bool(np.isfinite(unsure).all())
+    chosen = np.full(len(unsure), not measured)
     chosen[np.argsort(unsure, kind="stable")[: max(1, round(settings.keep * len(unsure)))]] = True
     if not (chosen & success).any():
         fault = f"none of the {chosen.sum()} surest of {len(unsure)} episodes is judged a success"
@@ -454,8 +457,9 @@ def _chosen(
                 counts = {
                     "prompt_frames": len(stored) - settings.frames,
                     "generated_frames": settings.frames - 1,  # the last one has no actions after it
-                    measure: round(1000 * float(unsure[number])),
                 }
+                if measured:
+                    counts[measure] = round(1000 * float(unsure[number]))
                 found.append(
                     SyntheticEpisode(f"synthetic_{number:06d}", stored, chunks, counts, str(group), judged)
                 )

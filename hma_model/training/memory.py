@@ -31,12 +31,16 @@ BF16_SHARE = 0.7  # of float32's bytes: norms and sums stay float32
 HIDDEN_SHARE = 0.8  # of the tokens are masked and predicted, at most, as a rule
 SCORE_COPIES = 3  # scores, their softmax, and their gradient
 DIFFUSION_VALUES = 13.0  # of a layer of the diffusion head, for each of its width
+UNET_VALUES = 9.0  # of a U-Net's block, for each value of its result
+UNET_BF16_SHARE = 0.54
 
 
 def activation_bytes(config: HMAConfig, recipe: Recipe, windows: int) -> float:
     """Return the bytes that a pass over B windows keeps for its backward pass."""
     predicts_video = any(OBJECTIVES[name].predicts_video for name in recipe.objectives)
     predicted = config.frames - 1 if predicts_video else 0
+    if config.trunk == "unet":
+        return windows * _unet_bytes(config, recipe, predicted)
     frames = config.frames
     if config.training_pass == "pairs" and predicts_video:
         frames += predicted  # a masked copy of each frame from the second on
@@ -54,6 +58,26 @@ def activation_bytes(config: HMAConfig, recipe: Recipe, windows: int) -> float:
         layers = config.diffusion_depth
         read = int(DIFFUSION_VALUES * layers * config.diffusion_width)
     return 4.0 * (values * (kept + PASS_VALUES) + hidden * read)
+
+
+def _unet_bytes(config: HMAConfig, recipe: Recipe, predicted: int) -> float:
+    """Return the bytes that a U-Net's pass over one window keeps for its backward pass.
+
+    A block keeps the same number of values for each of its result; most lie at the finest resolution.
+    """
+    places = config.tokens_per_frame // config.views
+    sizes = [channels * places / 4**level for level, channels in enumerate(config.levels)]
+    down_and_up = sum(sizes) + sum(sizes[:-1])
+    blocks = UNET_VALUES * config.layers * down_and_up
+    if recipe.checkpointing:  # what enters each block, and the values of the one that is recomputed
+        blocks = config.layers * down_and_up + UNET_VALUES * sizes[0]
+    every = any(not OBJECTIVES[name].predicts_video or OBJECTIVES[name].readout for name in recipe.objectives)
+    computed = predicted + (
+        config.frames if every else 0
+    )  # frames before the predicted ones are not computed
+    embedded = 2 * config.frames * config.tokens_per_frame * config.width
+    share = UNET_BF16_SHARE if recipe.precision == "bf16" else 1.0
+    return 4.0 * share * computed * (blocks + embedded)
 
 
 def needed_bytes(model: Network, recipe: Recipe, device: torch.device, ranks: int = 1) -> float:

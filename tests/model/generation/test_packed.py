@@ -8,9 +8,18 @@ from torch import nn
 
 from hma_data.errors import HMAError
 from hma_model.generation import engine
-from hma_model.generation.packed import PackedLinear, QuantizedLinear, has_bfloat16, has_int8, packed, packs
+from hma_model.generation.packed import (
+    LowConv,
+    PackedLinear,
+    QuantizedLinear,
+    has_bfloat16,
+    has_int8,
+    packed,
+    packs,
+)
 from hma_model.generation.rollout import Rollout
 from hma_model.network.model import HMA
+from tests.model.network.test_unet import stored, unet
 from tests.model.network_parts import small_batch, small_model
 
 needs_packing = pytest.mark.skipif(not packs(torch.device("cpu")), reason="this platform has no AVX-512")
@@ -185,3 +194,16 @@ def test_new_prompts_and_rows_that_begin_anew_compile_nothing_more(graphs: Graph
         rollout.decoding = replace(rollout.decoding, steps=steps)
         rollout.step(batch.actions[:, 3])
     assert len(graphs) > torch._dynamo.config.recompile_limit
+
+
+@needs_packing
+@needs_bfloat16
+def test_convolutions_of_a_unet_in_bfloat16_make_nearly_the_same_pixels() -> None:
+    model, seen = unet(), []
+    frames, actions = stored(model, 1, 3), torch.randn(1, 6, 6, generator=torch.Generator().manual_seed(1))
+    for precision in ("float32", "bf16"):
+        rollout = Rollout(model, "arm", precision=precision)
+        kinds = {type(one) for one in rollout.engine.trunk.modules()}
+        assert (LowConv in kinds) == (precision == "bf16") and (nn.Conv2d in kinds) != (LowConv in kinds)
+        seen.append(model.generate(frames, actions, "arm", 3, precision=precision))
+    assert 0 < (seen[0] - seen[1]).abs().mean() < 3

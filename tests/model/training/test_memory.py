@@ -20,6 +20,7 @@ from tests.model.shards import make_shards
 CPU = torch.device("cpu")
 TOKENS = TokenizerSpec("fsq-16", 1, "discrete", 256, (16, 16), vocab_size=64**2, factored=(64, 64))
 LAB = TokenizerSpec("fsq-lab", 1, "discrete", 128, (16, 16), vocab_size=8**5, factored=(8,) * 5)
+PIXELS = TokenizerSpec.continuous("raw-128", 1, 128, 1, 3, latent_scale=1 / 255, dtype="uint8")
 LATENTS = TokenizerSpec("vae-8", 1, "continuous", 256, (32, 32), channels=4, dtype="float16")
 MEASURE = """
 import json, sys, torch
@@ -61,7 +62,9 @@ def network(recipe: Recipe, spec: TokenizerSpec, device: str = "meta") -> HMA:
 SMALL, WIDE = {"model": {"layers": 4, "width": 192}}, {"model": {"layers": 8, "width": 256}}
 PAIRS = {"model": {"layers": 6, "width": 192, "training_pass": "pairs"}}
 DIFFUSION = {"model": {"layers": 4, "width": 128, "diffusion_width": 512}, "batch_size": 8}
+UNET = load_recipe("unet_tiny", ["frames=6", "batch_size=4"]).values()
 SLOW = [
+    (PIXELS, {**UNET, "precision": "fp32"}),
     (TOKENS, WIDE),
     (TOKENS, {**WIDE, "objectives": {"policy": 1}}),
     (TOKENS, {**WIDE, "checkpointing": True}),
@@ -74,7 +77,7 @@ SLOW = [
 @pytest.mark.skipif(sys.platform != "linux", reason="peaks are read from /proc")
 @pytest.mark.parametrize(
     ("spec", "changes"),
-    [(TOKENS, SMALL), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
+    [(TOKENS, SMALL), (PIXELS, UNET), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
 )
 def test_the_estimate_is_near_the_measured_peak(spec, changes):
     recipe = {"frames": 12, "batch_size": 3, "objectives": {"forward": 1}, **changes}
@@ -87,7 +90,8 @@ def test_the_estimate_is_near_the_measured_peak(spec, changes):
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
 @pytest.mark.parametrize(
-    ("name", "spec"), [("discrete_tiny", LAB), ("discrete_tiny", TOKENS), ("continuous_tiny", LATENTS)]
+    ("name", "spec"),
+    [("discrete_tiny", LAB), ("discrete_tiny", TOKENS), ("continuous_tiny", LATENTS), ("unet_tiny", PIXELS)],
 )
 def test_recipes_for_laptops_run_on_laptops(name, spec, objective):
     recipe = load_recipe(name, [f"objectives={{{objective}: 1}}"])

@@ -1,0 +1,126 @@
+"""Training of the U-Net: finetuning, resuming, ranks, recomputed blocks, and what does not fit refused."""
+
+import pytest
+import torch
+
+from hma_data.errors import CheckpointError, RecipeError
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.checkpoint.folder import Checkpoint, resolve
+from hma_model.hub import publish as hub
+from hma_model.network.model import HMA
+from hma_model.training.loop import TrainResult, finetune, train
+from hma_model.training.recipe import Recipe, make_recipe
+from tests.model.runs import TINY, same, train_until, weights
+from tests.model.shards import make_shards
+from tests.model.training.test_parallel import close, curve, spread
+
+SPEC = TokenizerSpec("raw", 1, "continuous", 16, (4, 4), channels=2, dtype="float16")
+UNET = {
+    "trunk": "unet", "layers": 1, "levels": (8, 16), "width": 16, "heads": 2, "patch": 1,
+    "shared_modulation": True, "training_pass": "pairs", "whole_share": 1.0, "video_loss": "regression",
+    "copy_previous": True, "told_noise": True, "latent_noise": 0.1,
+}  # fmt: skip
+TUNE = ["steps=3", "device=cpu", "report=false", "pictures=0", "track=[]", "eval_every=0", "batch_size=4"]
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory) -> list[str]:
+    folder = tmp_path_factory.mktemp("shards")
+    return [str(make_shards(folder / name, name, dims, spec=SPEC)) for name, dims in (("arm", 2), ("leg", 4))]
+
+
+def recipe(data: list[str], **changes: object) -> Recipe:
+    given = {"objectives": {"forward": 1, "policy": 1}, "model": UNET, "eval_every": 0, **changes}
+    return make_recipe({**TINY, "data": data, **given})
+
+
+@pytest.fixture(scope="module")
+def base(shards, tmp_path_factory) -> TrainResult:
+    return train(recipe(shards[:1]), out=tmp_path_factory.mktemp("base") / "run", show=False)
+
+
+def test_a_run_that_was_killed_ends_with_the_same_bits(base, shards, tmp_path):
+    train_until(recipe(shards[:1]), tmp_path / "run", 3)
+    assert same(train(recipe(shards[:1]), out=tmp_path / "run", show=False).checkpoint, base.checkpoint)
+
+
+@pytest.mark.parametrize("freeze", [True, False])
+def test_a_new_robot_is_tuned_published_and_pulled(base, shards, tmp_path, freeze):
+    out = tmp_path / "run"
+    tuned = finetune(base.out, shards[1:], out=out, freeze_trunk=freeze, overrides=TUNE, show=False)
+    assert (
+        Checkpoint.open(tuned.checkpoint).trunk_sha256 == Checkpoint.open(base.checkpoint).trunk_sha256
+    ) == (freeze)
+    home = tmp_path / "team" / "model"
+    hub.push(base.checkpoint, home)
+    if not freeze:
+        with pytest.raises(CheckpointError, match="trunk"):
+            hub.push(tuned.checkpoint, home, ["leg"])
+        return
+    hub.push(tuned.checkpoint, home, ["leg"])
+    model = hub.from_pretrained(home)
+    assert set(model.embodiments) == {"arm", "leg"} and model.config.trunk == "unet"
+    assert "unet of levels 8-16" in (home / "README.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault", "said"),
+    [
+        (
+            {"model.trunk": "transformer"},
+            RecipeError,
+            "model.trunk: is 'transformer', the checkpoint .* 'unet'",
+        ),
+        ({"model.levels": "[8, 8]"}, RecipeError, "model.levels"),
+    ],
+)
+def test_another_trunk_than_the_checkpoints_is_refused(base, shards, tmp_path, changes, fault, said):
+    more = [f"{key}={value}" for key, value in changes.items()]
+    with pytest.raises(fault, match=said):
+        finetune(base.out, shards[1:], out=tmp_path / "run", overrides=[*TUNE, *more], show=False)
+
+
+def test_latents_of_another_size_or_tokenizer_are_refused(base, tmp_path):
+    for name, grid, said in (
+        ("raw", (8, 8), "grid is .4, 4"),
+        ("vae", (4, 4), "tokenizer 'raw', this is 'vae'"),
+    ):
+        spec = TokenizerSpec(name, 1, "continuous", 16, grid, channels=2, dtype="float16")
+        made = make_shards(tmp_path / name, "arm", spec=spec)
+        with pytest.raises(CheckpointError, match=said):
+            finetune(base.out, [made], out=tmp_path / "run", overrides=TUNE, show=False)
+
+
+def test_recomputed_blocks_give_the_same_gradients(base):
+    from tests.model.network.test_unet import LATENTS, stored, unet
+    from tests.model.network_parts import small_batch
+
+    found = []
+    for checkpointing in (False, True):
+        model = unet(**LATENTS).train()
+        model.trunk.checkpointing = checkpointing
+        batch = small_batch(model.config, ["arm"])
+        batch.latents = stored(model, 1, 4)
+        model(batch, "full", torch.Generator().manual_seed(0)).loss.backward()
+        found.append([p.grad for p in model.parameters() if p.grad is not None])
+    assert all(map(torch.equal, *found)) and len(found[0]) == len(found[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["ddp", "fsdp"])
+def test_two_ranks_give_the_curve_and_the_weights_of_one(shards, tmp_path, mode):
+    few = {"batch_size": 1, "accumulate": 4, "weight_decay": 0.5}
+    alone = train(recipe(shards, **few), out=tmp_path / "alone", show=False)
+    told = spread(recipe(shards, parallel=mode, **few), tmp_path / "run")
+    assert curve(tmp_path / "run") == pytest.approx([loss for _, loss in alone.losses], rel=1e-4), told
+    close(alone.checkpoint, resolve(tmp_path / "run"))
+
+
+@pytest.mark.parametrize("objective", ["forward", "passive", "policy", "inverse", "full"])
+def test_the_loss_of_each_objective_falls(shards, tmp_path, objective):
+    changes = {"objectives": {objective: 1}, "steps": 40, "lr": 1e-2, "schedule": "constant_with_warmup"}
+    done = train(recipe(shards[:1], checkpoint_every=40, **changes), out=tmp_path / "run", show=False)
+    losses = [loss for _, loss in done.losses]
+    assert sum(losses[-8:]) < sum(losses[:8])
+    model = HMA.from_pretrained(done.checkpoint).eval()
+    assert "arm" in model.embodiments and weights(done.checkpoint)

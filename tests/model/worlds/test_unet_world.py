@@ -1,0 +1,59 @@
+"""A U-Net of pixels in the places where people use a model: none of them knows of its trunk."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.verify import verify
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.config import HMAConfig
+from hma_model.network.model import HMA
+from hma_model.policies.arenas import Scenes, TrueArena
+from hma_model.policies.planning import Cost
+from hma_model.simulate import World, WorldModelEnv
+from hma_model.synthetic.augment import Augmentation, augment
+from tests.model.network.test_unet import PIXELS
+from tests.model.true_world import _of_robot, family
+
+ROBOT = "rails_03"
+
+
+@pytest.fixture
+def world() -> World:
+    raw = get_tokenizer("raw-64")
+    values = {**PIXELS, "grid": (64, 64), "patch": 8, "tokenizer": raw.spec.to_json()}
+    return World(_of_robot(HMA(HMAConfig(**values)), family.embodiment(ROBOT), False), raw)
+
+
+def test_an_environment_steps_and_resets(world: World) -> None:
+    arena = TrueArena(Scenes.of(world, ROBOT, 1, 0), 64)
+    begin = {"frames": arena.prompts[0].frames, "chunks": arena.prompts[0].chunks}
+    env = WorldModelEnv(world, embodiment=ROBOT, prompt=begin, horizon=3)
+    first, _ = env.reset(seed=0)
+    image, *_ = env.step(env.action_space.sample())
+    assert np.array_equal(image, first)  # untrained, it repeats the frame
+
+
+def test_how_unsure_it_is_is_not_measured_rather_than_nothing(world: World) -> None:
+    arena = TrueArena(Scenes.of(world, ROBOT, 1, 0), 64)
+    session = world.open(ROBOT, arena.prompts[0].frames, arena.prompts[0].chunks)
+    world.measure = True
+    world.step({session: np.zeros(world.model.embodiments[ROBOT].chunk_dim, np.float32)})
+    assert np.isnan(world.uncertainty[session])
+
+
+def test_synthetic_episodes_are_all_kept_without_an_uncertainty(world: World, tmp_path: Path) -> None:
+    augment(tmp_path / "out", Augmentation(ROBOT, episodes=2, frames=3, keep=0.5), world=world)
+    assert verify(tmp_path / "out") == []
+    rows = ShardSet(tmp_path / "out").episodes.to_pylist()
+    assert len(rows) == 2 and not any("milli" in row["flags"] for row in rows)
+
+
+def test_plans_imagine_images(world: World) -> None:
+    arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 64)
+    cost = Cost(world, ROBOT)
+    cost.open([(prompt.frames, prompt.chunks) for prompt in arena.prompts])
+    candidates = np.zeros((2, 3, 2, 2), np.float32)
+    assert cost.imagine(cost.sessions, candidates).shape == (2, 3, 2, 64, 64, 3)
