@@ -8,6 +8,7 @@ import pytest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import get_tokenizer
+from hma_model.checkpoint import io as checkpoint
 from hma_model.config import HMAConfig
 from hma_model.network.model import HMA
 from hma_model.policies.arenas import Scenes, TrueArena
@@ -27,10 +28,14 @@ def world() -> World:
     return World(_of_robot(HMA(HMAConfig(**values)), family.embodiment(ROBOT), False), raw)
 
 
-def test_an_environment_steps_and_resets(world: World) -> None:
+def test_an_environment_steps_and_resets(world: World, tmp_path: Path) -> None:
+    yaml = family.embodiment(ROBOT).to_yaml()
+    space = world.model.embodiments[ROBOT]
+    stats = {ROBOT: {"action": {"mean": list(space.mean), "std": list(space.std)}}}
+    checkpoint.save(world.model, tmp_path / "model", embodiment_yaml={ROBOT: yaml}, stats=stats, cards={})
     arena = TrueArena(Scenes.of(world, ROBOT, 1, 0), 64)
     begin = {"frames": arena.prompts[0].frames, "chunks": arena.prompts[0].chunks}
-    env = WorldModelEnv(world, embodiment=ROBOT, prompt=begin, horizon=3)
+    env = WorldModelEnv(tmp_path / "model", embodiment=ROBOT, prompt=begin, horizon=3)
     first, _ = env.reset(seed=0)
     image, *_ = env.step(env.action_space.sample())
     assert np.array_equal(image, first)  # untrained, it repeats the frame
