@@ -41,6 +41,15 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 Content = Path | bytes
+ENV = "env.py"  # lerobot's EnvHub reads it
+ENV_CODE = '''"""Offer this checkpoint to lerobot as environments of its robots; pip install hma-toolkit."""
+
+
+def make_env(n_envs=1, use_async_envs=False, cfg=None):
+    from hma_model.lerobot_env import published_envs
+
+    return published_envs(__file__, {repo!r}, n_envs, cfg)
+'''
 MAX_NAMED = 50  # ids that an error lists
 _ADD_ONE = (
     f"Add one: hma finetune SHARDS --from {EMBEDDED_NAME} --out RUN, "
@@ -157,6 +166,8 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
         changes[CONFIG] = inside(source.folder, CONFIG)
     if TRUNK not in files:
         changes[TRUNK] = inside(source.folder, TRUNK)
+    if not {CONFIG, ENV} <= files.keys():
+        changes[ENV] = ENV_CODE.format(repo=store.repo).encode()
     for name in ids:
         shown = source.pictures(name)
         for part in (*shown, *PARTS):

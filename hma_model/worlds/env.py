@@ -292,13 +292,10 @@ class WorldModelVectorEnv(VectorEnv[Image, Floats, NDArray[Any]]):
         rewards = np.zeros(self.num_envs)
         terminated, truncated = (np.zeros(self.num_envs, np.bool_) for _ in range(2))
         infos: dict[str, Any] = {}
-        going = np.flatnonzero(~again)
-        chunks = [self.envs[i].take(actions[i]) for i in going]
-        made = self.world.step({session: chunk for part in chunks for session, chunk in part.items()})
+        made = self.advance(np.flatnonzero(~again), actions)
         for i in np.flatnonzero(again):
             infos = self._begin(i, infos)
-        for i in going:
-            seen, rewards[i], terminated[i], truncated[i], facts = self.envs[i].finish(made)
+        for i, (seen, rewards[i], terminated[i], truncated[i], facts) in made:
             self.observations[i] = seen
             if self.autoreset_mode == AutoresetMode.SAME_STEP and (terminated[i] or truncated[i]):
                 infos = self._add_info(infos, {"final_obs": seen, "final_info": facts}, i)
@@ -307,6 +304,12 @@ class WorldModelVectorEnv(VectorEnv[Image, Floats, NDArray[Any]]):
                 infos = self._add_info(infos, facts, i)
         self.ended = np.logical_or(terminated, truncated)
         return self.observations.copy(), rewards, terminated, truncated, infos
+
+    def advance(self, chosen: NDArray[np.int64], actions: Floats) -> list[tuple[int, Any]]:
+        """Send actions (N, …) to the chosen environments in one pass; return their numbers and steps."""
+        chunks = [self.envs[i].take(actions[i]) for i in chosen]
+        made = self.world.step({session: chunk for part in chunks for session, chunk in part.items()})
+        return [(i, self.envs[i].finish(made)) for i in chosen]
 
     def render(self) -> tuple[Image, ...] | None:
         """Return the newest image of each environment."""

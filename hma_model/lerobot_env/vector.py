@@ -1,0 +1,209 @@
+"""Show robots in a world model as lerobot's evaluation wants an environment to be.
+
+N environments, S pixels a side, S' values of a state, A action dims.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from hma_data.errors import UsageError
+from hma_data.lab.simulator import simulated
+from hma_data.shards.reader import ShardSet
+from hma_model.checkpoint.folder import Checkpoint
+from hma_model.evaluation.recorded_state import EPISODES_NEEDED, Reader, recorded_reader, simulated_reader
+from hma_model.policies.judge import StateJudge, task_of, train_judge
+from hma_model.worlds.env import WorldModelVectorEnv
+from hma_model.worlds.images import recorded_cameras, seen_cameras, trained_cameras
+from hma_model.worlds.world import World
+
+Floats = NDArray[np.float32]
+Observations = dict[str, Any]
+NEW_ROLLOUT = "lerobot_new_rollout"  # an option with which lerobot's evaluation begins each batch
+SYNTHETIC = "synthetic"  # an observation of 1; in lerobot's recordings it tells that no robot did this
+log = logging.getLogger(__name__)
+
+
+def camera_names(checkpoint: Checkpoint, embodiment: str) -> list[str]:
+    """Return the names of the cameras that a model's image shows side by side."""
+    stored = recorded_cameras(checkpoint.embodiment(embodiment))
+    return seen_cameras(trained_cameras(checkpoint.card(embodiment)), stored)
+
+
+def state_source(checkpoint: Checkpoint, embodiment: str) -> Callable[[World], Reader | None] | None:
+    """Return what trains a reader of a robot's state; None if it has no state, or no episodes tell it."""
+    robot = checkpoint.embodiment(embodiment)
+    if robot.state is None:
+        return None
+    if simulated(embodiment):
+        return lambda world: simulated_reader(embodiment, world.tokenizer, robot.stride, 0)
+    for shards in checkpoint.shards():
+        known = shards.embodiment.id == embodiment and shards.embodiment.state is not None
+        if known and shards.manifest.splits["train"]["episodes"] >= EPISODES_NEEDED:
+            return partial(_recorded, shards, tuple(camera_names(checkpoint, embodiment)))
+    return None
+
+
+def _recorded(shards: ShardSet, cameras: tuple[str, ...], world: World) -> Reader | None:
+    return recorded_reader(world.tokenizer, shards, cameras, 0)
+
+
+class LeRobotVectorEnv(WorldModelVectorEnv):
+    """N robots in a world model, in the form of lerobot 0.6: `lerobot.scripts.lerobot_eval.rollout`.
+
+    Observations are `pixels`, by camera if there are several, and `agent_pos`, the state read off the
+    images. An environment whose episode has ended stays as it is until the next reset, and costs nothing.
+    The reward is the judge's score so far. Success is judged at the end; of `reached`, which nothing can
+    undo, as soon as it is seen, and that ends the episode. Reader and judge are trained at the first reset.
+
+    Args:
+        checkpoint: of the world.
+        embodiment: an id of it.
+        num_envs: N.
+        world: of the checkpoint.
+        state: whether to read the state, where one is known.
+        judge: a task in words, as `task_of` takes it; None for no judge: nothing is a success.
+        task: what policies are told; by default the robot's id.
+        horizon: steps of an episode.
+        settings: of `WorldModelEnv`: prompt, clip, size.
+
+    Raises:
+        HMAError: an argument is wrong, or the robot cannot be judged.
+    """
+
+    def __init__(
+        self,
+        checkpoint: Checkpoint,
+        embodiment: str,
+        num_envs: int,
+        world: World,
+        *,
+        state: bool = True,
+        judge: str | None = None,
+        task: str | None = None,
+        horizon: int = 300,
+        **settings: Any,
+    ) -> None:
+        super().__init__(
+            num_envs, embodiment=embodiment, world=world, horizon=horizon, render_mode="rgb_array", **settings
+        )
+        self.metadata = self.metadata | {"render_fps": max(1, round(self.metadata["render_fps"]))}
+        self.task = self.task_description = task or embodiment
+        self._max_episode_steps = horizon
+        self._task = None if judge is None else judged_task(embodiment, judge)
+        self._cameras = camera_names(checkpoint, embodiment)
+        self._train_reader = state_source(checkpoint, embodiment) if state else None
+        image = self.single_observation_space
+        side = image.shape[0]
+        pixels: Any = image
+        if len(self._cameras) > 1:
+            pixels = spaces.Dict(dict.fromkeys(self._cameras, spaces.Box(0, 255, (side, side, 3), np.uint8)))
+        shown = {"pixels": pixels, SYNTHETIC: spaces.Box(1, 1, (1,), np.float32)}
+        robot = checkpoint.embodiment(embodiment)
+        self._states = np.zeros((num_envs, 0), np.float32)
+        if self._train_reader is not None and robot.state is not None:
+            self._states = np.zeros((num_envs, len(robot.state.names())), np.float32)
+            shown["agent_pos"] = spaces.Box(-np.inf, np.inf, self._states.shape[1:], np.float32)
+        self.single_observation_space = spaces.Dict(shown)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._frames = np.zeros(num_envs, np.int64)
+        self._scores = np.zeros(num_envs)
+        self._success = np.zeros(num_envs, np.bool_)
+        self._truncated = np.zeros(num_envs, np.bool_)
+
+    @cached_property
+    def reader(self) -> Reader | None:
+        """Train the reader of the state, and say what its error is."""
+        if self._train_reader is None:
+            return None
+        reader = self._train_reader(self.world)
+        if reader is None:
+            raise UsageError(self.embodiment, "has no episode whose states are all known", "give state=false")
+        own = reader.readable
+        error = f"{reader.error[own].mean():.2g} standard deviations" if len(own) else "unknown"
+        said = "%s: agent_pos is read off the images: %d of %d values, mean error on other episodes %s"
+        log.warning(said, self.embodiment, len(own), len(reader.std), error)
+        return reader
+
+    @cached_property
+    def judge(self) -> StateJudge | None:
+        """Train the judge, and say how often it is right."""
+        if self._task is None:
+            return None
+        spec = self.envs[0].action_spec
+        frames = self._max_episode_steps // spec.stride + 1
+        judge = train_judge(self.embodiment, self.world.tokenizer, spec.stride, frames, self._task)
+        log.warning("%s: success is that %s; the judge: %s", self.embodiment, self._task.text, judge.held_out)
+        return judge
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start episodes in all environments, as `WorldModelVectorEnv.reset` does."""
+        for env in self.envs:
+            env.judge = self.judge
+        options = {key: value for key, value in (options or {}).items() if key != NEW_ROLLOUT}
+        _, infos = super().reset(seed=seed, options=options)
+        self._frames[:] = 0
+        for facts in (self._scores, self._success, self._truncated):
+            facts[:] = 0
+        self._read(np.arange(self.num_envs))
+        return self._seen(), infos
+
+    def step(  # type: ignore[override]
+        self, actions: Floats
+    ) -> tuple[Observations, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Send an action to each environment that goes on; those that get an image get it in one pass."""
+        new = []
+        rewards = np.zeros(self.num_envs)
+        for i, (seen, score, _, truncated, facts) in self.advance(np.flatnonzero(~self.ended), actions):
+            self.observations[i] = seen
+            if facts["frames"] > self._frames[i]:
+                self._frames[i] = facts["frames"]
+                self._scores[i] = score
+                new.append(i)
+            rewards[i] = self._scores[i]
+            self._truncated[i] = truncated
+            lasting = self._task is not None and self._task.name == "reached"
+            if self.judge is not None and self._frames[i] and (truncated or lasting):
+                self._success[i] = self.judge.success(self._scores[i])
+        self.ended = self._success | self._truncated
+        self._read(np.array(new, np.int64))
+        infos = {"frames": self._frames.copy(), "is_success": self._success.copy()}
+        return self._seen(), rewards, self._success.copy(), self._truncated.copy(), infos
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return an attribute for each environment, as gymnasium's other vectors do."""
+        return (getattr(self, name),) * self.num_envs
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Return what a method gives for each environment, or an attribute."""
+        value = getattr(self, name)
+        return tuple(value(*args, **kwargs)) if callable(value) else (value,) * self.num_envs
+
+    def _read(self, rows: NDArray[np.int64]) -> None:
+        """Read the states of environments off their newest images."""
+        if self.reader is not None and len(rows):
+            self._states[rows] = self.reader.read(np.stack([self.envs[i].image for i in rows]))
+
+    def _seen(self) -> Observations:
+        pixels: Any = self.observations.copy()
+        if len(self._cameras) > 1:
+            views = np.split(pixels, len(self._cameras), axis=2)
+            pixels = {name: np.ascontiguousarray(view) for name, view in zip(self._cameras, views)}
+        seen = {"pixels": pixels, SYNTHETIC: np.ones((self.num_envs, 1), np.float32)}
+        return seen | ({} if self.reader is None else {"agent_pos": self._states.copy()})
+
+
+def judged_task(embodiment: str, words: str) -> Any:
+    """Return the task that a robot is judged by."""
+    if not simulated(embodiment):
+        remedy = "leave the judge out; nothing then counts as a success"
+        raise UsageError("judge", f"there is none of {embodiment}, which has no simulator", remedy)
+    return task_of(embodiment, words)

@@ -1,0 +1,174 @@
+"""A world model is an environment of lerobot's evaluation; what does not fit ends in one line."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hma_data.errors import HMAError
+from hma_model import lerobot_env
+from hma_model.checkpoint.folder import Checkpoint
+from hma_model.hub import push
+from hma_model.lerobot_env import HMAEnvConfig, vector
+from hma_model.worlds.world import World
+from tests.model.policies.test_lerobot_policy import CAMERA, saved
+
+ROBOT = "rails_03"
+RENAME = "--rename_map=" + json.dumps({"observation.image": CAMERA})
+IMAGE = np.full((64, 64, 3), 90, np.uint8)
+
+
+class Certain:
+    """A reader and judge that need no training."""
+
+    held_out = readable = ()
+
+    def read(self, pictures: np.ndarray) -> np.ndarray:
+        return pictures.reshape(len(pictures), -1)[:, :2].astype(float)
+
+    def success(self, score: float) -> bool:
+        return score >= 2
+
+    def __call__(self, images: np.ndarray, actions: np.ndarray) -> tuple[float, bool]:
+        return float(len(images) * (actions[0, 0, 0] > 0)), False
+
+
+@pytest.fixture
+def env(monkeypatch: pytest.MonkeyPatch, world: World) -> vector.LeRobotVectorEnv:
+    monkeypatch.setattr(vector, "state_source", lambda *_: lambda world: Certain())
+    monkeypatch.setattr(vector.LeRobotVectorEnv, "reader", Certain())
+    monkeypatch.setattr(vector.LeRobotVectorEnv, "judge", Certain())
+    return vector.LeRobotVectorEnv(
+        Checkpoint.open("embedded"),
+        ROBOT,
+        2,
+        world,
+        judge="reached",
+        horizon=10,
+        task="reach it",
+        prompt=IMAGE,
+    )
+
+
+def test_observations_are_what_lerobot_reads(env: vector.LeRobotVectorEnv) -> None:
+    from lerobot.envs.utils import preprocess_observation
+
+    seen, _ = env.reset(seed=[3, 4], options={"lerobot_new_rollout": True})
+    assert env.observation_space.contains(seen) and seen["pixels"].dtype == np.uint8
+    assert set(preprocess_observation(seen)) == {
+        "observation.image", "observation.state", "observation.synthetic"
+    }  # fmt: skip
+    assert env.call("_max_episode_steps") == (10, 10) and env.call("task_description") == ("reach it",) * 2
+    assert [one.shape for one in env.call("render")] == [env.world.image_shape] * 2
+    assert isinstance(env.unwrapped.metadata["render_fps"], int)
+    np.testing.assert_array_equal(env.reset(seed=[3, 4])[0]["pixels"], seen["pixels"])
+
+
+def test_an_episode_that_has_ended_stays_as_it_is(
+    env: vector.LeRobotVectorEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env.reset(seed=[0, 1])
+    dreamed: list[int] = []
+    step = env.world.step
+    monkeypatch.setattr(env.world, "step", lambda given: dreamed.append(len(given)) or step(given))
+    actions = np.array([[1, 0], [-1, 0]], np.float32)
+    stride = env.envs[0].action_spec.stride
+    for _ in range(stride):
+        seen, rewards, terminated, truncated, info = env.step(actions)
+    assert info["is_success"].tolist() == terminated.tolist() == [True, False] and rewards.tolist() == [2, 0]
+    for _ in range(10 - stride):
+        later, rewards, terminated, truncated, info = env.step(actions)
+    np.testing.assert_array_equal(later["pixels"][0], seen["pixels"][0])
+    assert max(dreamed[stride:]) == 1 and rewards[0] == 0
+    assert truncated.tolist() == [False, True] and info["is_success"].tolist() == [True, False]
+    assert not env.reset()[1].get("is_success") and not env.ended.any()
+
+
+def test_features_are_read_from_the_checkpoint() -> None:
+    config = HMAEnvConfig(embodiment=ROBOT)
+    assert config.features["action"].shape == (2,) and config.features["agent_pos"].shape == (2,)
+    assert config.features_map["pixels"] == "observation.image" and config.task == ROBOT
+    assert "agent_pos" not in HMAEnvConfig(embodiment=ROBOT, state=False).features
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, "embodiment: is not given — give --env.embodiment=ID; the model has: arm1_02"),
+        ({"embodiment": "nobody"}, "embedded: has no embodiment 'nobody'"),
+        ({"embodiment": ROBOT, "judge": "liked"}, "judge: 'liked' is no task"),
+        ({"embodiment": ROBOT, "horizon": 0}, "horizon: is 0 — give 1 or more"),
+    ],
+)
+def test_settings_that_are_wrong(given: dict[str, Any], said: str) -> None:
+    with pytest.raises(HMAError) as fault:
+        HMAEnvConfig(**given)
+    assert str(fault.value).startswith(said) and "\n" not in str(fault.value)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "rename", "state", "said"),
+    [
+        ({}, "", True, f"""takes {CAMERA}, and {ROBOT} gives action, observation.image,"""),
+        ({"state": 2}, RENAME, False, "takes observation.state, which nobody can read off the images"),
+        ({"state": 3}, RENAME, True, f"has 3 values of observation.state, {ROBOT} has 2"),
+        ({"actions": 3}, RENAME, True, f"has 3 values of action, {ROBOT} has 2"),
+    ],
+)  # fmt: skip
+def test_a_policy_that_does_not_fit(
+    inputs: dict[str, int], rename: str, state: bool, said: str, tmp_path: Path, monkeypatch: Any
+) -> None:
+    saved(tmp_path, **inputs)
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--policy.path={tmp_path}", rename])
+    with pytest.raises(SystemExit, match="error: policy ") as fault:
+        HMAEnvConfig(embodiment=ROBOT, state=state).create_envs(1)
+    assert said in str(fault.value) and "\n" not in str(fault.value)
+
+
+def test_a_published_checkpoint_makes_environments(tmp_path: Path) -> None:
+    from lerobot.envs.utils import _call_make_env, _import_hub_module
+
+    push("embedded", tmp_path / "hub", [ROBOT])
+    module = _import_hub_module(str(tmp_path / "hub" / "env.py"), "org/model")
+    envs = _call_make_env(module, n_envs=2, use_async_envs=True, cfg=None)
+    assert list(envs) == [ROBOT] and envs[ROBOT][0].num_envs == 2
+
+
+def test_a_repository_is_loaded_in_the_revision_of_its_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def located(source: str, names: Any) -> Any:
+        asked.append(source)
+        raise HMAError(source, "seen")
+
+    monkeypatch.setattr(lerobot_env, "located", located)
+    with pytest.raises(HMAError):
+        lerobot_env.published_envs("/cache/models--org--m/snapshots/abc/env.py", "org/m", 1)
+    assert asked == ["org/m@abc"]
+
+
+@pytest.mark.slow
+def test_lerobot_eval_and_its_recording(tmp_path: Path) -> None:
+    saved(tmp_path / "policy", state=2)
+    found = subprocess.run(
+        [
+            sys.executable, "-m", "lerobot.scripts.lerobot_eval", f"--policy.path={tmp_path / 'policy'}",
+            "--env.type=hma", "--env.checkpoint=embedded", f"--env.embodiment={ROBOT}",
+            "--env.discover_packages_path=hma_model.lerobot_env", "--env.horizon=10", "--eval.n_episodes=2",
+            "--eval.batch_size=2", "--eval.recording=true", "--policy.device=cpu", RENAME,
+            f"--output_dir={tmp_path / 'out'}",
+        ],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert found.returncode == 0, found.stderr[-3000:]
+    assert "agent_pos is read off the images: 2 of 2 values, mean error" in found.stderr
+    info = json.loads((tmp_path / "out" / "eval_info.json").read_text())
+    assert info["overall"]["n_episodes"] == 2 and info["overall"]["pc_success"] == 0
+    recorded = tmp_path / "out" / "recordings" / "hma_0" / "env_0"
+    facts = json.loads((recorded / "meta" / "info.json").read_text())
+    assert facts["total_frames"] == 10 and facts["fps"] == HMAEnvConfig(embodiment=ROBOT).fps
+    assert {"pixels", "agent_pos", "action", "synthetic", "next.success"} <= facts["features"].keys()
