@@ -118,7 +118,7 @@ def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: 
                 raise CheckpointError(where, f"model.{key} is {value!r}: no size of a network", _REMEDY)
     values = sum(tensor.numel() for tensor in state.values())
     width, hidden = config.width, config.mlp_ratio * config.width
-    needed = {
+    needed: dict[str, float] = {
         "grid": config.tokens_per_frame * width,
         "frames": config.frames * width if config.released else 0,
     }
