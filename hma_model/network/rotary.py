@@ -48,11 +48,12 @@ def rotate_qkv(
         within: whether there is an axis of places between the times and the axis of size 3.
         turns: `turns_of` these, if they are at hand.
     """
-    if qkv.dtype != torch.float32 or torch.compiler.is_compiling():
+    half = qkv.dtype == torch.bfloat16 and qkv.device.type == "cpu"
+    if torch.compiler.is_compiling() or not (half or qkv.dtype == torch.float32):
         cos, sin = (angle.unsqueeze(-2) if within else angle for angle in rotary)
         q, k, v = qkv.unbind(-3)
         return rotate(q, (cos, sin)), rotate(k, (cos, sin)), v
     turns = turns_of(rotary, qkv.shape[-2], within) if turns is None else turns
-    flat = torch.view_as_complex(qkv.view(*qkv.shape[:-3], -1, 2)) * turns
-    q, k, v = torch.view_as_real(flat).view_as(qkv).unbind(-3)
+    flat = torch.view_as_complex(qkv.float().view(*qkv.shape[:-3], -1, 2)) * turns
+    q, k, v = torch.view_as_real(flat).view_as(qkv).to(qkv.dtype).unbind(-3)
     return q, k, v

@@ -23,6 +23,9 @@ from hma_model.network.stem import LatentEmbedding, Modulation, NoiseEmbedding, 
 from hma_model.network.trunks.contract import Conditioning, TimePositions, rows_at
 
 SEQUENCE_LIMIT = 2**15  # of one call of attention: kernels of a GPU refuse 65,536 and more
+# Keys up to which attention in bfloat16 on a CPU is computed as products: there the fused kernel's backward pass
+# takes 4 to 17 times as long at 12 keys, and at 320 the float32 kernel is the fastest (docs/results.md).
+PRODUCT_KEYS = 128
 
 
 @dataclass
@@ -105,6 +108,10 @@ def attend(
     `mask` (T, R) or (1 or M, 1, T, R) is True where attention is allowed. Attention over time has a sequence
     for each place of each window: M may be large.
     """
+    if q.device.type == "cpu" and q.dtype == torch.bfloat16 and not torch.compiler.is_compiling():
+        if k.shape[-2] <= PRODUCT_KEYS:
+            return _attend_by_products(q, k, v, mask, scale, causal)
+        return attend(q.float(), k.float(), v.float(), mask, scale, causal).to(q.dtype)
     if len(q) <= SEQUENCE_LIMIT:
         return F.scaled_dot_product_attention(q, k, v, mask, is_causal=causal, scale=scale)
     masks: Sequence[Tensor | None] = [mask] * -(-len(q) // SEQUENCE_LIMIT)
@@ -112,6 +119,19 @@ def attend(
         masks = mask.split(SEQUENCE_LIMIT)
     parts = zip(*(x.split(SEQUENCE_LIMIT) for x in (q, k, v)), masks, strict=True)
     return torch.cat([attend(q, k, v, mask, scale, causal) for q, k, v, mask in parts])
+
+
+def _attend_by_products(
+    q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None, scale: float, causal: bool
+) -> Tensor:
+    """Do as `attend` in two products, with all scores in memory."""
+    scores = (q * scale) @ k.transpose(-1, -2)
+    if causal:
+        mask = torch.ones(scores.shape[-2:], dtype=torch.bool, device=q.device).tril()
+    if mask is not None:
+        # a sum needs no work in the backward pass, masked_fill would
+        scores = scores + torch.zeros_like(mask, dtype=q.dtype).masked_fill_(~mask, -torch.inf)
+    return scores.softmax(-1) @ v
 
 
 class Attention(nn.Module):
