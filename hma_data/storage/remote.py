@@ -17,12 +17,14 @@ from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path, PosixPath, PurePosixPath
-from typing import Any, BinaryIO, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from hma_data.errors import HMAError, StorageAwayError, StorageError
-from hma_data.storage.blocks import BlockFile, Blocks
 from hma_data.storage.fetch import ABSENT, file_system, retried, said
 from hma_data.storage.paths import StrPath, as_text
+
+if TYPE_CHECKING:  # blocks need numpy, which verbs that read no store answer without
+    from hma_data.storage.blocks import BlockFile, Blocks
 
 WAITS_S = (0.3, 1.5, 6.0)  # before the second, third and fourth try
 WHOLE_PUTS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "memory"}  # an object appears whole or not at all
@@ -323,8 +325,10 @@ def fetch_range(path: RemotePath, start: int, stop: int) -> bytes:
     return attempt(path, "read", ask)
 
 
-def remote_file(path: RemotePath, size: int | None = None) -> BlockFile:
+def remote_file(path: RemotePath, size: int | None = None) -> "BlockFile":
     """Open a file of a store, which can be read at any position; its size is asked for unless it is given."""
+    from hma_data.storage.blocks import BlockFile, Blocks
+
     size = path.info().get("size") if size is None else size
     if size is None:
         raise StorageError(path, "its server does not state its length", "copy the file here")
@@ -347,6 +351,8 @@ class LargeFile:
             return self._path.open("rb")
         if self._blocks is None:
             self._blocks = remote_file(self._path).blocks
+        from hma_data.storage.blocks import BlockFile
+
         return cast(BinaryIO, BlockFile(self._blocks))
 
 
