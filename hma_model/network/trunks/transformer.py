@@ -23,8 +23,8 @@ from hma_model.network.stem import LatentEmbedding, Modulation, NoiseEmbedding, 
 from hma_model.network.trunks.contract import Conditioning, TimePositions, rows_at
 
 SEQUENCE_LIMIT = 2**15  # of one call of attention: kernels of a GPU refuse 65,536 and more
-# Keys up to which attention in bfloat16 on a CPU is computed as products: there the fused kernel's backward pass
-# takes 4 to 17 times as long at 12 keys, and at 320 the float32 kernel is the fastest (docs/results.md).
+# Keys up to which attention in bfloat16 on a CPU is computed as products: the fused kernel's backward pass
+# takes 4 to 17 times as long at 12 keys. At 320 the float32 kernel is the fastest.
 PRODUCT_KEYS = 128
 
 
