@@ -45,8 +45,8 @@ Images = NDArray[np.uint8]
 MARKS = (5, 10, 25, 50, 100, 300, 1000, 3000)  # frames at which figures are given, and the last
 EARLY = 10  # the mark that the end is compared with
 SPAN = 5  # frames up to a mark over which a figure is the mean
-SHOWN = (1, 10, 25, 50, 100, 200, 300, 1000, 3000)  # frames of a sheet
-SHEETS = 2  # rollouts of a robot on it
+SHEET = (1, 10, 25, 50, 100, 200, 300, 1000, 3000)  # frames of a sheet
+SHEET_ROLLOUTS = 2  # of a robot on it
 LIMIT = 2.0  # of the error at the end over that at EARLY
 LOST = 0.5  # share of the spread from which a robot is somewhere else
 WHOLE = 0.8  # of the wholeness at the end over the copy's
@@ -90,22 +90,29 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     for key, least in (("frames", EARLY), ("rollouts", 2)):
         if settings[key] < least:
             raise UsageError("bench drift", f"{key}={settings[key]} is not allowed", f"give at least {least}")
-    from hma_data.tokenizers.base import get_tokenizer
     from hma_data.tokenizers.network import single_threads
-    from hma_model.checkpoint.folder import require_tokenizer
-    from hma_model.network.model import HMA
-    from hma_model.training.runtime import choose_device
 
-    device = str(choose_device(settings["device"]))
-    model = HMA.from_pretrained(settings["checkpoint"], embodiments=robots, device=device).eval()
-    tokenizer = get_tokenizer(str(model.config.tokenizer["name"]), device=device)
-    require_tokenizer(model.config, tokenizer.spec, settings["checkpoint"])
+    model, tokenizer = opened(settings["checkpoint"], robots, settings["device"])
     work = partial(measure, model, tokenizer, samplings=samplings, settings=settings)
     with single_threads(len(robots)) as pool:
         found = list(pool.map(work, robots))
     if settings["sheet"]:
         draw(found, Path(settings["sheet"]))
     return [row for one in found for row in rows(one, settings["seed"])]
+
+
+def opened(checkpoint: str, robots: list[str], device: str) -> "tuple[HMA, Tokenizer]":
+    """Return the model of a checkpoint with some robots, and its tokenizer."""
+    from hma_data.tokenizers.base import get_tokenizer
+    from hma_model.checkpoint.folder import require_tokenizer
+    from hma_model.network.model import HMA
+    from hma_model.training.runtime import choose_device
+
+    place = str(choose_device(device))
+    model = HMA.from_pretrained(checkpoint, embodiments=robots, device=place).eval()
+    tokenizer = get_tokenizer(str(model.config.tokenizer["name"]), device=place)
+    require_tokenizer(model.config, tokenizer.spec, checkpoint)
+    return model, tokenizer
 
 
 def _samplings(text: str) -> dict[str, dict[str, Any]]:
@@ -131,7 +138,7 @@ def looked_at(frames: int, sheet: bool) -> tuple[tuple[int, ...], tuple[int, ...
     """Return the marks of rollouts of so many frames, and all frames that are looked at."""
     marks = sorted({mark for mark in (*MARKS, frames) if mark <= frames})
     near = {frame for mark in marks for frame in range(mark - SPAN + 1, mark + 1)}
-    shown = {frame for frame in SHOWN if frame <= frames} if sheet else set()
+    shown = {frame for frame in SHEET if frame <= frames} if sheet else set()
     return tuple(marks), tuple(sorted(near | shown))
 
 
@@ -158,7 +165,7 @@ def measure(
     given = np.stack([tokenizer.encode(pictures[:prompt]) for pictures in shown])
     true = np.stack([as_shown(tokenizer, pictures[prompt:]) for pictures in shown])
     chunks = np.stack([one.chunks for one in episodes])
-    roll = partial(_rolled, model, tokenizer, robot, frames=frames, seed=seed)
+    roll = partial(rolled, model, tokenizer, robot, frames=frames, seed=seed)
     cases: list[Case] = []
     for name, options in samplings.items():
         if cases:
@@ -175,7 +182,7 @@ def measure(
     return Found(robot, probe, frames, true, parts, tuple(cases))
 
 
-def _rolled(
+def rolled(
     model: "HMA",
     tokenizer: "Tokenizer",
     robot: str,
@@ -276,21 +283,26 @@ def verdict(first: dict[str, Any], last: dict[str, Any], copy: dict[str, Any]) -
 
 
 def draw(found: Sequence[Found], path: Path) -> None:
-    """Write a PNG: for two rollouts a robot the truth, and below it the model, at the frames of SHOWN."""
+    """Write a PNG: for two rollouts a robot the truth, and below it the model, at the frames of SHEET."""
+    rows = []
+    for one in found:
+        columns = [one.frames.index(frame) for frame in SHEET if frame in one.frames]
+        told = ", ".join(str(one.frames[column]) for column in columns)
+        for number in range(min(SHEET_ROLLOUTS, len(one.truth))):
+            rows.append((one.truth[number, columns], f"{one.robot}, truth at frames {told}"))
+            rows += [
+                (case.pictures[number, columns], f"{one.robot}, {case.name}")
+                for case in one.cases
+                if case.judged
+            ]
+    write_sheet(path, rows)
+
+
+def write_sheet(path: Path, rows: Sequence[tuple[Images, str]]) -> None:
+    """Write a PNG of labelled rows of images."""
     from hma_data.episodes.sheets import grid, write_png
 
-    lines, labels = [], []
-    for one in found:
-        columns = [one.frames.index(frame) for frame in SHOWN if frame in one.frames]
-        told = ", ".join(str(one.frames[column]) for column in columns)
-        for number in range(min(SHEETS, len(one.truth))):
-            lines.append(list(one.truth[number, columns]))
-            labels.append(f"{one.robot}, truth at frames {told}")
-            for case in one.cases:
-                if case.judged:
-                    lines.append(list(case.pictures[number, columns]))
-                    labels.append(f"{one.robot}, {case.name}")
-    write_png(path, grid(lines, labels))
+    write_png(path, grid([list(images) for images, _ in rows], [label for _, label in rows]))
 
 
 BENCH = Bench(

@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.bench import Bench
-from hma_data.errors import UsageError
 from hma_data.lab import truth
 from hma_data.lab.simulator import embodiment
+from recipes.bench.drift import SHEET_ROLLOUTS, opened, rolled, write_sheet
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -44,7 +44,7 @@ NEAR = 60.0  # distance of RGB within which a pixel has an object's colour
 MOVED = 8.0  # px of 128 from which an object has moved
 FEWEST = 12  # pixels of an object below which it is hidden, and not judged
 TURNS = 36  # angles of the search for the best overlap
-SHOWN = (0, 1, 3, 6, 10, 20, 40, 60, 100, 200, 300)  # frames of a sheet; 0 is the prompt's last
+SHEET = (0, 1, 3, 6, 10, 20, 40, 60, 100, 200, 300)  # frames of a sheet; 0 is the prompt's last
 
 
 @dataclass(frozen=True)
@@ -65,21 +65,11 @@ class Found:
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row for each robot and mark; raise UsageError for a wrong setting."""
+    """Return a row for each robot and mark; raise UsageError for a robot without a simulator."""
     robots = [name.strip() for name in settings["robots"].split(",")]
     for robot in robots:
         embodiment(robot)
-    if min(settings["frames"], settings["rollouts"], settings["prompt"]) < 1:
-        raise UsageError("bench holds", "frames, rollouts and prompt are at least 1", "give larger ones")
-    from hma_data.tokenizers.base import get_tokenizer
-    from hma_model.checkpoint.folder import require_tokenizer
-    from hma_model.network.model import HMA
-    from hma_model.training.runtime import choose_device
-
-    device = str(choose_device(settings["device"]))
-    model = HMA.from_pretrained(settings["checkpoint"], embodiments=robots, device=device).eval()
-    tokenizer = get_tokenizer(str(model.config.tokenizer["name"]), device=device)
-    require_tokenizer(model.config, tokenizer.spec, settings["checkpoint"])
+    model, tokenizer = opened(settings["checkpoint"], robots, settings["device"])
     found = [measure(model, tokenizer, robot, settings) for robot in robots]
     if settings["sheet"]:
         draw(found, Path(settings["sheet"]))
@@ -89,11 +79,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 def measure(model: "HMA", tokenizer: "Tokenizer", robot: str, settings: dict[str, Any]) -> Found:
     """Simulate a robot's episodes, and continue them in the model."""
-    import torch
-
     from hma_data.episodes.images import prepare
-    from hma_model.generation.decode import decode
-    from hma_model.generation.rollout import Rollout
 
     begun, prompt, seed = time.monotonic(), settings["prompt"], settings["seed"]
     stride, length = model.embodiments[robot].stride, prompt + settings["frames"]
@@ -102,16 +88,12 @@ def measure(model: "HMA", tokenizer: "Tokenizer", robot: str, settings: dict[str
     size, (camera, *_) = tokenizer.spec.image_size, embodiment(robot).cameras
     seen = np.stack([prepare(one.pictures, camera, size, tokenizer.spec.resize_filter) for one in episodes])
     given = np.stack([tokenizer.encode(images[:prompt]) for images in seen])
-    kind = np.int64 if model.config.kind == "discrete" else np.float32
-    known = torch.from_numpy(given.astype(kind)).to(model.device)
-    actions = torch.from_numpy(np.stack([one.chunks for one in episodes])).to(model.device)
-    rollout = Rollout(model, robot, len(known), generator=torch.Generator().manual_seed(seed))
-    rollout.prompt(known, actions)
-    made = [known[:, -1]]
-    made += [rollout.step(actions[:, prompt - 1 + frame]) for frame in range(settings["frames"])]
-    images = decode(tokenizer, torch.stack([frame.cpu() for frame in made], dim=1))
+    chunks, frames = np.stack([one.chunks for one in episodes]), range(1, settings["frames"] + 1)
+    made = rolled(model, tokenizer, robot, given, chunks, options={}, frames=frames, seed=seed)
+    begin = tokenizer.decode(given[:, -1])[:, None]
     print(f"{robot}: {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
     parts = np.stack([one.parts for one in episodes])[:, prompt - 1 :]
+    images = np.concatenate([begin, made], axis=1)
     return Found(robot, seen[:, prompt - 1 :], images, parts, episodes[0].driven)
 
 
@@ -205,20 +187,16 @@ def _mean(values: Any) -> float | None:
     return round(float(kept.mean()), 3) if kept.size else None
 
 
-# -- sheet
-
-
 def draw(found: list[Found], path: Path) -> None:
-    """Write a PNG: for two rollouts a robot the truth, and below it the model, at the frames of SHOWN."""
-    from hma_data.episodes.sheets import grid, write_png
-
-    lines, labels = [], []
+    """Write a PNG: for two rollouts a robot the truth, and below it the model, at the frames of SHEET."""
+    rows = []
     for one in found:
-        columns = [frame for frame in SHOWN if frame < one.true.shape[1]]
-        for number in range(min(2, len(one.true))):
-            lines += [list(one.true[number, columns]), list(one.made[number, columns])]
-            labels += [f"{one.robot}, truth at frames {', '.join(map(str, columns))}", f"{one.robot}, model"]
-    write_png(path, grid(lines, labels))
+        columns = [frame for frame in SHEET if frame < one.true.shape[1]]
+        told = ", ".join(map(str, columns))
+        for number in range(min(SHEET_ROLLOUTS, len(one.true))):
+            rows.append((one.true[number, columns], f"{one.robot}, truth at frames {told}"))
+            rows.append((one.made[number, columns], f"{one.robot}, model"))
+    write_sheet(path, rows)
 
 
 BENCH = Bench(
@@ -235,4 +213,5 @@ BENCH = Bench(
         "sheet": "",  # a PNG to write
     },
     run,
+    choices={"driver": ("own", "wander")},
 )

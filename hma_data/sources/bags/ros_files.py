@@ -63,14 +63,12 @@ class Ros1File(IndexedFile):
 
     def _messages(self, index: FileIndex, view: View, at: int = 0) -> Iterator[Entry]:
         """See IndexedFile."""
-        while at < len(view):
-            place = at
-            header, start, at = _record(view, place)
+        for place, header, start, end in _records(view, at):
             kind = _number(header, "op")
             if kind == CONNECTION:
-                _learn(index, header, view[start:at])
+                _learn(index, header, view[start:end])
             elif kind == MESSAGE:
-                yield Entry(_number(header, "conn"), _time(header, "time"), place, start, at)
+                yield Entry(_number(header, "conn"), _time(header, "time"), place, start, end)
 
     def _make_index(self, file: BinaryIO) -> FileIndex:
         magic = file.read(len(ROS1_MAGIC))
@@ -87,21 +85,27 @@ class Ros1File(IndexedFile):
 
     def _index_of_chunks(self, file: BinaryIO) -> FileIndex:
         """Index a bag whose recorder was killed; every chunk is unpacked for it."""
-        index, at, view = FileIndex(counts=Counter()), len(ROS1_MAGIC), _whole(file)
+        index, view = FileIndex(counts=Counter()), _whole(file)
         without_index(self.path, file, len(view))
-        while at < len(view):
-            place = at
-            header, start, at = _record(view, place)
+        for place, header, start, end in _records(view, len(ROS1_MAGIC)):
             kind = _number(header, "op")
             if kind == CONNECTION:
-                _learn(index, header, view[start:at])
+                _learn(index, header, view[start:end])
             elif kind == CHUNK and index.counts is not None:
-                index.counts.update(self._look_into(file, index, place, at))
+                index.counts.update(self._look_into(file, index, place, end))
         return index
 
 
 def _whole(file: BinaryIO) -> FileView:
     return FileView(file, 0, file.seek(0, 2))
+
+
+def _records(view: View, at: int) -> Iterator[tuple[int, Header, int, int]]:
+    """Yield the place of each record from `at` on, its header, and where its content begins and ends."""
+    while at < len(view):
+        place = at
+        header, start, at = _record(view, place)
+        yield place, header, start, at
 
 
 def _record(view: View, at: int) -> tuple[Header, int, int]:

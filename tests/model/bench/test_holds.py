@@ -1,0 +1,71 @@
+"""What `hma bench holds` says of objects that stay, turn, melt, or lie elsewhere."""
+
+import numpy as np
+import pytest
+
+from hma_data.errors import UsageError
+from recipes.bench import holds
+
+RED, BLUE, GREY = (200, 20, 20), (20, 20, 200), (230, 230, 230)
+SIDE, FRAMES = 64, 3
+
+
+def scene(places: list[tuple[int, int]], bar: bool = True) -> np.ndarray:
+    """A film (1, T, S, S, 3) of a red L at these places (x, y), and of a blue robot that rests."""
+    film = np.full((1, len(places), SIDE, SIDE, 3), GREY, np.uint8)
+    film[:, :, 50:58, 50:58] = BLUE
+    for frame, (x, y) in enumerate(places):
+        film[0, frame, y : y + 16, x : x + 4] = RED
+        if bar:
+            film[0, frame, y + 12 : y + 16, x : x + 12] = RED
+    return film
+
+
+def found(made: np.ndarray, places: list[tuple[int, int]]) -> holds.Found:
+    loose = np.array(places, float) + 1
+    own = np.broadcast_to((54.0, 54.0), loose.shape)
+    parts = np.stack([own, loose], axis=1)[None] * 2  # px of 128
+    return holds.Found("toy", scene(places), made, parts, driven=1)
+
+
+PLACES = [(5, 5), (12, 9), (25, 20)]
+
+
+def row(made: np.ndarray) -> dict[str, float]:
+    return holds._row(found(made, PLACES), FRAMES - 1)
+
+
+def test_a_film_that_is_the_truth_holds_in_every_figure() -> None:
+    truth = row(scene(PLACES))
+    assert (truth["left"], truth["limbs"], truth["shape"], truth["off"], truth["overlap"]) == (1, 1, 1, 0, 1)
+    assert truth["moved"] == 1 and truth["repeat"] == 0 and truth["static_db"] == 99
+
+
+def test_an_object_that_lies_elsewhere_keeps_its_shape_and_is_off() -> None:
+    made = row(scene([PLACES[0]] * FRAMES))
+    assert made["shape"] == 1 and made["left"] == 1 and made["overlap"] == 0
+    assert made["off"] == pytest.approx(1, abs=0.01)  # it is left where it was
+
+
+def test_an_object_that_is_turned_keeps_its_shape_and_one_that_lost_a_limb_does_not() -> None:
+    turned = scene(PLACES)
+    turned[0, -1] = np.rot90(turned[0, -1], axes=(0, 1))
+    assert row(turned)["shape"] > 0.9
+    limb = row(scene(PLACES, bar=False))
+    assert limb["shape"] < 0.75 and limb["left"] == pytest.approx(64 / 96, abs=0.01)
+
+
+def test_what_melted_or_what_nobody_touched_is_told() -> None:
+    gone = scene(PLACES)
+    gone[gone == RED[0]] = GREY[0]
+    gone[0, -1][(scene(PLACES)[0, -1] == RED).all(-1)] = GREY
+    melted = row(gone)
+    assert melted["left"] == 0 and melted["shape"] == 0 and melted["off"] is None
+    darker = scene(PLACES)
+    darker[0, -1, :4] -= 40
+    assert row(darker)["static_db"] < 30 and row(darker)["left"] == 1
+
+
+def test_a_robot_without_a_simulator_is_named() -> None:
+    with pytest.raises(UsageError, match="bridge: has no simulator in the laboratory"):
+        holds.run({**holds.BENCH.defaults, "robots": "bridge"})
