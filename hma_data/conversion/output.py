@@ -17,9 +17,9 @@ from hma_data.conversion.extend import ways
 from hma_data.conversion.plan import Plan, differences
 from hma_data.errors import HMAError, OutputError, StorageAwayError
 from hma_data.shards.manifest import (
-    BESIDE,
     EMBODIMENT,
     EPISODES,
+    FILES_BESIDE,
     MANIFEST,
     QUARANTINE,
     SPLITS,
@@ -61,16 +61,16 @@ def clear(out: Path) -> None:
     """
     _refuse_foreign(out)
     if isinstance(out, RemotePath):
-        for name in out.listing().keys() - BESIDE:
+        for name in out.listing().keys() - FILES_BESIDE:
             (out / name).unlink(missing_ok=True)
         return
     for item in out.iterdir():
-        if item.name not in BESIDE and not item.name.startswith(LOCK):
+        if item.name not in FILES_BESIDE and not item.name.startswith(LOCK):
             shutil.rmtree(item) if item.is_dir() else item.unlink()
 
 
 def _refuse_foreign(out: Path) -> None:
-    names = {item.name for item in out.iterdir()} - OURS - BESIDE
+    names = {item.name for item in out.iterdir()} - OURS - FILES_BESIDE
     foreign = sorted(name for name in names if not (name.endswith(PART) or name.startswith(WORKING)))
     if foreign and (out / MANIFEST).is_file():
         what, them = ("a file that is", "it") if len(foreign) == 1 else ("files that are", "them")

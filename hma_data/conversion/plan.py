@@ -34,7 +34,7 @@ from hma_data.shards.manifest import SPLITS, digest_of_texts, json_list, plan_ha
 from hma_data.shards.schema import RowLayout, to_numpy
 from hma_data.sources.base import EpisodeRef, Source, open_source
 from hma_data.storage.paths import StrPath, as_text
-from hma_data.storage.records import BATCH, Records, schema_of, values_of
+from hma_data.storage.records import BATCH_RECORDS, Records, schema_of, values_of
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 
 FRAMES_TOKENIZED, EPISODES_TRIED = 64, 5  # of an estimate
@@ -219,7 +219,7 @@ def repeated(ids: pa.ChunkedArray) -> str | None:
 
 def recording_json(table: pa.Table) -> Iterator[str]:
     """Yield the JSON of [[id, fingerprint], …] in pieces."""
-    batches = table.select(["id", "fingerprint"]).to_batches(max_chunksize=BATCH)
+    batches = table.select(["id", "fingerprint"]).to_batches(max_chunksize=BATCH_RECORDS)
     return json_list(list(zip(*(column.to_pylist() for column in batch.columns))) for batch in batches)
 
 

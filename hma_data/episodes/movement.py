@@ -25,7 +25,7 @@ SMALL = 0.6  # a crop of at most this share of the side that is seen is worth it
 ALL = 0.9  # share of both sides from which a box says nothing about a robot
 CUT_OFF = 0.05  # share of the moving part that may lie beyond what is seen
 NARROWEST = 48  # pixels: least side of a proposed crop
-LOST = 0.5  # the robot is lost where decoded frames show less than this share of the change
+LOST_SHARE = 0.5  # the robot is lost where decoded frames show less than this share of the change
 
 
 def moving(film: Images) -> NDArray[np.bool_]:
@@ -203,7 +203,7 @@ class Kept:
     @property
     def lost(self) -> bool:
         """Check whether the decoded frames show too little of what moves for a model to see it."""
-        return self.change_shown < LOST
+        return self.change_shown < LOST_SHARE
 
     def __str__(self) -> str:
         if not self.moved:

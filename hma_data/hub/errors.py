@@ -10,7 +10,7 @@ from hma_data.storage.fetch import SECRET, causes
 
 TRANSIENT = (408, 429, 500, 502, 503, 504)
 LOG_IN = "log in with hf auth login, or set HF_TOKEN"
-AGAIN = "run the same command again; it goes on where it stopped"
+RUN_AGAIN = "run the same command again; it goes on where it stopped"
 LONGEST_WAIT = 300.0  # seconds; the hub counts requests over five minutes
 
 
@@ -58,11 +58,11 @@ def explain(where: str, fault: BaseException) -> HubError:
     if isinstance(fault, RuntimeError | ValueError) and isinstance(cause, away | httpx.HTTPError):
         return explain(where, cause)  # the client wraps what a download or an upload raised
     if isinstance(fault, httpx.TransportError) and not isinstance(fault, httpx.UnsupportedProtocol):
-        return HubError(where, f"the connection was cut: {name}", AGAIN)
+        return HubError(where, f"the connection was cut: {name}", RUN_AGAIN)
     if isinstance(fault, OSError) and fault.errno is not None:
         return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
     if isinstance(fault, OSError):
-        return HubError(where, f"did not come whole: {shown(str(fault))}", AGAIN)
+        return HubError(where, f"did not come whole: {shown(str(fault))}", RUN_AGAIN)
     if isinstance(fault, RuntimeError) and not isinstance(fault, RecursionError):
         remedy = "run it again; HF_HUB_DISABLE_XET=1 may help"  # of the hub's library for transfers
         return HubError(where, f"the transfer failed: {shown(str(fault))}", remedy)

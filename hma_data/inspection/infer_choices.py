@@ -50,7 +50,7 @@ BASE = _set("base displacement torso waist head body chassis wheel wheels")
 ROTATION = _set("rotation rot quat quaternion orientation euler rpy axis angular")
 JOINT = _set("joint joints qpos")
 CARTESIAN = _set("cartesian eef ee tcp end")
-GIVEN = _set("go start src box delta")  # poses that are given, not measured
+GIVEN_WORDS = _set("go start src box delta")  # poses that are given, not measured
 SIDES = _set("left right l r")
 _GRIPPER = _set("gripper grippers grip closedness close closed open finger fingers")
 _WHOLE_STATE = re.compile(r"(robot_)?(state|proprio|proprioception|obs)|qpos|agent_pos")
@@ -357,7 +357,7 @@ def _is_state(key: KeyInfo) -> bool:
     grips = is_gripper(key.key)
     if not key.dtype.startswith("float") and not (grips and key.dtype == "bool"):
         return False
-    if strength(said) or said & (MOTION | GIVEN):
+    if strength(said) or said & (MOTION | GIVEN_WORDS):
         return False
     return grips or bool(said & (STATES | ROTATION)) or _is_whole_state(key.key)
 

@@ -44,7 +44,7 @@ SLOW_LOOK = Look(96, "Peru", "Crimson", "DodgerBlue")
 FAST_STEPS, SLOW_TICKS = 80, 720
 CAMERA_TICKS, COMMAND_TICKS = 8, 20  # of pusht_slow: from one frame, and one action, to the next
 FAST_PERIOD_S = 0.1
-HELD = 4  # control steps for which a random target is held
+STEPS_HELD = 4  # control steps for which a random target is held
 PX = 128 / SIDE  # px of a frame of 128 in one of the arena
 STEM = np.array([0.0, 70.0])  # a point on the T's stem, px of the arena
 SHORTEST_S = 4.0  # of an episode
@@ -276,7 +276,7 @@ def fast_demo(
     while len(rows) < stop:
         seen = arena.picture(), arena.agent, arena.state
         before, action = arena.success, drive()
-        if len(rows) % HELD == 0:
+        if len(rows) % STEPS_HELD == 0:
             target = dice.uniform(15, 497, 2).astype(np.float32) if dice.random() < noise else None
         action = action if target is None else target
         robot.advance(action)

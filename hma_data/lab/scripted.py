@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hma_data.lab import FAMILY, planar_arm, pusht
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.driver import Driver, Reacher
-from hma_data.lab.family.world import REACH, World
+from hma_data.lab.family.table import REACH, BlockTable
 from hma_data.lab.simulator import Simulation
 
 Floats = NDArray[np.float64]
@@ -45,7 +45,7 @@ def steerable(robot: str) -> bool:
 
 def state_of(simulation: Simulation) -> State:
     """Return the true state of a robot that is steerable."""
-    if isinstance(simulation, World):
+    if isinstance(simulation, BlockTable):
         return State(simulation.pose, simulation.loose, simulation.held >= 0)
     if isinstance(simulation, pusht.FastPusher):
         return State(simulation.arena.agent, simulation.loose, False)

@@ -25,7 +25,7 @@ from hma_data.errors import ShardError, UsageError
 from hma_data.loading.mixture import TEMPERATURES, Draw, Mixture
 from hma_data.loading.pools import UnitAssignment, WindowSequence, pool_size
 from hma_data.loading.rows import MIB, Batch, Decoder, as_batch, assemble
-from hma_data.loading.views import FIRST, Cameras, Views, by_number, view_count
+from hma_data.loading.views import FIRST_CAMERA, Cameras, Views, by_number, view_count
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import Ints, Short
 from hma_data.storage.paths import StrPath
@@ -35,7 +35,7 @@ AHEAD, AHEAD_BYTES = 32, 8 * MIB  # most batches of a lane that are cut together
 __all__ = ["Batch", "MixtureDataset", "WindowDataset", "as_batch", "open_sets"]
 
 
-def open_sets(data: Sequence[StrPath | ShardSet], cameras: Cameras = FIRST) -> dict[str, ShardSet]:
+def open_sets(data: Sequence[StrPath | ShardSet], cameras: Cameras = FIRST_CAMERA) -> dict[str, ShardSet]:
     """Open shard sets; return embodiment id -> shard set.
 
     Args:
@@ -97,7 +97,7 @@ class WindowDataset(Dataset[Batch]):
         stride: int | None = None,
         short: Short = "drop",
         cache_mib: int = 256,
-        cameras: Cameras = FIRST,
+        cameras: Cameras = FIRST_CAMERA,
     ) -> None:
         self.shards = data if isinstance(data, ShardSet) else ShardSet(data)
         self._decoder = Decoder(self.shards, split, frames, stride, short, cache_mib * MIB, cameras)
@@ -200,7 +200,7 @@ class MixtureDataset(IterableDataset[Batch]):
         pool: int | None = None,
         lanes: int = 4,
         memory_mib: int = 1024,
-        cameras: Cameras = FIRST,
+        cameras: Cameras = FIRST_CAMERA,
     ) -> None:
         if not 0 <= rank < world:
             raise UsageError("rank", f"{rank} is not one of 0 to {world - 1}")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hma_data.errors import ShardError, UsageError
-from hma_data.loading.views import FIRST, Cameras, Views, stacked
+from hma_data.loading.views import FIRST_CAMERA, Cameras, Views, stacked
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns, token_column
 from hma_data.shards.windows import Ints, Short, WindowIndex
@@ -132,7 +132,7 @@ class Decoder:
         stride: int | None = None,
         short: Short = "drop",
         cache_bytes: int = 256 * MIB,
-        cameras: Cameras = FIRST,
+        cameras: Cameras = FIRST_CAMERA,
     ) -> None:
         if frames < 1:
             raise UsageError("frames", f"a window must have at least 1, not {frames}")

@@ -21,7 +21,7 @@ from hma_data.shards.windows import Ints
 from hma_data.tokenizers.base import TokenizerSpec
 
 Cameras = str | Sequence[str]
-FIRST, DRAWN = "first", "drawn"
+FIRST_CAMERA, DRAWN = "first", "drawn"
 
 
 def view_count(cameras: Cameras) -> int:
@@ -52,7 +52,7 @@ class Views:
         """
         layout, robot = shards.manifest.layout, shards.embodiment.id
         names: Sequence[str] = [cameras] if isinstance(cameras, str) else cameras
-        if cameras == FIRST:
+        if cameras == FIRST_CAMERA:
             names = layout.cameras[:1]
         elif cameras == DRAWN:
             names = layout.cameras

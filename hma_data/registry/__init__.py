@@ -17,7 +17,7 @@ FORMATS = {  # name -> package: RECOGNITION in it, open() in its module `source`
     "rh20t": "hma_data.sources.rh20t",
     "hands": "hma_data.sources.hands",
 }
-MORE = f"an installed package may add formats by entry points of {SOURCE_GROUP}"
+MORE_FORMATS = f"an installed package may add formats by entry points of {SOURCE_GROUP}"
 
 
 def known_formats() -> list[str]:

@@ -18,7 +18,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from hma_data.registry import FORMATS, MORE, known_formats
+from hma_data.registry import FORMATS, MORE_FORMATS, known_formats
 
 Space = Literal[
     "joint_position", "joint_velocity", "joint_delta", "eef_pose", "eef_delta", "base_velocity",
@@ -47,7 +47,7 @@ Start = Annotated[Count, Field(ge=0)]
 
 def _known_format(value: Any) -> Any:
     if not isinstance(value, str) or (value not in FORMATS and value not in known_formats()):
-        allowed = f"{', '.join(map(repr, known_formats()))}; {MORE}"
+        allowed = f"{', '.join(map(repr, known_formats()))}; {MORE_FORMATS}"
         raise PydanticCustomError("literal_error", "must be a known format", {"expected": allowed})
     return value
 

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from hma_data.cpu import usable_cores
 from hma_data.errors import HMAError
 from hma_data.shards.manifest import (
-    BESIDE,
     EMBODIMENT,
     EPISODES,
+    FILES_BESIDE,
     FINDER,
     MANIFEST,
     QUARANTINE,
@@ -293,7 +293,8 @@ def _checked(
 
 def _foreign(folder: Path, manifest: Manifest) -> Iterator[str]:
     """Yield a problem for each file that does not belong to the set."""
-    known = {shard.path for shard in manifest.shards} | {MANIFEST, EPISODES, QUARANTINE, EMBODIMENT} | BESIDE
+    known = {shard.path for shard in manifest.shards} | FILES_BESIDE
+    known |= {MANIFEST, EPISODES, QUARANTINE, EMBODIMENT}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if name in known or name.startswith(WORKING) or (path.is_dir() and name in SPLITS):

@@ -14,7 +14,7 @@ from typing import Protocol, runtime_checkable
 from hma_data.episodes.episode import Episode
 from hma_data.errors import SourceError
 from hma_data.plugins import SOURCE_GROUP, installed
-from hma_data.registry import FORMATS, MORE, known_formats
+from hma_data.registry import FORMATS, MORE_FORMATS, known_formats
 from hma_data.registry.embodiment import Embodiment
 
 # Packages that add a source take these names from here.
@@ -128,7 +128,9 @@ def open_source(name: str) -> Source:
         return source
     plugin = installed(SOURCE_GROUP).get(name)
     if plugin is None:
-        raise SourceError(name, "is not a source format", f"known: {', '.join(known_formats())}; {MORE}")
+        raise SourceError(
+            name, "is not a source format", f"known: {', '.join(known_formats())}; {MORE_FORMATS}"
+        )
     module = plugin.load()
     if not callable(getattr(module, "open", None)):
         raise plugin.broken(f"{plugin.entry_point.value} has no open()")

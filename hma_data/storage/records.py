@@ -12,7 +12,7 @@ from typing import Any, overload
 import numpy as np
 import pyarrow as pa
 
-BATCH = 4096  # records made into objects together
+BATCH_RECORDS = 4096  # records made into objects together
 _TYPES = {"str": pa.string(), "int": pa.int64(), "float": pa.float64(), "bool": pa.bool_()}
 _SCHEMAS: dict[type[Any], pa.Schema] = {}
 
@@ -75,7 +75,7 @@ class Records[T](Sequence[T]):
         return len(self.table)
 
     def __iter__(self) -> Iterator[T]:
-        for batch in self.table.to_batches(max_chunksize=BATCH):
+        for batch in self.table.to_batches(max_chunksize=BATCH_RECORDS):
             for values in zip(*(column.to_pylist() for column in batch.columns)):
                 yield self.kind(*values)
 
@@ -119,5 +119,5 @@ class Records[T](Sequence[T]):
 def values_of(column: pa.ChunkedArray | pa.Array) -> Iterator[Any]:
     """Yield the values of a column as Python objects, few of which exist at a time."""
     for chunk in column.chunks if isinstance(column, pa.ChunkedArray) else [column]:
-        for start in range(0, len(chunk), BATCH):
-            yield from chunk.slice(start, BATCH).to_pylist()
+        for start in range(0, len(chunk), BATCH_RECORDS):
+            yield from chunk.slice(start, BATCH_RECORDS).to_pylist()

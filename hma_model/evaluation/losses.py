@@ -18,7 +18,7 @@ from torch import Tensor
 
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
-from hma_data.loading.views import FIRST, Cameras, Views
+from hma_data.loading.views import FIRST_CAMERA, Cameras, Views
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
 from hma_model.config import OBJECTIVES
@@ -60,7 +60,7 @@ def windows(
     frames: int,
     count: int,
     batch_size: int = 8,
-    cameras: Cameras = FIRST,
+    cameras: Cameras = FIRST_CAMERA,
 ) -> Iterator[Batch]:
     """Yield up to `count` windows of a split in batches; they are evenly spaced and always the same.
 
@@ -129,7 +129,7 @@ def masked_val_loss(model: "HMA", batches: Iterable[Batch]) -> float:
 def digit_frequencies(
     shards: ShardSet,
     max_frames: int = BASELINE_FRAMES,
-    cameras: Cameras = FIRST,
+    cameras: Cameras = FIRST_CAMERA,
     factored: Sequence[int] | None = None,
 ) -> list[NDArray[np.float64]]:
     """Return the frequency of each value of each digit in train: F arrays (V,), add-one smoothed.
@@ -157,7 +157,7 @@ def digit_frequencies(
 def unconditional_baseline(
     train: Mapping[str, ShardSet] | Sequence[StrPath | ShardSet],
     batches: Iterable[Batch],
-    cameras: Cameras = FIRST,
+    cameras: Cameras = FIRST_CAMERA,
     factored: Sequence[int] | None = None,
     merge: int = 1,
 ) -> Means:

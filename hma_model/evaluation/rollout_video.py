@@ -24,7 +24,7 @@ from hma_data.episodes.sheets import (
 )
 from hma_data.errors import HMAError, UsageError
 from hma_data.loading.dataset import WindowDataset
-from hma_data.loading.views import FIRST, Cameras
+from hma_data.loading.views import FIRST_CAMERA, Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
@@ -251,7 +251,7 @@ def write_sheets(
     frames: int,
     count: int,
     seed: int,
-    cameras: Cameras = FIRST,
+    cameras: Cameras = FIRST_CAMERA,
 ) -> str:
     """Write `pictures/step-N-ID.png` for each robot.
 

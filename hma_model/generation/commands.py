@@ -21,7 +21,7 @@ from hma_model.checkpoint.folder import Checkpoint
 if TYPE_CHECKING:
     from hma_model.network.network import Network
 
-Floats = NDArray[np.float32]
+Float32s = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class Commands:
     names: tuple[str, ...]
     stride: int
     rate_hz: float | None
-    low: Floats
-    high: Floats
-    seen: Floats | None
+    low: Float32s
+    high: Float32s
+    seen: Float32s | None
 
     @classmethod
     def of(cls, model: "Network", embodiment: str) -> "Commands":
@@ -67,7 +67,7 @@ class Commands:
         rate = None if robot is None else robot.rate_hz
         return cls(embodiment, tuple(names), space.stride, rate, low, high, seen)
 
-    def read(self, commands: ArrayLike) -> tuple[Floats, bool]:
+    def read(self, commands: ArrayLike) -> tuple[Float32s, bool]:
         """Return commands as a chunk (K,), and whether it is known.
 
         Args:
@@ -86,7 +86,7 @@ class Commands:
             return np.zeros(values.size, np.float32), False
         return rows.reshape(-1), True
 
-    def one(self, command: ArrayLike) -> Floats:
+    def one(self, command: ArrayLike) -> Float32s:
         """Return one command (A,), checked; of NaN if it is unknown.
 
         Raises:
@@ -99,7 +99,7 @@ class Commands:
         self.unknown(values[None])
         return values
 
-    def unknown(self, rows: Floats) -> NDArray[np.bool_]:
+    def unknown(self, rows: Float32s) -> NDArray[np.bool_]:
         """Return which commands (n, A) are unknown; raise HMAError for values that mean nothing."""
         unknown = np.asarray(np.isnan(rows).all(axis=1))
         if not np.isfinite(rows[~unknown]).all():
@@ -107,7 +107,7 @@ class Commands:
             raise HMAError("commands", fault, "give numbers; a command of NaN alone is unknown")
         return unknown
 
-    def outside(self, commands: Floats) -> str:
+    def outside(self, commands: Float32s) -> str:
         """Say which of the commands (..., A) leave the range seen in training, and the range; "" for none."""
         if self.seen is None:
             return ""
@@ -119,7 +119,7 @@ class Commands:
         about = f"an action is outside the range seen in training ({', '.join(said)})"
         return f"{self.embodiment}: {about}" if said else ""
 
-    def clip(self, commands: Floats) -> Floats:
+    def clip(self, commands: Float32s) -> Float32s:
         """Return commands (..., A) inside the range seen in training; NaN stays."""
         return commands if self.seen is None else np.clip(commands, *self.seen)
 
@@ -193,7 +193,7 @@ def _checkpoint(model: "Network", embodiment: str) -> Checkpoint | None:
     return kept if kept and embodiment in kept.embodiments else None
 
 
-def _seen(model: "Network", embodiment: str) -> Floats | None:
+def _seen(model: "Network", embodiment: str) -> Float32s | None:
     kept = _checkpoint(model, embodiment)
     action = {} if kept is None else kept.stats(embodiment)["action"]
     if "min" not in action or "max" not in action:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hma_data.errors import UsageError
-from hma_data.loading.views import FIRST, Cameras, view_count
+from hma_data.loading.views import FIRST_CAMERA, Cameras, view_count
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.network import NetworkTokenizer
 
@@ -48,7 +48,7 @@ def cameras_for(model: "Network", shards: ShardSet, cameras: Cameras | None = No
     if cameras is None and model.source:
         card = model.source.card(shards.embodiment.id)
         cameras = card.get("data", {}).get("cameras")
-    cameras = FIRST if cameras is None else cameras
+    cameras = FIRST_CAMERA if cameras is None else cameras
     if (count := view_count(cameras)) != model.config.views:
         fault = f"are {count} in a frame, but the model takes {model.config.views}"
         raise UsageError(

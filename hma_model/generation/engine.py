@@ -40,13 +40,14 @@ class Engine:
         dtype, device = products_in(precision, model.device, compile), model.device
         whole = model.dtype == torch.float32 and not torch.is_autocast_enabled(device.type)
         pack = whole and not compile and packs(device)
-        self.trunk: nn.Module = packed(model.trunk, dtype) if pack else model.trunk
+        trunk = model.get_submodule("trunk")
+        self.trunk: nn.Module = packed(trunk, dtype) if pack else trunk
         # Scores of tokens stay float32; the diffusion head, most of a frame of latents, may be bfloat16.
         half = dtype == torch.bfloat16 and model.config.kind == "continuous"
         self.readout: nn.Module = (
             packed(model.readout, dtype if half else torch.float32) if pack else model.readout
         )
-        self.compiled = _compiled(model.trunk, device) if compile else None
+        self.compiled = _compiled(trunk, device) if compile else None
         self.whole = _compiled(self.unmasked_by, device) if compile else None
         self._casts = dtype == torch.bfloat16 and not pack
 

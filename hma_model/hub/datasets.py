@@ -10,8 +10,8 @@ from typing import Any
 from hma_data.conversion.publish import SMALL, publish
 from hma_data.errors import HubError, ShardError
 from hma_data.shards.manifest import (
-    BESIDE,
     EPISODES,
+    FILES_BESIDE,
     FINDER,
     MANIFEST,
     SHARD_NAME,
@@ -27,7 +27,7 @@ from hma_data.tokenizers.catalog import other_weights
 from hma_model.checkpoint.model_card import licence, line, number
 from hma_model.hub.stores import Store, open_store
 
-_OWN_FILES = {*SMALL, MANIFEST, *BESIDE}
+_OWN_FILES = {*SMALL, MANIFEST, *FILES_BESIDE}
 _PULL_AGAIN = "pull again; if it stays so, have it pushed again"
 _DATASETS = "hf://datasets/"
 _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"),

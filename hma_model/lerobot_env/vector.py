@@ -23,7 +23,7 @@ from hma_model.worlds.env import WorldModelVectorEnv
 from hma_model.worlds.images import recorded_cameras, seen_cameras, trained_cameras
 from hma_model.worlds.world import World
 
-Floats = NDArray[np.float32]
+Float32s = NDArray[np.float32]
 Observations = dict[str, Any]
 NEW_ROLLOUT = "lerobot_new_rollout"  # an option with which lerobot's evaluation begins each batch
 SYNTHETIC = "synthetic"  # an observation of 1; in lerobot's recordings it tells that no robot did this
@@ -157,7 +157,7 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         return self._seen(), infos
 
     def step(  # type: ignore[override]
-        self, actions: Floats
+        self, actions: Float32s
     ) -> tuple[Observations, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Send an action to each environment that goes on; those that get an image get it in one pass."""
         new = []

@@ -22,7 +22,7 @@ from hma_model.network.stem import to_digits
 
 # Nothing before a digit differs; only other tokens of its square do; its own token does.
 STATES = 3
-MOST = 2.0  # a patch's shares begin at the sigmoid of this, 0.88; begun at 0 they learn less
+START_LOGIT = 2.0  # a patch's shares begin at the sigmoid of this, 0.88; begun at 0 they learn less
 SCALE = 4.0  # of the features: gains grow as fast as scores at a learning rate of small steps
 
 
@@ -126,7 +126,7 @@ class PatchCopy(nn.Module):
         self.multiplier = SCALE * (config.base_width / config.width if config.mup else 1.0)
         self.linear = Linear(config.width, config.patch_dim)
         nn.init.zeros_(self.linear.weight)
-        nn.init.constant_(self.linear.bias, MOST)
+        nn.init.constant_(self.linear.bias, START_LOGIT)
 
     def forward(self, features: Tensor, before: Tensor) -> Tensor:
         """Return what is kept (..., C) float32 of patches (..., C), from features (..., D)."""

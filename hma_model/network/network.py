@@ -6,7 +6,7 @@ B batch, T frames, h,w token grid, S = h*w, N = S + action tokens, D width, K = 
 c channels and H,W grid of latents, p patch side.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -25,12 +25,12 @@ from hma_model.network.head import (
 )
 from hma_model.network.states import check_fit, module_key
 from hma_model.network.stem import Stem, merge_tokens, patchify, space_of_stem, waves_of_stem
-from hma_model.network.trunks.contract import Conditioning, TimePositions, window_times
+from hma_model.network.trunks.contract import Conditioning, TimePositions, Trunk, window_times
 from hma_model.network.trunks.transformer import Transformer
 from hma_model.network.trunks.unet import UNet
 
 # by `HMAConfig.trunk`
-TRUNKS: dict[str, type[Transformer] | type[UNet]] = {"transformer": Transformer, "unet": UNet}
+TRUNKS: dict[str, Callable[[HMAConfig], Trunk]] = {"transformer": Transformer, "unet": UNet}
 
 
 class Network(nn.Module):
@@ -49,7 +49,7 @@ class Network(nn.Module):
         self.config = config
         self.embodiments: dict[str, ActionSpace] = {}
         self.source: Checkpoint | None = None
-        self.trunk: Transformer | UNet = TRUNKS[config.trunk](config)
+        self.trunk: Trunk = TRUNKS[config.trunk](config)
         if config.kind == "discrete":
             self.readout: nn.Module = TokenReadout(config)
         else:
@@ -131,7 +131,7 @@ class Network(nn.Module):
         return self._shared().state_dict()
 
     def _shared(self) -> nn.ModuleDict:
-        return nn.ModuleDict({"trunk": self.trunk, "readout": self.readout})
+        return nn.ModuleDict({"trunk": self.get_submodule("trunk"), "readout": self.readout})
 
     def stem_state(self, embodiment: str) -> dict[str, Tensor]:
         """Return the tensors of an embodiment's action stem, statistics and modulation."""

@@ -18,7 +18,7 @@ from hma_data.episodes.images import opencv
 from hma_data.errors import UsageError
 from hma_model.play.divergence import DivergenceDetector
 from hma_model.play.pads import describe
-from hma_model.worlds.scenes import Drivable, Floats, Image, LabScene
+from hma_model.worlds.scenes import Drivable, Float32s, Image, LabScene
 
 if TYPE_CHECKING:
     from hma_model.worlds.world import World
@@ -51,8 +51,8 @@ class Frame:
     number: int
     model: bytes
     true: bytes | None
-    actions: Floats
-    state: Floats | None
+    actions: Float32s
+    state: Float32s | None
     psnr: float | None
     still: float | None = None
 
@@ -121,7 +121,7 @@ class Session:
         self.scene = self.robot.scene(number)
         prompt = self.scene.prompt
         self._true: deque[Image] = deque(prompt.frames, maxlen=RESTART_FRAMES)
-        self._chunks: deque[Floats] = deque(prompt.chunks, maxlen=RESTART_FRAMES - 1)
+        self._chunks: deque[Float32s] = deque(prompt.chunks, maxlen=RESTART_FRAMES - 1)
         self.held = self.scene.action.copy()
         self.frames: deque[Frame] = deque(maxlen=KEPT_FRAMES)
         self.count = 0
@@ -159,7 +159,7 @@ class Session:
         self._world.reset(self.row, *self._history())
         self._last = self._restarted(self._last)
 
-    def _history(self) -> tuple[Image, Floats]:
+    def _history(self) -> tuple[Image, Float32s]:
         """Return the true last frames, and the chunks between them."""
         frames = list(self._true)
         chunks = list(self._chunks)
@@ -173,7 +173,7 @@ class Session:
             return False
         return self.steps > 0 or (not self.paused and not (self.fast and self.viewer.behind > 1))
 
-    def next_chunk(self) -> Floats | None:
+    def next_chunk(self) -> Float32s | None:
         """Advance the truth, and return the chunk (K,) for the model; None at a recording's end."""
         stride = self.robot.embodiment.stride
         found = self.scene.advance(None if self.replays else np.tile(self.held, stride))
@@ -223,7 +223,7 @@ class Session:
             self.viewer.show(frame, facts)
 
     @property
-    def _state(self) -> Floats | None:
+    def _state(self) -> Float32s | None:
         """Return the state (S,) of the simulator, if there is one."""
         return self.scene.simulator.state if isinstance(self.scene, LabScene) else None
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import HMAError, UsageError
 from hma_model.play.session import FrameSampling, Session, Viewer
-from hma_model.worlds.scenes import Drivable, Floats
+from hma_model.worlds.scenes import Drivable, Float32s
 
 if TYPE_CHECKING:
     from hma_model.worlds.world import World
@@ -198,7 +198,7 @@ class Stepper:
         world = self._world
         world.unmask_steps, world.temperature, world.order = vars(sampling).values()
         begun = time.monotonic()
-        chunks: dict[int, Floats] = {}
+        chunks: dict[int, Float32s] = {}
         rows: dict[int, Session] = {}
         for session in sessions:
             chunk = self._guarded(session, session.next_chunk)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hma_data.errors import HMAError, UsageError
-from hma_model.policies.arenas import Arena, Floats, Scenes
+from hma_model.policies.arenas import Arena, Float32s, Scenes
 from hma_model.policies.base import split_options
 from hma_model.worlds.images import Prompt
 from hma_model.worlds.world import World, load_world, require_actor
@@ -65,7 +65,7 @@ class Follower:
         self.sessions = [
             self.world.open(name, *prompt, seed=seed + row) for row, prompt in enumerate(self._prompts)
         ]
-        self._taken: list[Floats] = []  # actions (N, A) since the last image
+        self._taken: list[Float32s] = []  # actions (N, A) since the last image
 
     def look(self, arena: Arena) -> None:
         """See the arena's images if they are new."""
@@ -82,7 +82,7 @@ class Follower:
                 self.world.reset(session, *prompt)
         self._taken = []
 
-    def take(self, actions: Floats) -> Floats:
+    def take(self, actions: Float32s) -> Float32s:
         """Note actions (N, A) that are given, and return them."""
         self._taken.append(actions)
         return actions
@@ -131,19 +131,19 @@ class Acting:
 
     def begin(self, arena: Arena) -> None:
         self._follower.begin(arena)
-        self._ahead: list[Floats] = []  # actions (N, A) that are still to be given
+        self._ahead: list[Float32s] = []  # actions (N, A) that are still to be given
 
-    def act(self, arena: Arena) -> Floats:
+    def act(self, arena: Arena) -> Float32s:
         self._follower.look(arena)
         if not self._ahead:
             self._ahead = self._chosen()
         return self._follower.take(self._ahead.pop(0))
 
-    def _chosen(self) -> list[Floats]:
+    def _chosen(self) -> list[Float32s]:
         """Return the actions (N, A) of the chunks up to the horizon."""
         world = self._follower.world
         sessions = self._follower.sessions
-        made = list[Floats]()
+        made = list[Float32s]()
         kept = {session: world.snapshot(session) for session in sessions if self._horizon > 1}
         for chunk in range(self._horizon):
             given = {one: self._follower.spec.clip(said) for one, said in world.act(sessions).items()}

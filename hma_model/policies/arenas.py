@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hma_model.evaluation.probe import Probe
     from hma_model.worlds.world import World
 
-Floats = NDArray[np.float32]
+Float32s = NDArray[np.float32]
 Places = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
@@ -115,7 +115,7 @@ class Arena(Protocol):
     scenes: Scenes
     prompts: Sequence[Prompt]  # of the scenes, at the rate of the model's frames
     images: Image  # (N, S, S, 3), the newest ones
-    held: Floats  # (N, A), the actions that leave the robot as it is after the prompt
+    held: Float32s  # (N, A), the actions that leave the robot as it is after the prompt
 
     @property
     def fresh(self) -> bool:
@@ -124,13 +124,13 @@ class Arena(Protocol):
     def states(self) -> list[State]:
         """Return the state of each scene; for robots that are steerable."""
 
-    def observed(self) -> Floats | None:
+    def observed(self) -> Float32s | None:
         """Return the robots' measurements of themselves (N, S'), as recorded; None if images tell none."""
 
-    def recorded(self) -> Floats:
+    def recorded(self) -> Float32s:
         """Return the next actions (N, A) of the recorder's own driver; call it once a step."""
 
-    def step(self, actions: Floats) -> None:
+    def step(self, actions: Float32s) -> None:
         """Take an action (N, A)."""
 
 
@@ -157,7 +157,7 @@ class TrueArena:
         self.prompts: Sequence[Prompt] = [scene.prompt for scene in self._begun]
         self.held = np.stack([scene.action for scene in self._begun])
         self.parts: list[Places] = []
-        self.told: list[Floats] = []
+        self.told: list[Float32s] = []
         self._look()
 
     @property
@@ -167,16 +167,16 @@ class TrueArena:
     def states(self) -> list[State]:
         return [state_of(scene.simulator.simulation) for scene in self._begun]
 
-    def observed(self) -> Floats | None:
+    def observed(self) -> Float32s | None:
         if not shows_state(self.scenes.name):
             return None
         return np.stack([scene.simulator.state for scene in self._begun])
 
-    def recorded(self) -> Floats:
+    def recorded(self) -> Float32s:
         self.told.append(np.stack([scene.simulator.recorded() for scene in self._begun]))
         return self.told[-1]
 
-    def step(self, actions: Floats) -> None:
+    def step(self, actions: Float32s) -> None:
         for scene, action in zip(self._begun, actions, strict=True):
             scene.simulator.advance(action)
         self._steps += 1
@@ -202,8 +202,8 @@ class Beginning(Protocol):
 
     scenes: Scenes
     prompts: Sequence[Prompt]
-    held: Floats
-    told: list[Floats]
+    held: Float32s
+    told: list[Float32s]
 
 
 class ModelArena:
@@ -231,7 +231,7 @@ class ModelArena:
         self._steps = 0
         self._seen: list[SeenState] | None = None
 
-    def outside(self, actions: Floats) -> str:
+    def outside(self, actions: Float32s) -> str:
         """Say which of the actions (N, A) leave the range seen in training; "" for none."""
         return self._world.action_spec(self.scenes.name).outside(actions)
 
@@ -252,16 +252,16 @@ class ModelArena:
             self._seen = [seen_state(self.scenes.name, self._probe.own, one) for one in places]
         return [seen.state for seen in self._seen]
 
-    def observed(self) -> Floats | None:
+    def observed(self) -> Float32s | None:
         if self._probe is None or not shows_state(self.scenes.name):
             return None
         return np.stack([state.pose for state in self.states()]).astype(np.float32)
 
-    def recorded(self) -> Floats:
+    def recorded(self) -> Float32s:
         """Return the actions of the simulator's driver in the true episode."""
         return self._told[self._steps]
 
-    def step(self, actions: Floats) -> None:
+    def step(self, actions: Float32s) -> None:
         self._steps += 1
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", OutsideRangeWarning)  # `run` says which policy leaves the range

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from hma_data.errors import HMAError, UsageError
-from hma_model.policies.arenas import Arena, Floats
+from hma_model.policies.arenas import Arena, Float32s
 
 if TYPE_CHECKING:
     from hma_model.policies.judge import StateJudge
@@ -24,7 +24,7 @@ class Policy(Protocol):
     def begin(self, arena: Arena) -> None:
         """Begin episodes in all scenes."""
 
-    def act(self, arena: Arena) -> Floats:
+    def act(self, arena: Arena) -> Float32s:
         """Return the next actions (N, A)."""
 
 
@@ -66,7 +66,7 @@ def begin(name: str, policy: Policy, arena: Arena) -> None:
         policy.begin(arena)
 
 
-def checked(name: str, policy: Policy, arena: Arena) -> Floats:
+def checked(name: str, policy: Policy, arena: Arena) -> Float32s:
     """Return the next actions (N, A) of a policy.
 
     Raises:

@@ -14,7 +14,7 @@ from hma_data.errors import HMAError
 from hma_data.hub.repository import Repository
 from hma_data.lab import imported
 from hma_data.storage.paths import REPOSITORY
-from hma_model.policies.arenas import Arena, Floats, Scenes
+from hma_model.policies.arenas import Arena, Float32s, Scenes
 
 STATE, TASK = "observation.state", "task"
 
@@ -79,7 +79,7 @@ class LeRobotPolicy:
             raise HMAError(self.name, fault, "give a policy that sees the same cameras")
         self._policy.reset()
 
-    def act(self, arena: Arena) -> Floats:
+    def act(self, arena: Arena) -> Float32s:
         import torch
         from torch.nn.functional import interpolate
 
@@ -93,7 +93,7 @@ class LeRobotPolicy:
             action = self._after(self._policy.select_action(self._before(batch)))
         return np.asarray(action.cpu(), np.float32)
 
-    def _observed(self, arena: Arena) -> Floats:
+    def _observed(self, arena: Arena) -> Float32s:
         state = arena.observed()
         if state is None or state.shape[1] != self._state:
             have = "none" if state is None else f"one of {state.shape[1]}"

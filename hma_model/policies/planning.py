@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, MissingDependencyError, UsageError, install_command
 from hma_model.policies.acting import Follower
-from hma_model.policies.arenas import Arena, Floats, Image, Scenes
+from hma_model.policies.arenas import Arena, Float32s, Image, Scenes
 from hma_model.policies.base import split_options
 from hma_model.worlds.world import World
 
@@ -72,7 +72,7 @@ class Cost:
         high = (self._own.high - self._mean) / scale
         return gymnasium.spaces.Box(low, high, dtype=np.float32)
 
-    def actions(self, candidates: NDArray[Any]) -> Floats:
+    def actions(self, candidates: NDArray[Any]) -> Float32s:
         """Return candidates (…, A), held for a chunk, or (…, K), as actions (…, stride, A)."""
         width = len(self._own.names)
         stride = self._own.stride
@@ -195,10 +195,10 @@ class Planning:
         )  # fmt: skip
         box = gymnasium.spaces.Box(np.tile(one.low, (count, 1)), np.tile(one.high, (count, 1)))
         self._solver.configure(action_space=box, n_envs=count, config=configured(horizon, receding))
-        self._ahead: list[Floats] = []
+        self._ahead: list[Float32s] = []
         self._rest: torch.Tensor | None = None
 
-    def act(self, arena: Arena) -> Floats:
+    def act(self, arena: Arena) -> Float32s:
         self._follower.look(arena)
         if not self._ahead:
             scenes = torch.arange(len(arena.images))

@@ -42,7 +42,7 @@ from hma_model.evaluation.agreement import (
     share_interval,
 )
 from hma_model.generation.commands import OutsideRangeWarning
-from hma_model.policies.arenas import Arena, Floats, Image, ModelArena, Scenes, TrueArena
+from hma_model.policies.arenas import Arena, Float32s, Image, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy, begin, checked
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import (
@@ -329,7 +329,7 @@ def score_policy(
 
 def run(
     name: str, policy: Policy, arena: Arena, frames: int, tell: Callable[[float], None] = lambda done: None
-) -> tuple[list[Image], list[Floats]]:
+) -> tuple[list[Image], list[Float32s]]:
     """Let a policy act for so many frames.
 
     Returns:
@@ -339,7 +339,7 @@ def run(
         HMAError: the policy fails.
     """
     images = [arena.images]
-    actions = list[Floats]()
+    actions = list[Float32s]()
     said = ""
     begin(name, policy, arena)
     for _ in range(frames * arena.scenes.stride):

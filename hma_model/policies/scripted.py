@@ -11,7 +11,7 @@ import numpy as np
 
 from hma_data.errors import UsageError
 from hma_data.lab.scripted import driver, reacher, steerable
-from hma_model.policies.arenas import Arena, Floats
+from hma_model.policies.arenas import Arena, Float32s
 
 
 class Still:
@@ -20,7 +20,7 @@ class Still:
     def begin(self, arena: Arena) -> None:
         pass
 
-    def act(self, arena: Arena) -> Floats:
+    def act(self, arena: Arena) -> Float32s:
         return arena.held
 
 
@@ -32,7 +32,7 @@ class Random:
         # A person drives a rate both ways; a rate that was only ever positive in training stays so here.
         self._low, self._high = arena.scenes.robot.seen
 
-    def act(self, arena: Arena) -> Floats:
+    def act(self, arena: Arena) -> Float32s:
         if arena.fresh:
             drawn = [rng.uniform(self._low, self._high) for rng in self._rng]
             self._action = np.stack(drawn).astype(np.float32)
@@ -59,14 +59,14 @@ class Scripted:
     def begin(self, arena: Arena) -> None:
         self._random.begin(arena)
         self._coins = arena.scenes.rng(2)
-        self._drivers: list[Callable[..., Floats]] = []
+        self._drivers: list[Callable[..., Float32s]] = []
         if self.reach:
             self._drivers = [reacher(arena.scenes.name) for _ in arena.images]
         elif steerable(arena.scenes.name):
             begun = zip(arena.states(), arena.scenes.rng(3), strict=True)
             self._drivers = [driver(arena.scenes.name, state.pose, rng) for state, rng in begun]
 
-    def act(self, arena: Arena) -> Floats:
+    def act(self, arena: Arena) -> Float32s:
         noisy = self._random.act(arena)
         if arena.fresh:
             self._thrown = np.array([coin.random() < self.noise for coin in self._coins])[:, None]
@@ -100,7 +100,7 @@ class Called:
             if hasattr(function, "reset"):
                 function.reset()
 
-    def act(self, arena: Arena) -> Floats:
+    def act(self, arena: Arena) -> Float32s:
         pairs = zip(self._functions, arena.images, strict=True)
         actions = [np.asarray(function(image.copy())) for function, image in pairs]
         shapes = {action.shape for action in actions}

@@ -31,7 +31,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.probe import Probe, train_probe
 from hma_model.evaluation.recorded_state import EPISODES_NEEDED, Reader, recorded_reader, simulated_reader
 from hma_model.generation.decode import cameras_for
-from hma_model.policies.arenas import Arena, Floats, ModelArena, Scenes, TrueArena
+from hma_model.policies.arenas import Arena, Float32s, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import device_facts, world_digests
@@ -51,7 +51,7 @@ from hma_model.worlds.scenes import at_rest
 from hma_model.worlds.world import World, load_world
 
 WORK = ".augment"
-BATCH = 16  # episodes that step in one pass
+BATCH_EPISODES = 16  # episodes that step in one pass
 UNCERTAINTY_FLAGS = {
     "discrete": "millinats",
     "continuous": "millilatents",
@@ -119,7 +119,7 @@ class SyntheticBatch:
     """
 
     stored: NDArray[Any]
-    chunks: Floats
+    chunks: Float32s
     uncertainty: NDArray[np.float64]
     success: NDArray[np.bool_]
     groups: NDArray[np.str_]
@@ -131,8 +131,8 @@ class RealBeginnings:
 
     scenes: Scenes
     prompts: Sequence[Prompt]
-    held: Floats
-    told: list[Floats]
+    held: Float32s
+    told: list[Float32s]
     groups: Sequence[str]
 
 
@@ -150,7 +150,7 @@ class ReplayPolicy:
         self._rng = arena.scenes.rng(4)
         self._low, self._high = arena.scenes.robot.seen
 
-    def act(self, arena: Arena) -> Floats:
+    def act(self, arena: Arena) -> Float32s:
         if arena.fresh:
             self._noise = np.stack([rng.normal(0, self._std) for rng in self._rng])
         actions = arena.recorded()
@@ -312,8 +312,8 @@ class _Maker:
         count = self.settings.episodes
         frames = self.settings.frames
         batches = []
-        for begin in range(0, count, BATCH):
-            numbers = range(begin, min(begin + BATCH, count))
+        for begin in range(0, count, BATCH_EPISODES):
+            numbers = range(begin, min(begin + BATCH_EPISODES, count))
 
             def make(numbers: range = numbers) -> dict[str, NDArray[Any]]:
                 self._train(on_progress)

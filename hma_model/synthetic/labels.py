@@ -28,7 +28,7 @@ from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import INVERSE
-from hma_model.generation.commands import Commands, Floats, card, described
+from hma_model.generation.commands import Commands, Float32s, card, described
 from hma_model.policies.fingerprints import device_facts, world_digests
 from hma_model.synthetic.film import FilmEpisode, ShardFilm, find_film, read_film
 from hma_model.synthetic.recorder import SyntheticEpisode, finished, write_shards
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 WORK = ".label"
 ORIGIN = "inferred: the actions are a model's, by inverse dynamics from the frames"
-BATCH = 16  # windows of a pass
+BATCH_WINDOWS = 16  # windows of a pass
 MAX_CHECKED = 64  # labelled episodes that the error is measured on, at most
 
 
@@ -155,7 +155,7 @@ def label_actions(
 # -- inference
 
 
-def infer(model: "HMA", spec: Commands, stored: NDArray[Any]) -> Floats:
+def infer(model: "HMA", spec: Commands, stored: NDArray[Any]) -> Float32s:
     """Return the chunks (T - 1, K) that led from each stored frame (T, …) to the next.
 
     A chunk is read off a window in whose later half it lies, except those of the first window.
@@ -166,8 +166,8 @@ def infer(model: "HMA", spec: Commands, stored: NDArray[Any]) -> Floats:
     starts = sorted({*range(0, count - width, hop), count - width})
     frames = torch.from_numpy(stored.astype(np.int64 if model.config.kind == "discrete" else np.float32))
     made = np.empty((count - 1, spec.stride * len(spec.names)), np.float32)
-    for begin in range(0, len(starts), BATCH):
-        some = starts[begin : begin + BATCH]
+    for begin in range(0, len(starts), BATCH_WINDOWS):
+        some = starts[begin : begin + BATCH_WINDOWS]
         windows = torch.stack([frames[at : at + width] for at in some]).to(model.device)
         read = model.predict_actions(windows, spec.embodiment, readout=INVERSE.name)
         for at, chunks in zip(some, read.numpy(force=True)):
@@ -191,8 +191,8 @@ def measure(
     split = "val" if film.numbers("val") else "train"
     numbers = film.numbers(split)[:MAX_CHECKED]
     width = len(spec.names)
-    misses = list[Floats]()
-    true = list[Floats]()
+    misses = list[Float32s]()
+    true = list[Float32s]()
     for done, number in enumerate(numbers):
         on_progress(done, "checking on labelled film", len(numbers))
         stored, actions, known = film.labelled(number)

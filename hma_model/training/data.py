@@ -13,7 +13,7 @@ from hma_data.errors import RecipeError, UsageError
 from hma_data.loading.dataset import Batch, MixtureDataset
 from hma_data.loading.mixture import Mixture
 from hma_data.shards.reader import ShardSet
-from hma_model.training.parallel import World
+from hma_model.training.parallel import Ranks
 from hma_model.training.resume import seed_for
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class TrainData:
     Args:
         recipe: states mixture, windows and seed.
         sets: shard sets by embodiment.
-        world: the ranks.
+        ranks: the ranks.
 
     Attributes:
         passes: passes of a step, of all ranks together.
@@ -56,9 +56,9 @@ class TrainData:
         ShardError: a set has no window.
     """
 
-    def __init__(self, recipe: "Recipe", sets: Mapping[str, ShardSet], world: World) -> None:
-        self.passes, size = share(recipe, world.size)
-        self.own = range(world.rank, self.passes, world.size)
+    def __init__(self, recipe: "Recipe", sets: Mapping[str, ShardSet], ranks: Ranks) -> None:
+        self.passes, size = share(recipe, ranks.size)
+        self.own = range(ranks.rank, self.passes, ranks.size)
         self._workers = -(-recipe.workers // len(self.own))
         self._data = [self._dataset(recipe, sets, size, self.own[0])]
         self._batches: list[Iterator[Batch]] = []
@@ -112,10 +112,10 @@ class TrainData:
         drawn = [[int(row["samples"]) for row in data.realised()] for data in self._data]
         return self.mixture.table([sum(column) for column in zip(*drawn, strict=True)])
 
-    def state(self, world: World) -> dict[str, Any]:
+    def state(self, ranks: Ranks) -> dict[str, Any]:
         """Return the state of all passes after whole steps; every rank must call it."""
         mine = dict(zip(self.own, (data.state_dict() for data in self._data)))
-        known = {number: state for part in world.gather(mine) for number, state in part.items()}
+        known = {number: state for part in ranks.gather(mine) for number, state in part.items()}
         return {"passes": [known[number] for number in range(self.passes)]}
 
     def load_state(self, state: Mapping[str, Any], force: bool) -> str:

@@ -13,7 +13,7 @@ from torch import Tensor
 from hma_data.loading.dataset import Batch
 from hma_data.shards.reader import ShardSet
 from hma_model.config import OBJECTIVES
-from hma_model.training.parallel import World
+from hma_model.training.parallel import Ranks
 
 if TYPE_CHECKING:
     from hma_model.network.objectives import Output
@@ -48,9 +48,9 @@ class StepMetrics:
         own = list(OBJECTIVES).index(output.objective)
         self._objectives[:, own] += torch.stack([output.loss.detach().to(losses), torch.ones_like(losses[0])])
 
-    def whole(self, world: World, passes: int) -> tuple[float, dict[str, float], dict[str, float]]:
+    def whole(self, ranks: Ranks, passes: int) -> tuple[float, dict[str, float], dict[str, float]]:
         """Return the mean loss over all ranks, the main objective's by embodiment, and each objective's."""
-        flat = world.sum(torch.cat([self._loss, self._sums.flatten(), self._objectives.flatten()]))
+        flat = ranks.sum(torch.cat([self._loss, self._sums.flatten(), self._objectives.flatten()]))
         parts = flat[1:].split([*[len(self._names)] * 2, *[len(OBJECTIVES)] * 2])
         by_name, by_objective = (
             {name: s / n for name, s, n in zip(names, sums.tolist(), counts.tolist()) if n}

@@ -82,22 +82,22 @@ def train(
     cuda = [device] if device.type == "cuda" else []
     if cuda:
         torch.cuda.set_device(device)  # FSDP takes the current one
-    with join(device) as world, run_errors(Path(folder)), ExitStack() as stack, torch.random.fork_rng(cuda):
-        world.once(lambda: stack.enter_context(own_folder(Path(folder))))
-        run = Run(recipe, Path(folder), device, world)
+    with join(device) as ranks, run_errors(Path(folder)), ExitStack() as stack, torch.random.fork_rng(cuda):
+        ranks.once(lambda: stack.enter_context(own_folder(Path(folder))))
+        run = Run(recipe, Path(folder), device, ranks)
         kept = run.resume(force)
         if kept is None:
             run.begin()
         run.prepare(kept)
         run.note_settings()
         trackers: list[Tracker] = []
-        world.once(lambda: trackers.extend(open_trackers(recipe, run.out, run.step)))
-        log = RunLog(run.out, recipe.steps, run.step, show and world.main, world.main, trackers, run.nats)
+        ranks.once(lambda: trackers.extend(open_trackers(recipe, run.out, run.step)))
+        log = RunLog(run.out, recipe.steps, run.step, show and ranks.main, ranks.main, trackers, run.nats)
         with log, stop_on_signals() as stop:
             _loop(run, log, stop, on_progress)
         result = _result(run)
         if recipe.report:
-            world.once(lambda: write_report(result.out))
+            ranks.once(lambda: write_report(result.out))
         return result
 
 
@@ -152,7 +152,7 @@ def _loop(
         log.step(facts)
         if on_progress:
             on_progress(facts)
-        asked = run.world.sum(torch.tensor([float(stop.is_set())]))  # all ranks stop after the same step
+        asked = run.ranks.sum(torch.tensor([float(stop.is_set())]))  # all ranks stop after the same step
         stopped = bool(asked[0])
         last = run.done >= 1
         if run.held_out and (last or _due(run.step, recipe.eval_every)):
@@ -165,7 +165,7 @@ def _loop(
             log.sync()
             run.save()
     rows = sorted(run.train_data.realised(), key=lambda row: -row["intended"])
-    if run.world.main and any(row["samples"] for row in rows):
+    if run.ranks.main and any(row["samples"] for row in rows):
         shares = (f"{r['embodiment']} {r['realised']:.1%} ({r['intended']:.1%} intended)" for r in rows)
         log.note(f"drawn: {', '.join(shares)}")
     if stopped:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 FETCHED = 4  # robots of a hub that are fetched for a new one; of a folder all are tried
 WINDOWS, FRAMES = 8, 4  # on which they are tried
-OWN = "normalizer."  # the statistics, which stay those of the new robot
+STATISTICS = "normalizer."  # the statistics, which stay those of the new robot
 INPUT, WAVES = "input.weight", "waves.weight"
 
 type State = Mapping[str, "Tensor"]
@@ -108,7 +108,7 @@ def copy_stem(model: "HMA", name: str, checkpoint: Checkpoint, like: str) -> Non
 
 def _fitted(stem: State, own: State, steps: int, own_steps: int) -> "dict[str, Tensor]":
     """Return a stem's tensors for chunks of another number of steps, with the statistics of `own`."""
-    kept = {key: value for key, value in own.items() if key.startswith(OWN)}
+    kept = {key: value for key, value in own.items() if key.startswith(STATISTICS)}
     fitted = {**stem, **kept, INPUT: _resampled(stem[INPUT].unsqueeze(-1), steps, own_steps).flatten(1)}
     if WAVES in own:  # they begin at zero, and those of the slow octaves come first
         chunk = stem[INPUT].shape[1]

@@ -58,7 +58,7 @@ def require_shardable(recipe: "Recipe", config: HMAConfig) -> None:
 
 
 @dataclass(frozen=True)
-class World:
+class Ranks:
     """The ranks of a run: `rank` is the number of this process, from 0, and `size` their number."""
 
     rank: int = 0
@@ -104,7 +104,7 @@ class World:
 
 
 @contextmanager
-def join(device: torch.device) -> Iterator[World]:
+def join(device: torch.device) -> Iterator[Ranks]:
     """Join the ranks that torchrun has started, or run as a single process; ranks communicate by `device`.
 
     Raises:
@@ -112,15 +112,15 @@ def join(device: torch.device) -> Iterator[World]:
         TrainingError: another rank has ended; it states the reason if that rank reported one.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        yield World()
+        yield Ranks()
         return
     store = _met(device)
-    world = World(dist.get_rank(), dist.get_world_size())
+    ranks = Ranks(dist.get_rank(), dist.get_world_size())
     try:
-        yield world
+        yield ranks
     except Exception as fault:
-        error = _explained(fault, world, store)
-        write_error(store, world.rank, error)  # before the group ends: the others then look for it
+        error = _explained(fault, ranks, store)
+        write_error(store, ranks.rank, error)  # before the group ends: the others then look for it
         if error is fault:
             raise
         raise error from fault
@@ -143,11 +143,11 @@ def _met(device: torch.device) -> dist.Store:
     return dist.PrefixStore(PREFIX, store)
 
 
-def _explained(fault: Exception, world: World, store: dist.Store) -> Exception:
+def _explained(fault: Exception, ranks: Ranks, store: dist.Store) -> Exception:
     """Return the error to raise for a fault; if this rank lost the others, the error that ended them."""
     if isinstance(fault, HMAError) or not isinstance(fault, RuntimeError):
         return fault
-    where, said = f"rank {world.rank}", str(fault).partition("\n")[0][:200]
+    where, said = f"rank {ranks.rank}", str(fault).partition("\n")[0][:200]
     if not isinstance(fault, dist.DistError) and "gloo" not in str(fault):
         return TrainingError(where, f"{type(fault).__name__}: {said}", "--debug shows where")
     remedy = "see what ended another rank, and run the same command to continue"
@@ -226,15 +226,15 @@ class _DDP(nn.parallel.DistributedDataParallel):
 class ParallelModel:
     """A model, the same on every rank, that is distributed over the ranks; `mode` fsdp shards it in place."""
 
-    def __init__(self, model: "HMA", world: World, mode: str) -> None:
-        self.model, self.world = model, world
-        self.sharded = mode == "fsdp" and world.size > 1
+    def __init__(self, model: "HMA", ranks: Ranks, mode: str) -> None:
+        self.model, self.ranks = model, ranks
+        self.sharded = mode == "fsdp" and ranks.size > 1
         self._call: nn.Module = model
         self._apart: list[nn.Parameter] = []  # parameters that DDP or FSDP leaves to `average`
-        if world.size < 2:
+        if ranks.size < 2:
             return
         if self.sharded:
-            _shard(model, world)
+            _shard(model, ranks)
             trained = (p for p in model.parameters() if p.requires_grad)
             self._apart = [p for p in trained if not isinstance(p, DTensor)]
         else:
@@ -268,7 +268,7 @@ class ParallelModel:
     def average(self) -> None:
         """Average, after the last pass, the gradients that neither DDP nor FSDP has averaged."""
         if self._apart:
-            _average(self._apart, self.world)
+            _average(self._apart, self.ranks)
 
     def clip(self, limit: float) -> float:
         """Scale the gradients to at most this norm over all ranks, and return the norm they had."""
@@ -279,32 +279,32 @@ class ParallelModel:
         for p in parameters:
             assert p.grad is not None
             squares[int(isinstance(p, DTensor))] += local(p.grad).float().square().sum()
-        norm = float((squares[0] + self.world.sum(squares[1:].clone())[0]).sqrt())
+        norm = float((squares[0] + self.ranks.sum(squares[1:].clone())[0]).sqrt())
         for p in parameters:
             assert p.grad is not None
             local(p.grad).mul_(min(1.0, limit / (norm + 1e-6)))
         return norm
 
 
-def _shard(model: "HMA", world: World) -> None:
+def _shard(model: "HMA", ranks: Ranks) -> None:
     from torch.distributed.device_mesh import init_device_mesh
     from torch.distributed.fsdp import fully_shard
 
-    mesh = init_device_mesh(model.device.type, (world.size,))
+    mesh = init_device_mesh(model.device.type, (ranks.size,))
     kept = set(model.parameters()) - set(model.trunk.blocks.parameters())
     for block in model.trunk.blocks:
         fully_shard(block, mesh=mesh)
     fully_shard(model, mesh=mesh, ignored_params=kept)
 
 
-def _average(parameters: list[nn.Parameter], world: World) -> None:
+def _average(parameters: list[nn.Parameter], ranks: Ranks) -> None:
     """Average gradients over ranks; a missing one counts as zero, unless no rank has it."""
     there = torch.tensor([float(p.grad is not None) for p in parameters], device=parameters[0].device)
-    used = [p for p, count in zip(parameters, world.sum(there).tolist()) if count]
+    used = [p for p, count in zip(parameters, ranks.sum(there).tolist()) if count]
     for p in used:
         if p.grad is None:
             p.grad = torch.zeros_like(p)
-    flat = world.sum(torch.cat([p.grad.flatten() for p in used if p.grad is not None])) / world.size
+    flat = ranks.sum(torch.cat([p.grad.flatten() for p in used if p.grad is not None])) / ranks.size
     for p, part in zip(used, flat.split([p.numel() for p in used])):
         assert p.grad is not None
         p.grad.copy_(part.view_as(p))

@@ -31,7 +31,7 @@ from hma_model.network.model import HMA
 from hma_model.training import guards, new_stem, optim
 from hma_model.training.data import TrainData
 from hma_model.training.memory import require_memory
-from hma_model.training.parallel import ParallelModel, World, gathered, require_shardable
+from hma_model.training.parallel import ParallelModel, Ranks, gathered, require_shardable
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import (
     OtherVersionError,
@@ -52,17 +52,17 @@ from hma_model.training.start import Start
 class Run:
     """A training run in an existing folder `out`: its model, optimizer, data and progress."""
 
-    def __init__(self, recipe: Recipe, out: Path, device: torch.device, world: World | None = None) -> None:
+    def __init__(self, recipe: Recipe, out: Path, device: torch.device, ranks: Ranks | None = None) -> None:
         if not recipe.data:
             raise RecipeError("recipe: data", "names no shards", "add data=[FOLDER, …]")
-        self.out, self.device, self.world = out, device, world or World()
+        self.out, self.device, self.ranks = out, device, ranks or Ranks()
         try:
             self.sets = open_sets(recipe.data, recipe.cameras)
         except UsageError as wrong:
             raise RecipeError(f"recipe: {wrong.where}", wrong.fault, wrong.remedy) from wrong
         self.start: Start | None = None
         if recipe.start is not None:
-            self.world.once(lambda: Start.bring(recipe, self.sets, self.out))
+            self.ranks.once(lambda: Start.bring(recipe, self.sets, self.out))
             self.start = Start.open(recipe, self.sets, self.out)
         elif recipe.freeze == "trunk":
             fault = "freezes a trunk that nothing has trained"
@@ -70,18 +70,18 @@ class Run:
         if self.start and "frames" not in recipe.model_fields_set:
             recipe = recipe.model_copy(update={"frames": self.start.checkpoint.config.frames})
         self.recipe = recipe
-        if recipe.parallel == "fsdp" and self.world.size > 1:
+        if recipe.parallel == "fsdp" and self.ranks.size > 1:
             require_shardable(recipe, self._config())
         often = max(recipe.objectives, key=lambda name: recipe.objectives[name])
         self.objective = OBJECTIVES[often]  # whose loss the evaluations compute
-        self.train_data = TrainData(recipe, self.sets, self.world)
+        self.train_data = TrainData(recipe, self.sets, self.ranks)
         self.digests = data_digests(self.sets)
         self.stats = {name: shards.manifest.stats for name, shards in self.sets.items()}
         if self.start:
             self.digests["the checkpoint it starts from"] = self.start.checkpoint.trunk_sha256[:16]
             self.stats = {name: self.start.stats(shards) for name, shards in self.sets.items()}
         with torch.device("meta"):  # shapes alone
-            require_memory(self._network(), recipe, device, self.world.size)
+            require_memory(self._network(), recipe, device, self.ranks.size)
         torch.manual_seed(seed_for(recipe.seed, "init"))
         self.model = self._fresh_model()
         splits = (
@@ -141,8 +141,8 @@ class Run:
             self.notes.append(f"the learning rate never reaches lr: {steps}")
         if self.start and not self.step:
             self.notes += self.start.remarks(self.sets)
-        if self.world.size > 1:
-            passes = f"{self.train_data.passes} passes a step over {self.world.size} ranks"
+        if self.ranks.size > 1:
+            passes = f"{self.train_data.passes} passes a step over {self.ranks.size} ranks"
             self.notes.append(f"{passes}, {recipe.parallel}")
 
     @torch.no_grad()
@@ -168,7 +168,7 @@ class Run:
             if name in start.embodiments or self.recipe.new_stem == "fresh":
                 continue
             choose = partial(new_stem.choose, self.model, name, start, shards, cameras, objective)
-            if chosen := self.world.once(choose):
+            if chosen := self.ranks.once(choose):
                 new_stem.copy_stem(self.model, name, start, chosen.like)
                 self.likes[name] = chosen.like
                 better = f"loss {chosen.loss:.3g}, with a fresh one {chosen.fresh_loss:.3g}"
@@ -179,7 +179,7 @@ class Run:
         if self.recipe.compile:
             for block in self.model.trunk.blocks:
                 block.compile()
-        self.parallel_model = ParallelModel(self.model, self.world, self.recipe.parallel)
+        self.parallel_model = ParallelModel(self.model, self.ranks, self.recipe.parallel)
         self.optimizer = optim.make_optimizer(self.model, self.recipe)
         self.average = optim.Average(self.model, self.recipe.ema) if self.recipe.ema else None
         if kept:
@@ -205,7 +205,7 @@ class Run:
             seen.append((batch, output.per_sample))
         self.parallel_model.average()
         norm = self.parallel_model.clip(recipe.clip)
-        loss, by_embodiment, by_objective = metrics.whole(self.world, self.train_data.passes)
+        loss, by_embodiment, by_objective = metrics.whole(self.ranks, self.train_data.passes)
         self.step += 1
         if not (math.isfinite(loss) and math.isfinite(norm)):
             self._refuse(f"the loss is {loss}, the gradient's norm {norm}", seen)
@@ -217,7 +217,7 @@ class Run:
         self.seconds += spent
         if recipe.cpu_seconds:  # all ranks end after the same step
             spent_cpu = torch.tensor([time.process_time() - cpu_begun])
-            self.cpu_seconds += float(self.world.sum(spent_cpu)[0]) / self.world.size
+            self.cpu_seconds += float(self.ranks.sum(spent_cpu)[0]) / self.ranks.size
         return {
             "step": self.step,
             "done": round(self.done, 6),
@@ -270,7 +270,7 @@ class Run:
         if self.recipe.nonfinite == "skip":
             self.skipped += 1
             return
-        suspected = [item for part in self.world.gather(guards.suspects(seen, self.sets)) for item in part]
+        suspected = [item for part in self.ranks.gather(guards.suspects(seen, self.sets)) for item in part]
         names = guards.listed([text for _, text in guards.worst(suspected)])
         remedy = "look at them with hma shards preview, lower lr, or skip such steps with nonfinite=skip"
         raise TrainingError(f"step {self.step}", f"{fault}; windows: {names}", remedy)
@@ -282,7 +282,7 @@ class Run:
         if not self.average and not self.parallel_model.sharded:
             return self.model
         state = self.average.state() if self.average else gathered(self.model.state_dict().items())
-        if self.world.main:
+        if self.ranks.main:
             self._twin = self._twin or self._network().to(self.device)
             self._twin.load_state_dict(state)
         return self._twin or self.model
@@ -295,7 +295,7 @@ class Run:
         the training loss on held-out windows, under masks that are the same at every evaluation.
         """
         model = self.saved_model()
-        self.evaluation = self.world.once(lambda: self._evaluated(model))
+        self.evaluation = self.ranks.once(lambda: self._evaluated(model))
         return self.evaluation
 
     def _evaluated(self, model: HMA) -> dict[str, Any]:
@@ -348,7 +348,7 @@ class Run:
 
     def save(self) -> Path:
         """Write checkpoints/step-N, and delete all but the last few; every rank must call it."""
-        model, sampler = self.saved_model(), self.train_data.state(self.world)
+        model, sampler = self.saved_model(), self.train_data.state(self.ranks)
         moments = optim.optimizer_state(self.optimizer)
         weights = gathered(self.model.state_dict().items()) if self.average else {}
         state = State(
@@ -378,7 +378,7 @@ class Run:
                 checkpoints.remove(old)
             return path
 
-        return self.world.once(write)
+        return self.ranks.once(write)
 
     def _card(self, name: str, shards: ShardSet) -> dict[str, Any]:
         figures = (("val_loss", "loss"), ("baseline_loss", "baseline"), ("accuracy", "accuracy"))
@@ -412,7 +412,7 @@ class Run:
             OtherVersionError: the newest checkpoint is of another format version.
             CheckpointError: there are checkpoints, and none can be read.
         """
-        self.world.once(lambda: remove_partial(self.out / "checkpoints"))
+        self.ranks.once(lambda: remove_partial(self.out / "checkpoints"))
         kept, paths = None, training_checkpoints(self.out)
         for path in reversed(paths):
             try:
@@ -425,7 +425,7 @@ class Run:
                     remedy = "no checkpoint here can be read: restore one, or train into another folder"
                     raise CheckpointError(fault.where, fault.fault, remedy) from fault
                 self.notes.append(f"skipped a damaged checkpoint: {fault}")
-        self.world.once(self._describe)
+        self.ranks.once(self._describe)
         return kept
 
     def _load(self, path: Path, force: bool) -> TrainingState:
@@ -470,5 +470,5 @@ class Run:
 
     def _describe(self) -> None:
         write_atomic(self.out / RECIPE, to_json(self.recipe.values()))
-        facts = {**environment(self.device), "ranks": self.world.size}
+        facts = {**environment(self.device), "ranks": self.ranks.size}
         write_atomic(self.out / ENVIRONMENT, to_json(facts))

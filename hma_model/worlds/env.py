@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, UsageError
 from hma_data.storage.paths import StrPath
-from hma_model.generation.commands import Floats, OutsideRangeWarning
+from hma_model.generation.commands import Float32s, OutsideRangeWarning
 from hma_model.worlds.images import Prompt
 from hma_model.worlds.prompts import read_prompt
 from hma_model.worlds.world import Image, World, load_world
@@ -38,7 +38,7 @@ CONTROLS = ("frame", "chunk")
 class Judge(Protocol):
     """A function that scores an episode after each new image."""
 
-    def __call__(self, images: Image, actions: Floats) -> tuple[float, bool]:
+    def __call__(self, images: Image, actions: Float32s) -> tuple[float, bool]:
         """Return the reward of the newest image, and whether the episode ends there.
 
         Args:
@@ -56,7 +56,7 @@ def _known(options: dict[str, Any] | None, *keys: str) -> dict[str, Any]:
     return options
 
 
-class WorldModelEnv(gymnasium.Env[Image, Floats]):
+class WorldModelEnv(gymnasium.Env[Image, Float32s]):
     """One robot in a world model, as a gymnasium environment.
 
     An observation is the newest image (S, V·S, 3) uint8. Actions outside the range seen in training cause
@@ -153,16 +153,16 @@ class WorldModelEnv(gymnasium.Env[Image, Floats]):
         self.image = self.world.image(self.session)
         self._steps = 0
         self._frames = 0
-        self._waiting: list[Floats] = []  # actions since the newest image
+        self._waiting: list[Float32s] = []  # actions since the newest image
         self._past = [self.image]  # kept for a judge only
-        self._chunks: list[Floats] = []
+        self._chunks: list[Float32s] = []
         return self._seen(self.image), {"frames": 0}
 
-    def step(self, action: Floats) -> tuple[Image, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Float32s) -> tuple[Image, float, bool, bool, dict[str, Any]]:
         """Send an action, or a chunk; between chunks the last image is shown."""
         return self.finish(self.world.step(self.take(action)))
 
-    def take(self, action: Any) -> dict[int, Floats]:
+    def take(self, action: Any) -> dict[int, Float32s]:
         """Take an action; return the session's chunk for the world once it is whole."""
         if self.session is None:
             raise HMAError("step", "there is no episode", "call reset() first")
@@ -210,7 +210,7 @@ class WorldModelEnv(gymnasium.Env[Image, Floats]):
             self._read[seed] = read_prompt(self.world.model, self.embodiment, self.prompt, seed=seed or 0)
         return self._read[seed]
 
-    def _checked(self, action: Any) -> Floats:
+    def _checked(self, action: Any) -> Float32s:
         """Return an action as actions (n, A): checked, clipped if wanted; warn once of a strange range."""
         if self.control == "frame":
             values = self.action_spec.one(action)[None]
@@ -232,7 +232,7 @@ class WorldModelEnv(gymnasium.Env[Image, Floats]):
         return image.copy() if self.size is None else resize(image[None], self.size)[0]
 
 
-class WorldModelVectorEnv(VectorEnv[Image, Floats, NDArray[Any]]):
+class WorldModelVectorEnv(VectorEnv[Image, Float32s, NDArray[Any]]):
     """N robots in a world model, whose sessions step in one pass and begin and end independently.
 
     Args:
@@ -283,7 +283,9 @@ class WorldModelVectorEnv(VectorEnv[Image, Floats, NDArray[Any]]):
         self.ended[chosen] = False
         return self.observations.copy(), infos
 
-    def step(self, actions: Floats) -> tuple[Image, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+    def step(
+        self, actions: Float32s
+    ) -> tuple[Image, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Send an action, or a chunk, to each environment; those that get an image get it in one pass."""
         again = self.ended & (self.autoreset_mode == AutoresetMode.NEXT_STEP)
         if self.autoreset_mode == AutoresetMode.DISABLED and self.ended.any():
@@ -305,7 +307,7 @@ class WorldModelVectorEnv(VectorEnv[Image, Floats, NDArray[Any]]):
         self.ended = np.logical_or(terminated, truncated)
         return self.observations.copy(), rewards, terminated, truncated, infos
 
-    def advance(self, chosen: NDArray[np.int64], actions: Floats) -> list[tuple[int, Any]]:
+    def advance(self, chosen: NDArray[np.int64], actions: Float32s) -> list[tuple[int, Any]]:
         """Send actions (N, …) to the chosen environments in one pass; return their numbers and steps."""
         chunks = [self.envs[i].take(actions[i]) for i in chosen]
         made = self.world.step({session: chunk for part in chunks for session, chunk in part.items()})

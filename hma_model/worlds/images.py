@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import decode_image, resize
 from hma_data.episodes.sheets import first_of_grid
 from hma_data.errors import EpisodeError, HMAError, UsageError
-from hma_data.loading.views import FIRST, Cameras
+from hma_data.loading.views import FIRST_CAMERA, Cameras
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
@@ -67,7 +67,7 @@ def image_shape(config: HMAConfig) -> tuple[int, int, int]:
 
 def trained_cameras(card: Mapping[str, Any]) -> Cameras:
     """Return the cameras that a robot's stem was trained on, by its card."""
-    found: Cameras = card.get("data", {}).get("cameras") or FIRST
+    found: Cameras = card.get("data", {}).get("cameras") or FIRST_CAMERA
     return found
 
 

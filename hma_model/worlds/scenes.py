@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import resize
 from hma_data.errors import UsageError
 from hma_data.lab.simulator import SIZE, LabSimulator, simulated
-from hma_data.loading.views import FIRST, Cameras
+from hma_data.loading.views import FIRST_CAMERA, Cameras
 from hma_data.registry.components import Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from hma_data.loading.dataset import WindowDataset
     from hma_data.tokenizers.base import Tokenizer
 
-Floats = NDArray[np.float32]
+Float32s = NDArray[np.float32]
 Array = NDArray[np.float64]
 
 PROMPT_FRAMES = 4  # frames; two would show velocities, more also show what stands still
@@ -74,9 +74,9 @@ class DrivenScene(Protocol):
     """
 
     prompt: Prompt
-    action: Floats
+    action: Float32s
 
-    def advance(self, chunk: Floats | None) -> tuple[Floats, Image | None] | None:
+    def advance(self, chunk: Float32s | None) -> tuple[Float32s, Image | None] | None:
         """Take the next chunk.
 
         Args:
@@ -146,7 +146,7 @@ class LabScene:
         self.prompt = Prompt(np.stack(frames), np.stack(chunks))
         self.action = at_rest(dims, self.prompt.chunks[-1][-self.width :])
 
-    def advance(self, chunk: Floats | None) -> tuple[Floats, Image]:
+    def advance(self, chunk: Float32s | None) -> tuple[Float32s, Image]:
         taken = []
         for step in range(self.stride):
             action = (
@@ -165,7 +165,7 @@ class LabScene:
 SCENE_SEED = 1_000_000  # of scenes; recordings for training have small seeds
 
 
-def at_rest(dims: Sequence[Dimension], held: NDArray[Any]) -> Floats:
+def at_rest(dims: Sequence[Dimension], held: NDArray[Any]) -> Float32s:
     """Return the action (…, A) after which nothing moves on: no rate, and the targets that are held."""
     return np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
 
@@ -237,14 +237,18 @@ class RecordedScene:
     """A prompt, and the frames (T, H, W, 3) and chunks (T, K) that were recorded after it, if any were."""
 
     def __init__(
-        self, prompt: Prompt, action: Floats, frames: Image | tuple[()] = (), chunks: Floats | tuple[()] = ()
+        self,
+        prompt: Prompt,
+        action: Float32s,
+        frames: Image | tuple[()] = (),
+        chunks: Float32s | tuple[()] = (),
     ) -> None:
         self.prompt = prompt
         self.action = action
         self._rest = iter(zip(chunks, frames, strict=True))
         self._followed = True  # whether all actions were the recorded ones
 
-    def advance(self, chunk: Floats | None) -> tuple[Floats, Image | None] | None:
+    def advance(self, chunk: Float32s | None) -> tuple[Float32s, Image | None] | None:
         if chunk is not None:
             self._followed = False
             return chunk, None
@@ -268,7 +272,7 @@ class ImageRobot:
         embodiment: Embodiment,
         stats: Mapping[str, Any],
         images: Image,
-        cameras: Cameras = FIRST,
+        cameras: Cameras = FIRST_CAMERA,
     ) -> None:
         self.embodiment = embodiment
         self.key = f"{embodiment.id}:images"

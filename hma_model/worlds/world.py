@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from hma_model.config import HMAConfig
     from hma_model.network.model import HMA
 
-Floats = NDArray[np.float32]
+Float32s = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class World:
         return self._specs[embodiment]
 
     def open(
-        self, embodiment: str, frames: NDArray[Any], chunks: Floats | None = None, *, seed: int = 0
+        self, embodiment: str, frames: NDArray[Any], chunks: Float32s | None = None, *, seed: int = 0
     ) -> int:
         """Open a session that starts from known frames, and return its number.
 
@@ -132,7 +132,7 @@ class World:
         return session
 
     def reset(
-        self, session: int, frames: NDArray[Any], chunks: Floats | None = None, *, seed: int | None = None
+        self, session: int, frames: NDArray[Any], chunks: Float32s | None = None, *, seed: int | None = None
     ) -> None:
         """Start a session anew, as `open` does; without a seed, with the one that it had."""
         one = self._at(session)
@@ -166,7 +166,7 @@ class World:
             self.uncertainty |= dict(zip(order, rollout.uncertainty.tolist()))
         return dict(zip(order, decode(self.tokenizer, frames.unsqueeze(1))[:, 0]))
 
-    def act(self, sessions: Iterable[int]) -> dict[int, Floats]:
+    def act(self, sessions: Iterable[int]) -> dict[int, Float32s]:
         """Return the actions (stride, A) that the model itself gives after the newest images of sessions.
 
         Raises:
@@ -306,7 +306,7 @@ class World:
     # -- prompts --------------------------------------------------------------------------------------------
 
     def _prompt(
-        self, embodiment: str, frames: NDArray[Any], chunks: Floats | None
+        self, embodiment: str, frames: NDArray[Any], chunks: Float32s | None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return stored frames (P, ...), chunks (P - 1, K), and which are known (P - 1,)."""
         spec = self.action_spec(embodiment)

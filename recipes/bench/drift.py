@@ -48,9 +48,15 @@ SPAN = 5  # frames up to a mark over which a figure is the mean
 SHEET = (1, 10, 25, 50, 100, 200, 300, 1000, 3000)  # frames of a sheet
 SHEET_ROLLOUTS = 2  # of a robot on it
 LIMIT = 2.0  # of the error at the end over that at EARLY
-LOST = 0.5  # share of the spread from which a robot is somewhere else
+LOST_SHARE = 0.5  # share of the spread from which a robot is somewhere else
 WHOLE = 0.8  # of the wholeness at the end over the copy's
-OWN = ("model", "embodiment", "batch", "generator", "self")  # arguments of a rollout that are no options
+OTHER_ARGUMENTS = (
+    "model",
+    "embodiment",
+    "batch",
+    "generator",
+    "self",
+)  # arguments of a rollout that are no options
 
 
 @dataclass(frozen=True)
@@ -119,7 +125,7 @@ def _samplings(text: str) -> dict[str, dict[str, Any]]:
     """Return the options of each way of sampling, by those of its words that not all have, or by all."""
     from hma_model.generation.rollout import Rollout
 
-    known = [name for name in inspect.signature(Rollout.__init__).parameters if name not in OWN]
+    known = [name for name in inspect.signature(Rollout.__init__).parameters if name not in OTHER_ARGUMENTS]
     ways: dict[str, dict[str, Any]] = {}
     worded = [[word.strip() for word in way.split(",")] for way in text.split("/")]
     for words in worded:
@@ -272,10 +278,10 @@ def verdict(first: dict[str, Any], last: dict[str, Any], copy: dict[str, Any]) -
     if "error_px" not in last:
         return "none: no part of the robot can be read"
     times, whole = last["error_px"] / max(first["error_px"], 1e-9), last["whole"] / max(copy["whole"], 1e-9)
-    if first["share"] > LOST:
+    if first["share"] > LOST_SHARE:
         follows = f"lost by frame {EARLY}"
     else:
-        follows = "holds" if times <= LIMIT and last["share"] <= LOST else "drifts"
+        follows = "holds" if times <= LIMIT and last["share"] <= LOST_SHARE else "drifts"
     return f"{follows}, error ×{times:.1f}; {'whole' if whole >= WHOLE else 'dissolved'}, ×{whole:.2f}"
 
 

@@ -78,7 +78,7 @@ def contact_demo(seed: int, episode: int) -> Demo:
     for step in range(CONTACT_STEPS):
         if step == until:
             targets, until = aimed(), step + int(rng.integers(*AIM_STEPS))
-        if strays and step % pusht.HELD == 0:
+        if strays and step % pusht.STEPS_HELD == 0:
             stray = rng.uniform(15, 497, 2).astype(np.float32) if rng.random() < 0.3 else None
         action = targets.next(arena.pose, arena.agent)
         action = action if stray is None else stray

@@ -2,7 +2,7 @@
 
 A name, such as `arm3_04`, decides everything about a robot: `hma_data.lab.family.bodies` draws it. All are
 recorded to HDF5, but the last of HELD_OUT to MCAP. The robots are seen from above and push one to three loose
-blocks (`hma_data.lab.family.world`). The action of a frame is applied between that frame and the next; the
+blocks (`hma_data.lab.family.table`). The action of a frame is applied between that frame and the next; the
 motion obeys the limits.
 
 The reward is the distance that the blocks moved, in px. An episode is a success if some block ends MOVED px
@@ -21,7 +21,7 @@ from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.driver import Driver, Reacher
 from hma_data.lab.family.look import SIZE
 from hma_data.lab.family.mechanisms import MAKERS, Axis
-from hma_data.lab.family.world import World, start
+from hma_data.lab.family.table import BlockTable, start
 from hma_data.lab.writers import BagEpisode, Demo, block_demo, write_hdf5, write_mcap
 from hma_data.registry.embodiment import Embodiment
 
@@ -152,14 +152,14 @@ def episode(
     return block_demo(world, drive, round(seconds * body.hz), MOVED, seed)
 
 
-def begin(robot: str, seed: int, number: int) -> tuple[World, Callable[[], NDArray[np.float32]]]:
+def begin(robot: str, seed: int, number: int) -> tuple[BlockTable, Callable[[], NDArray[np.float32]]]:
     """Return the simulation of an episode at its start, and the recorder's driver."""
     world, rng = start(Body.of(robot), seed, number)
     return world, driver(world, rng)
 
 
 def driver(
-    world: World, rng: np.random.Generator, reach: Reacher | None = None
+    world: BlockTable, rng: np.random.Generator, reach: Reacher | None = None
 ) -> Callable[[], NDArray[np.float32]]:
     """Return the recorder's driver, which returns the next action (A,)."""
     drive = reach or Driver(world.body, world.pose, rng)

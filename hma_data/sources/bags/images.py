@@ -23,12 +23,12 @@ from hma_data.sources.bags.messages import child, decode, field_names
 from hma_data.sources.common.checks import one_channel
 from hma_data.sources.common.video_file import is_spoilt
 
-RAW, STILL, VIDEO = "raw", "still", "video"
+RAW, STILL_IMAGE, VIDEO = "raw", "still", "video"
 KINDS = {
     "sensor_msgs/Image": RAW,
-    "sensor_msgs/CompressedImage": STILL,
+    "sensor_msgs/CompressedImage": STILL_IMAGE,
     "foxglove/RawImage": RAW,
-    "foxglove/CompressedImage": STILL,
+    "foxglove/CompressedImage": STILL_IMAGE,
     "foxglove/CompressedVideo": VIDEO,
     "ffmpeg_image_transport_msgs/FFMPEGPacket": VIDEO,
 }
@@ -65,12 +65,12 @@ def image_kind(message_type: str) -> str | None:
 
 def content_kind(message: Any, kind: str | None) -> str | None:
     """Return the kind of a message's content: a CompressedImage may hold a frame of H.264 or H.265."""
-    if kind != STILL or message is None:
+    if kind != STILL_IMAGE or message is None:
         return kind
     try:
-        return VIDEO if payload(message).startswith(START_CODES) else STILL
+        return VIDEO if payload(message).startswith(START_CODES) else STILL_IMAGE
     except (KeyError, TypeError, ValueError):  # `picture` raises it again
-        return STILL
+        return STILL_IMAGE
 
 
 def codec(message: Any, kind: str) -> str:
@@ -113,7 +113,7 @@ def encoding(message: Any, kind: str) -> str:
     if kind == RAW:
         return str(child(message, "encoding")).lower()
     before, separator, _ = (
-        str(child(message, "format")).lower().partition(";") if kind == STILL else ("",) * 3
+        str(child(message, "format")).lower().partition(";") if kind == STILL_IMAGE else ("",) * 3
     )
     return before if separator else ""
 
@@ -129,7 +129,7 @@ def picture(message: Any, kind: str, where: str, levels: Levels | None = None) -
             or it is grey of 16 bits and there are no levels.
     """
     try:
-        if kind == STILL and any(name in str(child(message, "format")).lower() for name in DEPTH):
+        if kind == STILL_IMAGE and any(name in str(child(message, "format")).lower() for name in DEPTH):
             stated = str(child(message, "format"))
             raise EpisodeError(where, f"{stated!r} is depth, not colour", "name a colour topic as camera")
         if encoding(message, kind) == MONO16 and (kind == RAW or _is_png(payload(message))):
@@ -172,9 +172,9 @@ def is_grey(message: Any, kind: str) -> bool:
     """Check whether a raw or still image has one channel; a mosaic has three."""
     if kind == RAW:
         return encoding(message, kind) in ("mono8", "8uc1", MONO16)
-    if kind == STILL and _mosaic(message):
+    if kind == STILL_IMAGE and _mosaic(message):
         return False
-    return kind == STILL and (encoding(message, kind) == MONO16 or one_channel(payload(message)))
+    return kind == STILL_IMAGE and (encoding(message, kind) == MONO16 or one_channel(payload(message)))
 
 
 def wide_grey(message: Any, kind: str, where: str) -> NDArray[np.uint16]:

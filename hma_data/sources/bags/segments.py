@@ -29,12 +29,12 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace
 from hma_data.sources.bags.clocks import SECOND_NS, MessageTimes
 from hma_data.sources.bags.container import Record, RecordFilter
-from hma_data.sources.bags.images import STILL, VIDEO, image_kind
+from hma_data.sources.bags.images import STILL_IMAGE, VIDEO, image_kind
 from hma_data.sources.bags.messages import decode
 from hma_data.sources.bags.topic_track import TopicTrack, missing_topic, parse_key
 from hma_data.storage.files import cache_folder, write_atomic
 
-SHOWN = 8  # values of a marker in an error
+MAX_VALUES = 8  # values of a marker in an error
 MAX_DELAY_S = 10.0  # header stamps further from receipt than this come from another clock
 KEPT_BAGS = 2
 KEPT_TABLES = 512
@@ -141,7 +141,9 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
         raise missing_topic(camera.key, topics, where)
     cameras = {camera.key for camera in embodiment.cameras}
     # Only the messages tell whether compressed images are frames of a video.
-    videos = {c.topic for c in bag.counts() if c.topic in cameras and image_kind(c.type) in (STILL, VIDEO)}
+    videos = {
+        c.topic for c in bag.counts() if c.topic in cameras and image_kind(c.type) in (STILL_IMAGE, VIDEO)
+    }
     tracks = {key: TopicTrack(key) for key in {camera.key} | videos}
     start = MarkerTrack(segments.start, topics, where) if segments.start else None
     stop = MarkerTrack(segments.stop, topics, where) if segments.stop else None
@@ -287,7 +289,7 @@ class MarkerTrack:
 
     def _fits(self, message: Any) -> bool:
         value, wanted = self._field.value(message, self._where), self.marker.equals
-        if len(self._seen) < SHOWN:
+        if len(self._seen) < MAX_VALUES:
             self._seen[str(value)] = None
         if isinstance(wanted, str) or isinstance(value, str):
             if type(wanted) is not type(value):

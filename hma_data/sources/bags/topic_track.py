@@ -52,7 +52,7 @@ from hma_data.sources.bags.messages import (
 
 STEP = re.compile(r"\.(?P<name>[A-Za-z_]\w*)|\[(?P<start>\d*)(?P<colon>:?)(?P<stop>\d*)\]")
 Step = str | int | slice
-SHOWN = 30  # topics or names in an error
+MAX_NAMES = 30  # topics or names in an error
 INT64 = np.iinfo(np.int64)
 
 
@@ -137,8 +137,8 @@ def missing_topic(key: str, topics: Iterable[str], where: str) -> EpisodeError:
     known = sorted(" ".join(topic.split()) for topic in topics)
     near = get_close_matches(re.split(r"[.\[]", key)[0], known, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
-    more = f" and {len(known) - SHOWN} more" if len(known) > SHOWN else ""
-    listed = f"its topics: {', '.join(known[:SHOWN])}{more}" if known else "it has no topics"
+    more = f" and {len(known) - MAX_NAMES} more" if len(known) > MAX_NAMES else ""
+    listed = f"its topics: {', '.join(known[:MAX_NAMES])}{more}" if known else "it has no topics"
     return EpisodeError(where, f"the bag has no topic for {key}", hint + listed)
 
 
@@ -205,7 +205,7 @@ class Column:
         if self._type is None:
             raise EpisodeError(self._where, f"{self.field.key}: no type of messages on this topic has it")
         if not self._rows:
-            seen = sorted({name for names in self._picks for name in names})[:SHOWN]
+            seen = sorted({name for names in self._picks for name in names})[:MAX_NAMES]
             names = ", ".join(self.component.names or ())
             raise EpisodeError(
                 self._where, f"{self.field.key}: no message names {names}", f"names there: {', '.join(seen)}"

@@ -29,7 +29,7 @@ PAUSE, PAUSE_S = 10, 0.5  # a pause is longer than this many median intervals an
 RARE = 0.05  # largest share of pauses among the intervals, for a rate without them; one always may be
 REGULAR = 0.8  # least share of intervals within a third of the median, for counting lost frames
 STREAM = 0.5  # least such share for reporting pauses; below it, the topic carries events
-LOST = 0.01  # share of lost frames above which they are reported
+MAX_LOST_SHARE = 0.01  # share of lost frames above which they are reported
 UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # least time since 1970, seconds a unit
 NAMED_UNITS = {  # endings of keys -> seconds a unit
     "s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "usec": 1e-6,
@@ -43,7 +43,7 @@ PAIRS = 16  # pairs of neighbouring images compared, for a camera over all its e
 PIXELS = 4096  # pixels of an image whose colours are checked
 DISTINCT = 1_000  # least number of distinct colours for the YCbCr sign
 SURE, CHANCE = 0.98, 0.6  # share of colours that YCbCr gives: least in the right order, most in the other
-STILL = 0.5  # least share of equal neighbours that is reported
+MAX_EQUAL_SHARE = 0.5  # least share of equal neighbours that is reported
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def time_findings(key: str, times: StreamTimes, camera: bool = False, episode: s
     if times.regular >= STREAM and times.gap_s > pause_s(times.period_s):
         said = f"pauses for {times.gap_s:.3g} s after {times.gap_at_s:.3g} s"
         yield found("gaps", said, gap_s=times.gap_s, at_s=times.gap_at_s)
-    if camera and times.lost and times.lost > LOST * times.count:
+    if camera and times.lost and times.lost > MAX_LOST_SHARE * times.count:
         said = f"has {times.count} frames; at its rate of {times.hz:.4g} Hz about {times.lost} are missing"
         yield found("frames", said, lost=times.lost, count=times.count)
 
@@ -422,7 +422,7 @@ def picture_findings(looks: dict[str, Look]) -> Iterator[Finding]:
             numbers = {"blank": look.blank, "episodes": look.episodes}
             yield Finding("blank", severity, said, "check the camera's key in the YAML", key, numbers)
         share = look.same / max(look.neighbours, 1)
-        if share > STILL and look.blank < look.episodes:
+        if share > MAX_EQUAL_SHARE and look.blank < look.episodes:
             said = f"{key}: {share:.0%} of neighbouring images are equal"
             remedy = f"the camera may be {'frozen' if share == 1 else 'slower than its rate'}"
             yield Finding("still", "warn", said, remedy, key, {"share": share, "pairs": look.neighbours})

@@ -12,7 +12,7 @@ from pathlib import Path
 from hma_data.errors import HMAError, RegistryError, UsageError
 from hma_data.registry.embodiment import Embodiment
 
-SHOWN = 3  # ids named in an error
+MAX_NAMES = 3  # ids named in an error
 
 
 def chosen_ids(
@@ -49,7 +49,7 @@ def _named(known: dict[str, None], words: Sequence[str], where: str, error: type
     for word, said in _lines(words, where, error):
         ids = [word] if word in known else matching(known, word)
         if not ids:
-            near = get_close_matches(word, known, n=1) or list(known)[:SHOWN]
+            near = get_close_matches(word, known, n=1) or list(known)[:MAX_NAMES]
             raise error(where, f"{said} matches no episode", f"there are ids such as {', '.join(near)}")
         found.update(ids)
     return found

@@ -48,7 +48,7 @@ CHECKS = {  # the checks of an inspection, in the order they are printed
     "hands": "hands in the images",
 }
 LOSSY = ("jpeg", "h264", "av1", "hevc", "vp8", "vp9", "mpeg4", "mjpeg")
-SHOWN = 5  # faults and episodes named at most
+MAX_NAMES = 5  # faults and episodes named at most
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 MAX_VALUES = 20_000_000  # numbers of one key of an episode
 MAX_LENGTHS = 1_000  # episodes whose lengths an inspection has
@@ -367,13 +367,13 @@ class Survey:
         whole = sum(not key for _, key in self._faults)
         severity: Severity = "error" if whole and whole >= looked else "warn"
         groups = alike((name, fault) for (name, _), fault in self._faults.items())
-        for names, first in groups[:SHOWN]:
+        for names, first in groups[:MAX_NAMES]:
             said = f"{first.where}: {first.fault}"
             if len(names) > 1:
                 named = said if said.startswith(names[0]) else f"{names[0]}: {said}"
                 said = f"{len(names):,} of {looked:,} episodes looked at, such as {named}"
             yield Finding("readable", severity, said, first.remedy, numbers={"episodes": len(names)})
-        rest = sum(len(names) for names, _ in groups[SHOWN:])
+        rest = sum(len(names) for names, _ in groups[MAX_NAMES:])
         if rest:
             said = f"{rest:,} more of {looked:,} episodes looked at cannot be read"
             yield Finding("readable", severity, said, numbers={"episodes": rest})

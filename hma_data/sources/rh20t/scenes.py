@@ -27,7 +27,7 @@ from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.rh20t import SCENE
 from hma_data.storage.files import read_json
 
-NEXT = "next"  # the ending of a key: the value of the next sample
+NEXT_SAMPLE = "next"  # the ending of a key: the value of the next sample
 CAMERA, TABLES, FILM, STAMPS = "cam_", "transformed", "color.mp4", "timestamps.npy"
 TASKS = "task_description.json"
 INSTRUCTION_FIELD = "task_description_english"  # the field of TASKS that gives the instruction by default
@@ -115,7 +115,7 @@ class Scene:
             EpisodeError: there is no such table, field or camera in it, or its values differ in number.
         """
         table, *rest = key.split("/")
-        ahead = rest[-1:] == [NEXT]
+        ahead = rest[-1:] == [NEXT_SAMPLE]
         field = "/".join(rest[:-1] if ahead else rest)
         path = self.folder / TABLES / f"{table}.npy"
         rows = _rows(self._table(table, path), camera.removeprefix(CAMERA), path)

@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 from hma_data.errors import MissingDependencyError, OutputError, UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
-from hma_data.lab.pusht import HELD, SLOW_LOOK, Arena
+from hma_data.lab.pusht import SLOW_LOOK, STEPS_HELD, Arena
 from hma_data.lab.tee_table import TeeTable
 from hma_data.lab.writers import _held_out
 from hma_data.registry.embodiment import Embodiment, find
@@ -121,9 +121,9 @@ def test_noisy_episodes_hold_random_targets_in_their_share(tmp_path: Path) -> No
     with h5py.File(tmp_path / "noisy.hdf5") as file:
         calm, wild = (np.diff(file[f"data/demo_{n}/actions"][:], axis=0).any(axis=1) for n in range(2))
         assert [file[f"data/demo_{n}"].attrs["noise"] for n in range(2)] == [0.1, 1.0]
-    assert not wild[np.arange(len(wild)) % HELD != HELD - 1].any() and wild.mean() == pytest.approx(
-        1 / HELD, abs=0.02
-    )
+    assert not wild[
+        np.arange(len(wild)) % STEPS_HELD != STEPS_HELD - 1
+    ].any() and wild.mean() == pytest.approx(1 / STEPS_HELD, abs=0.02)
     assert calm.mean() > 0.5  # planned motion changes its target each step
 
 

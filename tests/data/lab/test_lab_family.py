@@ -18,7 +18,7 @@ from hma_data.lab.family import HELD_OUT, TRUNK, embodiment, episode
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.look import SIZE
 from hma_data.lab.family.mechanisms import MAKERS
-from hma_data.lab.family.world import World, start
+from hma_data.lab.family.table import BlockTable, start
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import ShardSet
@@ -49,13 +49,13 @@ def quick(robots: Iterable[str], *few: str) -> list[Any]:
 EVERY = quick(ROBOTS, "arm2_12", "mover_52", "crane_01")
 
 
-def still(world: World) -> np.ndarray[Any, Any]:
+def still(world: BlockTable) -> np.ndarray[Any, Any]:
     """Return the command that keeps a world as it is: no velocity, and each target where its axis is."""
     follows = [axis.target for axis in world.body.commands]
     return np.where(follows, world.pose[: len(follows)], 0.0)
 
 
-def driven(robot: str, command: str, steps: int) -> tuple[World, list[np.ndarray[Any, Any]]]:
+def driven(robot: str, command: str, steps: int) -> tuple[BlockTable, list[np.ndarray[Any, Any]]]:
     """Return a world some steps from its start at the lowest, highest or still command, and its pictures."""
     world, _ = start(Body.of(robot), SEED, 0)
     pictures = [world.picture()]

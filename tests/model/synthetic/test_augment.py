@@ -37,7 +37,7 @@ ROBOT, FRAMES, KNOWN = "rails_03", 4, 2
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(augment_module, "BATCH", 2)
+    monkeypatch.setattr(augment_module, "BATCH_EPISODES", 2)
 
 
 @pytest.fixture

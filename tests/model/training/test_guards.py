@@ -15,7 +15,7 @@ from hma_model.checkpoint.folder import training_checkpoints
 from hma_model.training.guards import StepMetrics
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
-from hma_model.training.parallel import World
+from hma_model.training.parallel import Ranks
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import errors
 from tests.model.runs import TINY, same, train_until
@@ -116,6 +116,6 @@ def test_losses_of_several_objectives_are_kept_apart():
     ):  # fmt: skip
         values = torch.tensor(losses)
         metrics.add([name] * 2, SimpleNamespace(per_sample=values, loss=values.mean(), objective=objective))
-    loss, by_embodiment, by_objective = metrics.whole(World(), 3)
+    loss, by_embodiment, by_objective = metrics.whole(Ranks(), 3)
     assert loss == pytest.approx((4 + 0.5 + 0.25) / 3)
     assert by_embodiment == {"arm": 4} and by_objective == {"forward": 4, "policy": 0.375}

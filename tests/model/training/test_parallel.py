@@ -20,7 +20,7 @@ from hma_data.errors import HMAError, ShardError, TrainingError
 from hma_model.checkpoint.folder import resolve
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
-from hma_model.training.parallel import ParallelModel, World, join, read_error, report_once, write_error
+from hma_model.training.parallel import ParallelModel, Ranks, join, read_error, report_once, write_error
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import ROOT, errors, run_ranks
 from tests.model.runs import TINY, train_until, weights
@@ -227,7 +227,7 @@ class Network(torch.nn.Linear):
         self.trunk = SimpleNamespace(blocks=SimpleNamespace(parameters=self.parameters))
 
 
-def fail_under_ddp(world: World) -> None:
+def fail_under_ddp(world: Ranks) -> None:
     network = ParallelModel(Network(), world, "ddp")
     dist.all_reduce(torch.ones(1), async_op=True)
     raise TrainingError(str(network), "fails")
@@ -244,6 +244,6 @@ def await_sleep(pid: int) -> None:
 
 
 def test_one_process_is_a_world_of_one():
-    world = World()
+    world = Ranks()
     assert world.main and world.gather(3) == [3] and world.once(lambda: 4) == 4
     assert torch.equal(world.sum(torch.ones(2)), torch.ones(2))

@@ -10,7 +10,7 @@ from hma_data.loading.dataset import Batch
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.network.stem import to_digits
 from hma_model.training.loop import train
-from hma_model.training.parallel import World
+from hma_model.training.parallel import Ranks
 from hma_model.training.recipe import make_recipe
 from hma_model.training.run import Run
 from hma_model.training.scheduled_sampling import SAMPLE_STEPS, forwarded
@@ -98,7 +98,7 @@ def test_sharded_ranks_are_refused(tmp_path):
     data = [str(make_shards(tmp_path / "arm", "arm"))]
     recipe = make_recipe({**TINY, "data": data, "self_forward": 0.5, "parallel": "fsdp"})
     with pytest.raises(RecipeError, match="use parallel=ddp"):
-        Run(recipe, tmp_path, torch.device("cpu"), World(0, 2))
+        Run(recipe, tmp_path, torch.device("cpu"), Ranks(0, 2))
 
 
 def test_passes_that_skip_actions_are_refused_where_they_would_disagree(tmp_path):
@@ -107,7 +107,7 @@ def test_passes_that_skip_actions_are_refused_where_they_would_disagree(tmp_path
     recipe = {**TINY, "data": data, "objectives": objectives, "parallel": "fsdp"}
     recipe["model"] = {**TINY["model"], "absent_action": "skip"}
     with pytest.raises(RecipeError, match="absent_action: skip does not work with parallel=fsdp"):
-        Run(make_recipe(recipe), tmp_path, torch.device("cpu"), World(0, 2))
+        Run(make_recipe(recipe), tmp_path, torch.device("cpu"), Ranks(0, 2))
 
 
 def test_no_loss_is_due_on_padded_frames(model):

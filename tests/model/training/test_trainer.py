@@ -10,7 +10,7 @@ from hma_model.training.guards import listed
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.optim import Average
-from hma_model.training.parallel import World
+from hma_model.training.parallel import Ranks
 from hma_model.training.run import Run
 from tests.model.runs import TINY, weights
 
@@ -50,7 +50,7 @@ def test_accumulated_passes_have_the_gradient_of_the_whole_batch(recipe, tmp_pat
         "history_probability": 0.0,
     }
     whole = recipe(batch_size=8, model=model)
-    _, batch = next(TrainData(whole, Run(whole, tmp_path, torch.device("cpu")).sets, World()).step())
+    _, batch = next(TrainData(whole, Run(whole, tmp_path, torch.device("cpu")).sets, Ranks()).step())
     one = gradients(whole, tmp_path / "one", [batch])
     halves = [part(batch, slice(0, 4)), part(batch, slice(4, 8))]
     two = gradients(recipe(batch_size=4, accumulate=2, model=model), tmp_path / "two", halves)
@@ -164,8 +164,8 @@ def test_windows_that_cannot_be_shared_are_refused(recipe):
 def test_ranks_see_what_one_would_see_and_each_window_once(recipe, data, tmp_path):
     given = recipe(batch_size=4, accumulate=2)
     sets = Run(given, tmp_path, torch.device("cpu")).sets
-    alone = TrainData(given, sets, World())
-    pair = [TrainData(given, sets, World(rank, 2)) for rank in range(2)]
+    alone = TrainData(given, sets, Ranks())
+    pair = [TrainData(given, sets, Ranks(rank, 2)) for rank in range(2)]
     for _ in range(5):
         single = dict(alone.step())
         shared = {number: batch for feed in pair for number, batch in feed.step()}

@@ -17,7 +17,7 @@ from hma_data.lab.family.look import SIZE, Floats, block_shapes, draw, shrunk
 REACH = 8.0  # of a gripper, from its tip
 
 
-class World:
+class BlockTable:
     """A body at a pose (Q,) among its blocks (B, 2)."""
 
     def __init__(self, body: Body, pose: Floats, blocks: Floats) -> None:
@@ -137,11 +137,11 @@ def _overlap(blocks: Floats, sizes: Floats, ends: Floats, radii: Floats) -> tupl
     return radii[:, None] + sizes - far, way
 
 
-def start(body: Body, seed: int, number: int) -> tuple[World, np.random.Generator]:
+def start(body: Body, seed: int, number: int) -> tuple[BlockTable, np.random.Generator]:
     """Return the world at the start of an episode, and the generator of its driver."""
     rng = np.random.default_rng((seed, zlib.crc32(body.name.encode()), number))
     low, high = body.limits
     pose = rng.uniform(low + 0.1 * (high - low), high - 0.1 * (high - low))
     if body.grip:
         pose[-1] = float(body.grip == "gripper")
-    return World(body, pose, rng.uniform(18, SIZE - 18, (len(body.blocks), 2))), rng
+    return BlockTable(body, pose, rng.uniform(18, SIZE - 18, (len(body.blocks), 2))), rng
