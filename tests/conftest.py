@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
@@ -17,9 +17,10 @@ from hma_data.cpu import take_ordinary_priority
 from hma_data.registry.embodiment import Embodiment
 from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 
-# The same examples in every run, so that a red main means the change; HMA_FUZZ=1 draws new ones.
-settings.register_profile("same", derandomize=True, database=None, deadline=None)
-settings.register_profile("new", print_blob=True, deadline=None)
+# The same few examples in every run, so that a red main means the change; HMA_FUZZ=1 draws many new ones.
+ALWAYS = {"deadline": None, "suppress_health_check": [HealthCheck.function_scoped_fixture]}
+settings.register_profile("same", derandomize=True, database=None, max_examples=30, **ALWAYS)
+settings.register_profile("new", print_blob=True, max_examples=200, **ALWAYS)
 settings.load_profile("new" if os.environ.get("HMA_FUZZ") else "same")
 
 

@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.conversion.plan import (
@@ -28,7 +28,6 @@ def plan(episodes: list[EpisodeRef], arm: Embodiment, settings: Settings | None 
     return make_plan(episodes, arm, BlockTokenizer.spec, settings or Settings(), "toy")
 
 
-@settings(deadline=None)  # the first call imports
 @given(st.lists(st.integers(0, 3000), min_size=1, max_size=40), st.integers(1, 5000))
 def test_every_episode_is_in_one_shard_and_one_split(frames: list[int], size: int) -> None:
     arm = Embodiment.from_yaml(

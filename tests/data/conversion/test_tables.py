@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.conversion import extend
@@ -28,7 +28,6 @@ ARM = Embodiment.from_yaml(ARM_YAML)
 Cut = list[tuple[str, str, list[tuple[int, EpisodeRef]]]]
 GROUPS = st.sampled_from(["", "", "day", "night", "demo_3"])
 SPLITS, NONE = st.sampled_from([None, "train", "val"]), st.none()
-few = settings(max_examples=25, deadline=None)
 
 
 @st.composite
@@ -98,7 +97,6 @@ def together_by_hand(rows: Sequence[EpisodeRow], by: str) -> list[str]:
 # -- the same of tables
 
 
-@few
 @given(
     st.one_of(recordings(), recordings(SPLITS)),
     st.floats(0, 0.99),
@@ -125,7 +123,6 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("base")
 
 
-@few
 @given(data=st.data(), refs=recordings())
 def test_an_extension_is_that_of_plain_loops(base: Path, data: st.DataObject, refs: list[EpisodeRef]) -> None:
     states = data.draw(
@@ -181,14 +178,12 @@ ROWS = st.lists(
 ).map(lambda several: [row(*values) for values in several])
 
 
-@few
 @given(ROWS, st.sampled_from(["instruction", "source"]))
 def test_linked_episodes_are_those_of_plain_loops(rows: list[EpisodeRow], by: str) -> None:
     found = _together(Records.of(EpisodeRow, rows).table, by)
     assert found.to_pylist() == together_by_hand(rows, by)
 
 
-@few
 @given(st.lists(st.tuples(ROWS, st.lists(st.sampled_from("abgh"), unique=True)), min_size=1, max_size=3))
 def test_joined_sets_are_those_of_plain_loops(sets: list[tuple[list[EpisodeRow], list[str]]]) -> None:
     refused = [[Refused(name, "E", "") for name in names] for _, names in sets]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from hma_data.episodes.align import hold, interpolate, nearest, to_clip
@@ -12,7 +12,6 @@ from hma_data.episodes.episode import Clip, Episode, Pictures, Signal
 from hma_data.errors import AlignmentError, EpisodeError, RegistryError
 from hma_data.registry.embodiment import Embodiment
 
-QUICK = settings(max_examples=150, deadline=None)
 TICK = 1 / 64  # a binary fraction: sums and differences of times are exact, ties are ties
 
 
@@ -41,7 +40,6 @@ def one_between(source: np.ndarray, values: np.ndarray, target: float) -> float:
     return values[-1]
 
 
-@QUICK
 @given(source=times(), targets=times())
 def test_nearest_is_the_nearest_and_of_two_the_earlier(source: np.ndarray, targets: np.ndarray) -> None:
     index, skew_ms = nearest(source, targets)
@@ -50,7 +48,6 @@ def test_nearest_is_the_nearest_and_of_two_the_earlier(source: np.ndarray, targe
     np.testing.assert_array_equal(skew_ms, np.abs(np.array(expected) - targets) * 1e3)
 
 
-@QUICK
 @given(source=times(), targets=times())
 def test_hold_is_the_last_at_or_before(source: np.ndarray, targets: np.ndarray) -> None:
     index, age_ms = hold(source, targets)
@@ -59,7 +56,6 @@ def test_hold_is_the_last_at_or_before(source: np.ndarray, targets: np.ndarray) 
     np.testing.assert_array_equal(age_ms, (targets - source[index]) * 1e3)
 
 
-@QUICK
 @given(source=times(), targets=times(), late=st.integers(0, 50))
 def test_hold_with_a_tolerance_is_the_last_at_most_so_late(source, targets, late) -> None:
     index, skew_ms = hold(source, targets, late * TICK)
@@ -69,7 +65,6 @@ def test_hold_with_a_tolerance_is_the_last_at_most_so_late(source, targets, late
     np.testing.assert_array_equal(skew_ms[~trimmed], np.abs(targets - source[index])[~trimmed] * 1e3)
 
 
-@QUICK
 @given(source=times(), targets=times(), seed=st.integers(0, 99))
 def test_interpolate_is_linear_between_neighbours(source: np.ndarray, targets: np.ndarray, seed: int) -> None:
     assume((np.diff(source) > 0).all())
@@ -138,7 +133,6 @@ def assert_is_reference(clip: Clip, grid: np.ndarray, actions: str, states: str,
 METHODS = st.sampled_from(["nearest", "hold", "interpolate"])
 
 
-@QUICK
 @given(
     clocks=st.tuples(*[times() for _ in range(5)]),
     images=st.sampled_from(["nearest", "hold"]),
@@ -220,7 +214,6 @@ def test_frames_before_the_first_command_are_left_out_and_counted() -> None:
     assert clip.frames_at("front", np.arange(1))[0, 0, 0, 0] == 5
 
 
-@QUICK
 @given(limit=st.floats(1, 80), gap=st.integers(1, 12))
 def test_an_episode_is_refused_exactly_when_a_stream_is_further_off_than_allowed(limit, gap) -> None:
     wrist = np.concatenate([FAST[:100], FAST[100 + gap :]])
@@ -310,7 +303,6 @@ def ticks(draw: st.DrawFn) -> np.ndarray:
     return np.cumsum([draw(st.integers(0, 60)), *steps])
 
 
-@QUICK
 @given(
     source=ticks(),
     targets=ticks(),

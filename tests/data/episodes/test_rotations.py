@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.episodes.align import to_clip
@@ -10,7 +10,6 @@ from hma_data.episodes.episode import Episode, Pictures, Signal
 from hma_data.episodes.rotations import between
 from hma_data.registry.embodiment import Embodiment
 
-QUICK = settings(max_examples=60, deadline=None)
 SAMPLES = np.arange(6, dtype=float)
 TARGETS = np.sort(np.concatenate([SAMPLES, np.linspace(0.1, 4.9, 23)]))
 
@@ -47,7 +46,6 @@ def turning(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
     return axis / np.linalg.norm(axis), np.cumsum(rng.uniform(-1, 1, 6)) + rng.uniform(-6, 6)
 
 
-@QUICK
 @given(turning(), st.lists(st.sampled_from([-1.0, 1.0]), min_size=6, max_size=6), st.booleans())
 def test_quaternions_turn_along_the_shorter_arc_whatever_their_signs(turn, signs, w_first) -> None:
     axis, angles = turn
@@ -63,7 +61,6 @@ def test_quaternions_turn_along_the_shorter_arc_whatever_their_signs(turn, signs
     np.testing.assert_allclose(np.abs((found[at] * values).sum(axis=1)), 1, atol=1e-6)
 
 
-@QUICK
 @given(turning())
 def test_axis_angle_turns_along_the_shorter_arc_and_keeps_its_samples(turn) -> None:
     axis, angles = turn
@@ -77,7 +74,6 @@ def test_axis_angle_turns_along_the_shorter_arc_and_keeps_its_samples(turn) -> N
     np.testing.assert_allclose(found[np.isin(TARGETS, SAMPLES)], values, atol=1e-5)
 
 
-@QUICK
 @given(turning(), st.sampled_from([(-np.pi, "rad"), (0.0, "rad"), (-180.0, "deg"), (0.0, None)]))
 def test_angles_go_over_the_seam_and_stay_in_their_range(turn, convention) -> None:
     low, unit = convention

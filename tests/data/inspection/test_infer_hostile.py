@@ -1,7 +1,7 @@
 """Infer on inspections of any content: a YAML that parses and asks, or one line of error."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.errors import HMAError
@@ -38,7 +38,6 @@ FACTS = ["dataset", "simulator", "controller", "layout", "instruction", "timesta
 
 
 @pytest.mark.slow
-@settings(max_examples=300, deadline=None)
 @given(
     found=st.builds(
         Inspection,

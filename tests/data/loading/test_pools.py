@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.loading.pools import LARGEST_POOL, UnitAssignment, WindowSequence, pool_size, spread
@@ -49,7 +49,6 @@ def rows_of(stream: WindowSequence, start: int, count: int) -> list[float]:
     st.integers(1, 24),
     st.integers(0, 2**31),
 )
-@settings(max_examples=100, deadline=None)
 def test_windows_that_share_a_row_are_further_apart_than_promised(runs, span, seed) -> None:
     rows = np.concatenate([np.arange(n) + 100 * i for i, n in enumerate(runs)]).astype(np.int64)
     order, apart = spread(rows, span, np.random.default_rng(seed))
@@ -77,7 +76,6 @@ def test_the_order_of_a_pool_is_as_random_as_a_shuffle_in_place() -> None:
 
 
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=40), st.integers(1, 12), st.integers(1, 3))
-@settings(max_examples=80, deadline=None)
 def test_every_window_is_dealt_to_one_reader(lengths: list[int], readers: int, frames: int) -> None:
     index = WindowIndex.of(fake(lengths), "train", frames)
     if not index.count:

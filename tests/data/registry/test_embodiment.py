@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.errors import RegistryError
@@ -113,7 +113,6 @@ anything = st.recursive(
 # -- round trips
 
 
-@settings(max_examples=60, deadline=None)
 @given(values=embodiments())
 def test_yaml_gives_the_same_embodiment_back(values: dict[str, Any]) -> None:
     made = Embodiment.from_values(values, "made")
@@ -121,7 +120,6 @@ def test_yaml_gives_the_same_embodiment_back(values: dict[str, Any]) -> None:
     assert again == made and again.digest == made.digest and again.to_yaml() == made.to_yaml()
 
 
-@settings(max_examples=50, deadline=None)
 @given(values=embodiments())
 def test_dims_names_and_mask_have_one_width(values: dict[str, Any]) -> None:
     made = Embodiment.from_values(values, "made")
@@ -352,7 +350,6 @@ def test_open_questions_are_the_problem_not_what_pydantic_says_of_them() -> None
     assert str(fault.value) == said
 
 
-@settings(max_examples=120, deadline=None)
 @given(value=anything, path=st.sampled_from(["id", "action", "cameras", "sync", "source", "cameras.0", "x"]))
 def test_any_value_anywhere_is_valid_or_has_problems_of_one_line(value: Any, path: str) -> None:
     values = changed(path, value)
@@ -402,7 +399,6 @@ def test_what_is_not_plain_yaml_is_refused_with_its_place(text: str, said: str) 
     assert str(found.value).startswith("arm.yaml: not valid YAML") and "\n" not in str(found.value)
 
 
-@settings(max_examples=120, deadline=None)
 @given(text=st.text(max_size=60) | st.text("a:-[]{}&*!?|>'\"# \n\t1", max_size=40))
 def test_any_text_is_parsed_or_refused_by_our_error(text: str) -> None:
     try:
@@ -411,7 +407,6 @@ def test_any_text_is_parsed_or_refused_by_our_error(text: str) -> None:
         assert "\n" not in str(fault)
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     values=st.dictionaries(words, st.recursive(words | st.integers() | st.booleans(), st.lists), max_size=4)
 )

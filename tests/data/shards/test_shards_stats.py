@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.shards.stats import QUANTILES, Stats
@@ -90,7 +90,6 @@ def test_the_same_order_gives_the_same_bytes() -> None:
     st.lists(st.integers(0, 600), min_size=1, max_size=8),
     st.floats(-(2.0**126), 2.0**126, width=32, allow_subnormal=False),
 )
-@settings(max_examples=50, deadline=None)
 def test_a_constant_stays_exact_however_it_is_merged(sizes: list[int], value: float) -> None:
     stats = Stats.empty(1)
     for size in sizes:

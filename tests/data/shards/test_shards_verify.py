@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.conversion.job import convert
@@ -59,7 +59,6 @@ def test_a_sound_set_has_no_problems_however_it_is_verified(made: Path) -> None:
 
 
 @given(st.data())
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_flipped_bit_in_any_byte_of_any_file_is_found(made: Path, data: st.DataObject) -> None:
     path = data.draw(st.sampled_from(files(made)))
     whole = path.read_bytes()

@@ -3,14 +3,13 @@
 import json
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.shards.stats import Stats
 
 
 @given(st.lists(st.integers(1, 400), min_size=1, max_size=12), st.integers(0, 2**31))
-@settings(max_examples=30, deadline=None)
 def test_merged_parts_equal_the_whole(sizes: list[int], seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows = (rng.normal(size=(sum(sizes), 3)) * [1, 1e-3, 1e4] + [0, 1e3, -5]).astype(np.float32)

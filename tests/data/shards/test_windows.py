@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.shards.reader import EpisodeIndex
@@ -33,7 +33,6 @@ LENGTHS = st.lists(st.integers(1, 30), min_size=1, max_size=20)
 
 
 @given(LENGTHS, st.integers(1, 6), st.integers(1, 3), st.integers(1, 3))
-@settings(max_examples=80, deadline=None)
 def test_window_arithmetic_equals_counting(lengths: list[int], frames: int, stride: int, shards: int) -> None:
     index, starts, row = WindowIndex.of(fake(lengths, stride, shards=shards), "train", frames), [], 0
     for length in lengths:
@@ -64,7 +63,6 @@ def test_a_pause_as_long_as_a_step_divides_an_episode_into_pieces() -> None:
 
 
 @given(LENGTHS, st.integers(1, 4), st.integers(1, 3), st.data())
-@settings(max_examples=60, deadline=None)
 def test_the_pieces_of_one_episode_are_those_of_the_window_index(lengths, stride, frame_stride, data) -> None:
     rates = st.dictionaries(st.integers(0, 95), st.integers(1, 9), max_size=4)
     paused = [data.draw(rates) for _ in lengths]
@@ -85,7 +83,6 @@ def test_the_pieces_of_one_episode_are_those_of_the_window_index(lengths, stride
 
 
 @given(LENGTHS, st.integers(1, 6), st.integers(1, 3))
-@settings(max_examples=60, deadline=None)
 def test_a_row_group_reaches_as_far_as_its_windows_and_no_further(lengths, frames, stride) -> None:
     index = WindowIndex.of(fake(lengths, stride), "train", frames)
     for group in index.units():
@@ -95,7 +92,6 @@ def test_a_row_group_reaches_as_far_as_its_windows_and_no_further(lengths, frame
 
 
 @given(LENGTHS, st.integers(2, 6), st.integers(1, 3))
-@settings(max_examples=60, deadline=None)
 def test_a_padded_episode_gives_one_window_from_its_first_row(lengths, frames, stride) -> None:
     index = WindowIndex.of(fake(lengths, stride), "train", frames, short="pad")
     ends = np.cumsum(lengths)

@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from hma_data.errors import RecipeError
+from hma_data.loading.rows import Batch
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.config import OBJECTIVES, ActionSpace
 from hma_model.network.model import HMA
 from hma_model.training import memory
 from hma_model.training.loop import train
-from hma_model.training.memory import needed_bytes, require_memory
+from hma_model.training.memory import activation_bytes, needed_bytes, require_memory
 from hma_model.training.recipe import Recipe, load_recipe, make_recipe, parse_overrides
 from tests.model.shards import make_shards
 
@@ -24,10 +25,9 @@ PIXELS = TokenizerSpec.continuous("raw-128", 1, 128, 1, 3, latent_scale=1 / 255,
 LATENTS = TokenizerSpec("vae-8", 1, "continuous", 256, (32, 32), channels=4, dtype="float16")
 MEASURE = """
 import json, sys, torch
-from hma_data.loading.rows import Batch
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.training.recipe import make_recipe
-from tests.model.training.test_memory import network
+from tests.model.training.test_memory import forward, network
 recipe, spec = make_recipe(json.loads(sys.argv[1])), TokenizerSpec.from_json(json.loads(sys.argv[2]))
 def peak():  # getrusage would begin with the peak of the process that started this one
     with open("/proc/self/status") as file:
@@ -35,17 +35,9 @@ def peak():  # getrusage would begin with the peak of the process that started t
 before = peak()
 model = network(recipe, spec, "cpu").train()
 model.trunk.checkpointing = recipe.checkpointing
-optimizer, (objective,) = torch.optim.AdamW(model.parameters()), recipe.objectives
-b, t = recipe.batch_size, recipe.frames
-shape = (b, t, *model.config.frame_shape)
-frames = {"tokens": torch.zeros(shape, dtype=torch.int64)}
-if spec.kind == "continuous":
-    frames = {"latents": torch.zeros(shape)}
-batch = Batch(["arm"] * b, torch.zeros(b, t, 7), torch.ones(b, t, dtype=torch.bool), **frames)
+optimizer = torch.optim.AdamW(model.parameters())
 for _ in range(2):
-    with torch.autocast("cpu", torch.bfloat16, enabled=recipe.precision == "bf16"):
-        loss = model(batch, objective, torch.Generator().manual_seed(0)).loss
-    loss.backward()
+    forward(model, recipe).backward()
     optimizer.step()
     optimizer.zero_grad(set_to_none=True)
 print(peak() - before)
@@ -59,11 +51,28 @@ def network(recipe: Recipe, spec: TokenizerSpec, device: str = "meta") -> HMA:
     return model
 
 
+def forward(model: HMA, recipe: Recipe) -> torch.Tensor:
+    """Return the loss of a pass over windows of nothing."""
+    windows, frames = recipe.batch_size, recipe.frames
+    shape = (windows, frames, *model.config.frame_shape)
+    if model.config.kind == "continuous":
+        seen = {"latents": torch.zeros(shape)}
+    else:
+        seen = {"tokens": torch.zeros(shape, dtype=torch.int64)}
+    present = torch.ones(windows, frames, dtype=torch.bool)
+    batch = Batch(["arm"] * windows, torch.zeros(windows, frames, 7), present, **seen)
+    (objective,) = recipe.objectives
+    with torch.autocast("cpu", torch.bfloat16, enabled=recipe.precision == "bf16"):
+        return model(batch, objective, torch.Generator().manual_seed(0)).loss
+
+
 SMALL, WIDE = {"model": {"layers": 4, "width": 192}}, {"model": {"layers": 8, "width": 256}}
 PAIRS = {"model": {"layers": 6, "width": 192, "training_pass": "pairs"}}
 DIFFUSION = {"model": {"layers": 4, "width": 128, "diffusion_width": 512}, "batch_size": 8}
 UNET = load_recipe("unet_tiny", ["frames=6", "batch_size=4"]).values()
-SLOW = [
+MEASURED = [
+    (TOKENS, SMALL),
+    (PIXELS, UNET),
     (PIXELS, {**UNET, "precision": "fp32"}),
     (TOKENS, WIDE),
     (TOKENS, {**WIDE, "objectives": {"policy": 1}}),
@@ -74,11 +83,9 @@ SLOW = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="peaks are read from /proc")
-@pytest.mark.parametrize(
-    ("spec", "changes"),
-    [(TOKENS, SMALL), (PIXELS, UNET), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
-)
+@pytest.mark.parametrize(("spec", "changes"), MEASURED)
 def test_the_estimate_is_near_the_measured_peak(spec, changes):
     recipe = {"frames": 12, "batch_size": 3, "objectives": {"forward": 1}, **changes}
     words = [sys.executable, "-c", MEASURE, json.dumps(recipe), json.dumps(spec.to_json())]
@@ -86,6 +93,25 @@ def test_the_estimate_is_near_the_measured_peak(spec, changes):
     asked = make_recipe(recipe)
     estimate, measured = needed_bytes(network(asked, spec), asked, CPU), float(made.stdout.split()[-1])
     assert 0.7 < estimate / measured < 1.5, (estimate / memory.GIB, measured / memory.GIB)
+
+
+@pytest.mark.parametrize(
+    ("spec", "changes"),
+    [(TOKENS, {"model": {"layers": 6, "width": 64}}), (LATENTS, DIFFUSION), (PIXELS, UNET)],
+)
+def test_the_estimate_of_a_pass_is_near_what_it_keeps_for_its_backward_pass(spec, changes):
+    recipe = make_recipe({"objectives": {"forward": 1}, **changes, "frames": 4, "batch_size": 1})
+    model = network(recipe, spec, "cpu").train()
+    kept = {parameter.untyped_storage().data_ptr(): 0 for parameter in model.parameters()}
+
+    def note(tensor: torch.Tensor) -> torch.Tensor:
+        storage = tensor.untyped_storage()
+        kept.setdefault(storage.data_ptr(), storage.nbytes())
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
+        forward(model, recipe)
+    assert 0.5 < activation_bytes(model.config, recipe, 1) / sum(kept.values()) < 2
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)

@@ -41,7 +41,7 @@ def touch_every_part(path: Path) -> None:
 SINGLE = ["ros1", "ros1-bz2", "ros1-lz4", "mcap-cdr-zstd", "mcap-json", "mcap-without-chunks",
           "mcap-protobuf", "ros2-sqlite3"]  # fmt: skip
 PARTED = [f"of two episodes, {kind}" for kind in bag_parts.KINDS]
-PATIENT = settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+PATIENT = settings(max_examples=12, suppress_health_check=list(HealthCheck))
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -49,7 +49,6 @@ VALUES = st.recursive(
 )
 
 
-@settings(max_examples=150)
 @given(
     value=st.dictionaries(st.text(max_size=4) | st.integers(), VALUES, max_size=4), protocol=st.integers(0, 5)
 )

@@ -10,7 +10,7 @@ import av
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hma_data.episodes.episode import Pictures
@@ -39,7 +39,7 @@ def test_every_frame_equals_decoding_in_order(video: Path) -> None:
     assert np.array_equal(VideoFile(video).frames(range(LENGTH)), in_order(video))
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15)
 @given(calls=st.lists(st.lists(st.integers(0, LENGTH - 1), max_size=6), min_size=1, max_size=5))
 def test_any_order_of_calls_gives_the_frames_asked_for(video: Path, calls: list[list[int]]) -> None:
     file = VideoFile(video)
@@ -133,7 +133,6 @@ def test_a_playlist_named_mp4_opens_nothing_else(tmp_path: Path, video: Path) ->
             frame_table(tmp_path / f"{name}.mp4")
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_a_cut_or_flipped_file_gives_right_frames_or_our_error(video, tmp_path, data) -> None:
     whole = bytearray(video.read_bytes())
@@ -289,7 +288,6 @@ def test_a_huge_size_is_refused_wherever_it_is_claimed(suffix: str) -> None:
     assert done.returncode == 7, done.stderr.decode()
 
 
-@settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_a_damaged_picture_is_a_picture_or_our_error(data: st.DataObject) -> None:
     suffix = data.draw(st.sampled_from([".png", ".jpg", ".bmp", ".webp", ".tiff"]))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.conversion.job import convert
@@ -188,7 +188,6 @@ def test_nan_says_that_there_is_no_hand(folder: Path) -> None:
     check_run(folder, robot, "a.mp4#1", range(11, LENGTH))
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_runs_values_and_counts_against_a_plain_loop(data: st.DataObject) -> None:
     length = data.draw(st.integers(2, 30))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.episodes.align import to_clip
@@ -142,7 +142,6 @@ def test_a_folder_without_videos_is_refused(tmp_path: Path) -> None:
         videos_of(str(tmp_path))
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_cut_or_changed_byte_ends_in_an_error_of_ours_or_a_reading(folder, clip, data) -> None:
     name, labels = data.draw(

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.episodes.align import to_clip
@@ -117,7 +117,6 @@ def test_overlapping_finds_become_one_weighted_by_their_chances() -> None:
     np.testing.assert_allclose(merged[1], shapes[2])
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.floats(-3.1, 3.1), st.floats(20, 60), st.floats(-10, 70), st.floats(-10, 50))
 def test_the_map_of_a_square_turns_it_about_its_centre(angle: float, side: float, x: float, y: float) -> None:
     matrix = Square(x, y, side, angle).to_image(100)
@@ -138,7 +137,6 @@ def test_a_cut_of_the_same_size_is_the_picture_and_beyond_its_edge_black() -> No
     np.testing.assert_array_equal(turned, np.rot90(picture))
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.floats(-3.1, 3.1), st.floats(-50, 50), st.floats(0.5, 3))
 def test_where_a_hand_is_looked_for_turns_moves_and_grows_with_it(angle, moved, grown) -> None:
     points = np.random.default_rng(1).random((21, 2)) * 100

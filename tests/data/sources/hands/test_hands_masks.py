@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.conversion.job import convert
@@ -89,7 +89,6 @@ def test_a_video_with_too_few_hands_gives_no_masked_episode(folder: Path) -> Non
         source.index(str(folder), made.hand_video("landmarks", missing="mask", min_frames="27"))
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.booleans(), min_size=3, max_size=30), st.none() | st.integers(0, 4), st.integers(1, 8))
 def test_masked_runs_against_a_plain_loop(seen: list[bool], limit: int | None, least: int) -> None:
     if not any(seen):

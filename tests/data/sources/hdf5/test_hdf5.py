@@ -10,7 +10,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.episodes.align import to_clip
@@ -216,7 +216,6 @@ def test_pictures_of_other_shapes_become_rgb(tmp_path: Path, shape: tuple[int, .
 # -- reading
 
 
-@settings(max_examples=35, deadline=None)
 @given(
     indices=st.lists(st.integers(0, 49), max_size=12),
     chunk=st.sampled_from([None, 1, 7, 50]),
@@ -422,7 +421,6 @@ def test_a_damaged_file_among_others_is_one_refused_episode(demos: Path) -> None
     assert source.read(str(demos.parent), "demos/demo_0", embodiment()).id == "demos/demo_0"
 
 
-@settings(max_examples=35, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_a_cut_or_flipped_file_gives_only_our_errors(demos: Path, data: st.DataObject) -> None:
     whole = bytearray(demos.read_bytes())

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hma_data.episodes.align import to_clip
@@ -353,7 +353,7 @@ def test_a_folder_that_is_none_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12)
 @given(data=st.data())
 def test_a_cut_or_flipped_file_gives_only_our_errors(originals, tmp_path_factory, data) -> None:
     folder = tmp_path_factory.mktemp("bad") / "set"

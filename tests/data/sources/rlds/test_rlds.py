@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.episodes.align import to_clip
@@ -472,10 +472,6 @@ def _read_damaged(whole, data: bytes, tmp_path_factory, info: bool) -> set[str]:
     return good
 
 
-QUICK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-@QUICK
 @given(st.data())
 def test_truncated_at_any_byte_the_whole_episodes_before_it_are_read(whole, tmp_path_factory, data):
     _, content, actions = whole
@@ -488,7 +484,6 @@ def test_truncated_at_any_byte_the_whole_episodes_before_it_are_read(whole, tmp_
     assert good == {name for name, end in zip(actions, ends, strict=True) if end <= cut}
 
 
-@QUICK
 @given(st.data())
 def test_a_flipped_byte_anywhere_is_noticed(whole, tmp_path_factory, data):
     _, content, actions = whole
@@ -497,7 +492,6 @@ def test_a_flipped_byte_anywhere_is_noticed(whole, tmp_path_factory, data):
     assert len(_read_damaged(whole, damaged, tmp_path_factory, True)) < len(actions)
 
 
-@QUICK
 @given(st.data())
 def test_a_wrong_record_with_a_right_checksum_gives_an_episode_error_or_an_episode(tmp_path_factory, data):
     raw = bytearray(encode(record(0, 3)))
