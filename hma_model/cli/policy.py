@@ -146,9 +146,12 @@ def augment(
         print_json({"out": str(out), "made": episodes, "kept": count, "plan": made.plan})
         return
     before = "finished already: " if finished else ""
-    begun = len(set(ShardSet(out).episodes["group"].to_pylist()))
+    stored = ShardSet(out).episodes
+    begun = len(set(stored["group"].to_pylist()))
     said = f"kept {human_count(count, 'episode')} of {episodes} in {out}"
     print(f"{before}{said}, begun in {human_count(begun, 'real one')}; synthetic: true in every file")
+    if keep < 1 and not any("milli" in flags for flags in stored["flags"].to_pylist()):
+        print(f"  --keep {keep:g} was not applied: a model with video_loss: regression states no uncertainty")
     if lerobot:
         print(f"the same as a LeRobotDataset: {lerobot}")
         state = Embodiment.load(lerobot / "embodiment.yaml").provenance.get("state")

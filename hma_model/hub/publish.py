@@ -133,7 +133,7 @@ def _is_same(own: weights.State, stored: weights.State) -> bool:
 
 def _require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
     """Raise unless others can load the embodiments."""
-    source.trunk()
+    weights.trunk(source)
     for name in embodiments:
         checkpoints.read_embodiment(source, name)
         stated = source.card(name).get("id", name)

@@ -72,6 +72,16 @@ def test_a_checkpoint_does_not_go_to_a_shard_sets_place(folder, tmp_path):
     assert sorted(shards.rglob("*")) == before
 
 
+def test_a_trunk_that_nobody_could_load_is_not_published(tmp_path):
+    model = make_model({"arm": 2})
+    with torch.no_grad():
+        next(model.trunk.parameters()).fill_(float("nan"))
+    save(tmp_path / "broken", {"arm": 2}, model=model)
+    with pytest.raises(HMAError, match=r"trunk\.safetensors: holds values in .* that are not finite"):
+        hub.push(tmp_path / "broken", tmp_path / "published")
+    assert not (tmp_path / "published").exists()
+
+
 def test_a_damaged_manifest_is_named_where_it_is(tmp_path):
     shards = make_shards(tmp_path / "shards", "arm")
     cut(shards / "manifest.json", 300)
