@@ -17,7 +17,7 @@ ROOMS = (
     "hma_data.storage",
     "hma_data.hub", "hma_data.registry", "hma_data.episodes", "hma_data.sources", "hma_data.tokenizers",
     "hma_data.shards", "hma_data.tokenizers.training", "hma_data.inspection", "hma_data.conversion",
-    "hma_data.loading", "hma_data.loader", "hma_data.lab", "hma_data.bench", "hma_data.cli", "hma_data",
+    "hma_data.loading", "hma_data.loader", "hma_data.lab", "hma_data.cli", "hma_data",
     "hma_model.config", "hma_model.checkpoint.folder", "hma_model.network", "hma_model.checkpoint",
     "hma_model.generation",
     "hma_model.evaluation", "hma_model.released", "hma_model.hub", "hma_model.worlds",

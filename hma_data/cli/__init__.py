@@ -17,6 +17,7 @@ from hma_data.cli.registry import registry_app
 from hma_data.cli.shards import shards_app
 from hma_data.cli.tokenizer import tokenizer_app
 from hma_data.console import human_count, print_json, print_table
+from hma_data.storage.paths import recipe_module
 
 DATA = "Recordings and shards"  # the panel of `hma --help`
 
@@ -40,10 +41,9 @@ def bench(
 
     Example: hma bench loader frames=1000000 --json
     """
-    from hma_data.bench import BENCHES, load, report, settings_of
-
+    harness = recipe_module("harness")
     if name is None:
-        benches = {known: load(known) for known in sorted(BENCHES)}
+        benches = {known: harness.load(known) for known in sorted(harness.BENCHES)}
         if json:
             print_json({known: {"about": b.about, "settings": b.defaults} for known, b in benches.items()})
             return
@@ -53,10 +53,10 @@ def bench(
         ]
         print_table(["bench", "about", "settings"], rows)
         return
-    chosen = load(name)
-    values = settings_of(chosen, name, settings or [])
+    chosen = harness.load(name)
+    values = harness.settings_of(chosen, name, settings or [])
     results = chosen.run(values)
-    told = report(name, values, results)
+    told = harness.report(name, values, results)
     if json:
         print_json(told)
     else:

@@ -7,7 +7,10 @@ with `as_path` for a file or folder of this machine, with `as_address` for a hub
 
 import os
 import re
+import sys
+from importlib import import_module
 from pathlib import Path, PurePath
+from typing import Any
 
 from hma_data.errors import HubError, UsageError
 
@@ -80,3 +83,14 @@ def shipped(name: str) -> Path:
     package = Path(__file__).resolve().parents[1]
     packed = package / "shipped" / name
     return packed if packed.is_dir() else package.parent / name
+
+
+def recipe_module(name: str) -> Any:
+    """Import a module of `recipes/bench`; raise UsageError where this installation has none."""
+    folder = shipped("recipes")
+    if not (folder / "bench" / f"{name}.py").is_file():
+        remedy = "run it in a checkout of the project"
+        raise UsageError(f"recipes/bench/{name}.py", "is not part of this installation", remedy)
+    if str(folder.parent) not in sys.path:  # spawned processes take sys.path over, and find the module too
+        sys.path.append(str(folder.parent))
+    return import_module(f"recipes.bench.{name}")

@@ -166,7 +166,7 @@ class Start:
             if name in self.checkpoint.embodiments:
                 checkpoints.add_embodiment(model, self.checkpoint, name)
         if self.frozen:
-            model.trunk.requires_grad_(False)
+            model.get_submodule("trunk").requires_grad_(False)
             model.readout.requires_grad_(False)
 
     def _off(self) -> dict[str, str]:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.bench import Bench, make_robot, rss_mib
 from hma_data.errors import UsageError
+from recipes.bench.harness import Bench, make_robot, rss_mib
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:

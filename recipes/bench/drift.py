@@ -31,10 +31,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.bench import Bench
 from hma_data.errors import UsageError
 from hma_data.lab import simulator, truth
 from hma_data.storage.yaml_io import parse_yaml
+from recipes.bench.harness import Bench
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer

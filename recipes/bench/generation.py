@@ -19,8 +19,8 @@ from collections.abc import Callable
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from hma_data.bench import Bench, in_fresh_process
 from hma_data.errors import UsageError
+from recipes.bench.harness import Bench, in_fresh_process
 from recipes.bench.speed import (
     COMMON,
     KINDS,

@@ -27,10 +27,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.bench import Bench
 from hma_data.lab import truth
 from hma_data.lab.simulator import embodiment
 from recipes.bench.drift import SHEET_ROLLOUTS, opened, rolled, write_sheet
+from recipes.bench.harness import Bench
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer

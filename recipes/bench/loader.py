@@ -16,8 +16,8 @@ from typing import Any, get_args
 
 import numpy as np
 
-from hma_data.bench import Bench, in_fresh_process, make_robot, peak_rss_mib, rss_mib
 from hma_data.loading.mixture import Draw
+from recipes.bench.harness import Bench, in_fresh_process, make_robot, peak_rss_mib, rss_mib
 
 PEERS = ("datasets", "lance", "litdata", "streaming")  # of recipes/bench/peers.py
 

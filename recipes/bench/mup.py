@@ -13,10 +13,10 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from hma_data.bench import Bench
 from hma_data.errors import UsageError
 from hma_data.storage.files import write_atomic
 from hma_model.config import ActionSpace, HMAConfig
+from recipes.bench.harness import Bench
 
 if TYPE_CHECKING:
     import torch

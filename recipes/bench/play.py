@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hma_data.bench import Bench
 from hma_data.errors import HMAError, UsageError
+from recipes.bench.harness import Bench
 from recipes.bench.speed import check_settings, numbers_of
 
 if TYPE_CHECKING:

@@ -26,12 +26,12 @@ from pathlib import Path
 from typing import Any
 
 from hma_data import lab
-from hma_data.bench import Bench
 from hma_data.errors import OutputError, UsageError
 from hma_data.lab import family
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import cache_folder, read_json, to_json, write_atomic
+from recipes.bench.harness import Bench
 
 BANDS = Path(__file__).with_suffix(".json")
 EPISODES, SEED, VAL_FRACTION = 60, 0, 0.1  # of the recording

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hma_data.bench import Bench, in_fresh_process, make_robot, peak_rss_mib
 from hma_data.errors import UsageError
+from recipes.bench.harness import Bench, in_fresh_process, make_robot, peak_rss_mib
 
 if TYPE_CHECKING:
     from hma_data.conversion.plan import Plan, ShardUnit

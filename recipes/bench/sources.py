@@ -28,11 +28,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.bench import Bench, make_robot, peak_rss_mib
 from hma_data.cpu import usable_cores
 from hma_data.episodes.images import Images
 from hma_data.errors import HMAError, UsageError
 from hma_data.registry.embodiment import Embodiment
+from recipes.bench.harness import Bench, make_robot, peak_rss_mib
 
 SIZE, BATCH = 256, 32  # pixels of a side; frames requested at once
 DEADLINE_S = 1800

@@ -12,8 +12,8 @@ import time
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from hma_data.bench import Bench, in_fresh_process, peak_rss_mib
 from hma_data.errors import UsageError
+from recipes.bench.harness import Bench, in_fresh_process, peak_rss_mib
 
 if TYPE_CHECKING:
     import torch

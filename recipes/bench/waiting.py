@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from statistics import median
 from typing import Any
 
-from hma_data.bench import Bench, in_fresh_process
+from recipes.bench.harness import Bench, in_fresh_process
 from recipes.bench.speed import check_settings, numbers_of, step_seconds
 
 WAITS: dict[str, dict[str, str]] = {

@@ -29,11 +29,11 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from hma_data.bench import recipe_module
 from hma_data.console import run_script
 from hma_data.lab.family import TRUNK
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
+from hma_data.storage.paths import recipe_module
 
 quality = recipe_module("quality")
 FRAMES, PLAIN, PROMPT, recorded = quality.FRAMES, quality.PLAIN, quality.PROMPT, quality.recorded

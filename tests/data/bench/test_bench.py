@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hma_data import bench
 from hma_data.episodes.align import to_clip
 from hma_data.errors import UsageError
 from hma_data.sources.base import open_source
+from recipes.bench import harness as bench
 from recipes.bench import sources
 from recipes.bench.sources import CASES, actions, scene
 

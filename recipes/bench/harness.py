@@ -1,11 +1,7 @@
-"""Run benchmarks: `hma bench NAME [key=value …]`. Input is generated; nothing is downloaded.
-
-The benchmarks are modules of `recipes/bench`, which is shipped beside the packages.
-"""
+"""Run benchmarks: `hma bench NAME [key=value …]`. Input is generated; nothing is downloaded."""
 
 import os
 import platform
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -15,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from hma_data.cpu import usable_cores
 from hma_data.errors import UsageError
-from hma_data.storage.paths import shipped
 
 if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
 
-BENCHES: dict[str, str] = {  # name -> module of recipes/bench:object
+BENCHES: dict[str, str] = {  # name -> module of this folder:object
     "convert": "convert:BENCH",
     "drift": "drift:BENCH",
     "holds": "holds:BENCH",
@@ -66,18 +61,7 @@ def load(name: str) -> Bench:
         known = ", ".join(sorted(BENCHES))
         raise UsageError(f"benchmark {name!r}", "does not exist", f"known: {known}")
     module, _, entry = BENCHES[name].partition(":")
-    return getattr(recipe_module(module), entry)
-
-
-def recipe_module(name: str) -> Any:
-    """Import a module of `recipes/bench`; raise UsageError where this installation has none."""
-    folder = shipped("recipes")
-    if not (folder / "bench" / f"{name}.py").is_file():
-        remedy = "run it in a checkout of the project"
-        raise UsageError(f"recipes/bench/{name}.py", "is not part of this installation", remedy)
-    if str(folder.parent) not in sys.path:  # spawned processes take sys.path over, and find the module too
-        sys.path.append(str(folder.parent))
-    return import_module(f"recipes.bench.{name}")
+    return getattr(import_module(f"recipes.bench.{module}"), entry)
 
 
 def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, Any]:
