@@ -9,17 +9,19 @@ installed packages may add some.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Episode
-from hma_data.errors import SourceError
+from hma_data.errors import EpisodeError, SourceError
 from hma_data.plugins import SOURCE_GROUP, installed
 from hma_data.registry import FORMATS, MORE_FORMATS, known_formats
+from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 
 # Packages that add a source take these names from here.
-from hma_data.sources.common.compose import component_values as component_values
-from hma_data.sources.common.compose import compose as compose
 from hma_data.sources.common.inspection import Inspection as Inspection
 from hma_data.sources.common.inspection import KeyInfo as KeyInfo
 from hma_data.sources.common.inspection import TopicInfo as TopicInfo
@@ -140,3 +142,53 @@ def open_source(name: str) -> Source:
             f"open() gave {type(opened).__name__}, which is not an hma_data.sources.base.Source"
         )
     return opened
+
+
+# -- vectors
+
+
+def compose(vector: Vector, pieces: Sequence[NDArray[Any]], where: str) -> NDArray[np.float32]:
+    """Return a vector over time, joined from the recorded values of its components.
+
+    Slices, signs and offsets are applied only here.
+
+    Args:
+        vector: of the embodiment.
+        pieces: for each component (T, n) or (T,) numbers as recorded.
+        where: the episode, for the error.
+
+    Returns:
+        (T, A) float32.
+
+    Raises:
+        EpisodeError: a width, a length or a dtype does not fit.
+    """
+    parts = [
+        component_values(part, piece, where) for part, piece in zip(vector.components, pieces, strict=True)
+    ]
+    lengths = {part.key: len(values) for part, values in zip(vector.components, parts, strict=True)}
+    if len(set(lengths.values())) > 1:
+        said = ", ".join(f"{key} {length}" for key, length in lengths.items())
+        raise EpisodeError(where, f"its components differ in length: {said}")
+    return np.concatenate(parts, axis=1)
+
+
+def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.float32]:
+    """Return the values (T, dims) float32 of one component; see `compose`."""
+    if piece.dtype.kind not in "fiub":
+        raise EpisodeError(where, f"{part.key} holds {piece.dtype}, not numbers")
+    if piece.ndim < 1 or not len(piece):
+        raise EpisodeError(where, f"{part.key} holds no values over time (shape {piece.shape})")
+    values: NDArray[Any] = piece.reshape(len(piece), -1)
+    width = values.shape[1]
+    if part.slice:
+        fault = f"{part.key} has {width} values, slice {list(part.slice)} needs {part.slice[1]}"
+        if part.slice[1] > width:
+            raise EpisodeError(where, fault, "correct slice in the YAML")
+        values = values[:, part.slice[0] : part.slice[1]]
+    elif width != part.dims:
+        fault = f"{part.key} has {width} values, the embodiment says {part.dims}"
+        raise EpisodeError(where, fault, "correct dims or give slice in the YAML")
+    values = values.astype(np.float64) * np.asarray(part.sign) + np.asarray(part.offset)
+    with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite, and align refuses it
+        return values.astype(np.float32)

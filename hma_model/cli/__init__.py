@@ -41,8 +41,7 @@ from hma_model.cli.options import (
 )
 from hma_model.cli.play import play
 from hma_model.cli.policy import augment, label_actions, policy_eval
-from hma_model.cli.recipe import recipe_app
-from hma_model.cli.train import MODELS
+from hma_model.cli.train import MODELS, recipe_app
 from hma_model.cli.trial import try_recording
 from hma_model.cli.view import view
 

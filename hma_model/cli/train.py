@@ -1,4 +1,4 @@
-"""Define the commands `hma train` and `hma finetune`."""
+"""Define the commands `hma train` and `hma finetune`, and those of `hma recipe`."""
 
 import os
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from hma_data.cli.options import Json, recipes
 from hma_data.cli.shards import refuse_early
-from hma_data.console import human_seconds, interruptible, print_json
+from hma_data.console import human_seconds, interruptible, print_json, print_table
 from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ Out = Annotated[Path | None, Option("--out", help="The run's folder.")]
 Force = Annotated[bool, Option("--force", help="Resume although the recipe or the shards changed.")]
 MODELS = "Models"  # the panel of `hma --help`
 STOPPED = "the run's checkpoints are kept; the same command continues from the newest"
+recipe_app = typer.Typer(no_args_is_help=True, help="List the recipes of training, and show one.")
 
 
 def mount(app: typer.Typer) -> None:
@@ -169,3 +170,46 @@ def _print(result: "TrainResult") -> None:
         print(f"{result.skipped} steps were skipped; see skipped in {result.out}/metrics.jsonl")
     if (result.out / "report.html").is_file():
         print(f"open {result.out}/report.html")
+
+
+# -- hma recipe
+
+
+@recipe_app.command("list")
+def recipe_list(json: Json = False) -> None:
+    """List the recipes that come with the toolkit.
+
+    Example: hma recipe list
+    """
+    from hma_model.training.recipe import find_recipe, load_recipe
+
+    found = []
+    for name in recipes(""):
+        comment = [line[2:] for line in find_recipe(name).read_text("utf-8").splitlines() if line[:2] == "# "]
+        about = " ".join(comment).partition(". ")[0].removesuffix(".")
+        values = load_recipe(name)
+        found.append({"recipe": name, "steps": values.steps, "batch": values.batch_size, "about": about})
+    if json:
+        print_json(found)
+    else:
+        print_table(["recipe", "steps", "windows a step", "about"], [list(one.values()) for one in found])
+
+
+@recipe_app.command("show")
+def recipe_show(
+    name: Annotated[str, Argument(help="A recipe: name or YAML file.", autocompletion=recipes)],
+    json: Json = False,
+) -> None:
+    """Show every key of a recipe with its value, as `hma train` takes it.
+
+    Example: hma recipe show discrete_tiny
+    """
+    from hma_data.storage.yaml_io import write_yaml
+    from hma_model.training.recipe import load_recipe
+
+    values = load_recipe(name).values()
+    if json:
+        print_json(values)
+    else:
+        print(write_yaml(values), end="")
+        print(f"# change a key on the command line: hma train {name} DATA… steps=10 model.layers=4")

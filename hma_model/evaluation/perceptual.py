@@ -26,9 +26,9 @@ from torch import Tensor
 from hma_data.errors import UsageError
 from hma_data.storage.files import file_sha256
 from hma_data.storage.paths import StrPath, as_text
-from hma_model.evaluation.frechet import Moments, frechet_distance
 
 Images = NDArray[np.uint8]
+Floats = NDArray[np.float64]
 Network = Callable[[Tensor], Tensor]
 I3D_SIDE = 224  # pixels of the short side of I3D's videos
 SHORT_VIDEO, STRETCHED_FRAMES = 10, 16  # frames below which a video is stretched, and those that it then has
@@ -139,6 +139,63 @@ def as_video(pictures: Tensor) -> Tensor:
     large = F.interpolate(pictures, size=size, mode="bilinear", align_corners=False)
     top, left = ((side - I3D_SIDE) // 2 for side in size)
     return (large[:, :, top : top + I3D_SIDE, left : left + I3D_SIDE] / 127.5 - 1).transpose(0, 1)
+
+
+# -- Fréchet distances of features (N, D): Heusel et al. 2017
+
+
+@dataclass
+class Moments:
+    """The count, mean (D,) and sum of outer products of deviations (D, D) of features."""
+
+    count: int = 0
+    mean: Floats | None = None
+    scatter: Floats | None = None
+
+    def add(self, features: NDArray[np.floating]) -> None:
+        """Add features (N, D), as Chan et al. (1979) merge two sets."""
+        values = features.astype(np.float64)
+        mean = values.mean(axis=0)
+        scatter = (values - mean).T @ (values - mean)
+        if self.mean is None or self.scatter is None:
+            self.count, self.mean, self.scatter = len(values), mean, scatter
+            return
+        total, apart = self.count + len(values), mean - self.mean
+        self.scatter = self.scatter + scatter + np.outer(apart, apart) * (self.count * len(values) / total)
+        self.mean = self.mean + apart * (len(values) / total)
+        self.count = total
+
+    @property
+    def covariance(self) -> Floats:
+        """Return the unbiased covariance (D, D)."""
+        assert self.scatter is not None
+        return self.scatter / (self.count - 1)
+
+    @property
+    def needed(self) -> int:
+        """Return the least number of features whose covariance can have full rank."""
+        assert self.mean is not None
+        return len(self.mean) + 1
+
+
+def frechet_distance(one: Moments, other: Moments) -> float:
+    """Return |m1 - m2|² + tr(C1 + C2 - 2 (C1 C2)^½) of two normal distributions."""
+    assert one.mean is not None and other.mean is not None
+    root = _root(one.covariance)
+    product = np.linalg.eigvalsh(root @ other.covariance @ root)
+    apart = np.square(one.mean - other.mean).sum()
+    traces = np.trace(one.covariance) + np.trace(other.covariance)
+    return max(float(apart + traces - 2 * np.sqrt(product.clip(min=0)).sum()), 0.0)
+
+
+def _root(matrix: Floats) -> Floats:
+    """Return the square root of a symmetric matrix without negative eigenvalues."""
+    values, vectors = np.linalg.eigh(matrix)
+    root: Floats = (vectors * np.sqrt(values.clip(min=0))) @ vectors.T
+    return root
+
+
+# -- the judge
 
 
 @dataclass

@@ -3,7 +3,7 @@
     python recipes/bench/holding.py            # writes hma_model/play/holding.json for the bundled model
 
 Each robot with a simulator replays the recorder's actions in the model until model and truth have parted
-(`hma_model.play.divergence`), in several scenes. The lower median over scenes is the time that it holds.
+(`hma_model.play.session`), in several scenes. The lower median over scenes is the time that it holds.
 """
 
 import argparse

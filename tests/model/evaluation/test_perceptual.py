@@ -12,8 +12,16 @@ from torch import Tensor, nn
 
 from hma_data.errors import UsageError
 from hma_data.storage.files import file_sha256
-from hma_model.evaluation.frechet import Moments, frechet_distance
-from hma_model.evaluation.perceptual import Judge, Networks, as_video, open_networks, open_script, stretched
+from hma_model.evaluation.perceptual import (
+    Judge,
+    Moments,
+    Networks,
+    as_video,
+    frechet_distance,
+    open_networks,
+    open_script,
+    stretched,
+)
 
 
 def rng(seed: int = 0) -> np.random.Generator:

@@ -16,7 +16,7 @@ from hma_data.lab.truth import episode
 from hma_data.registry.embodiment import find
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.cli import main
-from hma_model.evaluation import showcase, suite
+from hma_model.evaluation import report, suite
 from hma_model.evaluation.report import difference, write_results
 from hma_model.evaluation.simulated import PERTURBATION, perturbed
 from hma_model.evaluation.suite import Settings, evaluate_all
@@ -42,7 +42,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (suite, showcase):
+    for module in (suite, report):
         monkeypatch.setattr(module, "tokenizer_of", lambda shards, **_: Blocks())
     suite._tokenizer.cache_clear()
 
@@ -264,7 +264,7 @@ def test_recorded_pictures_are_those_of_the_windows_frames(tmp_path: Path) -> No
     convert(find("pendulum"), recording, "fsq-8", tmp_path / "shards")
     shards = ShardSet(tmp_path / "shards")
     batch = WindowDataset(shards, "train", 4).batch([7])
-    seen = showcase.recorded_frames(shards, batch, 0)
+    seen = report.recorded_frames(shards, batch, 0)
     assert batch.tokens is not None
     shown = decode(tokenizer_of(shards), batch.tokens)[0]
     errors = [[np.abs(a.astype(int) - b).mean() for b in shown] for a in seen]
@@ -288,7 +288,7 @@ def test_recorded_pictures_are_of_the_camera_that_the_window_takes(cameras: str,
     batch = windows.batch(range(len(windows)))
     assert batch.camera is not None
     for row, camera in enumerate(batch.camera.tolist()):
-        seen = showcase.recorded_frames(shards, batch, row)
+        seen = report.recorded_frames(shards, batch, row)
         assert (seen[..., 0] == 17 * (1 + 4 * camera)).all()
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hma_model.play.divergence import DivergenceDetector
+from hma_model.play.session import DivergenceDetector
 
 SECOND = 10  # frames
 
