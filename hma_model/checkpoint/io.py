@@ -179,15 +179,18 @@ def write_readme(checkpoint: StrPath | Checkpoint) -> None:
     write_atomic(checkpoint.folder / README, text)
 
 
-def record_evaluation(checkpoint: Checkpoint, embodiment: str, facts: Mapping[str, Any]) -> None:
-    """Write what `hma evaluate` found into an embodiment's card, and the model card anew.
+def record_evaluation(
+    checkpoint: Checkpoint, embodiment: str, facts: Mapping[str, Any], part: str = "evaluation"
+) -> None:
+    """Write what a measurement found into an embodiment's card, and the model card anew.
 
     Args:
         facts: `verdict`, a sentence about the embodiment, and the figures behind it.
+        part: of the card; one of `model_card.JUDGED`.
     """
     card = checkpoint.card(embodiment)
-    if card.get("evaluation") != facts:
-        write_atomic(checkpoint.path(embodiment, CARD), to_json(card | {"evaluation": dict(facts)}))
+    if card.get(part) != facts:
+        write_atomic(checkpoint.path(embodiment, CARD), to_json(card | {part: dict(facts)}))
         write_readme(checkpoint)
 
 

@@ -16,6 +16,8 @@ from hma_data.tokenizers.catalog import other_weights
 from hma_model.config import token_words
 
 _TAGS = ("robotics", "world-model", "video-prediction", "hma")
+# Parts of a card that judge the weights: by `hma evaluate`, and by `hma bench holds`.
+JUDGED = ("evaluation", "holds")
 _DATASET = re.compile(rf"hf://datasets/({REPOSITORY.pattern})")
 
 # The identifiers that the hub accepts in a card's front matter; it refuses any other.
@@ -62,9 +64,10 @@ def render(
         front=write_yaml(front),
         title=line((repo or "HMA world model").rsplit("/", 1)[-1]),
         verdicts=[
-            (name, line(evaluation.get("verdict"), 400))
+            (name, line(judged.get("verdict"), 400))
             for name, card in sorted(cards.items())
-            if isinstance(evaluation := card.get("evaluation"), Mapping) and evaluation.get("verdict")
+            for part in JUDGED
+            if isinstance(judged := card.get(part), Mapping) and judged.get("verdict")
         ],
         model=_lines(model),
         levels="-".join(map(line, model.get("levels", ()))) if model.get("trunk") == "unet" else "",

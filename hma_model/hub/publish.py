@@ -32,7 +32,7 @@ from hma_model.checkpoint.folder import (
     inside,
     parse_config,
 )  # fmt: skip
-from hma_model.checkpoint.model_card import render
+from hma_model.checkpoint.model_card import JUDGED, render
 from hma_model.hub.stores import FolderStore, Store, embodiment_ids, open_published, open_store
 
 if TYPE_CHECKING:
@@ -104,10 +104,11 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
             stats[name] = source.stats(name)
             card = source.card(name)
             cards[name] = {key: card.get(key, {}) for key in ("data", "metrics", "training")}
-            if base and "evaluation" in card:  # it stays if it judged these weights
+            judged = {part: card[part] for part in JUDGED if part in card}
+            if base and judged:  # they stay if they judged these weights
                 stem, head = weights.embodiment(base, name, space)
                 if _is_same(model.stem_state(name), stem) and _is_same(model.head_state(name), head):
-                    cards[name]["evaluation"] = card["evaluation"]
+                    cards[name] |= judged
             continue
         try:
             yaml[name] = find(name).to_yaml()

@@ -44,6 +44,7 @@ NEAR = 60.0  # distance of RGB within which a pixel has an object's colour
 MOVED = 8.0  # px of 128 from which an object has moved
 FEWEST = 12  # pixels of an object below which it is hidden, and not judged
 TURNS = 36  # angles of the search for the best overlap
+CARD_MARKS = (20, 100)  # frames at which a model card says what is left
 SHEET = (0, 1, 3, 6, 10, 20, 40, 60, 100, 200, 300)  # frames of a sheet; 0 is the prompt's last
 
 
@@ -74,7 +75,10 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     if settings["sheet"]:
         draw(found, Path(settings["sheet"]))
     marks = sorted({mark for mark in (*MARKS, settings["frames"]) if mark <= settings["frames"]})
-    return [_row(one, mark) for one in found for mark in marks]
+    rows = [_row(one, mark) for one in found for mark in marks]
+    if settings["record"]:
+        record(settings["checkpoint"], rows, settings["rollouts"])
+    return rows
 
 
 def measure(model: "HMA", tokenizer: "Tokenizer", robot: str, settings: dict[str, Any]) -> Found:
@@ -95,6 +99,38 @@ def measure(model: "HMA", tokenizer: "Tokenizer", robot: str, settings: dict[str
     parts = np.stack([one.parts for one in episodes])[:, prompt - 1 :]
     images = np.concatenate([begin, made], axis=1)
     return Found(robot, seen[:, prompt - 1 :], images, parts, episodes[0].driven)
+
+
+def record(checkpoint: str, rows: list[dict[str, Any]], rollouts: int) -> None:
+    """Write the figures into the cards of a checkpoint's folder, with a sentence for its model card."""
+    from hma_model.checkpoint.folder import Checkpoint
+    from hma_model.checkpoint.io import record_evaluation
+
+    folder = Checkpoint.open(checkpoint)
+    for robot in dict.fromkeys(row["robot"] for row in rows):
+        marks = {
+            str(row["frame"]): {key: value for key, value in row.items() if key not in ("robot", "frame")}
+            for row in rows
+            if row["robot"] == robot and row["frame"] in CARD_MARKS
+        }
+        if marks:
+            facts = {"verdict": sentence(marks), "rollouts": rollouts, "frames": marks}
+            record_evaluation(folder, robot, facts, "holds")
+
+
+def sentence(marks: dict[str, dict[str, Any]]) -> str:
+    """Return what is left of a robot and of loose objects at each mark, in words."""
+    said = []
+    for mark, row in marks.items():
+        parts = []
+        if row["limbs"] is not None:
+            parts.append(f"{row['limbs']:.0%} of the robot's pixels")
+        if row["left"] is not None:
+            parts.append(f"{row['left']:.0%} of the pixels of loose objects")
+        if row["shape"] is not None:
+            parts.append(f"their shapes overlap the true ones by {row['shape']:.0%}")
+        said.append(f"after {mark} frames {', '.join(parts) or 'nothing was large enough to judge'}")
+    return f"in closed loop keeps {'; '.join(said)}"
 
 
 # -- figures
@@ -211,6 +247,7 @@ BENCH = Bench(
         "device": "auto",
         "seed": 4949,
         "sheet": "",  # a PNG to write
+        "record": False,  # write the figures into the cards of the checkpoint's folder
     },
     run,
     choices={"driver": ("own", "wander")},

@@ -8,6 +8,9 @@ steps on one thread, so that the same code on the same machine gives the same fi
     gain_db     PSNR of the last frame, true less shuffled commands: above 0 the model follows
     error_px    distance of the robot's parts at the last frame from where the simulator has them
 
+The case `holds` trains nothing: it drives the bundled model and measures what is left of the robot and of
+objects after 20 frames (`hma bench holds`), so that a bundled model that melts them is seen.
+
 The bands (quality.json) are recorded with several seeds by `record=true`. A figure is inside its band if one
 more run of unchanged code would be there in 95 % of cases (Student's t, from the spread over the seeds); with
 `seeds=3` the mean of three runs is compared, and the bands are narrower. The data are recorded into the cache
@@ -20,8 +23,9 @@ import math
 import statistics
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +41,11 @@ BANDS = Path(__file__).with_suffix(".json")
 EPISODES, SEED, VAL_FRACTION = 60, 0, 0.1  # of the recording
 MOST_SEEDS = 10
 FRAMES, PROMPT, WINDOWS, DRAWS = 8, 2, 24, 3  # of the rollouts
-FIGURES = {"loss": -1, "psnr_db": 1, "gain_db": 1, "error_px": -1}  # name -> the sign of what is better
+FIGURES = {  # name -> the sign of what is better
+    "loss": -1, "psnr_db": 1, "gain_db": 1, "error_px": -1, "limbs": 1, "left": 1, "shape": 1, "off": -1,
+}  # fmt: skip
+HOLDS = "holds"  # the case of the bundled model
+HOLDS_ROBOT, HOLDS_FRAMES, HOLDS_ROLLOUTS = "pusht_fast", 20, 12
 PLAIN = ["eval_every=0", "checkpoint_every=0", "pictures=0", "report=false", "device=cpu", "frames=8"]
 
 
@@ -73,8 +81,8 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """
     names = [name.strip() for name in settings["cases"].split(",")]
     for name in names:
-        if name not in CASES:
-            raise UsageError("bench quality", f"{name!r} is no case", f"cases: {', '.join(CASES)}")
+        if name not in (*CASES, HOLDS):
+            raise UsageError("bench quality", f"{name!r} is no case", f"cases: {', '.join((*CASES, HOLDS))}")
     if not 1 <= settings["seeds"] <= MOST_SEEDS:
         raise UsageError("bench quality", f"seeds={settings['seeds']} is not allowed", "give 1 to 10")
     path = Path(settings["bands"] or BANDS)
@@ -87,13 +95,17 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
             _check(name, kept, settings, path)
     rows: list[dict[str, Any]] = []
     for name in names:
-        budget = _budget(CASES[name], settings)
-        data = Path(settings["data"]) if settings["data"] else _cached(CASES[name])
-        facts = {"budget": budget, "data": digest_of(data), "torch": torch_version()}
-        if settings["record"]:
-            found = _record(name, data, facts, settings["seeds"], kept, path)
+        budget = _budget(name, settings)
+        if name == HOLDS:
+            data, work = bundled_digest(), measure_holds
         else:
-            found = [measure(name, data, budget, seed) for seed in range(settings["seeds"])]
+            folder = Path(settings["data"]) if settings["data"] else _cached(CASES[name])
+            data, work = digest_of(folder), partial(measure, name, folder, budget)
+        facts = {"budget": budget, "data": data, "torch": torch_version()}
+        if settings["record"]:
+            found = _record(name, work, facts, settings["seeds"], kept, path)
+        else:
+            found = [work(seed) for seed in range(settings["seeds"])]
         rows += judged(name, kept[name], found, facts)
     return rows
 
@@ -104,9 +116,11 @@ def fault(rows: Sequence[dict[str, Any]]) -> str:
     return f"outside the bands: {'; '.join(outside)}" if outside else ""
 
 
-def _budget(case: Case, settings: dict[str, Any]) -> dict[str, Any]:
+def _budget(name: str, settings: dict[str, Any]) -> dict[str, Any]:
+    if name == HOLDS:
+        return {"frames": HOLDS_FRAMES, "rollouts": HOLDS_ROLLOUTS}
     return {
-        "steps": settings["steps"] or case.steps,
+        "steps": settings["steps"] or CASES[name].steps,
         "windows": settings["windows"],
         "episodes": settings["episodes"],
     }
@@ -116,7 +130,7 @@ def _check(name: str, kept: dict[str, Any], settings: dict[str, Any], path: Path
     remedy = "record them: record=true seeds=3 bands=FILE"
     if len(kept.get(name, {}).get("seeds", [])) < 2:
         raise UsageError(path, f"has no bands of {name!r}", remedy)
-    budget = _budget(CASES[name], settings)
+    budget = _budget(name, settings)
     theirs = kept[name]["budget"]
     other = [f"{key}={theirs[key]}" for key in budget if theirs[key] != budget[key]]
     if other:
@@ -193,6 +207,23 @@ def measure(name: str, data: Path, budget: dict[str, Any], seed: int) -> dict[st
     return {key: round(value, 4) for key, value in figures.items()}
 
 
+def bundled_digest() -> str:
+    """Return sixteen hex digits that stand for the bundled trunk."""
+    from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+
+    return Checkpoint.open(EMBEDDED).trunk_sha256[:16]
+
+
+def measure_holds(seed: int) -> dict[str, float]:
+    """Return what the bundled model keeps of a pushed T and of its pusher."""
+    from recipes.bench import holds
+
+    _tell(f"{HOLDS}, seed {seed}: {HOLDS_ROBOT}, {HOLDS_FRAMES} frames")
+    own = {"robots": HOLDS_ROBOT, "frames": HOLDS_FRAMES, "rollouts": HOLDS_ROLLOUTS, "seed": seed}
+    last = holds.run(holds.BENCH.defaults | own)[-1]
+    return {key: last[key] for key in ("limbs", "left", "shape", "off")}
+
+
 def recipe_of(case: Case, data: Path, steps: int, seed: int) -> Any:
     """Return the recipe of a training of a case."""
     from hma_model.training.recipe import load_recipe
@@ -205,7 +236,12 @@ def recipe_of(case: Case, data: Path, steps: int, seed: int) -> Any:
 
 
 def _record(
-    name: str, data: Path, facts: dict[str, Any], seeds: int, kept: dict[str, Any], path: Path
+    name: str,
+    work: Callable[[int], dict[str, float]],
+    facts: dict[str, Any],
+    seeds: int,
+    kept: dict[str, Any],
+    path: Path,
 ) -> list[dict[str, float]]:
     """Measure the seeds of a case and write its bands; a recording that was stopped continues."""
     before = kept.get(name, {})
@@ -213,7 +249,7 @@ def _record(
         before = {**facts, "seeds": []}
     kept[name] = before
     for seed in range(len(before["seeds"]), seeds):
-        before["seeds"].append(measure(name, data, facts["budget"], seed))
+        before["seeds"].append(work(seed))
         write_atomic(path, to_json(kept))
     return list(before["seeds"])
 
@@ -268,7 +304,7 @@ def _tell(line: str) -> None:
 BENCH = Bench(
     "what a small model learns in a fixed number of steps, compared with recorded bands",
     {
-        "cases": "discrete",  # of discrete, continuous, finetuned
+        "cases": "discrete",  # of discrete, continuous, finetuned, holds
         "steps": 0,  # of the training; 0: the case's own
         "seeds": 1,
         "windows": WINDOWS,  # held out, that are rolled out

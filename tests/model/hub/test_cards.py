@@ -19,6 +19,7 @@ from hma_model.hub import publish as hub
 from hma_model.hub.datasets import push_data
 from hma_model.hub.listing import list_embodiments
 from hma_model.network.model import HMA
+from recipes.bench import holds
 from tests.model.robots import edit_card, make_model, save
 from tests.model.shards import make_shards
 
@@ -75,6 +76,23 @@ def test_a_card_opens_with_the_verdict_of_the_evaluation(folder: Path, tmp_path:
         assert text[0].startswith("# ") and text[2].startswith("> **arm** does not follow its actions yet")
     (row, other) = list_embodiments(tmp_path / "hub")
     assert (row["verdict"], other["verdict"]) == (NOT_YET, None)
+
+
+def test_a_card_says_what_is_left_of_objects_and_evaluating_again_keeps_it(folder: Path) -> None:
+    rows = [
+        {"robot": "arm", "frame": 20, "limbs": 0.97, "left": 0.18, "shape": 0.15, "off": 1.2, "moved": 9},
+        {"robot": "arm", "frame": 60, "limbs": 0.9, "left": 0.1, "shape": 0.1, "off": 1.9, "moved": 9},
+    ]
+    holds.record(str(folder), rows, rollouts=12)
+    record_evaluation(Checkpoint.open(folder), "arm", {"verdict": NOT_YET, "follows": False})
+    text = ModelCard.load(folder / "README.md").text
+    assert "> **arm** does not follow its actions yet" in text
+    assert (
+        "> **arm** in closed loop keeps after 20 frames 97% of the robot's pixels, 18% of the pixels of loose"
+        " objects, their shapes overlap the true ones by 15%." in text
+    )
+    kept = Checkpoint.open(folder).card("arm")["holds"]
+    assert (kept["rollouts"], list(kept["frames"]), kept["frames"]["20"]["off"]) == (12, ["20"], 1.2)
 
 
 @pytest.mark.parametrize("trained", [False, True])
