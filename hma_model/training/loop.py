@@ -155,7 +155,7 @@ def _loop(
         asked = run.ranks.sum(torch.tensor([float(stop.is_set())]))  # all ranks stop after the same step
         stopped = bool(asked[0])
         last = run.done >= 1
-        if run.held_out and (last or _due(run.step, recipe.eval_every)):
+        if run.held_out.sets and (last or _due(run.step, recipe.eval_every)):
             if last:
                 log.note("the steps are done; the held-out loss is measured")
             log.evaluation({**run.evaluate(), "mixture": run.train_data.realised()})

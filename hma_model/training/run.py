@@ -6,7 +6,6 @@ writes files.
 
 import math
 import time
-from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -17,19 +16,19 @@ import torch
 from torch import Tensor
 
 from hma_data.errors import CheckpointError, RecipeError, TrainingError, UsageError
-from hma_data.loading.dataset import Batch, WindowDataset, open_sets
+from hma_data.loading.dataset import Batch, open_sets
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import remove_partial, to_json, write_atomic
 from hma_data.storage.paths import addressed, is_repository
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import Checkpoint, action_stats, training_checkpoints
 from hma_model.config import OBJECTIVES, ActionSpace, HMAConfig
-from hma_model.evaluation import losses as held_out
-from hma_model.evaluation.metrics import perplexity
-from hma_model.evaluation.rollout_video import newest_sheets, write_sheets
+from hma_model.evaluation.losses import digit_frequencies
+from hma_model.evaluation.rollout_video import newest_sheets
 from hma_model.network.model import HMA
 from hma_model.training import guards, new_stem, optim
 from hma_model.training.data import TrainData
+from hma_model.training.held_out import HeldOut
 from hma_model.training.memory import require_memory
 from hma_model.training.parallel import ParallelModel, Ranks, gathered, require_shardable
 from hma_model.training.recipe import Recipe
@@ -84,19 +83,13 @@ class Run:
             require_memory(self._network(), recipe, device, self.ranks.size)
         torch.manual_seed(seed_for(recipe.seed, "init"))
         self.model = self._fresh_model()
-        splits = (
-            (name, s, WindowDataset(s, "val", recipe.frames, cameras=recipe.cameras))
-            for name, s in self.sets.items()
-        )
-        self.held_out = {name: shards for name, shards, dataset in splits if len(dataset)}
+        self.held_out = HeldOut(recipe, self.sets, self.objective)
         self.step, self.skipped, self.seconds = 0, 0, 0.0  # finished steps, and the time they took
         self.cpu_seconds = 0.0  # of the steps, the mean over the ranks
         self.evaluation: dict[str, Any] = {}  # the figures of the last one
         self.likes: dict[str, str] = {}  # new robot -> the robot with whose stem it began
         self.notes: list[str] = []  # texts for the user that nobody has shown yet
-        self._baseline: held_out.Means | None = None
         self._twin: HMA | None = None
-        self._sheet_seconds = [0.0]  # of each evaluation's pictures
 
     def _config(self) -> HMAConfig:
         if self.start:
@@ -134,7 +127,7 @@ class Run:
     def note_settings(self) -> None:
         """Note what the user may not expect of the recipe and the data."""
         recipe = self.recipe
-        if missing := sorted(set(self.sets) - set(self.held_out)):
+        if missing := self.held_out.missing:
             self.notes.append(f"no validation windows of {recipe.frames} frames: {', '.join(missing)}")
         if recipe.warmup > recipe.steps:
             steps = f"warmup takes {recipe.warmup} of {recipe.steps} steps"
@@ -155,7 +148,7 @@ class Run:
             return
         drawn = zip(self.train_data.mixture.p, self.sets.values())
         given: Any = {"cameras": self.recipe.cameras, "factored": self.model.config.factored}
-        shares = [[p * d for d in held_out.digit_frequencies(s, **given)] for p, s in drawn]
+        shares = [[p * d for d in digit_frequencies(s, **given)] for p, s in drawn]
         digits = [sum(digit) for digit in zip(*shares)]
         bias = np.log(np.concatenate(digits * self.model.config.merge**2))
         own = self.model.token_readout.linear.bias
@@ -288,63 +281,20 @@ class Run:
         return self._twin or self.model
 
     def evaluate(self) -> dict[str, Any]:
-        """Compute the held-out loss of the main objective, and return the line of metrics.jsonl.
-
-        For forward and full it is nats a token of each fully masked frame, given the true past and actions,
-        with the loss of the training tokens' frequencies as a baseline. For passive, policy and inverse it is
-        the training loss on held-out windows, under masks that are the same at every evaluation.
-        """
+        """Measure on held-out windows, see `HeldOut`, and return the line of metrics.jsonl."""
         model = self.saved_model()
         self.evaluation = self.ranks.once(lambda: self._evaluated(model))
         return self.evaluation
 
     def _evaluated(self, model: HMA) -> dict[str, Any]:
-        recipe, begun = self.recipe, time.monotonic()
-        video = self.objective.predicts_video and self.objective.sees_actions
+        begun = time.monotonic()
+        spare = self.recipe.pictures_share * self.seconds if self.done < 1 else math.inf
         with self._autocast(), torch.compiler.set_stance("force_eager"):
-            drawn = "forward" if video else self.objective.name
-            batches = self._held_out_batches()
-            losses, accuracy = held_out.validation_losses(model, batches, recipe.seed, drawn)
-            facts: dict[str, Any] = {
-                "step": self.step,
-                "objective": self.objective.name,
-                "loss": losses.mean(),
-                "loss_by_embodiment": losses.by_embodiment(),
-                "windows": sum(losses.counts.values()),
-            }
-            if video and model.config.kind == "discrete":
-                if self._baseline is None:
-                    batches = self._held_out_batches()
-                    self._baseline = held_out.unconditional_baseline(
-                        self.sets, batches, recipe.cameras, model.config.factored, model.config.merge
-                    )
-                facts["perplexity"] = perplexity(facts["loss"])
-                facts["accuracy"] = accuracy.mean()
-                facts["accuracy_by_embodiment"] = accuracy.by_embodiment()
-                facts["baseline"] = self._baseline.mean()
-                facts["baseline_by_embodiment"] = self._baseline.by_embodiment()
+            facts = {"step": self.step, **self.held_out.measure(model)}
             facts["seconds"] = round(time.monotonic() - begun, 3)
-            self._write_sheets(model)
+            if fault := self.held_out.draw(model, self.out, self.step, spare):
+                self.notes.append(fault)
         return facts
-
-    def _held_out_batches(self) -> Iterator[Batch]:
-        recipe = self.recipe
-        for shards in self.held_out.values():
-            yield from held_out.windows(
-                shards, "val", recipe.frames, recipe.eval_windows, recipe.batch_size, recipe.cameras
-            )
-
-    def _write_sheets(self, model: HMA) -> None:
-        """Write pictures of rollouts: after the last step always, after others if the time allows."""
-        recipe, begun = self.recipe, time.monotonic()
-        spare = recipe.pictures_share * self.seconds - sum(self._sheet_seconds) - self._sheet_seconds[-1]
-        if not (recipe.pictures and model.config.predicts_video) or (self.done < 1 and spare <= 0):
-            return
-        facts = {"frames": recipe.frames, "count": recipe.pictures, "seed": recipe.seed}
-        fault = write_sheets(model, self.held_out, self.out, self.step, cameras=recipe.cameras, **facts)
-        if fault and len(self._sheet_seconds) == 1:  # noted once
-            self.notes.append(fault)
-        self._sheet_seconds.append(time.monotonic() - begun)
 
     def save(self) -> Path:
         """Write checkpoints/step-N, and delete all but the last few; every rank must call it."""
