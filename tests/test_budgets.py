@@ -14,9 +14,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (700, 4_100, 7),
-    "hma_data/cli": (1_480, 10_500, 8),
-    "hma_data/conversion": (3_290, 23_900, 12),
-    "hma_data/episodes": (1_550, 13_500, 8),
+    "hma_data/cli": (1_540, 10_900, 8),
+    "hma_data/conversion": (4_020, 29_900, 14),
+    "hma_data/episodes": (1_640, 14_200, 9),
     "hma_data/hub": (520, 3_800, 3),
     "hma_data/inspection": (2_170, 20_400, 9),
     "hma_data/lab": (3_380, 31_100, 16),
@@ -42,7 +42,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_440, 28_500, 18),
     "hma_model/worlds": (1_530, 11_500, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 60_200, 475_000
+PRODUCT_LINES, PRODUCT_NODES = 61_200, 482_000
 TEST_LINES = 44_700
 DOC_WORDS = 38_000
 

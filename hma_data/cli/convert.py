@@ -44,7 +44,11 @@ def convert(
         str | None, Argument(help="Recording: file, folder or URI; default: source.uri of the YAML.")
     ] = None,
     embodiment: Annotated[str, robot_option("The robot: an id of the registry, or a YAML file.")],
-    out: Annotated[Path, Option(help="Folder of the shard set.")],
+    out: Annotated[Path, Option(help="Folder of the shard set, or of the LeRobotDataset.")],
+    to: Annotated[
+        Literal["shards", "lerobot"],
+        Option("--to", help="What to make."),
+    ] = "shards",
     source: Annotated[str | None, Option(help="The same as DATA.")] = None,
     tokenizer: Annotated[
         str, Option(help="Name of the tokenizer; see hma tokenizer list.", autocompletion=tokenizers)
@@ -65,6 +69,10 @@ def convert(
     frames: Annotated[
         Literal["all", "strided"], _data(help="Keep all rows, or only those of the model's grid.")
     ] = "all",
+    drop_idle: Annotated[
+        bool,
+        _data("--drop-idle", help="With --to lerobot, leave out frames in which nothing moves."),
+    ] = False,
     frequency_hz: Annotated[
         float | None, _data(help="Rate of the recording, where the YAML does not know it.")
     ] = None,
@@ -74,13 +82,16 @@ def convert(
             "--cameras",
             "--camera",
             metavar="all|NAME[,NAME…]",
-            help="Cameras to store; default: the YAML's first.",
+            help="Cameras to store; default: the YAML's first, with --to lerobot all.",
         ),
     ] = None,
     shard_frames: Annotated[int | None, _rare(min=1, help="Frames in a shard, about.")] = None,
     val_fraction: Annotated[
         float | None,
-        _data(help="Share of episodes for validation; default: 5 %, of small sets 5 episodes or a quarter."),
+        _data(
+            help="Share of episodes for validation; default: 5 %, of small sets 5 episodes or a quarter, "
+            "with --to lerobot none."
+        ),
     ] = None,
     seed: Annotated[int, _data(help="Seed of the split.")] = 0,
     max_quarantine: Annotated[
@@ -104,7 +115,7 @@ def convert(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Convert recordings to tokenized shards; run it again to continue.
+    """Convert recordings to tokenized shards or a LeRobotDataset; run it again to continue.
 
     Example: hma convert ./demo.hdf5 -e my_arm.yaml --out shards/my_arm
     """
@@ -125,6 +136,7 @@ def convert(
         shard_frames=shard_frames,
         only=tuple(only or ()),
         exclude=tuple(exclude or ()),
+        drop_idle=drop_idle,
     )
     share = None
     if shard_index is not None and shard_count is not None:
@@ -156,9 +168,13 @@ def convert(
         extend=extend,
         worker_cpus=worker_cpus,
         worker_gpus=worker_gpus,
+        to=to,
     )
     if dry_run:
-        _print_plan(conversion, share, json)
+        if to == "lerobot":
+            _print_dataset_plan(conversion, json)
+        else:
+            _print_plan(conversion, share, json)
         return
     with interruptible(lambda: _kept(conversion)), _shown(robot.id) as on_progress:
         summary = conversion.run_share(share, on_progress) if share else conversion.run(on_progress)
@@ -168,7 +184,9 @@ def convert(
     from hma_data.inspection.kept import kept_findings
     from hma_data.shards.reader import ShardSet
 
-    lasting = list(kept_findings(ShardSet(summary.out), weights, device)) if summary.made_shards else []
+    lasting: list[Finding] = []
+    if summary.made_shards and to == "shards":
+        lasting = list(kept_findings(ShardSet(summary.out), weights, device))
     _report(summary, lasting, max_quarantine, json)
     raise typer.Exit(1 if summary.too_many else 0)
 
@@ -189,6 +207,8 @@ def _kept(conversion: "Conversion") -> str:
     """Return what a Ctrl-C leaves, and how to go on."""
     from hma_data.storage.remote import is_remote, place
 
+    if conversion.to == "lerobot":
+        return f"finished parts of {conversion.out} kept beside it; run the same command again to continue"
     out = place(conversion.out)
     again = "run the same command again"
     if conversion.overwrite:
@@ -277,6 +297,28 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
         print(idle)
 
 
+def _print_dataset_plan(conversion: "Conversion", json: bool) -> None:
+    """Print what a LeRobotDataset would hold; its size depends on its videos, and is not estimated."""
+    from hma_data.conversion.job import plan_conversion
+    from hma_data.conversion.lerobot import AS_RECORDED
+
+    robot = conversion.embodiment
+    plan, uri = plan_conversion(robot, conversion.source, AS_RECORDED, conversion.settings, "lerobot")
+    facts = plan.facts["dataset"]
+    if json:
+        totals = {"episodes": plan.episodes, "left_out": plan.left_out, "frames": plan.frames}
+        print_json({"source": uri, "out": str(conversion.out), **totals, **facts, "parts": len(plan.units)})
+        return
+    stride = plan.facts["frame_stride"]
+    kept = f" (1 of {stride} is kept)" if stride > 1 else ""
+    print(
+        f"{uri}: {human_count(plan.episodes, 'episode')}, about {plan.frames:,} recorded frames{kept} into a "
+        f"LeRobotDataset v3.0 of {facts['fps']} fps, made in {human_count(len(plan.units), 'part')}"
+    )
+    _print_sizes(facts["sizes"])
+    _print_left_out(plan.left_out)
+
+
 # -- the result
 
 
@@ -299,7 +341,6 @@ def _report_share(done: "UnfinishedShare", share: "Share | None", json: bool) ->
 
 
 def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float, json: bool) -> None:
-    from hma_data.cli.shards import totals_line
     from hma_data.shards.schema import flag_words
 
     manifest = summary.manifest
@@ -309,6 +350,7 @@ def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float,
             {
                 "out": str(summary.out),
                 **totals,
+                "bytes": summary.bytes,
                 "splits": manifest.splits,
                 "shards_made": summary.made_shards,
                 "shards_kept": summary.kept_shards,
@@ -328,12 +370,10 @@ def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float,
             }
         )
     else:
-        kept = f" ({summary.kept_shards} were there already)" if summary.kept_shards else ""
-        print(f"{totals_line(summary.out, manifest)}{kept}, {human_seconds(summary.seconds)}")
-        robot, size = manifest.embodiment, manifest.tokenizer.image_size
-        _print_cameras(manifest.cameras_line, summary.frame_sizes, robot, size)
+        _print_made(summary)
         _print_left_out(summary.left_out)
-        print(summary.held_out)
+        if summary.held_out:
+            print(summary.held_out)
         if summary.flags:
             counts = [f"{count:,} {flag_words(name)}" for name, count in summary.flags.items()]
             print(f"flags: {', '.join(counts)}")
@@ -355,6 +395,31 @@ def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float,
             "— see quarantine.jsonl; --exclude leaves them out",
             err=True,
         )
+
+
+def _print_made(summary: "Summary") -> None:
+    """Print what was made, and of which cameras."""
+    from hma_data.cli.shards import totals_line
+
+    manifest = summary.manifest
+    if manifest.plan.get("to") == "lerobot":
+        totals, facts = manifest.to_json()["totals"], manifest.plan["dataset"]
+        print(
+            f"{summary.out}: LeRobotDataset v3.0, {human_count(totals['episodes'], 'episode')}, "
+            f"{totals['frames']:,} frames at {facts['fps']} fps, {human_bytes(summary.bytes)}, "
+            f"{human_seconds(summary.seconds)}"
+        )
+        _print_sizes(facts["sizes"])
+        return
+    kept = f" ({summary.kept_shards} were there already)" if summary.kept_shards else ""
+    print(f"{totals_line(summary.out, manifest)}{kept}, {human_seconds(summary.seconds)}")
+    robot, size = manifest.embodiment, manifest.tokenizer.image_size
+    _print_cameras(manifest.cameras_line, summary.frame_sizes, robot, size)
+
+
+def _print_sizes(sizes: dict[str, list[int]]) -> None:
+    named = [f"{name} {width}×{height}" for name, (height, width) in sizes.items()]
+    print(f"cameras: {', '.join(named)}")
 
 
 def _print_cameras(line: str, sizes: dict[str, tuple[int, int]], robot: Any, size: int) -> None:

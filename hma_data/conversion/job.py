@@ -19,19 +19,11 @@ from hma_data.conversion.engines import LIMITS, Limits
 from hma_data.conversion.engines.local import end_worker_that_starts_workers
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.extend import content_of, extended
-from hma_data.conversion.output import (
-    Journal,
-    Made,
-    Share,
-    base_manifest,
-    clear,
-    finished_shards,
-    known_hashes,
-    refuse_other,
-    remove_notes,
-)
+from hma_data.conversion.lerobot import AS_RECORDED, LeRobotHolder, as_dataset, with_dataset
+from hma_data.conversion.output import Holder, Made, ShardHolder, Share, known_hashes, refuse_other
 from hma_data.conversion.plan import Plan, Settings, ShardUnit, idle_workers, make_plan
 from hma_data.conversion.publish import HubOutput
+from hma_data.conversion.reading import Job
 from hma_data.conversion.report import (
     Counter,
     Progress,
@@ -41,33 +33,38 @@ from hma_data.conversion.report import (
     rate_warning,
     refusal_reasons,
     training_notes,
-    yaml_change,
 )
-from hma_data.conversion.worker import Job, MakeWork
+from hma_data.conversion.worker import MakeWork
 from hma_data.episodes.align import OFF_RATE
 from hma_data.errors import OutputError, RegistryError, SourceError, StorageAwayError, UsageError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, derive, shard_sizes
-from hma_data.shards.schema import RowLayout, flag_totals, to_numpy
+from hma_data.shards.manifest import Manifest, shard_sizes
+from hma_data.shards.schema import RowLayout, to_numpy
 from hma_data.sources.base import EpisodeRef, open_source
 from hma_data.sources.common.choice import chosen_ids, ids_for_robot
 from hma_data.sources.detect import of_another_format, require_utf8
 from hma_data.sources.lerobot.writer import origin_of
-from hma_data.storage.files import remove_parts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.records import Records
-from hma_data.storage.remote import parquet_file, place
+from hma_data.storage.remote import place
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.shapes import get_spec
 
 OnProgress = Callable[[Progress], None]
+Target = Literal["shards", "lerobot"]
 
 
 def plan_conversion(
-    embodiment: Embodiment, source: StrPath | None, tokenizer: TokenizerSpec, settings: Settings
+    embodiment: Embodiment,
+    source: StrPath | None,
+    tokenizer: TokenizerSpec,
+    settings: Settings,
+    to: Target = "shards",
 ) -> tuple[Plan, str]:
     """Return the plan of a conversion and the URI it reads; see `Conversion`."""
+    if to == "lerobot":
+        settings = as_dataset(settings)
     uri = embodiment.source.uri if source is None else as_text(source)
     if source is not None and not (uri or "").strip():
         raise UsageError("--source", "is empty", "name a recording, or leave it out to take the YAML's")
@@ -92,6 +89,8 @@ def plan_conversion(
     plan = make_plan(chosen, embodiment, tokenizer, settings, uri)
     if form == "lerobot":
         plan = plan.with_origin(origin_of(place(uri)))
+    if to == "lerobot":
+        plan = with_dataset(plan, uri, embodiment)
     own_split = any(chosen.column("split").unique().to_pylist())
     return replace(plan, left_out=len(refs) - len(chosen), own_split=own_split), uri
 
@@ -130,6 +129,7 @@ class Conversion:
         max_quarantine: fraction of episodes that may be refused.
         overwrite: delete what `out` holds, if it is a shard set.
         extend: add the episodes that a finished set in `out` does not have yet.
+        to: what is made: a shard set, or a LeRobotDataset, for which there is no tokenizer.
         worker_cpus, worker_gpus: what a worker reserves with engine="ray"; fractions let several share a CPU
             or a GPU. None: one GPU where the tokenizer runs on one.
     """
@@ -149,6 +149,16 @@ class Conversion:
     extend: bool = False
     worker_cpus: float = 1.0
     worker_gpus: float | None = None
+    to: Target = "shards"
+
+    def __post_init__(self) -> None:
+        if self.to == "lerobot" and self.extend:
+            raise UsageError(
+                "--extend", "adds to shard sets; a LeRobotDataset is made anew", "give another --out"
+            )
+        if self.to == "shards" and self.settings.drop_idle:
+            fault = "is for --to lerobot: frames left out of shards would be pauses, which no window crosses"
+            raise UsageError("--drop-idle", fault)
 
     def run(self, on_progress: OnProgress = lambda progress: None) -> Summary:
         """Make the shard set; running it again continues.
@@ -165,7 +175,7 @@ class Conversion:
         run = _Run(self)
         with locked(run.folder):
             if self.overwrite:
-                clear(run.folder)
+                run.holder.clear()
             plan, base = run.plan()
             if run.hub and run.hub.prepare() and not self.overwrite:
                 refuse_other(run.out, plan)
@@ -179,6 +189,8 @@ class Conversion:
 
         The bytes are those that `run` alone would write. The share that ends last finishes the set.
         """
+        if self.to == "lerobot":
+            raise UsageError("--shard-index", "is for shards", "convert with more --workers instead")
         run = _Run(self)
         with locked(run.out, share.name):
             plan, base = run.plan()
@@ -189,7 +201,7 @@ class Conversion:
                 suppress(OutputError),
                 locked(run.out),
             ):  # others are still writing: the last of them finishes
-                missing = len(plan.units) - len(finished_shards(run.out, plan, base, shared=False))
+                missing = len(plan.units) - len(run.holder.finished(plan, base, False))
                 if not missing:
                     # A journal shows that some share has made shards since the manifest was written.
                     return run.finish(plan, base, bool(run.made or known_hashes(run.out)))
@@ -202,24 +214,35 @@ class _Run:
     def __init__(self, given: Conversion) -> None:
         end_worker_that_starts_workers(given.workers)
         self.given, self.begun, self.out = given, time.monotonic(), place(given.out)
-        self.hub = HubOutput.of(self.out)
-        self.folder = self.hub.staging if self.hub else self.out
+        self.hub = HubOutput.of(self.out) if given.to == "shards" else None
         self.workers = given.workers
-        if not isinstance(given.tokenizer, str) or str(self.folder).startswith("memory:"):
+        if not isinstance(given.tokenizer, str) or str(self.out).startswith("memory:"):
             self.workers = 0  # no other process sees them
         self._opened: Tokenizer | None = None
-        tokenizer = given.tokenizer
+        self._spec = self._tokenizer_spec()
+        self.whole, self.uri = plan_conversion(
+            given.embodiment, given.source, self._spec, given.settings, given.to
+        )
+        if given.to == "lerobot":
+            self.holder: Holder = LeRobotHolder(self.out, given.embodiment, self.uri)
+        else:
+            folder = self.hub.staging if self.hub else self.out
+            self.holder = ShardHolder(folder, given.embodiment, self._spec, self.uri)
+        self.folder = self.holder.folder
+        self.frame_sizes: dict[str, tuple[int, int]] = {}
+        self.kept = self.made = 0  # units that were there, and that this run has made
+
+    def _tokenizer_spec(self) -> TokenizerSpec:
+        given, tokenizer = self.given, self.given.tokenizer
+        if given.to == "lerobot":
+            return AS_RECORDED
         if not isinstance(tokenizer, str):
             self._opened = tokenizer
         elif not self.workers and given.engine == "local":
             self._opened = get_tokenizer(tokenizer, weights=given.weights, device=given.device)
         else:  # workers open it; this process stays light, and may have no such device
-            self._spec = get_spec(tokenizer, weights=given.weights)
-        if self._opened is not None:
-            self._spec = self._opened.spec
-        self.whole, self.uri = plan_conversion(given.embodiment, given.source, self._spec, given.settings)
-        self.frame_sizes: dict[str, tuple[int, int]] = {}
-        self.kept = self.made = 0  # shards that were there, and that this run has made
+            return get_spec(tokenizer, weights=given.weights)
+        return self._opened.spec
 
     def plan(self) -> tuple[Plan, Manifest | None]:
         """Return the plan, and the manifest it extends or None.
@@ -227,7 +250,7 @@ class _Run:
         A set that was extended before can be continued without `extend`.
         """
         given = self.given
-        base = base_manifest(self.folder)
+        base = self.holder.base()
         if base is not None:
             self._check_stride(base)
         if base is None or not (given.extend or "extends" in base.plan):
@@ -262,7 +285,7 @@ class _Run:
         """Make the shards that are missing."""
         tasks = share.count if share else 1
         mine = plan.units[share.index :: tasks] if share else plan.units
-        there = finished_shards(self.folder, plan, base, shared=share is not None)
+        there = self.holder.finished(plan, base, share is not None)
         todo = [unit for unit in mine if unit.name not in there]
         kept = [unit for unit in mine if unit.name in there]
         layout = RowLayout.of_plan(plan.facts, self.given.embodiment)
@@ -280,9 +303,9 @@ class _Run:
             progress.notices.append(idle)
         on_progress(progress)
         if todo:
-            with Journal(self.folder, share) as journal:
+            with self.holder.noting(share) as note:
                 for made in self._made(todo, plan, Counter(progress, on_progress)):
-                    journal.add(made)
+                    note(made)
                     on_progress(progress)
         self.kept, self.made = progress.kept_shards, len(todo)
 
@@ -314,17 +337,17 @@ class _Run:
             changed: True where shards may have been made.
         """
         folder, out = self.folder, self.out
-        manifest, news = self._derived(plan, base, changed)
-        reasons = refusal_reasons(folder)
+        done = self.holder.finish(plan, base, changed)
+        manifest, reasons = done.manifest, refusal_reasons(done.refused)
         episodes = sum(split["episodes"] for split in manifest.splits.values())
         if not episodes:
-            clear(folder)
+            self.holder.clear()
             worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
             told = "; ".join(f"{count} × {reason}" for reason, count in worst)
             raise SourceError(self.uri, f"gave no usable episode, so nothing was written: {told}")
-        flags = flag_totals(parquet_file(folder / EPISODES).read(columns=["flags"])["flags"])
-        warning = rate_warning(folder, out) if OFF_RATE in flags else ""
-        notes = training_notes(folder, out, plan)
+        shards = self.given.to == "shards"
+        warning = rate_warning(folder, out) if shards and OFF_RATE in done.flags else ""
+        notes = training_notes(folder, out, plan) if shards else ()
         if self.hub:
             self.hub.upload()
         most = self.given.max_quarantine * (episodes + manifest.quarantined)
@@ -335,40 +358,18 @@ class _Run:
             made_shards=self.made,
             seconds=time.monotonic() - self.begun,
             reasons=reasons,
-            flags=flags,
+            flags=dict(done.flags),
             too_many=manifest.quarantined > most,
             frame_sizes=self.frame_sizes,
             left_out=self.whole.left_out,
-            changed=news,
+            changed=done.news,
             warning=warning,
             notes=notes,
-            held_out=held_out_line(manifest, self.whole),
+            held_out=held_out_line(manifest, self.whole)
+            if shards or manifest.splits["val"]["episodes"]
+            else "",
+            bytes=done.bytes,
         )
-
-    def _derived(self, plan: Plan, base: Manifest | None, changed: bool) -> tuple[Manifest, str]:
-        """Return the manifest, and in words what of the YAML a finished set did not say yet.
-
-        The manifest and the other files derived from footers are written, unless nothing has changed. A
-        finished set is written anew too where the YAML has changed: its shards stay, and readers take
-        target_hz and stride from the manifest.
-        """
-        folder, embodiment, news = self.folder, self.given.embodiment, ""
-        remove_parts(folder)  # of workers that died
-        before = Manifest.load(folder) if (folder / MANIFEST).is_file() else None
-        kept = base.shards if base else ()
-        if before is not None:
-            news = yaml_change(before.embodiment, embodiment)
-            if not changed and not damaged_files(folder, before):
-                if not news and before.plan["hash"] == plan.facts["hash"]:
-                    remove_notes(folder)
-                    return before, ""
-                kept = before.shards  # their hashes are known
-        names = list(dict.fromkeys([*(shard.path for shard in kept), *(unit.name for unit in plan.units)]))
-        known = {shard.path: shard.sha256 for shard in kept} | known_hashes(folder)
-        derived = derive(folder, names, embodiment, self._spec, plan.facts, self.uri, hashes=known)
-        manifest = derived.write(folder)
-        remove_notes(folder)
-        return manifest, news
 
 
 def _encoded(units: Sequence[ShardUnit], layout: RowLayout) -> int:

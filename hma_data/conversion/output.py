@@ -6,16 +6,17 @@ The folder is locked while the conversion runs. A folder of a store is claimed f
 import json
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from hma_data.conversion.extend import ways
 from hma_data.conversion.plan import Plan, differences
-from hma_data.errors import HMAError, OutputError, StorageAwayError
+from hma_data.errors import HMAError, OutputError, RegistryError, StorageAwayError
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import (
     EMBODIMENT,
     EPISODES,
@@ -25,13 +26,16 @@ from hma_data.shards.manifest import (
     SPLITS,
     WORKING,
     Manifest,
+    damaged_files,
+    derive,
     plan_hashes,
     shard_sizes,
 )
-from hma_data.shards.schema import PLAN_HASH, Footer, read_metadata
+from hma_data.shards.schema import PLAN_HASH, Footer, flag_totals, read_metadata
 from hma_data.storage.files import PART, remove_parts
 from hma_data.storage.locks import LOCK
-from hma_data.storage.remote import RemotePath, create_bytes, is_remote, put_bytes
+from hma_data.storage.remote import RemotePath, create_bytes, is_remote, parquet_file, put_bytes
+from hma_data.tokenizers.base import TokenizerSpec
 
 _, JOURNAL, PLAN = WORKING
 READERS, JOURNAL_S = 16, 20.0  # in a store: footers read at a time, seconds between writes of a journal
@@ -49,6 +53,128 @@ class Share:
     def name(self) -> str:
         """Return the name of the share, for files that each share has of its own."""
         return f"{self.index}-of-{self.count}"
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a conversion has made.
+
+    Attributes:
+        manifest: of the set, or of what a LeRobotDataset was made from.
+        news: what the YAML says now that a finished set did not say yet, in words; empty if nothing.
+        refused: lines of quarantine.jsonl.
+        flags: name -> count over all episodes.
+        bytes: of all files.
+    """
+
+    manifest: Manifest
+    news: str = ""
+    refused: Sequence[Mapping[str, Any]] = ()
+    flags: Mapping[str, int] = field(default_factory=dict)
+    bytes: int = 0
+
+
+class Holder(Protocol):
+    """What a conversion makes: where its units are kept while it runs, and what they become at the end.
+
+    Attributes:
+        folder: of the units; one job at a time writes it.
+    """
+
+    folder: Path
+
+    def clear(self) -> None:
+        """Delete what an earlier conversion made; refuse what is not one's."""
+        ...
+
+    def base(self) -> Manifest | None:
+        """Return the manifest of a set that may be extended; None where there is none."""
+        ...
+
+    def finished(self, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
+        """Return the names of the plan's units that are there and whole; see `finished_shards`."""
+        ...
+
+    def noting(self, share: "Share | None") -> AbstractContextManager[Callable[["Made"], None]]:
+        """Give what notes each unit when it is made."""
+        ...
+
+    def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Finished:
+        """Complete what is made; all units are there, and `changed` says whether some may be new."""
+        ...
+
+
+class ShardHolder:
+    """A shard set; see `Holder`."""
+
+    def __init__(self, folder: Path, embodiment: Embodiment, spec: TokenizerSpec, uri: str) -> None:
+        self.folder = folder
+        self._embodiment, self._spec, self._uri = embodiment, spec, uri
+
+    def clear(self) -> None:
+        """Delete the shard set."""
+        clear(self.folder)
+
+    def base(self) -> Manifest | None:
+        """Return the set's manifest."""
+        return base_manifest(self.folder)
+
+    def finished(self, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
+        """Return the names of the shards that are there."""
+        return finished_shards(self.folder, plan, base, shared)
+
+    @contextmanager
+    def noting(self, share: "Share | None") -> Iterator[Callable[["Made"], None]]:
+        """Give what notes the hash of each shard."""
+        with Journal(self.folder, share) as journal:
+            yield journal.add
+
+    def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Finished:
+        """Write what is derived from the shards."""
+        manifest, news = self._derived(plan, base, changed)
+        lines = (self.folder / QUARANTINE).read_text("utf-8").splitlines()
+        flags = flag_totals(parquet_file(self.folder / EPISODES).read(columns=["flags"])["flags"])
+        size = sum(shard.bytes for shard in manifest.shards)
+        return Finished(manifest, news, [json.loads(line) for line in lines], flags, size)
+
+    def _derived(self, plan: Plan, base: Manifest | None, changed: bool) -> tuple[Manifest, str]:
+        """Return the manifest, and in words what of the YAML a finished set did not say yet.
+
+        The manifest and the other files derived from footers are written, unless nothing has changed. A
+        finished set is written anew too where the YAML has changed: its shards stay, and readers take
+        target_hz and stride from the manifest.
+        """
+        folder, embodiment, news = self.folder, self._embodiment, ""
+        remove_parts(folder)  # of workers that died
+        before = Manifest.load(folder) if (folder / MANIFEST).is_file() else None
+        kept = base.shards if base else ()
+        if before is not None:
+            news = yaml_change(before.embodiment, embodiment)
+            if not changed and not damaged_files(folder, before):
+                if not news and before.plan["hash"] == plan.facts["hash"]:
+                    remove_notes(folder)
+                    return before, ""
+                kept = before.shards  # their hashes are known
+        names = list(dict.fromkeys([*(shard.path for shard in kept), *(unit.name for unit in plan.units)]))
+        known = {shard.path: shard.sha256 for shard in kept} | known_hashes(folder)
+        derived = derive(folder, names, embodiment, self._spec, plan.facts, self._uri, hashes=known)
+        manifest = derived.write(folder)
+        remove_notes(folder)
+        return manifest, news
+
+
+def yaml_change(before: Embodiment, now: Embodiment) -> str:
+    """Return what of the YAML has changed, in words; empty if it is the same."""
+    old, new = before.to_dict(), now.to_dict()
+    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+    if not keys:
+        return ""
+    with suppress(RegistryError):  # nobody states the rate
+        if before.stride != now.stride:
+            said = f"stride {before.stride} → {now.stride}: the model now sees {now.effective_hz:g} Hz"
+            others = [key for key in keys if key not in ("target_hz", "stride", "provenance")]
+            return said + (f"; also new from the YAML: {', '.join(others)}" if others else "")
+    return f"new from the YAML: {', '.join(keys)}"
 
 
 # -- what is there
@@ -154,7 +280,7 @@ def _metadata(out: Path, names: list[str]) -> Iterator[tuple[str, dict[bytes, by
 def other_plan(out: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> OutputError:
     """Return the error for a folder that holds the set of another plan."""
     remedy = "choose another --out, or --overwrite to start anew"
-    if ways(ours) == ways(theirs):
+    if ways(ours) == ways(theirs) and "to" not in ours:
         remedy = "--extend adds the episodes that are new, --overwrite starts anew"
     fault = f"belongs to another conversion; different: {differences(ours, theirs)}"
     return OutputError(out, fault, remedy)

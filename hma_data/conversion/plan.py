@@ -57,6 +57,7 @@ class Settings:
         limit: take only so many episodes, from the first on; None takes all.
         shard_frames: frames a shard, about; None lets the size of the recording decide.
         only, exclude: episodes to take and to leave out: ids, globs, or @FILE; see `chosen_ids`.
+        drop_idle: leave out frames in which nothing moves, see `hma_data.episodes.idle`.
     """
 
     frames: Literal["all", "strided"] = "all"
@@ -67,6 +68,7 @@ class Settings:
     shard_frames: int | None = None
     only: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
+    drop_idle: bool = False
 
     def __post_init__(self) -> None:
         if self.val_fraction is not None and not 0 <= self.val_fraction < 1:
@@ -79,6 +81,8 @@ class Settings:
     def facts(self, cameras: list[str]) -> dict[str, Any]:
         """Return the settings as the plan states them, without a choice of episodes that was not made."""
         values = asdict(self) | {"cameras": cameras}
+        if not self.drop_idle:
+            del values["drop_idle"]
         for name in ("only", "exclude"):
             words = values.pop(name)
             if words:  # the plan's digest of the recording covers the ids in a file
@@ -140,10 +144,12 @@ class Plan:
 
     def with_origin(self, made_by: Mapping[str, Any]) -> "Plan":
         """Return the plan with what made its episodes, if that is no robot's recorder."""
-        if not made_by:
-            return self
+        return self.with_facts({"made_by": dict(made_by)}) if made_by else self
+
+    def with_facts(self, more: Mapping[str, Any]) -> "Plan":
+        """Return the plan with more facts, and their hash."""
         facts = {key: value for key, value in self.facts.items() if key != "hash"}
-        return replace(Plan.of(self.units, facts | {"made_by": dict(made_by)}), left_out=self.left_out)
+        return replace(self, facts=Plan.of((), facts | dict(more)).facts)
 
     @property
     def episodes(self) -> int:

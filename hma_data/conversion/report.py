@@ -2,18 +2,16 @@
 
 import re
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from hma_data.console import human_count
 from hma_data.conversion.engines import Notice, Retry
 from hma_data.conversion.plan import HELD_OUT, VAL_FRACTION, Plan
-from hma_data.conversion.worker import Seen, Tick
-from hma_data.errors import RegistryError
+from hma_data.conversion.reading import Seen, Tick
 from hma_data.inspection.shard_flags import pause_finding, rate_finding, window_finding
-from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 
@@ -53,7 +51,8 @@ class Summary:
         changed: what the YAML says now that a finished set did not say yet; empty if nothing.
         warning: the fault of a rate that the recordings do not have; empty if there is none.
         notes: what else to mend before training, as `hma doctor` says it: no window, pauses.
-        held_out: how many episodes are for validation, and by what rule.
+        held_out: how many episodes are for validation, and by what rule; empty for a LeRobotDataset without.
+        bytes: of the files.
     """
 
     out: Path
@@ -70,6 +69,7 @@ class Summary:
     warning: str = ""
     notes: tuple[str, ...] = ()
     held_out: str = ""
+    bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -154,30 +154,16 @@ def _empty_val(manifest: Manifest, plan: Plan) -> str:
     return "the episodes are of one group, or all train by a split of the recording's own"
 
 
-def yaml_change(before: Embodiment, now: Embodiment) -> str:
-    """Return what of the YAML has changed, in words; empty if it is the same."""
-    old, new = before.to_dict(), now.to_dict()
-    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-    if not keys:
-        return ""
-    with suppress(RegistryError):  # nobody states the rate
-        if before.stride != now.stride:
-            said = f"stride {before.stride} → {now.stride}: the model now sees {now.effective_hz:g} Hz"
-            others = [key for key in keys if key not in ("target_hz", "stride", "provenance")]
-            return said + (f"; also new from the YAML: {', '.join(others)}" if others else "")
-    return f"new from the YAML: {', '.join(keys)}"
-
-
 def rate_warning(folder: Path, out: Path) -> str:
     """Return the fault and the remedy where episodes have another rate than the YAML states; else empty."""
     finding = rate_finding(ShardSet(folder))
     return f"{out}: {finding}" if finding else ""
 
 
-def refusal_reasons(out: Path) -> dict[str, int]:
+def refusal_reasons(refused: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     """Return reason -> number of refused episodes; reasons that differ in the episode's id alone are one."""
     told: dict[str, list[str]] = {}
-    for item in ShardSet(out).refused():
+    for item in refused:
         text = plain = f"{item['type']}: {item['message']}"
         if any(letter.isdigit() for letter in item["id"]):  # a numbered id would keep equal reasons apart
             text = re.sub(rf"(?<!\w){re.escape(item['id'])}(?!\w)", "<episode>", text)

@@ -116,3 +116,17 @@ def lerobot_features(embodiment: Embodiment) -> dict[str, dict[str, Any]]:
 
 def _vector_feature(vector: Vector) -> dict[str, Any]:
     return {"dtype": "float32", "shape": (vector.dims,), "names": vector.names()}
+
+
+def packed_components(vector: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    """Return the components of a YAML's vector as slices of one feature that holds them in their order."""
+    parts = []
+    start = 0
+    for part in vector["components"]:
+        facts = {
+            name: part[name] for name in ("names", "unit", "range", "normalize", "gripper") if name in part
+        }
+        stop = start + part["dims"]
+        parts.append({"key": key, "dims": part["dims"], "slice": [start, stop], **facts})
+        start = stop
+    return parts

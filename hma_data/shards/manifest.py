@@ -181,8 +181,17 @@ class Manifest:
                 raise ShardError(folder, *found)
             remedy = f"run the same hma convert again to finish it; if the manifest was lost, {restat}"
             raise ShardError(folder, f"has no {MANIFEST}: its conversion has not finished", remedy)
+        return cls.from_text(path.read_bytes(), path, restat)
+
+    @classmethod
+    def from_text(cls, text: bytes, path: Path, remedy: str) -> "Manifest":
+        """Return the manifest of the text that `to_text` wrote.
+
+        Args:
+            path, remedy: for the ShardError of a damaged one.
+        """
         try:
-            values = parse_json(path.read_bytes())
+            values = parse_json(text)
             check_version(values, path)
             manifest = cls(
                 plan=values["plan"],
@@ -201,7 +210,7 @@ class Manifest:
             return manifest
         except MALFORMED as fault:
             said = f"it lacks {fault}" if isinstance(fault, KeyError) else str(fault)
-            raise ShardError(path, f"is damaged: {said}", restat) from fault
+            raise ShardError(path, f"is damaged: {said}", remedy) from fault
 
 
 def cameras_line(stored: Sequence[str], embodiment: Embodiment) -> str:

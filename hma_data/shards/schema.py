@@ -28,7 +28,7 @@ SCHEMA_VERSION = 1
 ROW_GROUP = 2048
 GROUP_VALUES = 1 << 24  # tokens of a row group; Parquet's writer holds small integers in four bytes each
 MALFORMED = (KeyError, TypeError, ValueError, AttributeError, RecursionError)  # what wrong JSON raises
-_FOOTER = b"hma"
+FOOTER_KEY = b"hma"  # of the footer's JSON in the metadata of a file
 # flags that measure an episode and count no frames: a sum of them means nothing
 MEASURES = {"millinats", "millilatents"}
 PAUSES = "pauses="  # begins the word of an episode's flags that states its pauses
@@ -131,7 +131,7 @@ class Footer:
             "hma.tokenizer_sha256": self.plan["tokenizer"]["weights_sha256"],
         }
         return {
-            _FOOTER: json.dumps(values).encode(),
+            FOOTER_KEY: json.dumps(values).encode(),
             **{k.encode(): v.encode() for k, v in facts.items()},
             PLAN_HASH: self.plan["hash"].encode(),
         }
@@ -143,10 +143,10 @@ class Footer:
         Raises:
             ShardError: the file is no shard, its version is not read here, or its footer is damaged.
         """
-        if not metadata or _FOOTER not in metadata:
+        if not metadata or FOOTER_KEY not in metadata:
             raise ShardError(where, "is a parquet file but not a shard: its footer has no 'hma' entry")
         try:
-            values = parse_json(metadata[_FOOTER])
+            values = parse_json(metadata[FOOTER_KEY])
             check_version(values, where)
             return cls(
                 plan=values["plan"],

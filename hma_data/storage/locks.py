@@ -20,7 +20,7 @@ def locked(out: Path, share: str = "") -> Iterator[None]:
     plan.
 
     Args:
-        out: the folder; it is made, and removed again if the job writes nothing.
+        out: the folder; it is made, and removed again if the job writes nothing. The job may delete it.
         share: name of the part that this job writes; jobs of other parts may write at the same time.
     """
     if isinstance(out, RemotePath):
@@ -47,7 +47,7 @@ def locked(out: Path, share: str = "") -> Iterator[None]:
         try:
             yield
         finally:
-            if made and all(item.name.startswith(LOCK) for item in out.iterdir()):
+            if made and out.is_dir() and all(item.name.startswith(LOCK) for item in out.iterdir()):
                 shutil.rmtree(out, ignore_errors=True)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from hma_data.episodes.images import decode_image
 from hma_data.episodes.sheets import gif_bytes, write_mp4, write_text
 from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.export import packed_components
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 from hma_model.play.session import Frame, Session
 from hma_model.worlds.scenes import Drivable, Image
@@ -187,7 +188,7 @@ def embodiment_of(
         "kind": "simulation",
         "frequency_hz": hz,
         "stride": robot.stride,
-        "action": {"space": robot.action.space, "components": _packed(values["action"], "action")},
+        "action": {"space": robot.action.space, "components": packed_components(values["action"], "action")},
         "cameras": [
             {"name": name, "key": f"observation.images.{name}", "size": list(size)} for name in cameras
         ],
@@ -198,22 +199,8 @@ def embodiment_of(
         },
     }
     if with_state:
-        own["state"] = {"components": _packed(values["state"], "observation.state")}
+        own["state"] = {"components": packed_components(values["state"], "observation.state")}
     return Embodiment.from_values(own, f"embodiment {robot.id}")
-
-
-def _packed(vector: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    """Return a vector's components as slices of one feature."""
-    parts = []
-    start = 0
-    for part in vector["components"]:
-        facts = {
-            name: part[name] for name in ("names", "unit", "range", "normalize", "gripper") if name in part
-        }
-        stop = start + part["dims"]
-        parts.append({"key": key, "dims": part["dims"], "slice": [start, stop], **facts})
-        start = stop
-    return parts
 
 
 def _zipped(folder: Path) -> bytes:

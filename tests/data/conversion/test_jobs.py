@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
+from hma_data.conversion import reading
 from hma_data.conversion import worker as shard_work
 from hma_data.conversion.job import convert
 from hma_data.errors import HMAError, OutputError
@@ -148,7 +149,7 @@ def test_a_lock_left_by_a_killed_job_is_no_lock(toy_arm, toy_recording, tmp_path
 def test_a_read_error_that_goes_away_costs_nothing(
     toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
 ) -> None:
-    monkeypatch.setattr(shard_work, "WAITS_S", (0.0, 0.0, 0.0))
+    monkeypatch.setattr(reading, "WAITS_S", (0.0, 0.0, 0.0))
     failures = {"demo_3": [OSError(5, "Input/output error")] * 2, "demo_7": [TimeoutError("slow")] * 3}
     read = Hdf5Source.read
 
@@ -166,7 +167,7 @@ def test_a_read_error_that_goes_away_costs_nothing(
 def test_storage_that_stays_away_ends_the_job_and_quarantines_nobody(
     toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
 ) -> None:
-    monkeypatch.setattr(shard_work, "WAITS_S", (0.0,))
+    monkeypatch.setattr(reading, "WAITS_S", (0.0,))
     read, away = Hdf5Source.read, True
 
     def failing(self, uri, episode_id, embodiment):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hma_data.conversion import job
+from hma_data.conversion import output
 from hma_data.conversion.job import Conversion
 from hma_data.conversion.output import Share
 from hma_data.conversion.report import Summary
@@ -162,7 +162,7 @@ def test_an_extension_killed_before_its_manifest_is_finished_by_the_next_run(tmp
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(job, "derive", killed)
+        patch.setattr(output, "derive", killed)
         with pytest.raises(KeyboardInterrupt):
             run(robot(), recording, out, extend=True)
     summary = run(robot(), recording, out, extend=True)

@@ -1,0 +1,495 @@
+"""Convert recordings to a LeRobotDataset v3.0: each unit becomes a small one, and lerobot joins them.
+
+The units lie beside the output, in `.NAME.parts`, each whole or absent. The dataset is joined there and gets
+its name when it is whole, so the same command continues a job that was killed, and a dataset that is there
+is finished. Beside lerobot's files it has the embodiment for its rows, episodes.parquet, quarantine.jsonl,
+and conversion.json with the plan.
+
+Frames keep their recorded size, upright and in RGB; crop and resize stay with the YAML. Numbers are those
+that shards hold.
+
+N rows of an episode, n of them in a batch, H×W pixels, A action dims.
+"""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from hma_data.conversion.engines import Report
+from hma_data.conversion.output import Finished, Made, Share, other_plan
+from hma_data.conversion.plan import EPISODES_TRIED, Plan, Settings, ShardUnit, camera_fault, read_clip
+from hma_data.conversion.reading import (
+    End,
+    Frames,
+    Item,
+    Job,
+    ReadEpisode,
+    Seen,
+    Tick,
+    UnitNotes,
+    signs_of_life,
+)
+from hma_data.episodes.images import PictureCheck, picture_flags, prepare, upright
+from hma_data.errors import EpisodeError, HMAError, OutputError, SourceError, UsageError
+from hma_data.registry.embodiment import ONE_INDEX, Embodiment
+from hma_data.registry.export import lerobot_features, packed_components
+from hma_data.shards.manifest import EMBODIMENT, EPISODES, QUARANTINE, Derived, Manifest, ShardFile
+from hma_data.shards.schema import FOOTER_KEY, Footer, Refused, RowLayout, flag_totals, mask_columns, to_numpy
+from hma_data.sources.base import open_source
+from hma_data.sources.lerobot.writer import ORIGIN, DatasetWriter, join_datasets, load_lerobot, set_splits
+from hma_data.storage.fetch import disk_is_full
+from hma_data.storage.files import PART, sync_folder
+from hma_data.storage.locks import LOCK
+from hma_data.storage.remote import is_remote
+from hma_data.tokenizers.base import TokenizerSpec
+
+CONVERSION = "conversion.json"  # what the dataset was made from; last of a dataset's files
+FOOTER, DATASET = "footer.json", "dataset"  # of a part
+CHECKED = 256  # pixels a side of the frames that are checked for showing nothing, as most tokenizers have it
+BATCH_BYTES = 32 << 20  # of the frames of a batch
+MOST_FRAMES = 32  # of a batch
+TIMES, SUCCESS = "recorded_time", "next.success"
+# It stands in the plan where shards have their tokenizer: frames as they are.
+AS_RECORDED = TokenizerSpec("recorded", 1, "continuous", CHECKED, (CHECKED, CHECKED), channels=3)
+
+
+# -- the plan
+
+
+def as_dataset(settings: Settings) -> Settings:
+    """Return the settings with a dataset's own defaults: all cameras, no episode held out."""
+    held_out = 0.0 if settings.val_fraction is None else settings.val_fraction
+    return replace(settings, cameras=settings.cameras or ("all",), val_fraction=held_out)
+
+
+def with_dataset(plan: Plan, uri: str, robot: Embodiment) -> Plan:
+    """Return the plan with the facts that every row of the dataset shares.
+
+    They are the rate, the size of each camera's frames, and which of the columns TIMES and SUCCESS there are.
+    Sizes, and whether episodes say how they ended, are those of the first episodes that can be read.
+    """
+    layout = RowLayout.of_plan(plan.facts, robot)
+    hz = robot.rate_hz / layout.frame_stride
+    timed = robot.source.format not in ONE_INDEX or "timestamps" in (robot.source.layout or {})
+    facts: dict[str, Any] = {
+        "fps": max(1, round(hz)),
+        "times": timed or not hz.is_integer() or "drop_idle" in plan.facts["settings"],
+        **_seen(plan, uri, robot, layout),
+    }
+    return plan.with_facts({"to": "lerobot", "dataset": facts})
+
+
+def _seen(plan: Plan, uri: str, robot: Embodiment, layout: RowLayout) -> dict[str, Any]:
+    source = open_source(robot.source.format)
+    sizes: dict[str, list[int]] = {}
+    success, fault = False, ""
+    for _, ref in islice((item for unit in plan.units for item in unit.episodes), EPISODES_TRIED):
+        try:
+            clip = read_clip(source, uri, ref.id, robot, layout.cameras)
+            success = success or clip.episode.success is not None
+            for name in layout.cameras if not sizes and len(clip) else ():
+                frames = upright(clip.frames_at(name, np.zeros(1, np.int64)), robot.camera(name))
+                sizes[name] = [int(side) for side in frames.shape[1:3]]
+        except (HMAError, OSError, ValueError) as refused:
+            fault = str(refused)
+    if len(sizes) < len(layout.cameras):
+        raise SourceError(uri, f"none of the first episodes can be read: {fault or 'they are empty'}")
+    return {"sizes": sizes, "success": success}
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The features of the dataset of a plan, and which of our values each holds."""
+
+    layout: RowLayout
+    facts: dict[str, Any]
+
+    @property
+    def keys(self) -> dict[str, str]:
+        """Return camera -> feature: the recording's own for a LeRobotDataset."""
+        cameras = [self.layout.embodiment.camera(name) for name in self.layout.cameras]
+        own = self.layout.embodiment.source.format == "lerobot"
+        return {one.name: one.key if own else f"observation.images.{one.name}" for one in cameras}
+
+    @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        """Return the features, as lerobot takes them."""
+        robot, stride = self.layout.embodiment, self.layout.frame_stride
+        plain = lerobot_features(robot)
+        found: dict[str, dict[str, Any]] = {
+            key: plain[key] for key in ("action", "observation.state") if key in plain
+        }
+        if stride > 1:
+            names = [f"{name}+{step}" for step in range(stride) for name in robot.action.names()]
+            found["action"] = found["action"] | {"shape": (len(names),), "names": names}
+        for name, key in self.keys.items():
+            found[key] = plain[key] | {"shape": (*self.facts["sizes"][name], 3)}
+        for mask in mask_columns(robot):
+            found[mask] = {"dtype": "bool", "shape": (1,), "names": None}
+        if self.facts["success"]:
+            found[SUCCESS] = {"dtype": "bool", "shape": (1,), "names": None}
+        if self.facts["times"]:
+            found[TIMES] = {"dtype": "float64", "shape": (1,), "names": None}
+        return found
+
+    def embodiment(self) -> Embodiment:
+        """Return the embodiment that describes the dataset's rows: it makes the same shards of them."""
+        robot, stride = self.layout.embodiment, self.layout.frame_stride
+        values = robot.to_dict()
+        action = packed_components(values["action"], "action")
+        if stride > 1:
+            action = _repeated(action, robot.action_dim, stride)
+        cameras = [
+            {key: value for key, value in camera.items() if key in ("name", "resize", "crop")}
+            | {"key": self.keys[camera["name"]], "size": self.facts["sizes"][camera["name"]]}
+            for camera in values["cameras"]
+            if camera["name"] in self.keys
+        ]
+        rate = f"{robot.rate_hz / stride:g} Hz of the recording, a whole number in a LeRobotDataset"
+        values |= {
+            "frequency_hz": self.facts["fps"],
+            "stride": robot.stride if stride == 1 else 1,
+            "action": {"space": robot.action.space, "components": action},
+            "cameras": cameras,
+            "source": {"format": "lerobot"},
+            "provenance": {**robot.provenance, "frequency_hz": rate, "recording": "hma convert --to lerobot"},
+        }
+        if robot.state:
+            values["state"] = {"components": packed_components(values["state"], "observation.state")}
+        sync = values.pop("sync", {})
+        if sync.get("primary") in self.keys:
+            values["sync"] = {"primary": sync["primary"]}
+        return Embodiment.from_values(values, f"embodiment {robot.id} as a LeRobotDataset")
+
+
+def _repeated(components: list[dict[str, Any]], dims: int, stride: int) -> list[dict[str, Any]]:
+    """Return the components of a chunk of `stride` actions of `dims` values."""
+    found = []
+    for step in range(stride):
+        for part in components:
+            start, stop = part["slice"]
+            own = part | {"slice": [start + step * dims, stop + step * dims]}
+            if "names" in part:
+                own["names"] = [f"{name}+{step}" for name in part["names"]]
+            found.append(own)
+    return found
+
+
+# -- in the worker
+
+
+def part_folder(folder: Path, unit: str) -> Path:
+    """Return the folder of a unit's part; `unit` is its name in the plan."""
+    return folder / unit.removesuffix(".parquet").replace("/", "-")
+
+
+class LeRobotOutput:
+    """The output of a conversion to a LeRobotDataset: of each unit a part."""
+
+    def __init__(self, job: Job) -> None:
+        load_lerobot()
+        self._job, self._layout = job, job.layout
+        self._columns = Columns(self._layout, job.facts["dataset"])
+
+    def frames(self, episode: ReadEpisode, report: Report | None) -> Iterator[Frames]:
+        """Yield upright frames (n, H, W, 3) of every camera for the next rows, then for those after."""
+        clip, kept, cameras = episode.clip, episode.kept, self._layout.cameras
+        sizes = self._job.facts["dataset"]["sizes"]
+        checks = {name: PictureCheck() for name in cameras}
+        count = min(MOST_FRAMES, max(1, BATCH_BYTES // max(3 * h * w for h, w in sizes.values())))
+        for start in range(0, len(kept), count):
+            rows = kept[start : start + count]
+            for name in cameras:
+                camera = self._job.embodiment.camera(name)
+                try:
+                    raw = clip.frames_at(name, rows)
+                    if report and not start:
+                        report(Seen(name, *raw.shape[1:3]))
+                    frames = np.ascontiguousarray(upright(raw, camera))
+                    _check_size(episode.ref.id, name, frames, sizes[name])
+                    checks[name].add(prepare(raw, camera, CHECKED))
+                except EpisodeError as fault:
+                    if len(cameras) == 1:
+                        raise
+                    raise camera_fault(episode.ref.id, name, cameras, fault) from fault
+                yield Frames(name, frames)
+        for name, seen in checks.items():
+            episode.flags |= picture_flags(seen, self._job.embodiment.quality, episode.ref.id, name)
+
+    def make(self, unit: ShardUnit, items: Iterator[Item], report: Report) -> Made:
+        """Write the part of a unit; without a usable episode it holds no dataset."""
+        final = part_folder(self._job.out, unit.name)
+        part = final.with_name(f".{final.name}.part")
+        notes = UnitNotes(self._job, unit)
+        with space_explained(final.parent), signs_of_life(report):
+            shutil.rmtree(part, ignore_errors=True)
+            part.mkdir(parents=True)
+            try:
+                self._write(part, items, notes, report)
+                (part / FOOTER).write_bytes(notes.footer().to_metadata()[FOOTER_KEY])
+                _sync(part)
+                shutil.rmtree(final, ignore_errors=True)
+                part.rename(final)
+                sync_folder(final.parent)
+            finally:
+                shutil.rmtree(part, ignore_errors=True)
+        return Made(unit.name, _bytes(final), "")
+
+    def _write(self, part: Path, items: Iterator[Item], notes: UnitNotes, report: Report) -> None:
+        writer: DatasetWriter | None = None
+        rows = 0  # of the episode that was begun
+        begun: ReadEpisode | None = None
+        waiting: dict[str, NDArray[np.uint8]] = {}
+        total = 0
+        try:
+            for item in items:
+                if isinstance(item, Frames):
+                    assert begun is not None
+                    waiting[item.camera] = item.frames
+                    if len(waiting) < len(self._layout.cameras):
+                        continue
+                    writer = writer or self._open(part)
+                    rows += self._add(writer, begun, rows, waiting)
+                    report(Tick(frames=len(item.frames) * len(waiting)))
+                    waiting = {}
+                elif isinstance(item, End):
+                    assert begun is not None and writer is not None
+                    writer.save_episode()
+                    notes.add(begun, total, report)
+                    total += rows
+                    begun = None
+                else:
+                    if begun is not None and rows and writer is not None:  # what came of it is void
+                        writer.drop_episode()
+                    rows, waiting = 0, {}
+                    begun = item if isinstance(item, ReadEpisode) else None
+                    if isinstance(item, Refused):
+                        notes.refuse(item, report)
+        finally:
+            if writer is not None:
+                writer.close()
+
+    def _open(self, part: Path) -> DatasetWriter:
+        robot, fps = self._job.embodiment, self._job.facts["dataset"]["fps"]
+        return DatasetWriter(part / DATASET, robot.id, fps, self._columns.features, robot.robot)
+
+    def _add(
+        self, writer: DatasetWriter, episode: ReadEpisode, start: int, frames: dict[str, NDArray[np.uint8]]
+    ) -> int:
+        """Add the rows from `start` on that these frames show; return their number."""
+        clip, stride = episode.clip, self._layout.frame_stride
+        count = len(next(iter(frames.values())))
+        for row in range(count):
+            at = int(episode.kept[start + row])
+            steps = slice(at, at + stride)
+            known = clip.action_known is None or bool(clip.action_known[steps].all())
+            action = clip.actions[steps].reshape(-1)
+            values: dict[str, Any] = {
+                "task": clip.episode.instruction,
+                "action": action if known else np.zeros_like(action),
+            }
+            if clip.states is not None:
+                values["observation.state"] = clip.states[at]
+            for name, key in self._columns.keys.items():
+                values[key] = frames[name][row]
+            values |= self._further(episode, start + row, at, known)
+            writer.add_row(values)
+        return count
+
+    def _further(self, episode: ReadEpisode, row: int, at: int, known: bool) -> dict[str, Any]:
+        clip, features = episode.clip, self._columns.features
+        state_known = clip.state_known is None or clip.state_known[at]
+        ends = row == len(episode.kept) - 1
+        values = {
+            "action_known": np.array([known]),
+            "state_known": np.array([state_known]),
+            SUCCESS: np.array([ends and clip.episode.success is True]),
+            TIMES: np.array([clip.timestamps[at]]),
+        }
+        return {key: value for key, value in values.items() if key in features}
+
+
+def _check_size(episode_id: str, camera: str, frames: NDArray[np.uint8], size: list[int]) -> None:
+    if list(frames.shape[1:3]) != size:
+        said = f"{frames.shape[2]}×{frames.shape[1]} pixels, the dataset's first episode {size[1]}×{size[0]}"
+        remedy = "convert such episodes into a dataset of their own, with --only"
+        raise EpisodeError(episode_id, f"camera {camera} has frames of {said}", remedy)
+
+
+@contextmanager
+def space_explained(where: Path) -> Iterator[None]:
+    """Raise an OutputError where the disk is full or cannot be written; lerobot raises several errors."""
+    try:
+        yield
+    except HMAError:
+        raise
+    except Exception as fault:
+        if disk_is_full(fault) or isinstance(fault, PermissionError):
+            said = getattr(fault, "strerror", None) or fault
+            remedy = "free space and run the same command again, or choose another --out"
+            raise OutputError(where, f"cannot be written: {said}", remedy) from fault
+        raise
+
+
+def _sync(folder: Path) -> None:
+    for path in (*folder.rglob("*"), folder):
+        sync_folder(path)
+
+
+def _bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+# -- in the job
+
+
+class LeRobotHolder:
+    """The LeRobotDataset that a conversion makes, and the parts it is joined of; see `Holder`.
+
+    Args:
+        out: the dataset's folder.
+        embodiment: of the recording.
+        uri: of the recording.
+    """
+
+    def __init__(self, out: Path, embodiment: Embodiment, uri: str) -> None:
+        if is_remote(out):
+            remedy = (
+                "write a folder of this machine, and upload it with hf upload or LeRobotDataset.push_to_hub"
+            )
+            raise UsageError(
+                "--out", f"{out} is no folder of this machine, and lerobot writes no other", remedy
+            )
+        self.out, self._robot, self._uri = out, embodiment, uri
+        self.folder = out.absolute().with_name(f".{out.absolute().name}.parts")
+
+    def clear(self) -> None:
+        """Delete the dataset and the parts; refuse what else is there."""
+        self._dataset()
+        shutil.rmtree(self.out, ignore_errors=True)
+        for item in self.folder.iterdir() if self.folder.is_dir() else ():
+            if not item.name.startswith(LOCK):
+                shutil.rmtree(item) if item.is_dir() else item.unlink()
+
+    def base(self) -> Manifest | None:
+        """Return None: a LeRobotDataset is not extended."""
+        return None
+
+    def finished(self, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
+        """Return the names of the units whose part, or whose dataset, is there."""
+        planned = {unit.name for unit in plan.units}
+        if dataset := self._dataset():
+            if dataset.plan["hash"] != plan.facts["hash"]:
+                raise other_plan(self.out, plan.facts, dataset.plan)
+            return planned
+        if not shared:
+            self._remove_unfinished()
+        done = set()
+        for name in planned:
+            part = part_folder(self.folder, name)
+            if not part.is_dir():
+                continue
+            footer = _footer(part)
+            if footer.plan["hash"] != plan.facts["hash"]:
+                raise other_plan(self.out, plan.facts, footer.plan)
+            done.add(name)
+        return done
+
+    @contextmanager
+    def noting(self, share: Share | None) -> Iterator[Callable[[Made], None]]:
+        """Give what notes a unit: nothing needs to, a part says all about itself."""
+        yield lambda made: None
+
+    def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Finished:
+        """Join the parts to the dataset; where no episode is usable, write none."""
+        dataset = self._dataset()
+        if dataset is None:
+            derived = self._derived(plan)
+            if not len(derived.episodes):
+                return Finished(derived.manifest, refused=[asdict(item) for item in derived.refused])
+            try:
+                with space_explained(self.out):
+                    dataset = self._join(plan, derived)
+            finally:
+                shutil.rmtree(self.folder / DATASET, ignore_errors=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
+        refused = [json.loads(line) for line in (self.out / QUARANTINE).read_text("utf-8").splitlines()]
+        flags = flag_totals(pq.read_table(self.out / EPISODES, columns=["flags"])["flags"])
+        return Finished(dataset, refused=refused, flags=flags, bytes=_bytes(self.out))
+
+    def _derived(self, plan: Plan) -> Derived:
+        derived = Derived(plan.facts, self._robot, AS_RECORDED, self._uri)
+        for unit in plan.units:
+            footer = _footer(part_folder(self.folder, unit.name))
+            rows = sum(footer.table["rows"].to_pylist())
+            file = ShardFile(unit.name, unit.split, rows, len(footer.episodes), 0, "", ())
+            derived.add(file, footer)
+        return derived
+
+    def _join(self, plan: Plan, derived: Derived) -> Manifest:
+        whole = self.folder / DATASET
+        shutil.rmtree(whole, ignore_errors=True)
+        parts = [part_folder(self.folder, unit.name) / DATASET for unit in plan.units]
+        join_datasets([part for part in parts if part.is_dir()], whole, self._robot.id)
+        manifest = replace(derived.manifest, shards=())
+        held_out = manifest.splits["val"]["episodes"]
+        if held_out:
+            total = len(derived.episodes)
+            set_splits(whole, {"train": f"0:{total - held_out}", "val": f"{total - held_out}:{total}"})
+        layout = manifest.layout
+        embodiment = Columns(layout, plan.facts["dataset"]).embodiment()
+        (whole / EMBODIMENT).write_text(embodiment.to_yaml(), encoding="utf-8")
+        if "made_by" in plan.facts:
+            (whole / ORIGIN).write_text(json.dumps(plan.facts["made_by"], indent=1), encoding="utf-8")
+        pq.write_table(_numbered(derived.episodes), whole / EPISODES, compression="zstd")
+        (whole / QUARANTINE).write_text(derived.quarantine, encoding="utf-8")
+        (whole / CONVERSION).write_text(manifest.to_text(), encoding="utf-8")
+        _sync(whole)
+        if self.out.is_dir():
+            self.out.rmdir()  # it is empty
+        whole.rename(self.out)
+        sync_folder(self.out.parent)
+        return manifest
+
+    def _remove_unfinished(self) -> None:
+        for item in self.folder.iterdir() if self.folder.is_dir() else ():
+            if item.name.endswith(PART) or item.name == DATASET:
+                shutil.rmtree(item, ignore_errors=True)
+
+    def _dataset(self) -> Manifest | None:
+        """Return what the dataset in `out` says of its conversion; None where there is none."""
+        if not self.out.is_dir() or not any(self.out.iterdir()):
+            return None
+        path = self.out / CONVERSION
+        if not path.is_file():
+            raise OutputError(self.out, "holds something else", "choose an empty or new --out")
+        return Manifest.from_text(path.read_bytes(), path, "--overwrite makes the dataset anew")
+
+
+def _footer(part: Path) -> Footer:
+    return Footer.from_metadata({FOOTER_KEY: (part / FOOTER).read_bytes()}, str(part / FOOTER))
+
+
+def _numbered(episodes: pa.Table) -> pa.Table:
+    """Return the table in the order of the dataset, with the numbers and the first rows that it has there."""
+    table = episodes.sort_by([("split", "ascending"), ("episode_index", "ascending")])
+    rows = to_numpy(table["rows"])
+    own = {
+        "episode_index": np.arange(len(table), dtype=np.int32),
+        "row_start": np.cumsum(rows) - rows,
+        "shard": [""] * len(table),
+    }
+    for name, values in own.items():
+        field = table.schema.field(name)
+        table = table.set_column(table.schema.get_field_index(name), field, pa.array(values, field.type))
+    return table

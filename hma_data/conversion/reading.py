@@ -1,0 +1,270 @@
+"""Read the episodes of a unit of work one by one, ahead of what is made of them.
+
+Episodes come as items (see `Item`), so that no more than a few frames are in memory. An episode that cannot
+be read becomes a refusal with its reason; what is no episode's fault ends the job.
+
+n frames of a camera, H×W pixels, or S×S where they are resized.
+"""
+
+import json
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.conversion.engines import Attempt, Report, Step
+from hma_data.conversion.extend import kept_frames
+from hma_data.conversion.plan import ShardUnit, read_clip
+from hma_data.episodes.align import pauses, rate_flags
+from hma_data.episodes.episode import Clip
+from hma_data.episodes.idle import idle_rows
+from hma_data.errors import (
+    HMAError,
+    MissingDependencyError,
+    OutputError,
+    RegistryError,
+    ShardError,
+    TokenizerError,
+)
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, flags_text
+from hma_data.shards.stats import Stats
+from hma_data.sources.base import EpisodeRef, Expecting, Source, open_source
+from hma_data.storage.fetch import EPISODE_WAITS_S as WAITS_S
+from hma_data.storage.fetch import disk_is_full, storage_is_away, worth_another_try
+
+SIGN_EVERY_S = 20.0
+FATAL = TokenizerError, OutputError, ShardError, RegistryError, MissingDependencyError  # no episode's fault
+
+Pictures = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Job:
+    """The values a worker needs to make any unit of a conversion."""
+
+    source: str
+    embodiment: Embodiment
+    tokenizer: str
+    weights: str | None
+    device: str
+    out: Path
+    facts: dict[str, Any]
+
+    @property
+    def layout(self) -> RowLayout:
+        """Return which frames become rows, and in which columns."""
+        return RowLayout.of_plan(self.facts, self.embodiment)
+
+
+@dataclass(frozen=True)
+class Tick:
+    """Counts that a worker reports to the console."""
+
+    frames: int = 0
+    episodes: int = 0
+    quarantined: int = 0
+    bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The size of a camera's recorded frames in pixels, reported in the first episode of a unit."""
+
+    camera: str
+    height: int
+    width: int
+
+
+@dataclass(eq=False)
+class ReadEpisode:
+    """An episode on its way from the recording to the output.
+
+    Attributes:
+        kept: (N,) frames of the clip that become rows.
+        flags: of its grid and its frames, see `rate_flags` and `picture_flags`.
+        content: hash over what was read of it, where the output keeps one.
+        read: whether all its frames are in the queue, or encoded.
+        waiting: frames that are in the queue.
+        tokens: camera -> tokens of the frames that are encoded.
+    """
+
+    index: int
+    ref: EpisodeRef
+    clip: Clip
+    kept: NDArray[np.int64]
+    flags: dict[str, int]
+    content: str = ""
+    read: bool = False
+    waiting: int = 0
+    tokens: defaultdict[str, list[NDArray[Any]]] = field(default_factory=lambda: defaultdict(list))
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The next frames (n, H, W, 3) of a camera of the episode that was begun."""
+
+    camera: str
+    frames: Pictures
+
+
+class End:
+    """The end of the episode that was begun: all its frames have come."""
+
+
+# An episode is begun by itself, goes on with its frames, and ends with End; or it is refused.
+Item = ReadEpisode | Frames | End | Refused
+ReadFrames = Callable[[ReadEpisode, Report | None], Iterator[Frames]]
+
+
+def read_unit(
+    job: Job, unit: ShardUnit, frames: ReadFrames, report: Report, attempt: Attempt
+) -> Iterator[Item]:
+    """Read the episodes of a unit, each as the items that `Item` names.
+
+    This runs ahead in a thread. An episode may begin again, or be refused, after some of its frames; its
+    earlier items are then void.
+
+    Args:
+        frames: yields the frames of an episode as the output needs them, and adds to the episode's flags; it
+            is given `report` for the first episode alone, to report what it has seen.
+    """
+    source = open_source(job.embodiment.source.format)
+    if isinstance(source, Expecting):
+        with suppress(HMAError):  # reading raises it too, for the episode at fault
+            source.expect(job.source, [ref.id for _, ref in unit.episodes])
+    for place, (index, ref) in enumerate(unit.episodes):
+        if ref.id in attempt.refused:
+            yield Refused(ref.id, "Fatal", f"{ref.id}: reading it {attempt.refused[ref.id]}")
+            continue
+        report(Step(ref.id))
+        for wait_s in (*WAITS_S, None):
+            try:
+                episode = _begin(job, source, index, ref)
+                yield episode
+                yield from frames(episode, None if place else report)
+                yield End()
+                break
+            except (*FATAL, MemoryError):
+                raise
+            except Exception as fault:  # no fault of a decoder on one recording may end the job
+                if disk_is_full(fault):
+                    text = f"there is no space to unpack it: {fault}"
+                    raise OutputError(ref.id, text, "free space") from fault
+                if wait_s is not None and worth_another_try(fault):
+                    time.sleep(wait_s)
+                    continue
+                if storage_is_away(fault):
+                    remedy = "everything finished is kept: run the same command again"
+                    raise OutputError(job.source, f"storage does not answer: {fault}", remedy) from fault
+                text = str(fault) if isinstance(fault, HMAError) else f"{type(fault).__name__}: {fault}"
+                yield Refused(ref.id, type(fault).__name__, text)
+                break
+
+
+def _begin(job: Job, source: Source, index: int, ref: EpisodeRef) -> ReadEpisode:
+    layout = job.layout
+    clip = read_clip(source, job.source, ref.id, job.embodiment, layout.cameras)
+    kept = kept_frames(clip, layout)
+    flags = rate_flags(clip, job.embodiment)
+    if job.facts["settings"].get("drop_idle"):
+        idle = idle_rows(clip, job.embodiment, kept, layout.frame_stride)
+        kept = kept[~idle]
+        flags |= {"idle_frames": int(idle.sum())} if idle.any() else {}
+    return ReadEpisode(index, ref, clip, kept, flags)
+
+
+class UnitNotes:
+    """What is noted of a unit's episodes while they are written: the content of its footer."""
+
+    def __init__(self, job: Job, unit: ShardUnit) -> None:
+        self._facts, self._unit = job.facts, unit
+        self._rows: list[EpisodeRow] = []
+        self._refused: list[Refused] = []
+        self._stats = job.layout.empty_stats()
+
+    def refuse(self, item: Refused, report: Report) -> None:
+        """Note an episode that goes to quarantine."""
+        self._refused.append(item)
+        report(Tick(episodes=1, quarantined=1))
+
+    def add(self, item: ReadEpisode, start: int, report: Report) -> None:
+        """Note an episode that is written, from row `start` on."""
+        self._stats["action"].merge(Stats.of(item.clip.known_actions))
+        if item.clip.known_states is not None:
+            self._stats["state"].merge(Stats.of(item.clip.known_states))
+        self._rows.append(_row(item, self._unit, start, len(item.kept)))
+        report(Tick(episodes=1))
+
+    def footer(self) -> Footer:
+        """Return the footer of the unit."""
+        rows, refused = tuple(self._rows), tuple(self._refused)
+        return Footer(self._facts, self._unit.name, self._unit.split, rows, refused, self._stats)
+
+
+def _row(item: ReadEpisode, unit: ShardUnit, start: int, rows: int) -> EpisodeRow:
+    clip = item.clip
+    skew = {name: [float(v) for v in np.percentile(ms, [50, 95, 100])] for name, ms in clip.skew_ms.items()}
+    worst = max(skew.values(), key=lambda values: values[2], default=[0.0, 0.0, 0.0])
+    return EpisodeRow(
+        episode_index=item.index,
+        id=item.ref.id,
+        split=unit.split,
+        shard=unit.name,
+        row_start=start,
+        rows=rows,
+        length=rows,
+        instruction=clip.episode.instruction,
+        success=clip.episode.success,
+        fingerprint=item.ref.fingerprint,
+        skew_p50_ms=worst[0],
+        skew_p95_ms=worst[1],
+        skew_max_ms=worst[2],
+        skew=json.dumps(skew),
+        trimmed=clip.trimmed,
+        flags=flags_text(clip.trimmed, clip.flags | item.flags, pauses(clip.timestamps)),
+        group=item.ref.group,
+        content=item.content,
+    )
+
+
+@contextmanager
+def signs_of_life(report: Report) -> Iterator[None]:
+    """Report from a thread while the block runs, so that the engine does not count it as hung."""
+    over = Event()
+
+    def beat() -> None:
+        while not over.wait(SIGN_EVERY_S):
+            report(Tick())
+
+    thread = Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def prefetch[T](items: Iterator[T], depth: int = 3) -> Iterator[T]:
+    """Yield the same items in the same order; a thread reads up to `depth` of them ahead.
+
+    An error of `items` is raised in the place of the item.
+    """
+    end = object()
+    pool = ThreadPoolExecutor(1)
+    try:
+        ahead = deque(pool.submit(next, items, end) for _ in range(depth))
+        while (item := ahead.popleft().result()) is not end:
+            ahead.append(pool.submit(next, items, end))
+            yield cast(T, item)
+    finally:
+        pool.shutdown(cancel_futures=True)

@@ -1,0 +1,87 @@
+"""Find the frames of an episode in which nothing moves, by its numbers.
+
+A frame is idle where no value of its action or state has moved since the last frame that was kept. A command
+that is a motion by itself (a delta, a velocity) has moved where it is not near zero.
+
+A value has moved by more than `STILL` of the widest range that a value of its component has in the episode,
+and by more than `NOISE` in its own unit; a motion is not near zero above `STILL` of the component's largest.
+The first frame and frames with unknown numbers are kept. Frames are compared with the last one kept, so that
+of slow motion every few frames are left instead of none.
+
+T frames, A values.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.episode import Clip
+from hma_data.registry.components import Action, Component, Vector
+from hma_data.registry.embodiment import Embodiment
+
+STILL = 0.005
+NOISE = 0.001
+MOTIONS = ("eef_delta", "joint_delta", "joint_velocity", "base_velocity")  # action spaces
+
+
+def idle_frames(clip: Clip, embodiment: Embodiment) -> NDArray[np.bool_]:
+    """Return which frames (T,) of a clip are idle."""
+    values, limits = _numbers(clip, embodiment)
+    idle = np.zeros(len(clip), np.bool_)
+    kept = values[0]
+    for frame in range(1, len(clip)):
+        idle[frame] = bool((np.abs(values[frame] - kept) <= limits).all())
+        if not idle[frame]:
+            kept = values[frame]
+    asked = _motions(clip, embodiment.action)
+    idle &= ~asked
+    for known in (clip.action_known, clip.state_known):
+        if known is not None:
+            idle &= known
+    return idle
+
+
+def idle_rows(clip: Clip, embodiment: Embodiment, kept: NDArray[np.int64], stride: int) -> NDArray[np.bool_]:
+    """Return which of the rows are idle: those whose `stride` frames from `kept` (N,) on are all idle."""
+    idle = idle_frames(clip, embodiment)
+    return np.asarray(idle[kept[:, None] + np.arange(stride)].all(axis=1), np.bool_)
+
+
+def _is_motion(part: Component, action: Action) -> bool:
+    if part.gripper is not None:
+        return part.gripper in ("opening_is_high", "closing_is_high")
+    return action.space in MOTIONS
+
+
+def _numbers(clip: Clip, embodiment: Embodiment) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the values (T, n) of action and state that are no motions, and by how much each may change."""
+    found: list[NDArray[np.float64]] = [np.zeros((len(clip), 0))]
+    limits: list[NDArray[np.float64]] = [np.zeros(0)]
+    for part, values in _parts(clip.actions, embodiment.action):
+        if not _is_motion(part, embodiment.action):
+            found.append(values)
+            limits.append(_limits(values))
+    if embodiment.state is not None and clip.states is not None:
+        for _, values in _parts(clip.states, embodiment.state):
+            found.append(values)
+            limits.append(_limits(values))
+    return np.concatenate(found, axis=1), np.concatenate(limits)
+
+
+def _limits(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    widest = float(np.ptp(values, axis=0).max())
+    return np.full(values.shape[1], max(STILL * widest, NOISE))
+
+
+def _motions(clip: Clip, action: Action) -> NDArray[np.bool_]:
+    """Return at which frames (T,) a command that is a motion by itself is not near zero."""
+    asked = np.zeros(len(clip), np.bool_)
+    for part, values in _parts(clip.actions, action):
+        if _is_motion(part, action):
+            asked |= (np.abs(values) > STILL * np.abs(values).max()).any(axis=1)
+    return asked
+
+
+def _parts(values: NDArray[np.float32], vector: Vector) -> list[tuple[Component, NDArray[np.float64]]]:
+    ends = np.cumsum([part.dims for part in vector.components])
+    pieces = np.split(values.astype(np.float64), ends[:-1], axis=1)
+    return list(zip(vector.components, pieces, strict=True))
