@@ -207,6 +207,8 @@ def join_datasets(parts: Sequence[Path], folder: Path, name: str) -> None:
             aggregate.aggregate_datasets([f"lab/{name}"] * len(parts), f"lab/{name}", list(parts), folder)
     finally:
         aggregate.tqdm = bars
+    stats = folder / "meta" / "stats.json"  # lerobot writes its features in another order in each process
+    stats.write_text(json.dumps(read_json(stats, SourceError), indent=4, sort_keys=True), encoding="utf-8")
 
 
 def set_splits(folder: Path, splits: Mapping[str, str]) -> None:
