@@ -6,9 +6,15 @@
 # A part that fails leaves its log and does not stop the others. A second call with the same OUT/world goes on with
 # the training. START names a checkpoint to begin from (the state of an earlier call).
 set -uo pipefail
-out=$1 here=$(cd "$(dirname "$0")/../.." && pwd)
-mkdir -p "$out"
+gpu=$(nvidia-smi --query-gpu=name,memory.total --format=csv,noheader) ||
+    { echo "error: there is no GPU here — run this where nvidia-smi lists one" >&2 && exit 1; }
+mkdir -p "${1:?error: name the folder for the figures: recipes/gpu/all.sh OUT}"
+out=$(cd "$1" && pwd) here=$(cd "$(dirname "$0")/../.." && pwd)
 cd "$here" || exit 1
+if ! command -v hma > /dev/null; then # a bare machine; the installation is not part of the 25 minutes
+    pip install -q uv && uv sync -q --group dev || exit 1
+    export PATH="$here/.venv/bin:$PATH"
+fi
 part() { # name, seconds at most, command …
     local name=$1 most=$2 begun=$SECONDS
     shift 2
@@ -16,7 +22,7 @@ part() { # name, seconds at most, command …
     echo "$name: exit $?, $((SECONDS - begun)) s" | tee -a "$out/parts.txt"
     tail -n 12 "$out/$name.log"
 }
-nvidia-smi --query-gpu=name,memory.total --format=csv,noheader | tee "$out/gpu.txt"
+echo "$gpu" | tee "$out/gpu.txt"
 export WORKERS=${WORKERS:-$(nproc)}
 part world 840 recipes/world/make.sh "${WORLD:-/tmp/world}" 480 batch_size=256 lr=3e-3 compile=true \
     ${START:+start=$START}
