@@ -56,6 +56,7 @@ def test_it_holds_registry_recipes_and_weights(installed: Path) -> None:
     assert any(name.startswith("hma_data/tokenizers/weights/") for name in files)
     assert {
         "hma_model/play/page.html",
+        "hma_model/play/controls.js",
         "hma_model/play/holding.json",
         "hma_data/py.typed",
         "hma_model/py.typed",

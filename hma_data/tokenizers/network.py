@@ -129,10 +129,14 @@ class NetworkTokenizer:
         """
         parts, dtype = [], torch.int64 if self.spec.kind == "discrete" else self.dtype
         for part in tokens.split(self.batch):
-            pixels = self._decode(part.to(self.device, dtype)).float()
+            pixels = self.pixels(part.to(self.device, dtype)).float()
             whole = pixels.add(1).mul_(127.5).round_().clamp_(0, 255).to(torch.uint8)
             parts.append(whole.permute(0, 2, 3, 1))
         return torch.cat(parts)
+
+    def pixels(self, tokens: Tensor) -> Tensor:
+        """Decode ids (N, h, w) int64, or latents (N, c, h, w), to pixels (N, 3, S, S) of about [-1, 1]."""
+        return self._decode(tokens)
 
     def _decode_batch(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
         """Decode at most one batch of ids or latents."""

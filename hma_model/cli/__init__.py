@@ -22,6 +22,7 @@ from hma_data.cpu import bound_spinning, take_ordinary_priority
 from hma_data.errors import HMAError, UsageError
 from hma_model.cli import train as cli_train
 from hma_model.cli.evaluate import evaluate
+from hma_model.cli.export import export
 from hma_model.cli.hub import hub_app
 from hma_model.cli.options import (
     Cameras,
@@ -234,6 +235,7 @@ def _opened(checkpoint: str, data: Path, device: str) -> tuple[Any, Any, Any]:
     return model.eval(), tokenizer_of(shards, device=there), shards
 
 
+app.command(rich_help_panel=MODELS)(export)
 app.command("policy-eval", rich_help_panel=MODELS)(policy_eval)
 app.command(rich_help_panel=MODELS)(augment)
 app.command("label-actions", rich_help_panel=MODELS)(label_actions)

@@ -19,8 +19,7 @@ from torch import Tensor
 from hma_model.network.conditioning import ActionConditioning
 from hma_model.network.head import device_of
 from hma_model.network.network import Network
-from hma_model.network.rotary import rotary_angles
-from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions
+from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions, ring_times
 
 
 @dataclass(frozen=True)
@@ -276,19 +275,13 @@ class RowState:
     def cached_times(self, rows: Sequence[int], begin: Sequence[int], frames: int) -> TimePositions:
         """Return the times of a pass over T frames of each row, from the times `begin` on."""
         positions = self.tensor(begin).unsqueeze(1) + torch.arange(frames, device=self.model.device)
-        newest, batch = positions[:, -1:], len(self.times)
-        # Slot r holds the newest time t with t mod R = r. A negative one is a slot that nothing has filled.
-        held = newest - (newest - torch.arange(self.slots, device=newest.device)) % self.slots  # (n, R) times
-        age = positions.unsqueeze(2) - held.unsqueeze(1)
-        allowed = (held >= 0).unsqueeze(1) & (age >= 0) & (age < self.config.frames)
-        places = positions % self.slots * batch + self.tensor(rows).unsqueeze(1)
+        batch, times = len(self.times), ring_times(self.config, positions, self.slots)
         chosen: slice | Tensor | None = self.tensor(rows)
         if list(rows) == list(range(rows[0], rows[0] + len(rows))):
             # A slice of the cache is a view; an index would copy it in every layer.
             chosen = None if len(rows) == batch else slice(rows[0], rows[0] + len(rows))
-        return TimePositions(
-            positions, allowed, rotary_angles(self.config, positions), slots=places, rows=chosen
-        )
+        assert times.slots is not None
+        return replace(times, slots=times.slots * batch + self.tensor(rows).unsqueeze(1), rows=chosen)
 
     # -- snapshots ----------------------------------------------------------------------------------------
 

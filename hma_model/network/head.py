@@ -8,7 +8,7 @@ M rows, C values of a sample, W width of the diffusion head.
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from itertools import accumulate
 from operator import mul
 
@@ -28,7 +28,8 @@ TRAINING_LEVELS = 1000  # of noise
 CLIP = 10.0  # a step's estimate of the clean sample is clipped to ± this
 
 
-type Generators = torch.Generator | Sequence[torch.Generator] | None  # several draw equal parts of axis 0
+# Several draw equal parts of axis 0; a tensor holds numbers that were drawn before.
+type Generators = torch.Generator | Sequence[torch.Generator] | Tensor | None
 
 
 def uniform(shape: Sequence[int], generator: Generators, device: torch.device | str = "cpu") -> Tensor:
@@ -44,6 +45,8 @@ def randn(shape: Sequence[int], generator: Generators, device: torch.device | st
 def _draw(
     draw: Callable[..., Tensor], shape: Sequence[int], generator: Generators, device: torch.device | str
 ) -> Tensor:
+    if isinstance(generator, Tensor):
+        return generator.view(tuple(shape))
     if generator is None or isinstance(generator, torch.Generator):
         return draw(tuple(shape), generator=generator, device=device_of(generator)).to(device)
     part = (shape[0] // len(generator), *shape[1:])
@@ -384,6 +387,12 @@ def cosine_levels(steps: int) -> Tensor:
     return (1 - noise).cumprod(0)
 
 
+@cache
+def sampling_levels(total: int, count: int) -> tuple[int, ...]:
+    """Return the noise levels of so many sampling steps, out of `total` levels, the noisiest first."""
+    return tuple(torch.linspace(total - 1, 0, count).round().long().tolist())
+
+
 class _Block(nn.Module):
     """A residual MLP whose input is shifted and scaled, and whose output is gated."""
 
@@ -471,9 +480,10 @@ class DiffusionHead(nn.Module):
         """
         total = len(self.alpha_bars)
         count = min(steps or self.sample_steps, total)
-        levels = torch.linspace(total - 1, 0, count).round().long()
-        alpha_bars = [*(self.alpha_bars[level] for level in levels.tolist()), 1.0]
-        embedded, embedded_levels = self.condition(condition), self._level(levels.to(condition.device))
+        levels = sampling_levels(total, count)
+        alpha_bars = [*(self.alpha_bars[level] for level in levels), 1.0]
+        embedded_levels = self._level(torch.tensor(levels, device=condition.device))
+        embedded = self.condition(condition)
         x = randn((len(condition), self.values), generator, condition.device)
         for index in range(count):
             predicted = self._predict(x, embedded_levels[index], embedded)

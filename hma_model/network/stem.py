@@ -103,13 +103,21 @@ class TokenEmbedding(nn.Module):
             masked: not used: an id says by itself that it is masked.
             previous: (T,) for each frame the index of the frame before it, or -1 if it is not there.
         """
-        hidden = (tokens == self.mask_id).unsqueeze(-1)
-        digits = to_digits(tokens.masked_fill(hidden.squeeze(-1), 0), self.factored)
+        hidden = tokens == self.mask_id
+        return self.of_digits(to_digits(tokens.masked_fill(hidden, 0), self.factored), hidden, previous)
+
+    def of_digits(self, digits: Tensor, hidden: Tensor, previous: Sequence[int]) -> Tensor:
+        """Embed digits (B, T, S, F) as (B, T, S, D); `hidden` (B, T, S) bool says which tokens are masked."""
+        hidden = hidden.unsqueeze(-1)
         if len(self.factored) > 2:  # one sum over all digits
-            starts = _places(tuple(self.factored), tokens.device)[2]
+            starts = _places(tuple(self.factored), digits.device)[2]
             rows = (digits + starts).flatten(0, -2)
-            embedding = F.embedding_bag(rows, torch.cat(list(self.digits)), mode="sum")
-            embedding = embedding.view(*tokens.shape, -1)
+            table = torch.cat(list(self.digits))
+            if torch.compiler.is_exporting():  # ONNX has no such operator, and would loop over the tokens
+                embedding = F.embedding(rows, table).sum(1)
+            else:
+                embedding = F.embedding_bag(rows, table, mode="sum")
+            embedding = embedding.view(*digits.shape[:-1], -1)
         else:
             embedding = F.embedding(digits[..., 0], self.digits[0])
             for index in range(1, len(self.factored)):

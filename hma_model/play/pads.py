@@ -21,6 +21,10 @@ from hma_model.worlds.scenes import Dimension, Drivable
 
 PLANE_SIDES = {"pusht_fast": 512.0}  # side of the image in units of the action, for targets in the plane
 EDGE_TURN = 1.0  # rad: farthest that the first joint of an arm turns that stands at the image's edge
+# Keys for down and up, and those for left and right; FURTHER for a value that no pad has.
+ACROSS = (("ArrowLeft", "ArrowRight"), ("a", "d"), ("j", "l"), ("f", "h"))
+ALONG = (("ArrowDown", "ArrowUp"), ("s", "w"), ("k", "i"), ("g", "t"))
+FURTHER = ("q", "e")
 MAX_SHARED_PADS = 2  # pads side by side for values that no image shows
 
 
@@ -109,6 +113,28 @@ def _arm(mechanism: Arm, found: list[Pad]) -> list[Pad]:
     return [replace(first, x=first.y, y=first.x, flips=(False, bool(along < 0))), *found[1:]]
 
 
+def driving_keys(robot: Drivable) -> list[list[str]]:
+    """Return the keys of each value, as browsers name them: down and up, one for a switch, or none."""
+    across, along = list(ACROSS), list(ALONG)
+    found: list[list[str]] = [[" "] if dim.kind == "switch" else [] for dim in robot.dimensions]
+
+    def turned(pair: tuple[str, str], flips: bool) -> list[str]:
+        return list(pair[::-1] if flips else pair)
+
+    for pad in pads(robot):
+        if pad.x is not None and across:
+            found[pad.x] = turned(across.pop(0), pad.flips[0])
+        if pad.y is not None and along:
+            found[pad.y] = turned(along.pop(0), not pad.flips[1])
+    rest = [FURTHER]
+    for number in range(max(len(across), len(along))):
+        rest += [*across[number : number + 1], *along[number : number + 1]]
+    for number, own in enumerate(found):
+        if not own and rest:
+            found[number] = list(rest.pop(0))
+    return found
+
+
 def hint(robot: Drivable) -> str:
     """Return what a drag on the image does, as a sentence without its full stop."""
     found = pads(robot)
@@ -157,5 +183,6 @@ def describe(robot: Drivable) -> dict[str, Any]:
             vars(dim) | {"label": label} for dim, label in zip(robot.dimensions, labels(robot), strict=True)
         ],
         "pads": [asdict(pad) for pad in pads(robot)],
+        "keys": driving_keys(robot),
         "hint": hint(robot),
     }

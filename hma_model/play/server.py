@@ -16,7 +16,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, TypeVar
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, quote, urlsplit
 
 import anyio
 import numpy as np
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 FIRST_ROBOT = "rails_03"  # the robot that a page opens with: it follows, and is easy to drive
+PARTS = {"page.css": "text/css", "controls.js": "text/javascript"}  # that the page shares with exported pages
 MAX_VIEWERS = 32
 MESSAGES_PER_S, MESSAGE_BURST = 200.0, 400.0  # messages of a viewer a second, and at once
 SCENE_COST = 20.0  # messages that one counts as which begins a scene: all other sessions wait for it
@@ -121,10 +122,12 @@ class Server:
         self.holdings = holdings or {}
         self.viewers = 0
         self._page = files("hma_model.play").joinpath("page.html").read_text("utf-8")
+        self._query = f"?token={quote(token, safe='')}" if token else ""
         self._saving = asyncio.Semaphore(1)
         routes = [
             Route("/", self.page),
             Route("/save", self.save),
+            Route("/{name:str}", self.part),
             WebSocketRoute("/drive", self.drive),
         ]
         self.app = Guard(Starlette(routes=routes), host, token)
@@ -142,7 +145,17 @@ class Server:
             "Referrer-Policy": "no-referrer",
             "X-Content-Type-Options": "nosniff",
         }
-        return HTMLResponse(self._page.replace("NONCE", nonce), headers=headers)
+        page = self._page.replace("NONCE", nonce).replace("QUERY", self._query)
+        return HTMLResponse(page, headers=headers)
+
+    async def part(self, request: Request) -> Response:
+        """Return the style or the controls of the page."""
+        name = request.path_params["name"]
+        if name not in PARTS:
+            return PlainTextResponse("there is no such file\n", 404)
+        content = files("hma_model.play").joinpath(name).read_text("utf-8")
+        headers = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+        return Response(content, media_type=PARTS[name], headers=headers)
 
     async def save(self, request: Request) -> Response:
         """Return what was driven in a session as a file."""

@@ -166,6 +166,19 @@ def window_times(config: HMAConfig, frames: int, device: torch.device | str) -> 
     return TimePositions(positions, allowed, rotary_angles(config, positions), causal=frames <= config.frames)
 
 
+def ring_times(config: HMAConfig, positions: Tensor, slots: int) -> TimePositions:
+    """Return the times of frames at (B, T) of rows whose frame at time t is carried in slot t mod R.
+
+    The slots of the frames (`TimePositions.slots`) are those of a single row.
+    """
+    newest = positions[:, -1:]
+    # Slot r holds the newest time t with t mod R = r. A negative one is a slot that nothing has filled.
+    held = newest - (newest - torch.arange(slots, device=newest.device)) % slots  # (B, R) times
+    age = positions.unsqueeze(2) - held.unsqueeze(1)
+    allowed = (held >= 0).unsqueeze(1) & (age >= 0) & (age < config.frames)
+    return TimePositions(positions, allowed, rotary_angles(config, positions), slots=positions % slots)
+
+
 def paired_times(config: HMAConfig, past: int, frames: int, device: torch.device | str) -> TimePositions:
     """Return the times of the first `past` frames, then of a copy of each frame from the second on.
 

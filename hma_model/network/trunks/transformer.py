@@ -81,8 +81,7 @@ def remember(cache: Tensor, new: tuple[Tensor, Tensor], times: TimePositions) ->
     """Write keys and values (B, T, ...) into a cache (2, R, rows, ...); return that of the pass's rows."""
     assert times.slots is not None
     # `slots` numbers (slot, row) pairs: one index_copy_ writes frames of rows at different times.
-    for values, kept in zip(new, cache):
-        kept.flatten(0, 1).index_copy_(0, times.slots.flatten(), values.flatten(0, 1))
+    cache.flatten(1, 2).index_copy_(1, times.slots.flatten(), torch.stack(new).flatten(1, 2))
     return cache if times.rows is None else cache[:, :, times.rows]
 
 

@@ -128,7 +128,7 @@ def opened(page: "Page", address: str, robot: str = "mover_04") -> "Page":
     page.wait_for_selector("body[data-frame='0']")
     if page.input_value("#robot") != robot:
         page.select_option("#robot", robot)
-        page.wait_for_function("(key) => robot.key === key", arg=robot)
+        page.wait_for_selector(f"body[data-robot='{robot}']")
     return page
 
 
@@ -449,13 +449,15 @@ def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(pa
             return map;
         };
         window.seen = [];
-        const note = () => seen.push($("parted").textContent);
-        new MutationObserver(note).observe($("parted"), { childList: true });
+        const parted = document.getElementById("parted");
+        const note = () => seen.push(parted.textContent);
+        new MutationObserver(note).observe(parted, { childList: true });
     }""")
     page.keyboard.press("n")
     page.keyboard.press("y")
     page.wait_for_selector("#sync:not(.call)")
-    bright = "Math.max(...$('model-view').getContext('2d').getImageData(5, 5, 1, 1).data.slice(0, 3)) > 50"
+    pixel = "document.getElementById('model-view').getContext('2d').getImageData(5, 5, 1, 1).data"
+    bright = f"Math.max(...{pixel}.slice(0, 3)) > 50"
     for _ in range(100):  # until the true image is there, where the model of before was black
         if page.evaluate(bright):
             break

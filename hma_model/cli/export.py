@@ -1,0 +1,84 @@
+"""Define the verb `hma export`: ONNX graphs of a checkpoint."""
+
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Argument, Option
+
+from hma_model.cli.hub import Embodiments
+from hma_model.cli.options import Checkpoint, UnmaskSteps, require_checkpoint
+
+
+def export(
+    checkpoint: Checkpoint,
+    out: Annotated[Path, Option(help="Folder to write; an older export there is replaced.")],
+    data: Annotated[
+        list[Path] | None, Argument(help="Shard sets, whose held-out episodes give frames to start from.")
+    ] = None,
+    embodiment: Embodiments = None,
+    starts: Annotated[int, Option(min=1, max=20, help="Scenes of each robot to start from.")] = 3,
+    unmask_steps: UnmaskSteps = 2,
+    half: Annotated[
+        bool, Option("--half/--float32", help="Weights in float16 if that costs less than 0.1 dB.")
+    ] = True,
+) -> None:  # fmt: skip
+    """Write ONNX graphs of a model, which run without torch.
+
+    Example: hma export embedded --out page -e rails_03
+    """
+    made = export_checkpoint(
+        checkpoint, data or [], out, embodiment, starts=starts, unmask_steps=unmask_steps, half=half,
+    )  # fmt: skip
+    parts = [made["step"], *(robot["stem"] for robot in made["robots"])]
+    size = sum(part["bytes"] for part in parts) / 1e6
+    robots = len(made["robots"])
+    said = f"{robots} robot{'s' * (robots != 1)}, graphs of {size:.1f} MB with weights in {made['weights']}"
+    if made["float16_loss_db"] is not None:
+        said += f" (float16 costs {made['float16_loss_db']:.2f} dB)"
+    print(f"wrote {out}: {said}")
+
+
+def export_checkpoint(
+    checkpoint: str, data: list[Path], out: Path, embodiments: list[str] | None, **settings: Any
+) -> dict[str, Any]:
+    """Export robots of a checkpoint; return the manifest."""
+    import sys
+
+    from hma_data.errors import UsageError
+    from hma_data.shards.reader import ShardSet
+    from hma_model.export.files import require_onnx
+    from hma_model.hub.publish import located
+    from hma_model.worlds.scenes import Drivable, drivable, trained_on
+
+    require_onnx()
+    sets = list(map(ShardSet, data))
+    require_checkpoint(checkpoint)
+    opened, ids = located(checkpoint, embodiments)
+
+    @cache
+    def tokenizer() -> Any:
+        from hma_data.tokenizers.base import get_tokenizer
+
+        return get_tokenizer(opened.config.tokenizer["name"])
+
+    chosen: dict[str, Drivable] = {}
+    offered = drivable(opened, sets or trained_on(opened), tokenizer).values()
+    for robot in sorted(offered, key=lambda one: ("simulator", "recordings", "images").index(one.source)):
+        if robot.embodiment.id in ids:
+            chosen.setdefault(robot.embodiment.id, robot)
+    if not chosen:
+        raise UsageError("--embodiment", "none has frames to start from", "give shards of one")
+    if lacking := [name for name in ids if name not in chosen]:
+        print(f"left out, for want of frames to start from: {', '.join(lacking)}", file=sys.stderr)
+    from hma_model.checkpoint.io import load
+    from hma_model.export.folder import export_folder
+
+    model = load(opened, list(chosen), "cpu").eval()
+    name = "the bundled model" if opened.name == "embedded" else Path(checkpoint).name
+    robots = list(chosen.values())
+
+    def report(said: str) -> None:
+        print(f"export: {said}", file=sys.stderr)
+
+    return export_folder(model, tokenizer(), robots, out, name=name, report=report, **settings)

@@ -1,0 +1,116 @@
+"""Write graphs as ONNX files, with their weights in float16 where these lose nothing.
+
+The runtime computes in float32: a weight stored as float16 is followed by a cast, which it computes once when
+it loads the graph. `rounded` rounds the weights of a model before the export, so that the files lose nothing.
+"""
+
+import logging
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from hma_data.errors import MissingDependencyError, install_command
+from hma_data.storage.files import atomic_path, file_sha256
+from hma_model.export.graphs import Port, example
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
+
+OPSET = 18  # of ONNX: runtimes of 2023 and later know it
+SMALL = 64  # values of a tensor that stays float32
+
+
+def require_onnx() -> None:
+    """Raise MissingDependencyError unless the packages that write ONNX are installed."""
+    try:
+        import onnx  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError as fault:
+        remedy = install_command("export")
+        raise MissingDependencyError("hma export", f"needs {fault.name}", remedy) from fault
+
+
+def rounded[M: nn.Module](module: M) -> M:
+    """Round the weights of a module to float16, in place; statistics of actions stay."""
+    with torch.no_grad():
+        for parameter in module.parameters():
+            if parameter.numel() >= SMALL:
+                parameter.copy_(parameter.half())
+    return module
+
+
+def write_graph(
+    path: Path, graph: nn.Module, inputs: Sequence[Port], outputs: Sequence[str]
+) -> dict[str, Any]:
+    """Write a graph, and return its file's facts: name, bytes and digest."""
+    with _quiet(), torch.no_grad():
+        program = torch.onnx.export(
+            graph,
+            tuple(example(inputs)),
+            dynamo=True,
+            opset_version=OPSET,
+            input_names=[port.name for port in inputs],
+            output_names=list(outputs),
+            verbose=False,
+        )
+    assert program is not None
+    made = program.model_proto
+    _strip(made)
+    _halve(made)
+    with atomic_path(path) as part:
+        part.write_bytes(made.SerializeToString())
+    return facts(path)
+
+
+def facts(path: Path) -> dict[str, Any]:
+    """Return name, bytes and SHA-256 of a file."""
+    return {"file": path.name, "bytes": path.stat().st_size, "sha256": file_sha256(path)}
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the exporter's remarks about its own work from the terminal."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
+
+
+def _strip(model: "ModelProto") -> None:
+    """Remove what the exporter notes of this machine's source files, a quarter of a small graph."""
+    graph = model.graph
+    del graph.value_info[:]
+    for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.initializer):
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
+
+
+def _halve(model: "ModelProto") -> None:
+    """Store each weight as float16 that float16 holds exactly, with a cast behind it."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    casts = []
+    for tensor in model.graph.initializer:
+        if tensor.data_type != TensorProto.FLOAT:
+            continue
+        values = numpy_helper.to_array(tensor)
+        with np.errstate(over="ignore"):
+            half = values.astype(np.float16)
+        if values.size < SMALL or not np.array_equal(half.astype(np.float32), values):
+            continue
+        name = tensor.name
+        tensor.CopyFrom(numpy_helper.from_array(half, f"{name}_half"))
+        casts.append(helper.make_node("Cast", [f"{name}_half"], [name], to=TensorProto.FLOAT))
+    nodes = [*casts, *model.graph.node]
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)

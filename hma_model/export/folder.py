@@ -1,0 +1,149 @@
+"""Write a folder that holds a model, its robots, and frames to start from.
+
+    manifest.json            what is in the folder; written last
+    step.onnx                one frame of any robot
+    robots/ID/stem.onnx      what commands of a robot mean to the step
+    robots/ID/frames.npy     (starts, P, …) known frames, as the step takes them
+    robots/ID/chunks.npy     (starts, P - 1, K) commands between them; NaN where they are unknown
+    robots/ID/start-0.png    the last known frame of each start
+
+P frames of a start, K = stride * action dim.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data import __version__
+from hma_data.episodes.images import opencv
+from hma_data.errors import OutputError
+from hma_data.storage.files import new_folder, read_json, to_json, write_atomic
+from hma_model.export.files import require_onnx, write_graph
+from hma_model.export.graphs import Port, StemGraph, StepGraph, require_exportable
+from hma_model.export.starts import Start, round_weights, take_starts
+from hma_model.play.holding import UNKNOWN, holdings
+from hma_model.play.pads import describe
+from hma_model.worlds.scenes import Drivable
+from hma_model.worlds.world import World
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.network.model import HMA
+
+FORMAT, FORMAT_VERSION = "hma-export", 1
+MANIFEST = "manifest.json"
+
+
+def export_folder(
+    model: "HMA",
+    tokenizer: "Tokenizer",
+    robots: Sequence[Drivable],
+    out: Path,
+    *,
+    name: str,
+    starts: int = 3,
+    unmask_steps: int = 2,
+    half: bool = True,
+    report: Callable[[str], None] = lambda said: None,
+) -> dict[str, Any]:
+    """Export a model; return the manifest.
+
+    Args:
+        model: in eval mode, on the CPU. Its weights are rounded in place if they are exported in float16.
+        tokenizer: the model's, on the CPU; likewise.
+        robots: those to export, one for each embodiment.
+        out: the folder; an older export there is replaced.
+        name: of the model.
+        starts: scenes of each robot to begin from.
+        unmask_steps: passes in which a frame is decoded.
+        half: store weights in float16 if that costs little.
+        report: is told what is done next.
+
+    Raises:
+        CheckpointError: no graph can be written of such a model.
+        MissingDependencyError: the extra `export` is not installed.
+        OutputError: `out` holds something else.
+    """
+    require_onnx()
+    require_exportable(model, tokenizer)
+    _require_own(out)
+    world = World(model, tokenizer)
+    taken = {robot.embodiment.id: take_starts(world, robot, starts) for robot in robots}
+    loss, halved = round_weights(model, tokenizer, taken) if half else (None, False)
+    with new_folder(out) as folder:
+        report("step.onnx, which all robots share")
+        step = StepGraph(model, tokenizer, unmask_steps).eval()
+        manifest: dict[str, Any] = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "library": f"hma-toolkit {__version__}",
+            "model": name,
+            "trunk_sha256": model.source.trunk_sha256 if model.source else None,
+            "tokenizer": tokenizer.spec.to_json(),
+            "image": list(world.image_shape),
+            "weights": "float16" if halved else "float32",
+            "float16_loss_db": loss,
+            "step": write_graph(folder / "step.onnx", step, step.inputs, step.outputs),
+            "state": [vars(port) for port in step.state],
+            "draws": [vars(port) for port in step.draws if port.law],
+            "temperature": world.temperature if model.config.kind == "discrete" else None,
+            "robots": [],
+        }
+        known = holdings(model.source) if model.source else {}
+        for robot in sorted(robots, key=lambda one: known.get(one.embodiment.id, UNKNOWN).rank):
+            report(robot.embodiment.id)
+            held = known.get(robot.embodiment.id, UNKNOWN)
+            about = describe(robot) | {"holds": held.words, "follows": held.follows is not False}
+            manifest["robots"].append(about | _write_robot(folder, model, robot, taken[robot.embodiment.id]))
+        write_atomic(folder / MANIFEST, to_json(manifest))
+    return manifest
+
+
+def _require_own(out: Path) -> None:
+    """Raise OutputError if a folder holds something else than an export."""
+    if not out.exists():
+        return
+    if out.is_dir() and not any(out.iterdir()):
+        return
+    if not (out / MANIFEST).is_file() or read_json(out / MANIFEST).get("format") != FORMAT:
+        raise OutputError(out, "holds something else than an export", "choose another --out")
+
+
+def _write_robot(folder: Path, model: "HMA", robot: Drivable, starts: Sequence[Start]) -> dict[str, Any]:
+    """Write the files of a robot; return what the manifest says of them."""
+    name = robot.embodiment.id
+    home = folder / "robots" / name
+    home.mkdir(parents=True)
+    chunks = Port("chunks", (2, model.embodiments[name].chunk_dim), "float32")
+    stem = write_graph(home / "stem.onnx", StemGraph(model, name).eval(), [chunks], ["actions"])
+    frames = np.stack([start.frames for start in starts])
+    if model.config.kind == "discrete":
+        frames = frames.astype(np.int32)
+    elif model.config.pixels:
+        frames = frames.astype(np.uint8)
+    _save(home / "frames.npy", frames)
+    _save(home / "chunks.npy", np.stack([start.chunks for start in starts]))
+    pictures = []
+    for number, start in enumerate(starts):
+        pictures.append(f"robots/{name}/start-{number}.png")
+        write_atomic(folder / pictures[-1], _png(start.image))
+    return {
+        "stem": stem | {"file": f"robots/{name}/stem.onnx"},
+        "frames": f"robots/{name}/frames.npy",
+        "chunks": f"robots/{name}/chunks.npy",
+        "pictures": pictures,
+        "held": [start.action.tolist() for start in starts],
+    }
+
+
+def _save(path: Path, values: NDArray[Any]) -> None:
+    np.save(path, np.ascontiguousarray(values), allow_pickle=False)
+
+
+def _png(image: NDArray[np.uint8]) -> bytes:
+    cv2 = opencv()
+    data: bytes = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+    return data

@@ -1,0 +1,151 @@
+"""Exported graphs: the frames are those of torch, and the folder says how to drive them."""
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from hma_data.errors import CheckpointError, OutputError
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.checkpoint.io import load
+from hma_model.cli.export import export_checkpoint
+from hma_model.export.files import rounded
+from hma_model.export.graphs import require_exportable
+from hma_model.generation.decode import decode
+from hma_model.generation.rollout import Rollout
+from hma_model.play.session import psnr
+from tests.command import hma
+from tests.model.export.checkpoints import ROBOT, Driver, drawn_as_torch, save_pixels, save_tokens
+from tests.model.true_world import BlockLatents, latent_model
+
+FRAMES = 100
+
+
+@pytest.fixture(scope="session")
+def tokens(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A discrete transformer, exported; the checkpoint lies beside it."""
+    folder = tmp_path_factory.mktemp("tokens")
+    save_tokens(folder / "model")
+    export_checkpoint(str(folder / "model"), [], folder / "page", None)
+    return folder / "page"
+
+
+@pytest.fixture(scope="session")
+def pixels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A U-Net of pixels, likewise."""
+    folder = tmp_path_factory.mktemp("pixels")
+    save_pixels(folder / "model")
+    export_checkpoint(str(folder / "model"), [], folder / "page", None)
+    return folder / "page"
+
+
+def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[Any, Any, float]]:
+    """Return the frames that onnxruntime and torch make of the same actions, and the images' PSNR."""
+    model = rounded(load(checkpoint, [robot], "cpu").eval())
+    tokenizer = get_tokenizer(model.config.tokenizer["name"])
+    driver = Driver(page, robot)
+    rollout = Rollout(model, robot, temperature=0.0)
+    frames, chunks = torch.from_numpy(driver.frames)[None], torch.from_numpy(driver.chunks)[None]
+    rollout.prompt(frames, chunks, seeds=[7])
+    draws = drawn_as_torch(driver, model.config, 7)
+    low, high = np.transpose([(dim["low"], dim["high"]) for dim in driver.robot["dimensions"]])
+    actions, found = np.random.default_rng(3), []
+    for _ in range(FRAMES):
+        chunk = actions.uniform(low, high, (driver.robot["stride"], len(low))).astype(np.float32).reshape(-1)
+        image = driver.advance(chunk, next(draws))
+        frame = rollout.step(torch.from_numpy(chunk)[None])
+        shown = decode(tokenizer, frame[None])[0, 0]
+        found.append((driver.state["frame"], frame[0].numpy(), psnr(image, shown)))
+    return found
+
+
+def test_a_transformer_makes_the_tokens_of_torch(tokens: Path) -> None:
+    made = closed_loop(tokens, Checkpoint.open(tokens.with_name("model")), ROBOT)
+    assert all(np.array_equal(own, theirs) for own, theirs, _ in made)
+    assert min(score for *_, score in made) > 50
+    assert len({own.tobytes() for own, *_ in made}) > FRAMES / 2  # they change
+
+
+def test_a_u_net_makes_the_pixels_of_torch(pixels: Path) -> None:
+    made = closed_loop(pixels, Checkpoint.open(pixels.with_name("model")), ROBOT)
+    assert min(score for *_, score in made) > 45
+    assert len({own.tobytes() for own, *_ in made}) > FRAMES / 2
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+def test_every_bundled_robot_makes_the_tokens_of_torch(tmp_path: Path) -> None:
+    manifest = export_checkpoint("embedded", [], tmp_path / "page", None)
+    checkpoint = Checkpoint.open(EMBEDDED)
+    assert {robot["id"] for robot in manifest["robots"]} == set(checkpoint.embodiments)
+    assert manifest["weights"] == "float16" and manifest["step"]["bytes"] < 15e6
+    for robot in checkpoint.embodiments:
+        made = closed_loop(tmp_path / "page", checkpoint, robot)
+        assert all(np.array_equal(own, theirs) for own, theirs, _ in made), robot
+
+
+def test_the_manifest_says_how_to_drive_and_its_digests_fit(tokens: Path) -> None:
+    manifest = json.loads((tokens / "manifest.json").read_text())
+    (robot,) = manifest["robots"]
+    assert [(dim["name"], dim["unit"]) for dim in robot["dimensions"]] == [
+        (f"slide_{i}", "px") for i in range(3)
+    ]
+    assert all(dim["low"] < dim["high"] for dim in robot["dimensions"]) and len(robot["keys"]) == 3
+    assert robot["hz"] / robot["stride"] > 1
+    for part in (manifest["step"], robot["stem"]):
+        content = (tokens / part["file"]).read_bytes()
+        assert (len(content), hashlib.sha256(content).hexdigest()) == (part["bytes"], part["sha256"])
+    assert np.load(tokens / robot["frames"]).shape[:2] == (3, 4) and len(robot["held"]) == 3
+    assert all((tokens / picture).is_file() for picture in robot["pictures"])
+
+
+def test_shapes_are_fixed_and_no_operator_depends_on_data(tokens: Path, pixels: Path) -> None:
+    for page in (tokens, pixels):
+        graph = onnx.load(page / "step.onnx").graph
+        assert not {"Loop", "If", "Scan", "NonZero"} & {node.op_type for node in graph.node}
+        shapes = [port.type.tensor_type.shape.dim for port in (*graph.input, *graph.output)]
+        assert all(side.HasField("dim_value") for shape in shapes for side in shape)
+
+
+def test_weights_are_stored_as_float16(tokens: Path) -> None:
+    weights = onnx.load(tokens / "step.onnx").graph.initializer
+    counts = dict.fromkeys((onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT16), 0)
+    for one in weights:
+        if one.data_type in counts:
+            counts[one.data_type] += int(np.prod(one.dims))
+    assert counts[onnx.TensorProto.FLOAT16] > 20 * counts[onnx.TensorProto.FLOAT]
+
+
+def test_the_snippet_of_the_docs_drives_a_robot(tokens: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (Path(__file__).parents[3] / "docs" / "play.md").read_text()
+    (snippet,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(tokens.parent)
+    found: dict[str, Any] = {}
+    exec(snippet, found)
+    assert found["image"].shape == tuple(found["about"]["image"]) and found["image"].dtype == np.uint8
+    assert int(found["state"]["time"][0]) == 13
+
+
+def test_another_folder_is_not_replaced(tokens: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(OutputError, match="holds something else than an export"):
+        export_checkpoint(str(tokens.with_name("model")), [], tmp_path, None)
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+def test_a_tokenizer_without_a_network_is_refused() -> None:
+    with pytest.raises(CheckpointError, match="no network to export"):
+        require_exportable(latent_model(ROBOT), BlockLatents())
+
+
+def test_an_unknown_robot_is_one_line(tokens: Path, tmp_path: Path) -> None:
+    ended = hma("export", str(tokens.with_name("model")), "--out", str(tmp_path / "page"), "-e", "nobody")
+    assert ended.returncode == 1 and len(ended.stderr.strip().splitlines()) == 1
+    assert "has no embodiment 'nobody'" in ended.stderr
