@@ -94,10 +94,9 @@ def test_every_bundled_robot_makes_the_tokens_of_torch(tmp_path: Path) -> None:
 def test_the_manifest_says_how_to_drive_and_its_digests_fit(tokens: Path) -> None:
     manifest = json.loads((tokens / "manifest.json").read_text())
     (robot,) = manifest["robots"]
-    assert [(dim["name"], dim["unit"]) for dim in robot["dimensions"]] == [
-        (f"slide_{i}", "px") for i in range(3)
-    ]
-    assert all(dim["low"] < dim["high"] for dim in robot["dimensions"]) and len(robot["keys"]) == 3
+    named = [(dim["name"], dim["unit"], keys) for dim, keys in zip(robot["dimensions"], robot["keys"])]
+    assert named == [("slider_1", "px/s", ["w", "s"]), ("slider_2", "px/s", ["ArrowUp", "ArrowDown"])]
+    assert all(dim["low"] < dim["high"] for dim in robot["dimensions"])
     assert robot["hz"] / robot["stride"] > 1
     for part in (manifest["step"], robot["stem"]):
         content = (tokens / part["file"]).read_bytes()
