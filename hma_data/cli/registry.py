@@ -14,7 +14,7 @@ from hma_data.console import human_count, print_json, print_table
 from hma_data.registry import FORMATS
 
 if TYPE_CHECKING:
-    from hma_data.registry.catalog import Entry
+    from hma_data.registry.catalog import RegistryEntry
 
 registry_app = typer.Typer(no_args_is_help=True, help="Look at embodiments, check and write their YAML.")
 Id = Annotated[str, Argument(help="Registry id, or a YAML file.", autocompletion=robots)]
@@ -145,7 +145,7 @@ def registry_validate(
     raise typer.Exit(1 if found else 0)
 
 
-def _notes(judged: "list[Entry]") -> Iterator[tuple[Path, str]]:
+def _notes(judged: "list[RegistryEntry]") -> Iterator[tuple[Path, str]]:
     """Yield path and note of the YAMLs that want more frames a second than were recorded."""
     for entry in judged:
         facts = entry.facts or {}

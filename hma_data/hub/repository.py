@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Entry:
+class StoredFile:
     """A file of a repository, as a listing states it.
 
     Attributes:
@@ -100,7 +100,7 @@ class Repository:
         self._by_xet = True  # False once an upload by Xet has failed, as behind some firewalls
         self._commit: str | None = None
         self._cached: Path | None = None
-        self._entries: dict[str, Entry] = {}
+        self._entries: dict[str, StoredFile] = {}
         if write and get_token() is None:
             raise HubError(self.name, "needs a token to be written", f"{LOG_IN}; for a folder write ./{repo}")
         if get_session().timeout.read is None:  # by default the client waits for an answer without limit
@@ -142,17 +142,17 @@ class Repository:
             return entry.sha256 == sha256
         return entry is not None and entry.states(content)
 
-    def _listing(self) -> dict[str, Entry]:
+    def _listing(self) -> dict[str, StoredFile]:
         from huggingface_hub import RepoFile
 
         entries = self._api.list_repo_tree(**self._place, revision=self._commit, recursive=True)
         return {
-            item.path: Entry(item.size or 0, item.lfs.sha256 if item.lfs else None, str(item.blob_id))
+            item.path: StoredFile(item.size or 0, item.lfs.sha256 if item.lfs else None, str(item.blob_id))
             for item in entries
             if isinstance(item, RepoFile)
         }
 
-    def _of_cache(self) -> dict[str, Entry]:
+    def _of_cache(self) -> dict[str, StoredFile]:
         """Return the files that earlier pulls have left in the client's cache."""
         from huggingface_hub import snapshot_download
 
@@ -161,7 +161,7 @@ class Repository:
             found = snapshot_download(**self._place, **only, revision=self._revision)
         self._cached = folder = Path(found)
         names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
-        return {name: Entry((folder / name).stat().st_size, None, "") for name in names}
+        return {name: StoredFile((folder / name).stat().st_size, None, "") for name in names}
 
     # -- pulling
 

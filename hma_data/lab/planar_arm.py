@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import pymunk
 
 Floats = NDArray[np.float64]
-Manoeuvre = Callable[["Arm"], Floats]  # returns velocities (J,)
+Manoeuvre = Callable[["PlanarArm"], Floats]  # returns velocities (J,)
 
 TASK = "shove the blocks about"
 STEPS, HZ, TICKS = 96, 30, 8  # frames of an episode, their rate, ticks of the physics a frame
@@ -62,7 +62,7 @@ def _as_lerobot(demo: Demo) -> LeRobotEpisode:
     return LeRobotEpisode({"observation.images.top": seen["image"]}, demo.actions, state, TASK)
 
 
-class Arm:
+class PlanarArm:
     """The arm and its blocks, at start with joint angles (J,) and blocks (B, 3): x, y, angle of each.
 
     Raises:
@@ -202,7 +202,7 @@ def joints_at(tip: Floats, bend: int) -> Floats:
     return np.array([shoulder, elbow])
 
 
-def start(seed: int, episode: int) -> tuple[Arm, np.random.Generator]:
+def start(seed: int, episode: int) -> tuple[PlanarArm, np.random.Generator]:
     """Return the arm at the start of an episode, with the blocks apart, and the generator of its driver."""
     rng = np.random.default_rng((seed, 3, episode))
     joints = np.array([rng.uniform(-np.pi, np.pi), rng.uniform(-ELBOW_TURN, ELBOW_TURN)])
@@ -215,10 +215,10 @@ def start(seed: int, episode: int) -> tuple[Arm, np.random.Generator]:
         if np.linalg.norm(taken - place, axis=1).min() > BLOCK * 0.75 + RADIUS + 8:
             blocks.append(np.array([*place, rng.uniform(-np.pi, np.pi)]))
             taken = np.concatenate([taken, place[None]])
-    return Arm(joints, np.stack(blocks)), rng
+    return PlanarArm(joints, np.stack(blocks)), rng
 
 
-def begin(robot: str, seed: int, episode: int) -> tuple[Arm, Callable[[], NDArray[np.float32]]]:
+def begin(robot: str, seed: int, episode: int) -> tuple[PlanarArm, Callable[[], NDArray[np.float32]]]:
     """Return the simulation of an episode at its start, and the recorder's driver."""
     arm, rng = start(seed, episode)
     return arm, driver(arm, rng)
@@ -237,7 +237,7 @@ def _link(here: Floats, there: Floats, color: Color) -> list[Shape]:
 # -- driver
 
 
-def driver(arm: Arm, rng: np.random.Generator) -> Callable[[], NDArray[np.float32]]:
+def driver(arm: PlanarArm, rng: np.random.Generator) -> Callable[[], NDArray[np.float32]]:
     """Return the recorder's driver, which returns the next velocities (J,).
 
     It runs manoeuvres of 0.3 to 1.5 s, and turns the elbow back before its stops.
@@ -261,11 +261,11 @@ def driver(arm: Arm, rng: np.random.Generator) -> Callable[[], NDArray[np.float3
     return drive
 
 
-def _rest(arm: Arm) -> Floats:
+def _rest(arm: PlanarArm) -> Floats:
     return np.zeros(2)
 
 
-def _go(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
+def _go(arm: PlanarArm, rng: np.random.Generator) -> Manoeuvre:
     """Return a manoeuvre that goes to a block, and through it, or to any point in reach."""
     angle, far = rng.uniform(-np.pi, np.pi), rng.uniform(60, 220)
     point = BASE + far * np.array([np.cos(angle), np.sin(angle)])
@@ -275,7 +275,7 @@ def _go(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
         point = block + (block - tip) * 0.3
     goal, gain = joints_at(point, int(rng.choice((-1, 1)))), rng.uniform(3, 7)
 
-    def drive(arm: Arm) -> Floats:
+    def drive(arm: PlanarArm) -> Floats:
         error = goal - arm.angles
         error[0] = (error[0] + np.pi) % (2 * np.pi) - np.pi
         return gain * error
@@ -283,13 +283,13 @@ def _go(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
     return drive
 
 
-def _weave(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
+def _weave(arm: PlanarArm, rng: np.random.Generator) -> Manoeuvre:
     strength, hz, phase = rng.uniform(0.8, 2.4, 2), rng.uniform(0.2, 0.9, 2), rng.uniform(0, 2 * np.pi, 2)
     seconds = iter(np.arange(STEPS) / HZ)
     return lambda arm: strength * np.sin(2 * np.pi * hz * next(seconds) + phase)
 
 
-def _hold(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
+def _hold(arm: PlanarArm, rng: np.random.Generator) -> Manoeuvre:
     velocities = rng.uniform(-SPEED, SPEED, 2)
     if rng.random() < 0.4:
         velocities[rng.integers(2)] = 0.0

@@ -30,7 +30,7 @@ PLACED_PX = 4.0  # mean distance of the T's corners from the goal at which a dri
 STARTS = ("near", "random", "near", "far", "near")
 
 
-class Look(NamedTuple):
+class FrameLook(NamedTuple):
     """The side of a robot's square frames in px, and the names of their colours."""
 
     size: int
@@ -39,8 +39,8 @@ class Look(NamedTuple):
     raised: str
 
 
-FAST_LOOK = Look(128, "LightSlateGray", "RoyalBlue", "RoyalBlue")
-SLOW_LOOK = Look(96, "Peru", "Crimson", "DodgerBlue")
+FAST_LOOK = FrameLook(128, "LightSlateGray", "RoyalBlue", "RoyalBlue")
+SLOW_LOOK = FrameLook(96, "Peru", "Crimson", "DodgerBlue")
 FAST_STEPS, SLOW_TICKS = 80, 720
 CAMERA_TICKS, COMMAND_TICKS = 8, 20  # of pusht_slow: from one frame, and one action, to the next
 FAST_PERIOD_S = 0.1
@@ -61,17 +61,17 @@ def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
             _slow_bag(part / f"episode_{episode:04d}.mcap", seed, episode)
 
 
-def write_fast(part: Path, demos: Iterable[Demo], look: Look = FAST_LOOK) -> None:
+def write_fast(part: Path, demos: Iterable[Demo], look: FrameLook = FAST_LOOK) -> None:
     """Write episodes of `pusht_fast` as a file of robomimic's layout."""
     kwargs = {"observation_width": look.size, "observation_height": look.size}
     env_args = {"env_name": "gym_pusht/PushT-v0", "type": 2, "env_kwargs": kwargs}
     write_hdf5(part, demos, env_args)
 
 
-class Arena:
+class PushArena:
     """The table, with the parts of its state that the robots need; `start` is one of STARTS."""
 
-    def __init__(self, look: Look, start: str, rng: np.random.Generator) -> None:
+    def __init__(self, look: FrameLook, start: str, rng: np.random.Generator) -> None:
         self._size = look.size
         dice = np.random.default_rng(int(rng.integers(2**31)))
         places = [dice.integers(low, high) for low, high in ((50, 450), (50, 450), (100, 400), (100, 400))]
@@ -140,7 +140,7 @@ class Arena:
         self.success = self.success or coverage > SUCCESS
 
 
-def _policy(arena: Arena, rng: np.random.Generator, start: str, fly: bool) -> Planned | Wandering:
+def _policy(arena: PushArena, rng: np.random.Generator, start: str, fly: bool) -> Planned | Wandering:
     if start == "random":
         return Wandering(arena.agent, fly, rng)
     return Planned(arena.tee, arena.goal, arena.agent, SPEED, fly, rng)
@@ -153,7 +153,7 @@ def _within(target: Floats) -> Floats:
 class _Pusher:
     """What both robots have: an arena, which the camera shows whole."""
 
-    arena: Arena
+    arena: PushArena
 
     @property
     def own(self) -> Floats:
@@ -196,11 +196,11 @@ class FastPusher(_Pusher):
     """pusht_fast: an arena whose actions are targets of the pusher, one each 0.1 s."""
 
     def __init__(
-        self, seed: int, episode: int, look: Look = FAST_LOOK, starts: tuple[str, ...] = STARTS
+        self, seed: int, episode: int, look: FrameLook = FAST_LOOK, starts: tuple[str, ...] = STARTS
     ) -> None:
         self.rng = np.random.default_rng((seed, 0, episode))
         self.start = starts[episode % len(starts)]
-        self.arena = Arena(look, self.start, self.rng)
+        self.arena = PushArena(look, self.start, self.rng)
 
     @property
     def observed(self) -> NDArray[np.float32]:
@@ -261,11 +261,11 @@ def pusher_of(agent: Floats, rng: np.random.Generator) -> Callable[[Floats, Floa
 @cache
 def tee() -> Tee:
     """Return the T of both robots."""
-    return Arena(FAST_LOOK, "far", np.random.default_rng(0)).tee
+    return PushArena(FAST_LOOK, "far", np.random.default_rng(0)).tee
 
 
 def fast_demo(
-    seed: int, episode: int, noise: float = 0.0, look: Look = FAST_LOOK, starts: tuple[str, ...] = STARTS
+    seed: int, episode: int, noise: float = 0.0, look: FrameLook = FAST_LOOK, starts: tuple[str, ...] = STARTS
 ) -> Demo:
     """Simulate an episode of `pusht_fast`; `noise` is the share of its targets that are random."""
     dice, target = np.random.default_rng((seed, 2, episode)), None
@@ -303,7 +303,7 @@ class SlowPusher(_Pusher):
     def __init__(self, seed: int, episode: int) -> None:
         self.rng = np.random.default_rng((seed, 1, episode))
         self.start = STARTS[episode % len(STARTS)]
-        self.arena = Arena(SLOW_LOOK, self.start, self.rng)
+        self.arena = PushArena(SLOW_LOOK, self.start, self.rng)
         self.setpoint = self.arena.agent
         self.velocity: Floats = np.zeros(2)
 

@@ -30,7 +30,7 @@ CLOSE = 1e-4  # step in that scale at which a search ends
 
 
 @dataclass(frozen=True)
-class State:
+class SceneState:
     """The scene as a driver sees it: a pose (Q,), blocks (B, 2), and whether one of them is carried."""
 
     pose: Floats
@@ -43,17 +43,17 @@ def steerable(robot: str) -> bool:
     return robot in ("planar_arm", PUSHER) or FAMILY.fullmatch(robot) is not None
 
 
-def state_of(simulation: Simulation) -> State:
+def state_of(simulation: Simulation) -> SceneState:
     """Return the true state of a robot that is steerable."""
     if isinstance(simulation, BlockTable):
-        return State(simulation.pose, simulation.loose, simulation.held >= 0)
+        return SceneState(simulation.pose, simulation.loose, simulation.held >= 0)
     if isinstance(simulation, pusht.FastPusher):
-        return State(simulation.arena.agent, simulation.loose, False)
-    assert isinstance(simulation, planar_arm.Arm)
-    return State(simulation.angles, simulation.loose, False)
+        return SceneState(simulation.arena.agent, simulation.loose, False)
+    assert isinstance(simulation, planar_arm.PlanarArm)
+    return SceneState(simulation.angles, simulation.loose, False)
 
 
-def reacher(robot: str) -> Callable[[State], NDArray[np.float32]]:
+def reacher(robot: str) -> Callable[[SceneState], NDArray[np.float32]]:
     """Return a driver of a robot of the family that goes to the block that lies nearest.
 
     Raises:
@@ -63,7 +63,7 @@ def reacher(robot: str) -> Callable[[State], NDArray[np.float32]]:
     return lambda state: drive(state.pose, state.blocks, state.holding).astype(np.float32)
 
 
-def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[State], NDArray[np.float32]]:
+def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[SceneState], NDArray[np.float32]]:
     """Return a driver that begins at a pose (Q,): from a state it tells the next action (A,)."""
     if FAMILY.fullmatch(robot):
         drive = Driver(Body.of(robot), pose, rng)
@@ -74,7 +74,7 @@ def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[Stat
     arm = SimpleNamespace(angles=pose, blocks=np.zeros((1, 2)))
     next_command = planar_arm.driver(arm, rng)  # type: ignore[arg-type]
 
-    def action(state: State) -> NDArray[np.float32]:
+    def action(state: SceneState) -> NDArray[np.float32]:
         arm.angles, arm.blocks = state.pose, state.blocks / planar_arm.PX
         return next_command()
 
@@ -85,7 +85,7 @@ class SeenState(Protocol):
     """The state of a steerable robot, as frames and actions tell it."""
 
     @property
-    def state(self) -> State:
+    def state(self) -> SceneState:
         """Return the state as it is now."""
 
     def move(self, action: NDArray[np.float32]) -> None:
@@ -113,8 +113,8 @@ class SeenPush:
         self._agent, self._tee = places[0] / pusht.PX, places[1:]
 
     @property
-    def state(self) -> State:
-        return State(self._agent, self._tee, False)
+    def state(self) -> SceneState:
+        return SceneState(self._agent, self._tee, False)
 
     def move(self, action: NDArray[np.float32]) -> None:
         self._agent = self._agent + (action - self._agent) * (1 - np.exp(-pusht.FAST_PERIOD_S / pusht.LAG_S))
@@ -138,12 +138,12 @@ class SeenPose:
         self._blocks = places[len(self._forward(self.pose)) :]
 
     @property
-    def state(self) -> State:
+    def state(self) -> SceneState:
         holding = False
         if self._body is not None and self._body.grip and self._body.holds(self.pose):
             tip, _ = self._body.mechanism.tip(self.pose)
             holding = bool((np.linalg.norm(self._blocks - tip, axis=1) < REACH).any())
-        return State(self.pose, self._blocks, holding)
+        return SceneState(self.pose, self._blocks, holding)
 
     def move(self, action: NDArray[np.float32]) -> None:
         if self._body is None:

@@ -25,7 +25,7 @@ PUSHERS = ("pusht_fast", "pusht_slow")
 
 
 @dataclass(frozen=True)
-class Episode:
+class TrueEpisode:
     """An episode and its state.
 
     Attributes:
@@ -52,7 +52,7 @@ def episode(
     drawn: Collection[int] | None = None,
     commands: Floats | None = None,
     wander: bool = True,
-) -> Episode:
+) -> TrueEpisode:
     """Simulate an episode; the same seed and number give the same one, and a longer one begins like it.
 
     Args:
@@ -80,7 +80,7 @@ def episode(
         given.append(own)
         simulator.advance(own)
     chunks = np.stack(given).reshape(frames, -1)
-    return Episode(np.stack(pictures), chunks, np.stack(parts), np.stack(states), driven)
+    return TrueEpisode(np.stack(pictures), chunks, np.stack(parts), np.stack(states), driven)
 
 
 def parts_of(simulation: Simulation) -> tuple[int, Floats]:

@@ -24,7 +24,7 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 from hma_data.errors import ShardError, UsageError
 from hma_data.loading.mixture import TEMPERATURES, Draw, Mixture
 from hma_data.loading.pools import UnitAssignment, WindowSequence, pool_size
-from hma_data.loading.rows import MIB, Batch, Decoder, as_batch, assemble
+from hma_data.loading.rows import MIB, Batch, RowDecoder, as_batch, assemble
 from hma_data.loading.views import FIRST_CAMERA, Cameras, Views, by_number, view_count
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import Ints, Short
@@ -100,7 +100,7 @@ class WindowDataset(Dataset[Batch]):
         cameras: Cameras = FIRST_CAMERA,
     ) -> None:
         self.shards = data if isinstance(data, ShardSet) else ShardSet(data)
-        self._decoder = Decoder(self.shards, split, frames, stride, short, cache_mib * MIB, cameras)
+        self._decoder = RowDecoder(self.shards, split, frames, stride, short, cache_mib * MIB, cameras)
         self._short: Short = short
         self._views = view_count(cameras)
         self.index = self._decoder.index
@@ -213,7 +213,7 @@ class MixtureDataset(IterableDataset[Batch]):
         self.seed, self._short = seed, short
         share = memory_mib * MIB / len(self.sets)
         self._decoders = {
-            name: Decoder(shards, split, frames, None, short, int(share / 5), cameras)
+            name: RowDecoder(shards, split, frames, None, short, int(share / 5), cameras)
             for name, shards in self.sets.items()
         }
         for decoder in self._decoders.values():

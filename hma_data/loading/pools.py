@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.loading.rows import Decoder, Rows
+from hma_data.loading.rows import RowDecoder, Rows
 from hma_data.shards.windows import Ints, WindowIndex
 
 UNITS = 8  # at least so many per reader: with fewer units, shares are less equal
 LARGEST_POOL = 8  # row groups
 
 
-def pool_size(decoder: Decoder, budget: float) -> int:
+def pool_size(decoder: RowDecoder, budget: float) -> int:
     """Return the number of row groups to decode together within `budget` bytes: 1 to LARGEST_POOL."""
     return int(np.clip(budget // max(1, decoder.group_bytes), 1, LARGEST_POOL))
 
@@ -111,7 +111,7 @@ class WindowSequence:
 
     def __init__(
         self,
-        decoder: Decoder,
+        decoder: RowDecoder,
         assignment: UnitAssignment,
         seed: int,
         reader: int,

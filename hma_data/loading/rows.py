@@ -110,7 +110,7 @@ class Rows:
         }
 
 
-class Decoder:
+class RowDecoder:
     """The row groups of one split of a shard set, and their windows; the last used row groups stay decoded.
 
     Args:

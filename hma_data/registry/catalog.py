@@ -23,7 +23,7 @@ from hma_data.storage.yaml_io import decode_yaml, parse_yaml, read_bytes
 
 
 @dataclass(frozen=True)
-class Entry:
+class RegistryEntry:
     """One YAML of the registry.
 
     Attributes:
@@ -39,7 +39,7 @@ class Entry:
     name: str | None
 
 
-def entries(files: Iterable[StrPath] | None = None) -> list[Entry]:
+def entries(files: Iterable[StrPath] | None = None) -> list[RegistryEntry]:
     """Return an Entry per YAML of the registry (or of those files, each a str or path), in search order.
 
     Problems between files are added: two files of one folder tree with the same id, and, in a registry
@@ -59,12 +59,12 @@ def entries(files: Iterable[StrPath] | None = None) -> list[Entry]:
     return found
 
 
-def _entry(path: Path, cache: "_Cache") -> Entry:
+def _entry(path: Path, cache: "_Cache") -> RegistryEntry:
     try:
         found = cache.judgement(read_bytes(path), path)
     except HMAError as fault:
         found = _unreadable(fault)
-    return Entry(path, found["facts"], tuple(found["problems"]), found["name"])
+    return RegistryEntry(path, found["facts"], tuple(found["problems"]), found["name"])
 
 
 def _judge(content: bytes, path: Path) -> dict[str, Any]:
@@ -116,12 +116,12 @@ def _unreadable(fault: HMAError) -> dict[str, Any]:
     return {"facts": None, "problems": [problem], "name": None}
 
 
-def _with(entry: Entry, fault: str) -> Entry:
+def _with(entry: RegistryEntry, fault: str) -> RegistryEntry:
     problem = {"path": "id", "fault": fault, "value": repr(entry.name), "allowed": None}
-    return Entry(entry.path, None, (*entry.problems, problem), entry.name)
+    return RegistryEntry(entry.path, None, (*entry.problems, problem), entry.name)
 
 
-def _doubles(found: list[Entry]) -> list[Entry]:
+def _doubles(found: list[RegistryEntry]) -> list[RegistryEntry]:
     """Add a problem to every file whose id an earlier file has."""
     owners: dict[str, Path] = {}
     for i, entry in enumerate(found):

@@ -84,11 +84,11 @@ def evaluate(
         require_checkpoint(name)
     with interruptible(lambda: kept("parts", out)):
         from hma_model.evaluation.perceptual import open_networks
-        from hma_model.evaluation.suite import Settings, evaluate_all
+        from hma_model.evaluation.suite import EvaluationSettings, evaluate_all
 
         sampling: dict[str, Any] = {"unmask_steps": unmask_steps, "sample_steps": sample_steps}
         sampling |= {"precision": precision, "compile": compile}
-        settings = Settings(
+        settings = EvaluationSettings(
             split, windows, frames, prompt, seed=seed, cameras=camera_names(cameras), paper=paper,
             state=episodes if state else 0, sampling=sampling,
         )  # fmt: skip

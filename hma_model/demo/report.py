@@ -15,7 +15,7 @@ from hma_data.registry.embodiment import find
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.recorded import Recorded
 from hma_data.storage.files import write_atomic
-from hma_model.demo.results import Demo
+from hma_model.demo.results import DemoRun
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import over_horizon
 from hma_model.evaluation.report import strip
@@ -37,7 +37,7 @@ hma hub push runs/my_arm ./my-hub/team/model --embodiment my_arm
 """
 
 
-def write_report(made: Demo) -> Path:
+def write_report(made: DemoRun) -> Path:
     """Write `out`/report.html from the results of the demo, and return its path."""
     import torch
 
@@ -62,7 +62,7 @@ def write_report(made: Demo) -> Path:
     return path
 
 
-def _headline(page: Page, made: Demo) -> None:
+def _headline(page: Page, made: DemoRun) -> None:
     tiles = []
     for robot, found in made.figures.items():
         gain, seconds = found["psnr_action_gain_last"], horizon(found)
@@ -76,7 +76,7 @@ def _headline(page: Page, made: Demo) -> None:
     page.figures(tiles)
 
 
-def _films(page: Page, made: Demo) -> None:
+def _films(page: Page, made: DemoRun) -> None:
     prompt = next(iter(made.films.values())).prompt
     page.text(
         "Left: what happened. Middle: the model with the same actions. Right: the model with the actions of "
@@ -92,7 +92,7 @@ def _films(page: Page, made: Demo) -> None:
         page.text(f"The model {verdict(made.figures[robot])}.")
 
 
-def _robots(page: Page, made: Demo) -> None:
+def _robots(page: Page, made: DemoRun) -> None:
     about = (
         "Two robots that the embedded trunk has not seen, in two formats, each described by one YAML. A "
         "training sample is drawn with the probability p ∝ windows^(1/τ), τ = 3."
@@ -114,7 +114,7 @@ def _robots(page: Page, made: Demo) -> None:
     page.table([*heads, "train", "held out", "drawn", "success"], rows)
 
 
-def _kept_by_tokens(page: Page, made: Demo) -> None:
+def _kept_by_tokens(page: Page, made: DemoRun) -> None:
     about = "Recorded frames, and the same decoded from their tokens. The model predicts tokens only."
     page.section("What the tokens keep", about)
     for robot, shards in made.sets.items():
@@ -131,7 +131,7 @@ def _kept_by_tokens(page: Page, made: Demo) -> None:
         page.strips(robot, f"held-out episode {row['id']}", strips)
 
 
-def _rollouts(page: Page, made: Demo) -> None:
+def _rollouts(page: Page, made: DemoRun) -> None:
     page.section(
         "Rollouts on held-out episodes",
         "The model, pulled from the hub for one robot alone, sees the first frames and the actions. It "

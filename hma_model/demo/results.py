@@ -22,7 +22,7 @@ TIMINGS = "timings.json"
 
 
 @dataclass
-class Demo:
+class DemoRun:
     """The results of the demo so far."""
 
     out: Path  # the folder of the demo

@@ -32,7 +32,7 @@ from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
 from hma_model.demo.report import write_report
-from hma_model.demo.results import TIMINGS, Demo
+from hma_model.demo.results import TIMINGS, DemoRun
 
 if TYPE_CHECKING:
     from hma_model.evaluation.rollout_video import RolloutVideo
@@ -71,7 +71,7 @@ def demo(out: StrPath, *, episodes: int = 32, steps: int | None = None, seed: in
     if foreign := sorted({item.name for item in out.glob("*")} - OURS):
         raise OutputError(out, f"holds {', '.join(foreign[:3])}", "choose an empty or new --out")
     _require_same(out, {"episodes": episodes, "steps": steps, "seed": seed})
-    made = Demo(out, Checkpoint.open(START))
+    made = DemoRun(out, Checkpoint.open(START))
     with made.stage(1, "record and convert"):
         record_and_convert(made, episodes, seed)
     with made.stage(2, "mix"):
@@ -126,7 +126,7 @@ def _worker(out: Path, tokenizer: str, episodes: int, seed: int, workers: int) -
     return work
 
 
-def record_and_convert(made: Demo, episodes: int, seed: int) -> None:
+def record_and_convert(made: DemoRun, episodes: int, seed: int) -> None:
     """Record episodes of each robot, and convert them to verified shard sets (stage 1).
 
     Each robot has its own process, which ends when this process ends.
@@ -156,7 +156,7 @@ def record_and_convert(made: Demo, episodes: int, seed: int) -> None:
         print(f"  {robot}: {splits} episodes, {human_bytes(size)}, verified", flush=True)
 
 
-def mix(made: Demo) -> None:
+def mix(made: DemoRun) -> None:
     """Compute how often each robot is drawn (stage 2)."""
     frames = made.start.config.frames
     sets = open_sets(list(made.sets.values()))
@@ -166,7 +166,7 @@ def mix(made: Demo) -> None:
         print(f"  {name}: {count:,} windows, drawn with p = {p:.3f}", flush=True)
 
 
-def train(made: Demo, steps: int | None, seed: int) -> None:
+def train(made: DemoRun, steps: int | None, seed: int) -> None:
     """Finetune the trunk on both robots (stage 3)."""
     from hma_model.training.loop import finetune
     from hma_model.training.recipe import load_recipe
@@ -182,7 +182,7 @@ def train(made: Demo, steps: int | None, seed: int) -> None:
     print(f"  {result.step:,} steps in {result.seconds:.0f} s", flush=True)
 
 
-def publish(made: Demo) -> None:
+def publish(made: DemoRun) -> None:
     """Push the checkpoint to a folder hub, and pull each robot back alone (stage 4)."""
     from hma_model.hub import publish as hub
 
@@ -194,14 +194,13 @@ def publish(made: Demo) -> None:
     made.sizes["checkpoint of both"] = _size(published)
 
 
-def roll_out(made: Demo) -> None:
+def roll_out(made: DemoRun) -> None:
     """Compute each robot's figures and film with the model pulled for it alone (stage 5).
 
     The robots run in parallel, each in one thread, because a second thread speeds up small products little.
     """
     from hma_data.tokenizers.network import single_threads
-    from hma_model.evaluation.evaluate import Settings as EvaluationSettings
-    from hma_model.evaluation.evaluate import measure
+    from hma_model.evaluation.evaluate import EvaluationSettings, measure
     from hma_model.evaluation.rollout_video import lively_windows, rollout_video
     from hma_model.evaluation.verdict import verdict
     from hma_model.generation.decode import default_prompt

@@ -46,8 +46,8 @@ from hma_model.evaluation.metrics import (
     perplexity_summary,
     teacher_forced,
 )
-from hma_model.evaluation.perceptual import Judge, Networks
-from hma_model.evaluation.rollouts import Pictures, rollout
+from hma_model.evaluation.perceptual import FeatureCollector, Networks
+from hma_model.evaluation.rollouts import RolloutImages, rollout
 from hma_model.evaluation.scores import ROLLOUT_KINDS, Rolled, Scores
 from hma_model.generation.decode import cameras_for, default_prompt
 
@@ -61,7 +61,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Settings:
+class EvaluationSettings:
     """The choices that decide the figures, beside the checkpoint and the shard set.
 
     Attributes:
@@ -92,7 +92,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Plan:
+class WindowPlan:
     """What the settings come to for a model and a shard set.
 
     Attributes:
@@ -107,7 +107,7 @@ class Plan:
     windows: int
 
     @classmethod
-    def of(cls, model: "HMA", shards: ShardSet, settings: Settings) -> "Plan":
+    def of(cls, model: "HMA", shards: ShardSet, settings: EvaluationSettings) -> "WindowPlan":
         """Return the plan; raise CheckpointError or UsageError where the three do not fit together."""
         require_tokenizer(model.config, shards.spec, shards.folder)
         cameras = cameras_for(model, shards, settings.cameras)
@@ -121,7 +121,7 @@ class Plan:
             raise no_window(shards, settings.split, frames)
         return cls(cameras, frames, prompt, min(settings.windows, there))
 
-    def predicted_frames(self, settings: Settings) -> int:
+    def predicted_frames(self, settings: EvaluationSettings) -> int:
         """Return how many frames the rollouts predict."""
         kinds = 2 + settings.draws  # true actions, none, and each draw of shuffled ones
         of_paper = 1 + settings.draws if settings.paper else 0
@@ -149,7 +149,7 @@ def measure(
     model: "HMA",
     tokenizer: "Tokenizer",
     data: StrPath | ShardSet,
-    settings: Settings = Settings(),
+    settings: EvaluationSettings = EvaluationSettings(),
     networks: Networks | None = None,
     on_frames: Callable[[int], None] = lambda frames: None,
 ) -> Measured:
@@ -174,7 +174,7 @@ def measure(
         UsageError: the split has no window, or the prompt leaves no frame to predict.
     """
     shards = opened(data)
-    plan = Plan.of(model, shards, settings)
+    plan = WindowPlan.of(model, shards, settings)
     first, seed, draws = plan.prompt, settings.seed, settings.draws
     batches = list(
         windows(shards, settings.split, plan.frames, settings.windows, settings.batch_size, plan.cameras)
@@ -186,14 +186,14 @@ def measure(
     on_frames(0)  # the losses are done: the clock of the time left starts here
     predicted = 0
 
-    def roll(batch: Batch, **options: Any) -> Pictures:
+    def roll(batch: Batch, **options: Any) -> RolloutImages:
         nonlocal predicted
         made = rollout(model, tokenizer, batch, **options, **settings.sampling)
         predicted += made.finite.size
         on_frames(predicted)
         return made
 
-    rolled = Rolled(first, Judge(networks or Networks()))
+    rolled = Rolled(first, FeatureCollector(networks or Networks()))
     for number, batch in enumerate(batches):
         rolled.add(batch, partial(roll, prompt=first, seed=seed + number), draws, seed)
     joined = {name: Scores.join(parts) for name, parts in rolled.scores.items()}
@@ -271,7 +271,7 @@ def _losses(
 
 
 def _paper(
-    roll: Callable[..., Pictures],
+    roll: Callable[..., RolloutImages],
     batches: list[Batch],
     episodes: NDArray[np.int64],
     shards: ShardSet,

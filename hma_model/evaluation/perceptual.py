@@ -199,7 +199,7 @@ def _root(matrix: Floats) -> Floats:
 
 
 @dataclass
-class Judge:
+class FeatureCollector:
     """Collects features of the truth and of each kind of rollout, and compares them."""
 
     networks: Networks

@@ -237,7 +237,7 @@ def train_probe(
 
 def shown_episodes(
     robot: str, tokenizer: "Tokenizer", stride: int, seed: int, tell: Callable[[str], None]
-) -> tuple[Images, list[truth.Episode]]:
+) -> tuple[Images, list[truth.TrueEpisode]]:
     """Return simulated episodes, and their pictures (N, S, S, 3) as the tokenizer shows them.
 
     The episodes have one frame of every FRAME_STRIDE. Arguments are those of `train_probe`.

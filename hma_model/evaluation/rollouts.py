@@ -35,7 +35,7 @@ class Sampling(TypedDict, total=False):
 
 
 @dataclass(frozen=True)
-class Pictures:
+class RolloutImages:
     """A rollout and the truth, both uint8 (B, T, S, C·S, 3); the first P frames are the prompt.
 
     Attributes:
@@ -60,7 +60,7 @@ def rollout(
     seed: int = 0,
     truth: NDArray[np.uint8] | None = None,
     **sampling: Unpack[Sampling],
-) -> Pictures:
+) -> RolloutImages:
     """Predict the frames that follow the first frames of each window, given its actions.
 
     Args:
@@ -101,4 +101,4 @@ def rollout(
         finite = predicted.isfinite().flatten(2).all(dim=2).cpu().numpy()
     made = decode(tokenizer, predicted.nan_to_num(0, 0, 0))
     made[~finite] = 0  # black, so that a page shows that there is no prediction
-    return Pictures(first, np.concatenate([truth[:, :first], made], axis=1), truth, predicted, finite)
+    return RolloutImages(first, np.concatenate([truth[:, :first], made], axis=1), truth, predicted, finite)

@@ -16,8 +16,8 @@ from hma_data.loading.dataset import Batch
 from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, Episodes, horizon_summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, SSIM_RANGE, psnr, ssim
-from hma_model.evaluation.perceptual import Judge
-from hma_model.evaluation.rollouts import Pictures
+from hma_model.evaluation.perceptual import FeatureCollector
+from hma_model.evaluation.rollouts import RolloutImages
 
 ROLLOUT_KINDS = ("true", "shuffled", "none", "copy")
 Floats = NDArray[np.float64]
@@ -33,7 +33,7 @@ class Scores:
     finite: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, pictures: Pictures, judge: Judge | None = None) -> "Scores":
+    def of(cls, pictures: RolloutImages, judge: FeatureCollector | None = None) -> "Scores":
         """Return the scores of rollouts; LPIPS where the judge has a network for it."""
         truth = pictures.truth[:, pictures.prompt :]
         predicted = pictures.predicted[:, pictures.prompt :]
@@ -101,14 +101,14 @@ class Rolled:
     """
 
     first: int
-    judge: Judge
+    judge: FeatureCollector
     scores: dict[str, list[Scores]] = field(default_factory=lambda: {name: [] for name in ROLLOUT_KINDS})
     predicted: dict[str, list[torch.Tensor]] = field(
         default_factory=lambda: {name: [] for name in ROLLOUT_KINDS if name != "copy"}
     )
     still: int = 0
 
-    def add(self, batch: Batch, roll: Callable[..., Pictures], draws: int, seed: int) -> None:
+    def add(self, batch: Batch, roll: Callable[..., RolloutImages], draws: int, seed: int) -> None:
         """Roll a batch out with the true actions, in several draws with shuffled ones, and with none."""
         first = self.first
         true = roll(batch)
@@ -125,7 +125,7 @@ class Rolled:
         self._keep("shuffled", others)
         self._keep("none", [none])
 
-    def _keep(self, kind: str, draws: list[Pictures]) -> None:
+    def _keep(self, kind: str, draws: list[RolloutImages]) -> None:
         self.judge.add(kind, draws[0].predicted[:, self.first :])
         self.scores[kind].append(Scores.mean([Scores.of(pictures, self.judge) for pictures in draws]))
         if kind in self.predicted:

@@ -24,7 +24,7 @@ from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded, summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, perplexity_summary, psnr, teacher_forced
 from hma_model.evaluation.probe import Probe, as_seen, state_errors, train_probe
-from hma_model.evaluation.rollouts import Pictures, Sampling, rollout
+from hma_model.evaluation.rollouts import RolloutImages, Sampling, rollout
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -102,7 +102,7 @@ def perturbed(chunks: NDArray[np.float32], dims: int, prompt: int, seed: int) ->
     return (steps + PERTURBATION * noise).reshape(chunks.shape).astype(np.float32)
 
 
-def _batch(model: "HMA", tokenizer: "Tokenizer", robot: str, made: list[truth.Episode]) -> Batch:
+def _batch(model: "HMA", tokenizer: "Tokenizer", robot: str, made: list[truth.TrueEpisode]) -> Batch:
     """Return simulated episodes as windows."""
     stored = np.stack([tokenizer.encode(as_seen(robot, tokenizer, one.pictures)) for one in made])
     actions = torch.from_numpy(np.stack([one.chunks for one in made]))
@@ -128,7 +128,7 @@ def _controllability(probe: Probe, ways: dict[str, Images], parts: Floats, seed:
 
 
 def _perturbed(
-    model: "HMA", true: Pictures, made: Pictures, batch: Batch, other: Batch, seed: int
+    model: "HMA", true: RolloutImages, made: RolloutImages, batch: Batch, other: Batch, seed: int
 ) -> dict[str, Any]:
     """Return PSNR and perplexity under the true actions, and under the perturbed ones."""
     found: dict[str, Any] = {"scale": PERTURBATION}

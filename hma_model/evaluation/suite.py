@@ -35,7 +35,7 @@ from hma_data.storage.kept import kept_arrays
 from hma_data.storage.paths import StrPath, as_path, as_text, is_repository
 from hma_model.checkpoint.folder import EMBEDDED
 from hma_model.checkpoint.io import record_evaluation
-from hma_model.evaluation.evaluate import Plan, Settings, measure
+from hma_model.evaluation.evaluate import EvaluationSettings, WindowPlan, measure
 from hma_model.evaluation.perceptual import Networks
 from hma_model.evaluation.recorded_state import measure_recorded_state
 from hma_model.evaluation.simulated import measure_state
@@ -69,7 +69,7 @@ class Part:
 def evaluate_all(
     checkpoints: Sequence[StrPath],
     data: Sequence[StrPath],
-    settings: Settings | None = None,
+    settings: EvaluationSettings | None = None,
     networks: Networks | None = None,
     out: StrPath | None = None,
     device: str = "cpu",
@@ -89,7 +89,7 @@ def evaluate_all(
         UsageError: a split has no window, cameras do not fit, or a set of a checkpoint comes twice.
         OutputError: the folder holds something else.
     """
-    settings, networks = settings or Settings(), networks or Networks()
+    settings, networks = settings or EvaluationSettings(), networks or Networks()
     folder = None if out is None else _folder(as_path(out))
     sets = [ShardSet(item) for item in data]
     _once([as_text(item) for item in checkpoints], "checkpoint")
@@ -135,8 +135,8 @@ class _Work:
     frames: int
 
     @classmethod
-    def of(cls, label: str, model: "HMA", shards: ShardSet, settings: Settings) -> "_Work":
-        plan = Plan.of(model, shards, settings)
+    def of(cls, label: str, model: "HMA", shards: ShardSet, settings: EvaluationSettings) -> "_Work":
+        plan = WindowPlan.of(model, shards, settings)
         if settings.state and not simulated(shards.embodiment.id) and not shards.embodiment.state:
             fault = "is no robot of the laboratory, and its shards have no states"
             remedy = "leave --state out, or name the recorded states in its YAML and convert again"
@@ -150,7 +150,7 @@ def _once(names: Sequence[str], what: str) -> None:
         raise UsageError(twice, f"is the {what} of two arguments", "give each once")
 
 
-def fingerprint(model: "HMA", shards: ShardSet, settings: Settings, networks: Networks) -> str:
+def fingerprint(model: "HMA", shards: ShardSet, settings: EvaluationSettings, networks: Networks) -> str:
     """Return sixteen hex digits that stand for a part: its checkpoint, set and settings."""
     robot, source = shards.embodiment.id, model.source
     assert source, "the models of a suite are loaded from checkpoints"
@@ -174,7 +174,9 @@ def _tokenizer(folder: str, device: str) -> "Tokenizer":
     return tokenizer_of(ShardSet(folder), device=device)
 
 
-def _measured(work: _Work, settings: Settings, networks: Networks, tell: Callable[..., None]) -> Part:
+def _measured(
+    work: _Work, settings: EvaluationSettings, networks: Networks, tell: Callable[..., None]
+) -> Part:
     model, shards, robot = work.model, work.shards, work.shards.embodiment.id
     tokenizer = _tokenizer(str(shards.folder), str(model.device))
     tell(0, "losses first")
@@ -210,7 +212,7 @@ def _measured(work: _Work, settings: Settings, networks: Networks, tell: Callabl
     return Part(label, str(shards.folder), finite(found), rows, predicted)
 
 
-def _record(label: str, model: "HMA", part: Part, settings: Settings) -> None:
+def _record(label: str, model: "HMA", part: Part, settings: EvaluationSettings) -> None:
     """Write the verdict on held-out episodes into the card of a checkpoint of this machine."""
     source = model.source
     fetched = is_repository(label) or "://" in label

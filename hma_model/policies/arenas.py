@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError
 from hma_data.lab import FAMILY, truth
-from hma_data.lab.scripted import PUSHER, SeenState, State, seen_state, state_of
+from hma_data.lab.scripted import PUSHER, SceneState, SeenState, seen_state, state_of
 from hma_data.lab.simulator import LabSimulator, simulated
 from hma_model.generation.commands import OutsideRangeWarning, described
 from hma_model.worlds.env import WorldModelVectorEnv
@@ -121,7 +121,7 @@ class Arena(Protocol):
     def fresh(self) -> bool:
         """Return whether the images came with the last step."""
 
-    def states(self) -> list[State]:
+    def states(self) -> list[SceneState]:
         """Return the state of each scene; for robots that are steerable."""
 
     def observed(self) -> Float32s | None:
@@ -164,7 +164,7 @@ class TrueArena:
     def fresh(self) -> bool:
         return self._steps % self.scenes.stride == 0
 
-    def states(self) -> list[State]:
+    def states(self) -> list[SceneState]:
         return [state_of(scene.simulator.simulation) for scene in self._begun]
 
     def observed(self) -> Float32s | None:
@@ -239,7 +239,7 @@ class ModelArena:
     def fresh(self) -> bool:
         return self._steps % self.scenes.stride == 0
 
-    def states(self) -> list[State]:
+    def states(self) -> list[SceneState]:
         """Return what the probe reads off the images, moved by the actions since the last one.
 
         Raises:

@@ -46,7 +46,7 @@ class OtherVersionError(CheckpointError):
 
 
 @dataclass(frozen=True)
-class State:
+class RunState:
     """The state of a run when its checkpoint was written."""
 
     step: int  # number of finished steps
@@ -96,7 +96,7 @@ def data_digests(sets: Mapping[str, ShardSet]) -> dict[str, str]:
 
 
 def write_state(
-    folder: Path, state: State, moments: Mapping[str, "Tensor"], weights: Mapping[str, "Tensor"]
+    folder: Path, state: RunState, moments: Mapping[str, "Tensor"], weights: Mapping[str, "Tensor"]
 ) -> None:
     """Write the files of `training/`; without `weights` the checkpoint's weights are those of training."""
     write_tensors(folder / OPTIMIZER, moments, {"format": "pt"})
@@ -127,7 +127,7 @@ def require_version(path: Path) -> None:
 class TrainingState:
     """The content of a checkpoint for a run, read completely before the model changes."""
 
-    state: State
+    state: RunState
     shown: dict[str, tuple[dict[str, "Tensor"], ...]]  # published tensors: trunk (""), each stem and head
     weights: dict[str, "Tensor"]  # the weights of training, if they differ from the published ones
     moments: dict[str, "Tensor"]  # of the optimizer
@@ -166,7 +166,7 @@ def read_training_state(checkpoint: Checkpoint, embodiments: Iterable[str]) -> T
     files = values.pop("files")
     del values["version"]
     try:
-        state = State(**values)
+        state = RunState(**values)
     except TypeError as fault:
         raise CheckpointError(path, f"is damaged: {fault}", "delete this checkpoint") from fault
     shown: dict[str, tuple[dict[str, Tensor], ...]] = {"": (read_tensors(checkpoint.trunk()),)}

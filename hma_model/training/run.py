@@ -34,7 +34,7 @@ from hma_model.training.parallel import ParallelModel, Ranks, gathered, require_
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import (
     OtherVersionError,
-    State,
+    RunState,
     TrainingState,
     data_digests,
     read_training_state,
@@ -301,7 +301,7 @@ class Run:
         model, sampler = self.saved_model(), self.train_data.state(self.ranks)
         moments = optim.optimizer_state(self.optimizer)
         weights = gathered(self.model.state_dict().items()) if self.average else {}
-        state = State(
+        state = RunState(
             step=self.step,
             recipe=self.recipe.identity(),
             data=self.digests,

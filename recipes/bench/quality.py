@@ -178,7 +178,7 @@ def measure(name: str, data: Path, budget: dict[str, Any], seed: int) -> dict[st
     from hma_data.tokenizers.base import get_tokenizer
     from hma_data.tokenizers.network import one_thread
     from hma_model.evaluation import evaluate as evaluation
-    from hma_model.evaluation.evaluate import Settings
+    from hma_model.evaluation.evaluate import EvaluationSettings
     from hma_model.evaluation.simulated import measure_state
     from hma_model.network.model import HMA
     from hma_model.training.loop import train
@@ -192,7 +192,7 @@ def measure(name: str, data: Path, budget: dict[str, Any], seed: int) -> dict[st
         if result.interrupted:
             raise UsageError("bench quality", "was stopped by a signal", "run it again")
         model = HMA.from_pretrained(result.checkpoint).eval()
-        settings = Settings(windows=budget["windows"], frames=FRAMES, prompt=PROMPT, draws=DRAWS)
+        settings = EvaluationSettings(windows=budget["windows"], frames=FRAMES, prompt=PROMPT, draws=DRAWS)
         found = evaluation.measure(model, tokenizer, shards, settings).found
         figures = {
             "loss": found["loss"],

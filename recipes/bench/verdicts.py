@@ -11,14 +11,14 @@ import shutil
 from pathlib import Path
 
 from hma_data.conversion.job import convert
-from hma_data.conversion.plan import Settings as Plan
+from hma_data.conversion.plan import Settings
 from hma_data.lab import record
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.checkpoint.io import record_evaluation
-from hma_model.evaluation.suite import Settings, evaluate_all
+from hma_model.evaluation.suite import EvaluationSettings, evaluate_all
 
 EPISODES, SEED, JUDGED, WINDOWS = 40, 20261126, 8, 8
 
@@ -36,7 +36,7 @@ def main() -> None:
             shutil.rmtree(work / name, ignore_errors=True)
             shards = judged(name, copy, work / name, tokenizer)
             evaluate_all(
-                [copy], [shards], Settings("val", WINDOWS)
+                [copy], [shards], EvaluationSettings("val", WINDOWS)
             )  # writes the verdict into the copy's card
             card = Checkpoint.open(copy).card(name)
         record_evaluation(bundled, name, card["evaluation"])
@@ -51,7 +51,7 @@ def judged(name: str, checkpoint: Path, work: Path, tokenizer: object) -> Path:
     held_out = [ref.id for ref in refs if ref.split == "val"][:JUDGED]
     others = [ref.id for ref in refs if ref.split != "val"]
     # Some formats have no split of their own: then all but a few of ten are held out.
-    plan = Plan(only=(*held_out, others[0])) if held_out else Plan(limit=10, val_fraction=0.8)
+    plan = Settings(only=(*held_out, others[0])) if held_out else Settings(limit=10, val_fraction=0.8)
     convert(robot, uri, tokenizer, work / "shards", settings=plan)
     return work / "shards"
 

@@ -63,7 +63,7 @@ def contact_demo(seed: int, episode: int) -> Demo:
     Of five episodes three aim, one of these with random targets in between, and one wanders.
     """
     rng = np.random.default_rng((seed, 3, episode))
-    arena = pusht.Arena(pusht.FAST_LOOK, ("near", "far", "far")[episode % 3], rng)
+    arena = pusht.PushArena(pusht.FAST_LOOK, ("near", "far", "far")[episode % 3], rng)
     wanders, strays = episode % 5 == 4, episode % 5 == 3
 
     def aimed() -> pusht.Targets:

@@ -137,7 +137,7 @@ class Piece(NamedTuple):
     last_ns: int = -1
     channels: frozenset[int] = frozenset()
 
-    def including(self, message: "Entry") -> "Piece":
+    def including(self, message: "StoredMessage") -> "Piece":
         """Return the piece with the time and channel of one message more."""
         return self._replace(
             first_ns=min(self.first_ns, message.log_ns),
@@ -146,7 +146,7 @@ class Piece(NamedTuple):
         )
 
 
-class Entry(NamedTuple):
+class StoredMessage(NamedTuple):
     """A message among the records of a piece: it lies at `at`, its data from `start` to `end`."""
 
     number: int  # of its channel
@@ -297,7 +297,7 @@ class IndexedFile(ABC):
         """Return the records of the piece at an offset: unpacked, or read lazily outside of chunks."""
 
     @abstractmethod
-    def _messages(self, index: FileIndex, view: "View", at: int = 0) -> Iterator[Entry]:
+    def _messages(self, index: FileIndex, view: "View", at: int = 0) -> Iterator[StoredMessage]:
         """Yield the messages of a piece from an offset on; add the channels met to the index."""
 
 

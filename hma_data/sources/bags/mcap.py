@@ -24,11 +24,11 @@ from mcap.data_stream import ReadDataStream
 from hma_data.sources.bags.container import (
     Channel,
     ChunkCache,
-    Entry,
     FileIndex,
     FileView,
     IndexedFile,
     Piece,
+    StoredMessage,
     View,
     damaged,
     decompress,
@@ -66,7 +66,7 @@ class McapFile(IndexedFile):
             return FileView(file, at, end or len(whole))
         return self._chunks.get(self.path, at, lambda: _unpacked(whole[start:stop]))
 
-    def _messages(self, index: FileIndex, view: View, at: int = 0) -> Iterator[Entry]:
+    def _messages(self, index: FileIndex, view: View, at: int = 0) -> Iterator[StoredMessage]:
         """See IndexedFile."""
         for opcode, place, start, end in _records(view, at, len(view)):
             if opcode == MESSAGE:
@@ -192,10 +192,10 @@ def _unpacked(data: bytes) -> bytes:
     return unpacked
 
 
-def _entry(view: View, at: int, start: int, end: int) -> Entry:
+def _entry(view: View, at: int, start: int, end: int) -> StoredMessage:
     """Return the message whose content lies between `start` and `end`."""
     number, _, log_ns, _ = MESSAGE_HEAD.unpack(view[start : start + MESSAGE_HEAD.size])
-    return Entry(number, log_ns, at, start + MESSAGE_HEAD.size, end)
+    return StoredMessage(number, log_ns, at, start + MESSAGE_HEAD.size, end)
 
 
 def _stream(data: bytes) -> Any:

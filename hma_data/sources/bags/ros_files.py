@@ -20,7 +20,6 @@ from hma_data.sources.bags.container import (
     FOREVER,
     Channel,
     Data,
-    Entry,
     FileIndex,
     FilePlace,
     FileView,
@@ -28,6 +27,7 @@ from hma_data.sources.bags.container import (
     Piece,
     Record,
     RecordFilter,
+    StoredMessage,
     View,
     damaged,
     decompress,
@@ -61,14 +61,14 @@ class Ros1File(IndexedFile):
 
         return self._chunks.get(self.path, at, unpacked)
 
-    def _messages(self, index: FileIndex, view: View, at: int = 0) -> Iterator[Entry]:
+    def _messages(self, index: FileIndex, view: View, at: int = 0) -> Iterator[StoredMessage]:
         """See IndexedFile."""
         for place, header, start, end in _records(view, at):
             kind = _number(header, "op")
             if kind == CONNECTION:
                 _learn(index, header, view[start:end])
             elif kind == MESSAGE:
-                yield Entry(_number(header, "conn"), _time(header, "time"), place, start, end)
+                yield StoredMessage(_number(header, "conn"), _time(header, "time"), place, start, end)
 
     def _make_index(self, file: BinaryIO) -> FileIndex:
         magic = file.read(len(ROS1_MAGIC))

@@ -62,7 +62,7 @@ class Segment:
 
 
 @dataclass(frozen=True)
-class Table:
+class SegmentTable:
     """The episodes of a bag.
 
     Attributes:
@@ -89,10 +89,10 @@ class Table:
 
 # By process id: a forked child must not clean up after its parent.
 _bags: dict[int, dict[Any, Bag]] = {}
-_tables: dict[Any, Table] = {}
+_tables: dict[Any, SegmentTable] = {}
 
 
-def parted(path: Path, root: Path, embodiment: Embodiment, segments: Segments) -> tuple[Bag, Table]:
+def parted(path: Path, root: Path, embodiment: Embodiment, segments: Segments) -> tuple[Bag, SegmentTable]:
     """Return the bag and its episodes, from the cache where no file changed.
 
     Raises:
@@ -107,12 +107,12 @@ def parted(path: Path, root: Path, embodiment: Embodiment, segments: Segments) -
     return bag, table
 
 
-def _stored(key: Any, make: Callable[[], Table]) -> Table:
+def _stored(key: Any, make: Callable[[], SegmentTable]) -> SegmentTable:
     """Return the table of a bag from this machine's cache, so that its workers read the bag once."""
     kept = cache_folder() / "bags" / f"{hashlib.sha256(repr((TABLE, key)).encode()).hexdigest()[:32]}.json"
     with suppress(OSError, ValueError, KeyError, TypeError):
         values = json.loads(kept.read_bytes())
-        return Table(tuple(Segment(**one) for one in values.pop("segments")), **values)
+        return SegmentTable(tuple(Segment(**one) for one in values.pop("segments")), **values)
     table = make()
     with suppress(OSError):
         kept.parent.mkdir(parents=True, exist_ok=True)
@@ -129,7 +129,7 @@ def _cached[V](cache: dict[Any, V], key: Any, make: Callable[[], V], limit: int)
     return value
 
 
-def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
+def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> SegmentTable:
     """Return the table of a bag.
 
     Raises:
@@ -176,7 +176,7 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
         raise EpisodeError(where, fault, "correct source.segments in the YAML")
     # The camera's frames may arrive late; other messages may arrive without that delay.
     delay_s = np.abs(times.seconds("receive") - shown).max()
-    return Table(
+    return SegmentTable(
         segments=found,
         frames=len(times),
         clock=clock,

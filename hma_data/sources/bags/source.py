@@ -25,7 +25,7 @@ from hma_data.sources.bags.container import Record, RecordFilter, damaged
 from hma_data.sources.bags.images import image_kind
 from hma_data.sources.bags.inspect import report
 from hma_data.sources.bags.messages import decode
-from hma_data.sources.bags.segments import Table, parted
+from hma_data.sources.bags.segments import SegmentTable, parted
 from hma_data.sources.bags.topic_track import Column, TopicTrack, camera_stream, missing_topic, parse_key
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values
 from hma_data.sources.common.places import existing_path, nothing_there
@@ -145,7 +145,12 @@ class _EpisodeReading:
     """
 
     def __init__(
-        self, bag: Bag, episode_id: str, embodiment: Embodiment, table: Table | None = None, number: int = 0
+        self,
+        bag: Bag,
+        episode_id: str,
+        embodiment: Embodiment,
+        table: SegmentTable | None = None,
+        number: int = 0,
     ) -> None:
         self._bag, self._id, self._embodiment = bag, episode_id, embodiment
         self._table, self._number = table, number

@@ -269,7 +269,7 @@ def seconds_of(values: NDArray[Any], key: str = "") -> NDArray[np.float64] | Non
 
 
 @dataclass
-class Look:
+class CameraLook:
     """Statistics of one camera's images.
 
     Attributes:
@@ -405,7 +405,7 @@ def one_channel(data: bytes) -> bool:
         return False
 
 
-def picture_findings(looks: dict[str, Look]) -> Iterator[Finding]:
+def picture_findings(looks: dict[str, CameraLook]) -> Iterator[Finding]:
     """Yield what looks wrong, camera by camera."""
     for key, look in looks.items():
         if not look.images:

@@ -21,7 +21,7 @@ from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import Images
 from hma_data.errors import HMAError
 from hma_data.sources.common import checks
-from hma_data.sources.common.checks import Finding, Look, Severity, StreamTimes, is_times, seconds_of
+from hma_data.sources.common.checks import CameraLook, Finding, Severity, StreamTimes, is_times, seconds_of
 from hma_data.sources.common.inspection import Inspection, KeyInfo
 
 CHECKS = {  # the checks of an inspection, in the order they are printed
@@ -113,7 +113,7 @@ class Survey:
     def __init__(self, episodes: int, alone: bool = False, by_field: bool = False) -> None:
         self.episodes, self.alone, self.by_field = episodes, alone, by_field
         self.looked: list[str] = []
-        self.looks: dict[str, Look] = {}
+        self.looks: dict[str, CameraLook] = {}
         self.infos: dict[str, KeyInfo] = {}  # of the first episode that has the key
         self.pairs = 1  # of neighbouring frames looked at, for a camera of an episode
         self.made: set[str] = {"readable"}
@@ -245,7 +245,7 @@ class Survey:
     ) -> None:
         """Add some images (n, H, W, 3) of an episode's camera, and the indices of their frames."""
         self.made |= {"size", "blank", "colour"} | ({"still"} if (np.diff(indices) == 1).any() else set())
-        look = self.looks.setdefault(key, Look(lossless=codec not in LOSSY))
+        look = self.looks.setdefault(key, CameraLook(lossless=codec not in LOSSY))
         look.add(frames, indices, again=self._shown.get(key) == name)
         self._shown[key] = name
 

@@ -101,7 +101,7 @@ def load_models(place: StrPath | None = None) -> HandModels:
     return HandModels(palm, hand, str(path))
 
 
-class Network:
+class HandNetwork:
     """One model, ready to run.
 
     Args:
@@ -199,8 +199,8 @@ class MediaPipeHands:
     def __init__(self, models: HandModels | None = None, mirrored: bool = False) -> None:
         models = models or load_models()
         widths = (ANCHORS * 18, ANCHORS)
-        self._palm = Network(models.palm, PALM_SIDE, widths, f"{models.where}: palm model")
-        self._hand = Network(models.hand, HAND_SIDE, (63, 1, 1), f"{models.where}: landmark model")
+        self._palm = HandNetwork(models.palm, PALM_SIDE, widths, f"{models.where}: palm model")
+        self._hand = HandNetwork(models.hand, HAND_SIDE, (63, 1, 1), f"{models.where}: landmark model")
         self._mirrored = mirrored
         self._anchors = palm_anchors()
         self._tracks: list[Track] = []

@@ -484,7 +484,7 @@ def walk(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
                 yield f"{prefix}{name}", item
 
 
-class Recorded:
+class RecordedRows:
     """How many rows of an episode's series were recorded: all, or fewer where preallocated buffers say so.
 
     Args:

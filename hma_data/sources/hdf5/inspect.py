@@ -25,7 +25,7 @@ from hma_data.sources.hdf5.file import (
     EpisodeFinder,
     EpisodeGroup,
     OpenFiles,
-    Recorded,
+    RecordedRows,
     dataset,
     explained,
     is_plausible,
@@ -79,7 +79,7 @@ def inspect(
         with survey.reading(name), explained(place):
             group = finder.group(place)
             sizes = {key: item.shape[0] for key, item in walk(group) if item.shape}
-            recorded = Recorded(group, _length(sizes))
+            recorded = RecordedRows(group, _length(sizes))
             lengths[name] = recorded.rows
             if not lengths[name]:
                 raise EpisodeError(name, "has no frames")
@@ -170,7 +170,7 @@ class _Looked:
     finder: EpisodeFinder
     files: OpenFiles
     first: _First
-    recorded: Recorded
+    recorded: RecordedRows
 
     def series(self, key: str) -> Series:
         """Return how a key is read."""
@@ -238,7 +238,7 @@ def _rate(
     if key is None:
         return stated, holder, ""
     buffer = numbers(group, key, where).reshape(-1)
-    values = buffer[: Recorded(group, len(buffer)).rows]
+    values = buffer[: RecordedRows(group, len(buffer)).rows]
     unit = seconds_a_unit(values, key) if values.dtype.kind in "fiu" else None
     if unit is None:
         return stated, holder, ""

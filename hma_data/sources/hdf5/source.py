@@ -41,7 +41,7 @@ from hma_data.sources.hdf5.file import (
     EpisodeFinder,
     EpisodeGroup,
     OpenFiles,
-    Recorded,
+    RecordedRows,
     dataset,
     explained,
     is_elsewhere,
@@ -133,7 +133,7 @@ class Hdf5Source:
         with explained(where):
             group = self._finder.group(place)
             actions = _vector(group, embodiment.action, where)
-            recorded = Recorded(group, len(actions))
+            recorded = RecordedRows(group, len(actions))
             check = partial(_check_length, layout, where, recorded)
             times = _times(group, embodiment, layout, recorded, where)
             check(layout.timestamps or "", len(times))
@@ -187,7 +187,7 @@ class Hdf5Source:
                 group = self._finder.group(place)
                 key = next((key for key in keys if key.strip("/") in group), None)
                 if key:
-                    return Recorded(group, len(dataset(group, key, str(place)))).rows
+                    return RecordedRows(group, len(dataset(group, key, str(place)))).rows
                 return max((item.shape[0] for _, item in walk(group) if item.shape), default=0)
         except HMAError:
             return 0
@@ -204,7 +204,7 @@ def _split_of(demo: str, masks: dict[str, set[str]]) -> str | None:
 
 
 def _check_length(
-    layout: Hdf5Layout, where: str, recorded: Recorded, key: str, rows: int, missing: int = 0
+    layout: Hdf5Layout, where: str, recorded: RecordedRows, key: str, rows: int, missing: int = 0
 ) -> None:
     """Raise an EpisodeError where a series is not as long as the actions, or one row longer to be dropped.
 
@@ -227,7 +227,7 @@ def _check_length(
 
 
 def _times(
-    group: h5py.Group, embodiment: Embodiment, layout: Hdf5Layout, recorded: Recorded, where: str
+    group: h5py.Group, embodiment: Embodiment, layout: Hdf5Layout, recorded: RecordedRows, where: str
 ) -> Floats:
     """Return the seconds of the frames: the episode's own where the YAML names their key."""
     key, hz = layout.timestamps, embodiment.frequency_hz

@@ -42,7 +42,7 @@ FIXED: dict[str, tuple[str, Shape, str]] = {  # class -> kind, shape and dtype
 
 
 @dataclass(frozen=True)
-class Feature:
+class RldsFeature:
     """One leaf of features.json."""
 
     name: str  # flattened, as records name it: steps/observation/image
@@ -60,7 +60,7 @@ class Feature:
         return None if None in sizes else math.prod(size for size in sizes if size is not None)
 
 
-def read_features(text: bytes, where: str) -> dict[str, Feature]:
+def read_features(text: bytes, where: str) -> dict[str, RldsFeature]:
     """Return the leaves of a features.json by name, in its order.
 
     Raises:
@@ -73,7 +73,7 @@ def read_features(text: bytes, where: str) -> dict[str, Feature]:
         raise SourceError(where, said, "write it again with tensorflow_datasets") from fault
 
 
-def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[Feature]:
+def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[RldsFeature]:
     kind, content = _content(node)
     if kind == "FeaturesDict":
         children = content.get("features", content)
@@ -84,23 +84,25 @@ def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[Feature]:
     if kind in ("Sequence", "Dataset"):
         return _leaves(content["feature"], name, (*nesting, _size(content.get("length"))))
     if kind == "Translation":
-        return [Feature(f"{name}/{key}", "text", (), "string", nesting) for key in content["languages"]]
+        return [RldsFeature(f"{name}/{key}", "text", (), "string", nesting) for key in content["languages"]]
     return [_leaf(kind, content, name, nesting)]
 
 
-def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> Feature:
+def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> RldsFeature:
     stated, dtype = content.get("shape"), str(content.get("dtype") or "")
     shape = tuple(map(_size, (stated.get("dimensions") if isinstance(stated, dict) else stated) or ()))
     if kind in FIXED:
-        return Feature(name, *FIXED[kind], nesting)
+        return RldsFeature(name, *FIXED[kind], nesting)
     if kind in ("Image", "LabeledImage", "Video"):
         nesting = (*nesting, *(shape[:1] or (None,))) if kind == "Video" else nesting
         codec = content.get("encodingFormat") or content.get("encoding_format") or "png"
-        return Feature(name, "image", shape[-3:] or (None, None, 3), dtype or "uint8", nesting, codec=codec)
+        return RldsFeature(
+            name, "image", shape[-3:] or (None, None, 3), dtype or "uint8", nesting, codec=codec
+        )
     if kind not in ("Tensor", "Scalar"):
-        return Feature(name, "other", shape, dtype or kind, nesting)
+        return RldsFeature(name, "other", shape, dtype or kind, nesting)
     if dtype in ("string", "object", "str"):
-        return Feature(name, "text", shape, "string", nesting)
+        return RldsFeature(name, "text", shape, "string", nesting)
     encoding = str(content.get("encoding") or "none").lower()
     try:
         readable = dtype == BFLOAT16 or np.dtype(dtype).kind in "fiub"
@@ -108,7 +110,7 @@ def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> Feat
         readable = False
     if not nesting and shape and shape[0] is None and encoding == "none":
         shape, nesting = shape[1:], (None,)  # an episode without `steps`: the tensor is the sequence
-    return Feature(name, "number" if readable else "other", shape, dtype, nesting, encoding)
+    return RldsFeature(name, "number" if readable else "other", shape, dtype, nesting, encoding)
 
 
 def _content(node: dict[str, Any]) -> tuple[str, dict[str, Any]]:
@@ -139,7 +141,7 @@ class Steps:
             kind, ragged, or has not T rows.
     """
 
-    def __init__(self, example: Example, features: dict[str, Feature], name: str) -> None:
+    def __init__(self, example: Example, features: dict[str, RldsFeature], name: str) -> None:
         self.example, self.features, self.name = example, features, name
         counts = map(self._rows, sorted(features.values(), key=lambda item: item.width or 0))
         count = next((count for count in counts if count is not None), None)
@@ -190,7 +192,7 @@ class Steps:
             return lambda index: _tensor_of(blobs[index], feature, feature.shape, self.name)
         return lambda index: decode_image(np.frombuffer(blobs[index], np.uint8), f"{where}, step {index}")
 
-    def _rows(self, feature: Feature) -> int | None:
+    def _rows(self, feature: RldsFeature) -> int | None:
         """Return the number of steps of a feature, if it can be known without the other features."""
         lengths = f"{feature.name}/ragged_row_lengths_0"
         if lengths in self.example:
@@ -202,7 +204,7 @@ class Steps:
             return count // feature.width if feature.kind == "text" and feature.width else count
         return len(self.example.numbers(feature.name)) // feature.width if feature.width else None
 
-    def _stored(self, feature: Feature) -> tuple[str, list[int]]:
+    def _stored(self, feature: RldsFeature) -> tuple[str, list[int]]:
         """Return (name that holds the values, sizes of the sequences around each value, T first)."""
         if f"{feature.name}/ragged_flat_values" not in self.example:
             inner = [-1 if size is None else size for size in feature.nesting[1:]]
@@ -220,7 +222,7 @@ class Steps:
             sizes.append(int(lengths[0]) if len(lengths) else 0)
         return f"{feature.name}/ragged_flat_values", sizes
 
-    def _decoded(self, feature: Feature, name: str) -> NDArray[Any]:
+    def _decoded(self, feature: RldsFeature, name: str) -> NDArray[Any]:
         """Decode the tensors that are stored as bytes or zlib; return (n, …)."""
         blobs = self.example.blobs(name)
         shapes: Any = [feature.shape] * len(blobs)
@@ -236,7 +238,7 @@ class Steps:
         return np.stack(values) if values else np.zeros((0, 0), _given(feature))
 
 
-def scalar(example: Example, feature: Feature) -> Any:
+def scalar(example: Example, feature: RldsFeature) -> Any:
     """Return a feature outside the steps as a bool, int, float or str; None where it is not one value."""
     if feature.name not in example or feature.nesting or feature.shape or feature.encoding != "none":
         return None
@@ -247,7 +249,7 @@ def scalar(example: Example, feature: Feature) -> Any:
     return np.asarray(values).astype(_given(feature))[0].item() if len(values) == 1 else None
 
 
-def _tensor_of(blob: memoryview, feature: Feature, shape: Any, where: str) -> NDArray[Any]:
+def _tensor_of(blob: memoryview, feature: RldsFeature, shape: Any, where: str) -> NDArray[Any]:
     """Decode one tensor that is encoded to bytes; at most one of the sizes of `shape` is None."""
     sizes = [-1 if size is None else int(size) for size in shape]
     dtype = np.dtype(np.uint16 if feature.dtype == BFLOAT16 else feature.dtype)
@@ -264,11 +266,11 @@ def _tensor_of(blob: memoryview, feature: Feature, shape: Any, where: str) -> ND
     return values
 
 
-def _given(feature: Feature) -> np.dtype:
+def _given(feature: RldsFeature) -> np.dtype:
     """Return the dtype of the values that are handed out."""
     return np.dtype(np.float32 if feature.dtype == BFLOAT16 else feature.dtype)
 
 
-def _printed(feature: Feature) -> str:
+def _printed(feature: RldsFeature) -> str:
     sizes = ", ".join("?" if size is None else str(size) for size in (*feature.nesting[1:], *feature.shape))
     return f"{feature.dtype} ({sizes})"

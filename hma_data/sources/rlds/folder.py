@@ -23,8 +23,8 @@ from pydantic.alias_generators import to_camel
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.common.places import local_path
 from hma_data.sources.rlds.example import Example
-from hma_data.sources.rlds.features import Feature, read_features
-from hma_data.sources.rlds.records import Framing, RecordFile, open_records
+from hma_data.sources.rlds.features import RldsFeature, read_features
+from hma_data.sources.rlds.records import RecordFile, RecordFraming, open_records
 from hma_data.storage.blocks import Blocks
 from hma_data.storage.fetch import attempt, fetch_whole, file_system, is_listless, is_local
 
@@ -88,7 +88,7 @@ class Shard:
         """
         return open_records(self.files, self.path)
 
-    def framing(self, limit: int = -1) -> Framing:
+    def framing(self, limit: int = -1) -> RecordFraming:
         """Return where the shard's records lie; see `RecordFile.framing`.
 
         Raises:
@@ -110,11 +110,11 @@ class Shard:
 
 
 @dataclass(frozen=True)
-class Folder:
+class RldsFolder:
     """One version of a TFDS dataset."""
 
     uri: str  # as given
-    features: dict[str, Feature]  # leaves of features.json by name
+    features: dict[str, RldsFeature]  # leaves of features.json by name
     splits: dict[str, tuple[Shard, ...]]  # the shards that are there, in order
     remote: bool  # whether every read of a file is a request over the network
     name: str  # of the dataset; empty when not stated, as is `version`
@@ -122,7 +122,7 @@ class Folder:
     problems: tuple[str, ...]  # contradictions in the dataset, one sentence each
 
     @cached_property
-    def step_features(self) -> dict[str, Feature]:
+    def step_features(self) -> dict[str, RldsFeature]:
         """Return the features over the steps by their path in a step; without `steps`, by their name."""
         found = self.features.items()
         inside = {name.removeprefix("steps/"): leaf for name, leaf in found if name.startswith("steps/")}
@@ -182,7 +182,7 @@ def episode_id(split: str, index: int) -> str:
     return f"{split}/{index:06d}"
 
 
-def open_folder(uri: str) -> Folder:
+def open_folder(uri: str) -> RldsFolder:
     """Open the TFDS dataset at `uri`, which is cached for the process.
 
     The URI is a version folder, a folder above with one version, or one shard of the dataset. A local folder
@@ -202,7 +202,7 @@ def open_folder(uri: str) -> Folder:
 
 
 @lru_cache(maxsize=64)
-def _open_remote(uri: str, pid: int) -> Folder:
+def _open_remote(uri: str, pid: int) -> RldsFolder:
     try:
         files, path = file_system(uri)
     except ValueError as fault:
@@ -237,7 +237,7 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
 
 
 @lru_cache(maxsize=64)
-def _open(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) -> Folder:
+def _open(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) -> RldsFolder:
     """Make the folder of `open_folder`; `only` is the path of the one shard that the user chose, or empty."""
     described = fetch_whole(files, f"{root}/features.json", LONGEST_JSON)
     if described is None:
@@ -257,7 +257,7 @@ def _open(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) 
     if not shards:
         fault = "holds no TFRecord file"
         raise SourceError(uri, fault, "names are like name-train.tfrecord-00000-of-00001")
-    return Folder(
+    return RldsFolder(
         uri=uri,
         features=read_features(described, f"{root}/features.json"),
         splits={split: _counted(items) for split, items in shards.items()},

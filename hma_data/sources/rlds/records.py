@@ -36,7 +36,7 @@ Read = Callable[[int, int], bytes]  # (start, end) -> the bytes between them
 
 
 @dataclass(frozen=True)
-class Framing:
+class RecordFraming:
     """The positions of the N records of a file."""
 
     offsets: NDArray[np.int64]  # first byte of each record's data
@@ -53,7 +53,7 @@ class Framing:
         return f"{int(self.lengths[index]):016x}{int(self.checks[index]):08x}"
 
 
-EMPTY = Framing(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.uint32), whole=False)
+EMPTY = RecordFraming(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.uint32), whole=False)
 
 
 class RecordFile:
@@ -65,7 +65,7 @@ class RecordFile:
         self._lock = Lock()
         self.blocks = None if is_local(files) else Blocks(partial(fetch, files, path), size)
 
-    def framing(self, limit: int = -1) -> Framing:
+    def framing(self, limit: int = -1) -> RecordFraming:
         """Return where the records lie; for a remote file at least the first `limit`, -1 for all.
 
         Raises:
@@ -76,7 +76,7 @@ class RecordFile:
                 self._frames = self._scanned(limit)
             return self._frames
 
-    def _scanned(self, limit: int) -> Framing:
+    def _scanned(self, limit: int) -> RecordFraming:
         stop = -1 if is_local(self._files) else limit
         with self._parts() as read:
             return scan_tfrecord(read, self._path, self._size, self._frames, stop)
@@ -110,7 +110,7 @@ class RecordFile:
             raise EpisodeError(where, f"{self._path}: {frames.fault or f'ends after {len(frames)} records'}")
         return self._picked(frames, index, where)
 
-    def _picked(self, frames: Framing, index: int, where: str) -> bytes:
+    def _picked(self, frames: RecordFraming, index: int, where: str) -> bytes:
         offset, length = int(frames.offsets[index]), int(frames.lengths[index])
         data = self._bytes(offset, offset + length)
         if masked_crc(data) != frames.checks[index]:
@@ -122,7 +122,7 @@ class RecordFile:
 class ArrayRecordFile(RecordFile):
     """One ArrayRecord file; its framing has each record's number in place of the offset."""
 
-    def _scanned(self, limit: int) -> Framing:
+    def _scanned(self, limit: int) -> RecordFraming:
         """Read every record once; a damaged one gets length 0, and fails when it is read."""
         reader = self._reader()
         if not reader.ok():
@@ -141,9 +141,9 @@ class ArrayRecordFile(RecordFile):
             except RuntimeError:
                 continue
             lengths[index], checks[index] = len(data), google_crc32c.value(data)
-        return Framing(np.arange(count, dtype=np.int64), lengths, checks)
+        return RecordFraming(np.arange(count, dtype=np.int64), lengths, checks)
 
-    def _picked(self, frames: Framing, index: int, where: str) -> bytes:
+    def _picked(self, frames: RecordFraming, index: int, where: str) -> bytes:
         try:
             [data] = self._reader().read([index])
         except RuntimeError as fault:
@@ -197,7 +197,9 @@ def masked_crc(data: Any) -> int:
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
 
 
-def scan_tfrecord(read: Read, path: str, size: int, known: Framing = EMPTY, limit: int = -1) -> Framing:
+def scan_tfrecord(
+    read: Read, path: str, size: int, known: RecordFraming = EMPTY, limit: int = -1
+) -> RecordFraming:
     """Return the framing of a TFRecord file: begin where `known` ends, stop after `limit` records (-1: none).
 
     Raises:
@@ -220,7 +222,7 @@ def scan_tfrecord(read: Read, path: str, size: int, known: Framing = EMPTY, limi
         checks.append(FOOTER.unpack_from(tail)[0])
         header, position = tail[FOOTER.size :], end + FOOTER.size
     columns = np.array(offsets, np.int64), np.array(lengths, np.int64), np.array(checks, np.uint32)
-    return Framing(*columns, fault, bool(fault) or position >= size)
+    return RecordFraming(*columns, fault, bool(fault) or position >= size)
 
 
 def _data_end(header: bytes, position: int, size: int) -> tuple[int, str]:

@@ -27,8 +27,8 @@ from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, KeyInfo, compo
 from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.survey import Series, Survey
 from hma_data.sources.rlds.example import Example
-from hma_data.sources.rlds.features import Feature, Steps, scalar
-from hma_data.sources.rlds.folder import Folder, Shard, episode_id, open_folder
+from hma_data.sources.rlds.features import RldsFeature, Steps, scalar
+from hma_data.sources.rlds.folder import RldsFolder, Shard, episode_id, open_folder
 from hma_data.storage.fetch import info, mark
 from hma_data.storage.paths import StrPath, as_text
 
@@ -107,7 +107,7 @@ class RldsSource:
         )
 
     def expect(self, uri: StrPath, episode_ids: Sequence[str]) -> None:
-        """See `Folder.expect`."""
+        """See `RldsFolder.expect`."""
         open_folder(as_text(uri)).expect(episode_ids)
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
@@ -144,7 +144,7 @@ def _remote_refs(split: str, shard: Shard, own: str | None, rate: float) -> list
     return [EpisodeRef(name, frames, own, fingerprint) for name in ids]
 
 
-def _lengths(folder: Folder, splits: list[str], refs: list[EpisodeRef]) -> dict[str, int]:
+def _lengths(folder: RldsFolder, splits: list[str], refs: list[EpisodeRef]) -> dict[str, int]:
     """Return the lengths of the readable episodes; none of a folder that is remote or too large to read."""
     if folder.remote or len(refs) > COUNTED_EPISODES:
         return {}
@@ -158,7 +158,7 @@ def _lengths(folder: Folder, splits: list[str], refs: list[EpisodeRef]) -> dict[
     return lengths
 
 
-def _steps_per_byte(folder: Folder, split: str) -> float:
+def _steps_per_byte(folder: RldsFolder, split: str) -> float:
     """Return steps a byte, from the first record of some of a split's shards; 0 when none can be read."""
     shards = folder.splits[split]
     steps = size = 0
@@ -179,7 +179,7 @@ def _steps_per_byte(folder: Folder, split: str) -> float:
 # -- the embodiment's keys
 
 
-def is_camera(feature: Feature) -> bool:
+def is_camera(feature: RldsFeature) -> bool:
     """Check whether a feature holds a colour image a step, encoded or as a tensor."""
     if feature.dtype != "uint8" or len(feature.nesting) != 1:
         return False
@@ -187,7 +187,7 @@ def is_camera(feature: Feature) -> bool:
     return feature.kind == "image" or colours
 
 
-def _check_keys(folder: Folder, embodiment: Embodiment) -> None:
+def _check_keys(folder: RldsFolder, embodiment: Embodiment) -> None:
     """Raise a SourceError where features.json lacks a key of the embodiment, or has it with another width."""
     for camera in embodiment.cameras:
         feature = _step_feature(folder, camera.key)
@@ -201,7 +201,7 @@ def _check_keys(folder: Folder, embodiment: Embodiment) -> None:
         _text_feature(folder, embodiment.source.instruction)
 
 
-def _check_component(folder: Folder, part: Component) -> None:
+def _check_component(folder: RldsFolder, part: Component) -> None:
     feature = _step_feature(folder, part.key)
     if feature.kind != "number":
         raise SourceError(folder.uri, f"{part.key} is {_described(feature)} of {feature.dtype}, not numbers")
@@ -211,7 +211,7 @@ def _check_component(folder: Folder, part: Component) -> None:
         raise SourceError(folder.uri, fault, "correct dims or give slice in the YAML")
 
 
-def _step_feature(folder: Folder, key: str) -> Feature:
+def _step_feature(folder: RldsFolder, key: str) -> RldsFeature:
     """Return the feature at a path inside a step; name the nearest keys where there is none."""
     found = folder.step_features
     if key in found:
@@ -221,7 +221,7 @@ def _step_feature(folder: Folder, key: str) -> Feature:
     raise SourceError(folder.uri, f"has no key {key!r} in its steps", remedy)
 
 
-def _text_feature(folder: Folder, key: str) -> Feature:
+def _text_feature(folder: RldsFolder, key: str) -> RldsFeature:
     """Return the feature of the instruction, from inside the steps or from the whole episode."""
     inside = key in folder.step_features or key not in folder.features
     feature = _step_feature(folder, key) if inside else folder.features[key]
@@ -232,7 +232,7 @@ def _text_feature(folder: Folder, key: str) -> Feature:
     raise SourceError(folder.uri, f"source.instruction: {key} is {_described(feature)}, not text")
 
 
-def _described(feature: Feature) -> str:
+def _described(feature: RldsFeature) -> str:
     if feature.kind == "image":
         return "a sequence of images a step" if len(feature.nesting) > 1 else "an image"
     return {"number": "a tensor", "text": "text"}.get(feature.kind, "a feature")
@@ -277,7 +277,7 @@ def _ends_with_padding(steps: Steps, keys: Iterable[str]) -> bool:
     return moved and not any(value[-1].any() for value in floats)
 
 
-def _instruction(folder: Folder, steps: Steps, key: str | None) -> str:
+def _instruction(folder: RldsFolder, steps: Steps, key: str | None) -> str:
     """Return the instruction of the first step."""
     if key is None:
         places = [f"{place}{name}" for place in ("", "observation/") for name in INSTRUCTIONS]
@@ -295,7 +295,7 @@ def _instruction(folder: Folder, steps: Steps, key: str | None) -> str:
     return bytes(int(code) & 0xFF for code in codes if code).decode(errors="replace")
 
 
-def _success(folder: Folder, steps: Steps) -> bool | None:
+def _success(folder: RldsFolder, steps: Steps) -> bool | None:
     """Return the stated success; without one, True where the last step is terminal and has a reward > 0."""
     stated = folder.features.get("episode_metadata/success")
     if stated:
@@ -307,7 +307,7 @@ def _success(folder: Folder, steps: Steps) -> bool | None:
     return True if all(end.size == 1 and end > 0 for end in ends) else None
 
 
-def _metadata(folder: Folder, example: Example) -> dict[str, Any]:
+def _metadata(folder: RldsFolder, example: Example) -> dict[str, Any]:
     found = {
         name.removeprefix("episode_metadata/"): scalar(example, feature)
         for name, feature in folder.features.items()
@@ -340,7 +340,7 @@ def _inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
 
 
 def _survey(
-    folder: Folder, names: list[str], episodes: int, survey: Survey
+    folder: RldsFolder, names: list[str], episodes: int, survey: Survey
 ) -> tuple[list[int], Steps | None]:
     """Look into a sample of the episodes; return the lengths of those read, and the first of the sample."""
     chosen = survey.sample(names, episodes)
@@ -379,7 +379,7 @@ def _series(steps: Steps, key: str, survey: Survey) -> Series:
     return Series(numbers=lambda: values)
 
 
-def _facts(folder: Folder) -> dict[str, str]:
+def _facts(folder: RldsFolder) -> dict[str, str]:
     splits = [f"{name} {sum(shard.count() for shard in shards)}" for name, shards in folder.splits.items()]
     outside = [name for name in folder.features if not name.startswith("steps/")]
     found = {"dataset": folder.name, "version": folder.version}

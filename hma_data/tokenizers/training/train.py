@@ -141,7 +141,7 @@ def start_from(network: Autoencoder, source: StrPath) -> str:
     return sha256
 
 
-class Run:
+class TokenizerTraining:
     """A training in progress: network, averaged weights, optimizers, and the step it has reached."""
 
     def __init__(self, recipe: TokenizerRecipe, pools: list[Pool], device: torch.device) -> None:
@@ -311,7 +311,7 @@ def train(
     torch.set_num_threads(recipe.training.threads)
     pools, corpus_sha256 = load_pools(recipe.sources, Path(recipe.corpus).expanduser())
     report("pictures: " + ", ".join(f"{pool.name} {len(pool.pictures)}" for pool in pools))
-    run, state = Run(recipe, pools, place), out.with_name(out.name + ".state")
+    run, state = TokenizerTraining(recipe, pools, place), out.with_name(out.name + ".state")
     if state.exists():
         run.resume(state)
         report(f"resuming from step {run.step}")
@@ -346,7 +346,7 @@ def train(
     return facts
 
 
-def _crops(run: Run, workers: int) -> Iterator[Tensor]:
+def _crops(run: TokenizerTraining, workers: int) -> Iterator[Tensor]:
     """Yield the crops of every remaining step, in order; threads draw them ahead."""
     count, steps = run.recipe.training.batch, iter(range(run.step, run.recipe.training.steps))
     if not workers:

@@ -15,7 +15,7 @@ from skimage import data
 from hma_data.inspection.inspect import inspect_recording
 from hma_data.sources.base import Inspection, open_source
 from hma_data.sources.common import checks
-from hma_data.sources.common.checks import Look, choose, measure, ycbcr_share
+from hma_data.sources.common.checks import CameraLook, choose, measure, ycbcr_share
 from hma_data.sources.common.survey import CHECKS
 from tests.data.bag_files import make_recording, write_ros1, write_ros2
 from tests.data.rlds_files import TEXT, image, png, tensor, write
@@ -271,7 +271,7 @@ def decoded(picture: np.ndarray) -> np.ndarray:
 def test_swapped_channels_of_what_once_was_jpeg_are_certain(name: str) -> None:
     picture = decoded(getattr(data, name)())
     for order, verdict in ((picture, "no"), (picture[..., ::-1], "sure")):
-        look = Look()
+        look = CameraLook()
         look.add(order[None], np.array([0]))
         assert look.swapped()[0] == verdict
 

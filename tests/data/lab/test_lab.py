@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 from hma_data.errors import MissingDependencyError, OutputError, UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
-from hma_data.lab.pusht import SLOW_LOOK, STEPS_HELD, Arena
+from hma_data.lab.pusht import SLOW_LOOK, STEPS_HELD, PushArena
 from hma_data.lab.tee_table import TeeTable
 from hma_data.lab.writers import _held_out
 from hma_data.registry.embodiment import Embodiment, find
@@ -61,8 +61,8 @@ def hashes(path: Path) -> list[str]:
     return [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
 
 
-def arena(start: str = "near", seed: int = 0) -> Arena:
-    return Arena(SLOW_LOOK, start, np.random.default_rng(seed))
+def arena(start: str = "near", seed: int = 0) -> PushArena:
+    return PushArena(SLOW_LOOK, start, np.random.default_rng(seed))
 
 
 # -- pusht_fast

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.loading.pools import LARGEST_POOL, UnitAssignment, WindowSequence, pool_size, spread
-from hma_data.loading.rows import MIB, Decoder
+from hma_data.loading.rows import MIB, RowDecoder
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import WindowIndex
@@ -34,8 +34,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def decoder(made: Path) -> Decoder:
-    return Decoder(ShardSet(made), "train", 6)
+def decoder(made: Path) -> RowDecoder:
+    return RowDecoder(ShardSet(made), "train", 6)
 
 
 def rows_of(stream: WindowSequence, start: int, count: int) -> list[float]:
@@ -106,7 +106,7 @@ def test_readers_get_about_the_same_number_of_windows(episodes: int, readers: in
     assert max(shares) <= 1.15 * min(shares) + 2
 
 
-def test_an_epoch_of_all_readers_is_every_window_once(decoder: Decoder) -> None:
+def test_an_epoch_of_all_readers_is_every_window_once(decoder: RowDecoder) -> None:
     deal = UnitAssignment.of(decoder.index, 3)
     streams = [WindowSequence(decoder, deal, 5, reader, 2) for reader in range(3)]
     first = [window for stream in streams for window in rows_of(stream, 0, stream.length)]
@@ -116,7 +116,7 @@ def test_an_epoch_of_all_readers_is_every_window_once(decoder: Decoder) -> None:
     assert len(set(first)) == decoder.index.count // 4  # four links of one shard
 
 
-def test_the_sequence_does_not_depend_on_how_it_is_taken(decoder: Decoder) -> None:
+def test_the_sequence_does_not_depend_on_how_it_is_taken(decoder: RowDecoder) -> None:
     deal = UnitAssignment.of(decoder.index, 2)
     length = WindowSequence(decoder, deal, 5, 1, 3).length
     whole = rows_of(WindowSequence(decoder, deal, 5, 1, 3), 0, 2 * length + 7)
@@ -126,13 +126,13 @@ def test_the_sequence_does_not_depend_on_how_it_is_taken(decoder: Decoder) -> No
         assert rows_of(stream, start, 7) == whole[start : start + 7]
 
 
-def test_seeds_and_readers_have_orders_of_their_own(decoder: Decoder) -> None:
+def test_seeds_and_readers_have_orders_of_their_own(decoder: RowDecoder) -> None:
     deal = UnitAssignment.of(decoder.index, 1)
     one, other = (rows_of(WindowSequence(decoder, deal, seed, 0, 4), 0, 50) for seed in (1, 2))
     assert one != other
 
 
-def test_a_pool_fits_its_memory(decoder: Decoder) -> None:
+def test_a_pool_fits_its_memory(decoder: RowDecoder) -> None:
     assert pool_size(decoder, 0) == 1
     assert pool_size(decoder, 3.5 * decoder.group_bytes) == 3
     assert pool_size(decoder, 1024 * MIB) == LARGEST_POOL
@@ -143,7 +143,11 @@ def test_row_groups_that_are_used_again_are_decoded_once(made: Path, monkeypatch
     read = shards.read
     monkeypatch.setattr(shards, "read", lambda *a: reads.append(a[:2]) or read(*a))
     stream = WindowSequence(
-        kept := Decoder(shards, "train", 6, cache_bytes=100 * MIB), UnitAssignment.of(kept.index, 1), 0, 0, 4
+        kept := RowDecoder(shards, "train", 6, cache_bytes=100 * MIB),
+        UnitAssignment.of(kept.index, 1),
+        0,
+        0,
+        4,
     )
     stream.take(0, 3 * stream.length)
     assert len(reads) == len(kept.index.groups)

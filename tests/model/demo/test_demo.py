@@ -12,7 +12,7 @@ from hma_data.errors import OutputError
 from hma_data.shards.verify import verify
 from hma_model.demo import report
 from hma_model.demo import run as demos
-from hma_model.demo.results import Demo
+from hma_model.demo.results import DemoRun
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.rollout_video import RolloutVideo
 from hma_model.evaluation.verdict import verdict
@@ -20,7 +20,7 @@ from hma_model.evaluation.verdict import verdict
 
 @pytest.mark.slow
 def test_a_demo_that_was_cut_goes_on_by_the_same_command(tmp_path, monkeypatch) -> None:
-    def cut(made: Demo) -> None:
+    def cut(made: DemoRun) -> None:
         raise KeyboardInterrupt
 
     out = tmp_path / "demo"

@@ -16,7 +16,7 @@ from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.shards.reader import ShardSet
 from hma_model.evaluation import actions, tables
 from hma_model.evaluation.actions import gaussian, shuffled, shuffled_actions, without_actions
-from hma_model.evaluation.evaluate import Settings, measure
+from hma_model.evaluation.evaluate import EvaluationSettings, measure
 from hma_model.evaluation.intervals import interval, over_datasets
 from hma_model.evaluation.losses import (
     digit_frequencies,
@@ -37,7 +37,7 @@ from tests.model.shards import make_shards
 
 def evaluate(model: HMA, tokenizer: Any, data: Any, **settings: Any) -> dict[str, Any]:
     """Return the figures of a model on a shard set."""
-    return measure(model, tokenizer, data, Settings(**settings)).found
+    return measure(model, tokenizer, data, EvaluationSettings(**settings)).found
 
 
 class Oracle(HMA):
@@ -465,7 +465,7 @@ def test_the_papers_protocol_predicts_the_last_frame_from_the_true_past(data):
     oracle.add_embodiment(make_model({"arm": 2}).embodiments["arm"])
     oracle.truth = list(windows(data, "val", 4, 6, batch_size=3))
     found = measure(
-        oracle.eval(), Blocks(), data, Settings(windows=6, batch_size=3, prompt=1, paper=True)
+        oracle.eval(), Blocks(), data, EvaluationSettings(windows=6, batch_size=3, prompt=1, paper=True)
     ).found
     paper = found["paper"]
     assert paper["psnr_last"] == 60.0 and paper["gaussian_psnr_last"] < 30
@@ -474,7 +474,7 @@ def test_the_papers_protocol_predicts_the_last_frame_from_the_true_past(data):
 
 
 def test_the_papers_perplexity_is_a_mean_over_batches_of_four(data, model):
-    measured = measure(model, Blocks(), data, Settings(windows=6, paper=True, draws=1))
+    measured = measure(model, Blocks(), data, EvaluationSettings(windows=6, paper=True, draws=1))
     nats = measured.by_window["loss"]
     expected = np.mean([np.exp(nats[:4].mean()), np.exp(nats[4:].mean())])
     assert measured.found["paper"]["perplexity"] == pytest.approx(expected, abs=1e-3)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from hma_data.errors import UsageError
 from hma_data.storage.files import file_sha256
 from hma_model.evaluation.perceptual import (
-    Judge,
+    FeatureCollector,
     Moments,
     Networks,
     as_video,
@@ -132,7 +132,7 @@ def test_lpips_takes_pairs_of_pictures_from_minus_one_to_one(tmp_path: Path) -> 
 def test_distances_are_of_all_pictures_and_too_few_are_refused_with_the_number(script: Path) -> None:
     opened = open_networks(fid=pinned(script), fvd=pinned(script))
     truth, made = rng().integers(0, 255, (2, 6, 4, 16, 16, 3)).astype(np.uint8)
-    judge = Judge(opened)
+    judge = FeatureCollector(opened)
     for part in (slice(0, 3), slice(3, 6)):
         judge.add("truth", truth[part])
         judge.add("true", made[part])
@@ -143,7 +143,7 @@ def test_distances_are_of_all_pictures_and_too_few_are_refused_with_the_number(s
     expected += np.trace(c1 + c2 - 2 * sqrtm(c1 @ c2).real)
     assert found["true"]["fid"] == pytest.approx(expected, rel=1e-3) and found["true"]["fvd"] > 0
     assert list(missing) == ["lpips"] and "--lpips FILE" in missing["lpips"]
-    few = Judge(Networks(features={"fvd": opened.features["fvd"]}, facts=opened.facts))
+    few = FeatureCollector(Networks(features={"fvd": opened.features["fvd"]}, facts=opened.facts))
     few.add("truth", truth[:3])
     few.add("true", made[:3])
     found, missing = few.figures(4)

@@ -19,13 +19,13 @@ from hma_model.cli import main
 from hma_model.evaluation import report, suite
 from hma_model.evaluation.report import difference, write_results
 from hma_model.evaluation.simulated import PERTURBATION, perturbed
-from hma_model.evaluation.suite import Settings, evaluate_all
+from hma_model.evaluation.suite import EvaluationSettings, evaluate_all
 from hma_model.evaluation.tables import MEAN, absences, comparison, means, results
 from hma_model.evaluation.verdict import verdict
 from tests.model.robots import CONFIG, SPEC, Blocks, make_model, save
 from tests.model.shards import make_shards
 
-SETTINGS = Settings(windows=3, draws=1)
+SETTINGS = EvaluationSettings(windows=3, draws=1)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 def run(
     made: Path,
     out: Path | None = None,
-    settings: Settings = SETTINGS,
+    settings: EvaluationSettings = SETTINGS,
     checkpoints: tuple[str, ...] = ("one",),
 ) -> list[suite.Part]:
     folders = [made / name for name in checkpoints]

@@ -41,11 +41,11 @@ def episodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def episode(
         robot: str, frames: int, stride: int, seed: int, number: int, drawn: Any, wander: bool
-    ) -> truth.Episode:
+    ) -> truth.TrueEpisode:
         rng = np.random.default_rng(number)
         parts = np.repeat(rng.uniform(30, 90, (1, 3, 2)), frames, axis=0)
         parts[-4:, 1] += (8 * (number % 2), 0)
-        return truth.Episode(
+        return truth.TrueEpisode(
             written(parts)[sorted(drawn)], np.zeros((frames, 1), np.float32), parts, parts[:, 0], 1
         )
 

@@ -50,7 +50,7 @@ def test_three_views_are_trained_generated_and_evaluated(made: Path, run: Path) 
     assert cameras_for(model, shards) == NAMES  # those of its training
     film = rollout_video(model, tokenizer, shards, prompt=1)
     assert film.frames.shape[2] > 3 * 3 * 64  # three panels of three views
-    found = evaluate.measure(model, tokenizer, shards, evaluate.Settings(windows=2)).found
+    found = evaluate.measure(model, tokenizer, shards, evaluate.EvaluationSettings(windows=2)).found
     assert found["cameras"] == "top, wrist, side"
     assert np.isfinite(found["loss"])
     with pytest.raises(UsageError, match="the model takes 3"):

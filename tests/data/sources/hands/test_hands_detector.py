@@ -20,8 +20,8 @@ from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands import scan as hands_scan
 from hma_data.sources.hands.detect import (
     Hand,
+    HandNetwork,
     MediaPipeHands,
-    Network,
     Square,
     choose_sides,
     cut,
@@ -363,4 +363,4 @@ def test_models_in_each_others_place_or_damaged_are_refused(models: Path, tmp_pa
 def test_without_litert_the_error_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
     with pytest.raises(MissingDependencyError, match="uv sync --inexact --extra hands"):
-        Network(b"", 192, (1,), "x")
+        HandNetwork(b"", 192, (1,), "x")
