@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_300, 11_100, 6),
     "hma_data/registry": (1_280, 8_200, 6),
     "hma_data/shards": (2_540, 19_600, 11),
-    "hma_data/sources": (12_540, 104_900, 51),
+    "hma_data/sources": (12_680, 106_000, 54),
     "hma_data/storage": (1_640, 10_700, 11),
     "hma_data/tokenizers": (3_290, 23_900, 17),
     "hma_model": (520, 3_100, 3),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_530, 11_500, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 61_700, 486_500
-TEST_LINES = 45_300
+TEST_LINES = 45_450
 DOC_WORDS = 38_000
 
 

@@ -46,6 +46,7 @@ from hma_data.registry.export import lerobot_features, packed_components
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, QUARANTINE, Derived, Manifest, ShardFile
 from hma_data.shards.schema import FOOTER_KEY, Footer, Refused, RowLayout, flag_totals, mask_columns, to_numpy
 from hma_data.sources.base import open_source
+from hma_data.sources.lerobot.language import on_rows, write_language
 from hma_data.sources.lerobot.writer import ORIGIN, DatasetWriter, join_datasets, load_lerobot, set_splits
 from hma_data.storage.fetch import disk_is_full
 from hma_data.storage.files import PART, sync_folder
@@ -223,6 +224,8 @@ class LeRobotOutput:
                         raise
                     raise camera_fault(episode.ref.id, name, cameras, fault) from fault
                 yield Frames(name, frames)
+        fps = self._job.facts["dataset"]["fps"]
+        episode.language = on_rows(episode.language, clip.timestamps[kept], fps)
         for name, seen in checks.items():
             episode.flags |= picture_flags(seen, self._job.embodiment.quality, episode.ref.id, name)
 
@@ -442,16 +445,24 @@ class LeRobotHolder:
         parts = [part_folder(self.folder, unit.name) / DATASET for unit in plan.units]
         join_datasets([part for part in parts if part.is_dir()], whole, self._robot.id)
         manifest = replace(derived.manifest, shards=())
+        episodes = _numbered(derived.episodes)
         held_out = manifest.splits["val"]["episodes"]
         if held_out:
             total = len(derived.episodes)
             set_splits(whole, {"train": f"0:{total - held_out}", "val": f"{total - held_out}:{total}"})
+        said = {
+            row["episode_index"]: json.loads(row["language"])
+            for row in episodes.to_pylist()
+            if row.get("language")
+        }
+        if said:
+            write_language(whole, said)
         layout = manifest.layout
         embodiment = Columns(layout, plan.facts["dataset"]).embodiment()
         (whole / EMBODIMENT).write_text(embodiment.to_yaml(), encoding="utf-8")
         if "made_by" in plan.facts:
             (whole / ORIGIN).write_text(json.dumps(plan.facts["made_by"], indent=1), encoding="utf-8")
-        pq.write_table(_numbered(derived.episodes), whole / EPISODES, compression="zstd")
+        pq.write_table(episodes, whole / EPISODES, compression="zstd")
         (whole / QUARANTINE).write_text(derived.quarantine, encoding="utf-8")
         (whole / CONVERSION).write_text(manifest.to_text(), encoding="utf-8")
         _sync(whole)

@@ -9,7 +9,7 @@ n frames of a camera, H×W pixels, or S×S where they are resized.
 import json
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -38,6 +38,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, flags_text
 from hma_data.shards.stats import Stats
 from hma_data.sources.base import EpisodeRef, Expecting, Source, open_source
+from hma_data.sources.lerobot.language import to_text
 from hma_data.storage.fetch import EPISODE_WAITS_S as WAITS_S
 from hma_data.storage.fetch import disk_is_full, storage_is_away, worth_another_try
 
@@ -91,6 +92,7 @@ class ReadEpisode:
     Attributes:
         kept: (N,) frames of the clip that become rows.
         flags: of its grid and its frames, see `rate_flags` and `picture_flags`.
+        language: what is said about its moments, at seconds from the clip's first frame.
         content: hash over what was read of it, where the output keeps one.
         read: whether all its frames are in the queue, or encoded.
         waiting: frames that are in the queue.
@@ -102,6 +104,7 @@ class ReadEpisode:
     clip: Clip
     kept: NDArray[np.int64]
     flags: dict[str, int]
+    language: Sequence[Mapping[str, Any]] = ()
     content: str = ""
     read: bool = False
     waiting: int = 0
@@ -179,7 +182,25 @@ def _begin(job: Job, source: Source, index: int, ref: EpisodeRef) -> ReadEpisode
         idle = idle_rows(clip, job.embodiment, kept, layout.frame_stride)
         kept = kept[~idle]
         flags |= {"idle_frames": int(idle.sum())} if idle.any() else {}
-    return ReadEpisode(index, ref, clip, kept, flags)
+    return ReadEpisode(index, ref, clip, kept, flags, _language(clip))
+
+
+def _language(clip: Clip) -> list[dict[str, Any]]:
+    """Return what is said about the moments of a clip; what held before it begins holds from its start."""
+    items = clip.episode.metadata.get("language", ())
+    if not items:
+        return []
+    camera, indices = next(iter(clip.frame_indices.items()))
+    times = clip.episode.streams[camera].timestamps
+    start = float(times[indices[0]] - times[0])
+    later = [dict(item) | {"timestamp": item["timestamp"] - start} for item in items]
+    kept = [item for item in later if 0 <= item["timestamp"] <= clip.timestamps[-1] + 1e-4]
+    before = {
+        item["style"]: item | {"timestamp": 0.0}
+        for item in later
+        if item["timestamp"] < 0 and item["column"] == "persistent"
+    }
+    return [*before.values(), *kept]
 
 
 class UnitNotes:
@@ -233,6 +254,7 @@ def _row(item: ReadEpisode, unit: ShardUnit, start: int, rows: int) -> EpisodeRo
         flags=flags_text(clip.trimmed, clip.flags | item.flags, pauses(clip.timestamps)),
         group=item.ref.group,
         content=item.content,
+        language=to_text(item.language),
     )
 
 

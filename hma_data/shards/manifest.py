@@ -56,7 +56,7 @@ _UNSEALED = "0" * 64
 _EPISODE_COLUMNS = (
     "episode_index", "id", "split", "shard", "row_start", "rows", "length", "instruction", "success",
     "source", "fingerprint", "skew_p50_ms", "skew_p95_ms", "skew_max_ms", "skew", "trimmed", "flags",
-    "group", "content",
+    "group", "content", "language",
 )  # fmt: skip
 _EPISODE_SCHEMA = pa.schema(
     [
@@ -329,7 +329,9 @@ class Derived:
         columns = [  # one after the other: taking from many chunks is slow
             table[column.name].combine_chunks().take(order).cast(column.type) for column in _EPISODE_SCHEMA
         ]
-        return pa.table(columns, schema=_EPISODE_SCHEMA)
+        episodes = pa.table(columns, schema=_EPISODE_SCHEMA)
+        has_language = pc.any(pc.not_equal(episodes["language"], "")).as_py()
+        return episodes if has_language else episodes.drop_columns(["language"])
 
     @property
     def quarantine(self) -> str:

@@ -56,6 +56,7 @@ class EpisodeRow:
         source: source of the episode if it differs from the set's.
         content: hash over what was read of it, see `hma_data.conversion.extend`; empty if it was not
             recorded.
+        language: what is said in words about moments of the episode, as JSON; empty where nothing is.
     """
 
     episode_index: int
@@ -77,6 +78,11 @@ class EpisodeRow:
     group: str = ""
     source: str = ""
     content: str = ""
+    language: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields, without an empty `language`: few recordings have one."""
+        return {name: value for name, value in vars(self).items() if value or name != "language"}
 
 
 @dataclass(frozen=True)
@@ -120,7 +126,7 @@ class Footer:
             "plan": self.plan,
             "name": self.name,
             "split": self.split,
-            "episodes": [vars(row) for row in self.episodes],
+            "episodes": [row.to_json() for row in self.episodes],
             "quarantine": [vars(item) for item in self.quarantine],
             "stats": {name: stats.to_json() for name, stats in self.stats.items()},
         }

@@ -211,7 +211,7 @@ class Metadata:
         self.fps, self.features = self.info.fps, self.info.features
         self._is_v3 = is_v3 = self.info.codebase_version == "v3.0"
         self.splits = _splits(self.info.splits)
-        self.tasks = _by_number(_tasks_v3(folder) if is_v3 else _tasks_v2(folder))
+        self.tasks = _by_number(numbered_texts(folder, "task") if is_v3 else _tasks_v2(folder))
         self.episodes = _by_index(_episodes_v3(folder) if is_v3 else _lines(folder, "episodes.jsonl"))
         self._spans: dict[str, dict[str, tuple[Span, ...]]] = {}  # camera -> video -> its episodes
         self.fits: dict[tuple[str, str], tuple[Any, Any]] = {}  # camera, video -> its table, and its Fit
@@ -372,18 +372,19 @@ def _tasks_v2(folder: Folder) -> Iterator[tuple[Any, Any]]:
     yield from ((row.get("task_index"), row.get("task")) for _, row in rows)
 
 
-def _tasks_v3(folder: Folder) -> Iterator[tuple[Any, Any]]:
+def numbered_texts(folder: Folder, kind: str) -> Iterator[tuple[Any, Any]]:
+    """Yield number and text of each task or subtask, as version 3 stores them; none without the file."""
     import pyarrow.parquet as pq
 
-    path = folder.root / "meta" / "tasks.parquet"
+    path = folder.root / "meta" / f"{kind}s.parquet"
     if not path.is_file():
         return
     with parquet_explained(path, SourceError):
         with pq.ParquetFile(path) as file:
             table = file.read(use_threads=False)
-        # The text is pandas' index, whose column is named `task` or not at all.
-        texts = "task" if "task" in table.column_names else "__index_level_0__"
-        yield from zip(table["task_index"].to_pylist(), table[texts].to_pylist(), strict=True)
+        # The text is pandas' index, whose column is named by the kind or not at all.
+        texts = kind if kind in table.column_names else "__index_level_0__"
+        yield from zip(table[f"{kind}_index"].to_pylist(), table[texts].to_pylist(), strict=True)
 
 
 def _by_number(tasks: Iterator[tuple[Any, Any]]) -> dict[int, str]:

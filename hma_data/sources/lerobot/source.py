@@ -15,6 +15,7 @@ T frames of an episode.
 import hashlib
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
 from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.lerobot.films import FilmRows, fit_of, frames_of_rows, open_video
 from hma_data.sources.lerobot.inspect import inspect
+from hma_data.sources.lerobot.language import language_of
 from hma_data.sources.lerobot.metadata import Folder, Metadata, episode_name
 from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, tasks_of, times_of
 from hma_data.storage.paths import StrPath, as_text
@@ -111,6 +113,9 @@ class LeRobotSource:
             streams[camera.name] = FilmRows(file, times, found)
             if unused := fit_of(meta, camera.key, file, span).unused.get(index):
                 flags[f"{UNUSED}:{camera.name}"] = unused
+        metadata: dict[str, Any] = {"flags": flags, "language": language_of(meta, rows, times)}
+        if len(tasks) > 1:
+            metadata["tasks"] = tasks
         return Episode(
             id=episode_id,
             streams=streams,
@@ -119,7 +124,7 @@ class LeRobotSource:
             instruction=_instruction(rows, embodiment.source.instruction, tasks),
             success=_success(rows),
             source=str(rows.path),
-            metadata={"flags": flags} | ({"tasks": tasks} if len(tasks) > 1 else {}),
+            metadata=metadata,
         )
 
     def _open(self, uri: str, again: bool = False) -> Metadata:
