@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import gc
 import os
 import shutil
 from collections.abc import Generator, Iterable
@@ -22,6 +23,15 @@ ALWAYS = {"deadline": None, "suppress_health_check": [HealthCheck.function_scope
 settings.register_profile("same", derandomize=True, database=None, max_examples=30, **ALWAYS)
 settings.register_profile("new", print_blob=True, max_examples=200, **ALWAYS)
 settings.load_profile("new" if os.environ.get("HMA_FUZZ") else "same")
+
+
+gc.disable()  # modules that are imported and rewritten are kept: looking for garbage among them takes a fifth
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage again, among what tests make alone."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Iterator
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
@@ -30,11 +31,17 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, token: str) -> Itera
         close_session()
 
 
+_pushed: dict[Path, tuple] = {}  # a checkpoint -> what a hub holds after its push; pushed once in a session
+
+
 @pytest.fixture
 def published(server: Hub, source: Path) -> Hub:
     """The hub with that checkpoint in REPO."""
     from hma_model.hub import publish as hub
 
-    hub.push(source, REPO)
+    if source not in _pushed:
+        hub.push(source, REPO)
+        _pushed[source] = deepcopy((server.repositories, server.objects))
+    server.repositories, server.objects = deepcopy(_pushed[source])
     server.log.clear()
     return server

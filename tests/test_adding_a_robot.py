@@ -12,7 +12,7 @@ from tests.command import hma
 from tests.data.bag_files import make_recording, write_ros2
 from tests.data.videos import make_v3
 
-TINY = ["frames=3", "batch_size=2", "steps=2", "warmup=1"]
+TINY = ["frames=3", "batch_size=2", "steps=2", "warmup=1", "workers=0"]
 TINY += ["model.layers=1", "model.width=32", "model.heads=2"]
 
 
@@ -22,9 +22,9 @@ def hdf5_arm(folder: Path) -> Path:
     with h5py.File(folder / "friday.hdf5", "w") as file:
         for i in range(3):
             demo = file.create_group(f"data/demo_{i}")
-            demo["actions"] = draw.normal(size=(40, 7)).astype(np.float32)
-            demo["obs/joint_pos"] = draw.normal(size=(40, 7))
-            demo["obs/front_image"] = draw.integers(0, 256, (40, 48, 64, 3), np.uint8)
+            demo["actions"] = draw.normal(size=(20, 7)).astype(np.float32)
+            demo["obs/joint_pos"] = draw.normal(size=(20, 7))
+            demo["obs/front_image"] = draw.integers(0, 256, (20, 48, 64, 3), np.uint8)
     return folder / "friday.hdf5"
 
 
@@ -59,7 +59,7 @@ def test_a_robot_goes_from_a_recording_to_the_hub_by_its_yaml_alone(make, tmp_pa
     run("registry", "validate", path)
     assert "friday" in run("registry", "list", "friday")
     hma("inspect", str(data), "-e", "friday", cwd=tmp_path)
-    run("convert", "-e", "friday", "--tokenizer", "fsq-8", "--out", "shards")
+    run("convert", "-e", "friday", "--tokenizer", "fsq-8", "--workers", "0", "--out", "shards")
     run("shards", "verify", "shards")
     facts = json.loads(run("shards", "info", "shards", "--json"))
     assert facts["totals"]["episodes"] == 3 and facts["totals"]["quarantined"] == 0

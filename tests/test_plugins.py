@@ -96,7 +96,7 @@ def test_a_built_in_format_is_recognised_before_that_of_a_package(toy_robot: Non
 def test_a_bad_episode_of_a_package_goes_to_quarantine(toy_robot: None, episodes: Path) -> None:
     np.savez(episodes / "episodes/run_3.npz", actions=np.zeros((12, 3)))
     words = "convert -e npz_arm.yaml --source episodes --tokenizer grey-8 --out shards --max-quarantine 0.5"
-    done = hma(*words.split(), "--json", cwd=episodes)
+    done = hma(*words.split(), "--json", "--workers", "0", cwd=episodes)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["quarantined"] == 1
 

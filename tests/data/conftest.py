@@ -39,17 +39,16 @@ def bags(tmp_path_factory: pytest.TempPathFactory, recording: Recording) -> dict
 
 @pytest.fixture(scope="session")
 def toy_set(toy_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The shards that `convert_toy` makes of `toy_recording`; not to be changed."""
+    """The shards that `convert_toy` makes of `toy_file`; not to be changed."""
     out = tmp_path_factory.mktemp("toy") / "set"
     convert_toy(Embodiment.from_yaml(ARM_YAML), toy_file, out)
     return out
 
 
-@pytest.fixture
-def whole(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
-    """The files of an undisturbed conversion: what every disturbed one must end with."""
-    convert_toy(toy_arm, toy_recording, tmp_path / "whole")
-    return contents(tmp_path / "whole")
+@pytest.fixture(scope="session")
+def whole(toy_set: Path) -> dict[str, bytes]:
+    """The files of an undisturbed conversion of `toy_file`: what every disturbed one must end with."""
+    return contents(toy_set)
 
 
 @pytest.fixture(scope="session")

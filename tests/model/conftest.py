@@ -63,6 +63,13 @@ def tiny_run(data: list[str], tmp_path_factory: pytest.TempPathFactory) -> Train
 
 
 @pytest.fixture(scope="session")
+def finished(data: list[str], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
+    """The run of the tiny recipe without a change, from its first step to its last."""
+    recipe = make_recipe({**TINY, "data": data})
+    return train(recipe, out=tmp_path_factory.mktemp("finished") / "run", show=False)
+
+
+@pytest.fixture(scope="session")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained checkpoint of two robots, `arm` and `hand`."""
     folder = tmp_path_factory.mktemp("source") / "model"

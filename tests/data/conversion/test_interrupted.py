@@ -43,16 +43,16 @@ def out(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Monk
 
 @IN_PROCESS
 @pytest.mark.parametrize("stop_at", [1, 4, 9])
-def test_a_job_stopped_anywhere_goes_on_where_it_was(stop_at, toy_arm, toy_recording, out, whole) -> None:
+def test_a_job_stopped_anywhere_goes_on_where_it_was(stop_at, toy_arm, toy_file, out, whole) -> None:
     with pytest.raises(KeyboardInterrupt):
-        convert(toy_arm, toy_recording, StoppingTokenizer(stop_at), out, settings=SMALL)
+        convert(toy_arm, toy_file, StoppingTokenizer(stop_at), out, settings=SMALL)
     there = shard_sizes(out)
     left = files(out).keys() - there.keys()
     assert "manifest.json" not in left and not [name for name in left if name.endswith(".part")]
     if not is_remote(out):  # a kill would leave it
         (out / "train").mkdir(exist_ok=True)
         (out / "train" / ".shard-00000.parquet.1.part").write_bytes(b"left by a kill")
-    assert run(toy_arm, toy_recording, out).kept_shards == len(there)
+    assert run(toy_arm, toy_file, out).kept_shards == len(there)
     assert files(out) == whole
     assert not [path for path in cache_folder().rglob("*") if path.is_file()]
 
@@ -80,18 +80,18 @@ def test_an_extension_stopped_anywhere_ends_with_the_same_bytes(stop_at, toy_arm
 
 @pytest.mark.parametrize("out", ["folder"], indirect=True)
 @pytest.mark.parametrize("count", [1, 3, 20])
-def test_shares_in_any_order_make_what_one_job_makes(count, toy_arm, toy_recording, out, whole) -> None:
+def test_shares_in_any_order_make_what_one_job_makes(count, toy_arm, toy_file, out, whole) -> None:
     order = list(range(count))
     random.Random(count).shuffle(order)
-    job = Conversion(toy_arm, toy_recording, BlockTokenizer(), out, settings=SMALL)
+    job = Conversion(toy_arm, toy_file, BlockTokenizer(), out, settings=SMALL)
     for index in order:
         assert isinstance(job.run_share(Share(index, count)), Summary) == (index == order[-1])
     assert files(out) == whole
 
 
 @IN_PROCESS
-def test_shares_run_side_by_side_and_one_of_them_finishes(toy_arm, toy_recording, out, whole) -> None:
-    job = Conversion(toy_arm, toy_recording, BlockTokenizer(), out, settings=SMALL)
+def test_shares_run_side_by_side_and_one_of_them_finishes(toy_arm, toy_file, out, whole) -> None:
+    job = Conversion(toy_arm, toy_file, BlockTokenizer(), out, settings=SMALL)
     threads = [threading.Thread(target=job.run_share, args=(Share(i, 3),)) for i in range(3)]
     for thread in threads:
         thread.start()
@@ -104,9 +104,9 @@ def test_shares_run_side_by_side_and_one_of_them_finishes(toy_arm, toy_recording
 
 
 @KILLED
-def test_a_killed_job_is_continued_by_the_same_command(toy_recording, out, whole, tmp_path) -> None:
+def test_a_killed_job_is_continued_by_the_same_command(toy_file, out, whole, tmp_path) -> None:
     for wanted in (1, 3):
-        process = start(tmp_path, toy_recording, out, workers=0, stop_at=wanted)
+        process = start(tmp_path, toy_file, out, workers=0, stop_at=wanted)
         while process.poll() is None:
             if len(shard_sizes(out)) >= wanted:
                 process.kill()
@@ -114,7 +114,7 @@ def test_a_killed_job_is_continued_by_the_same_command(toy_recording, out, whole
         _, errors = process.communicate()
         assert process.returncode == -signal.SIGKILL, errors
     assert "manifest.json" not in files(out)
-    ends(start(tmp_path, toy_recording, out))
+    ends(start(tmp_path, toy_file, out))
     assert files(out) == whole
     assert not list(cache_folder().rglob("*.part"))
 
@@ -131,11 +131,11 @@ def workers_of(pid: int) -> list[int]:
 @pytest.mark.slow
 @pytest.mark.parametrize("out", ["folder"], indirect=True)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_storm_of_kills_ends_with_the_same_bytes(seed, toy_recording, out, whole, tmp_path) -> None:
+def test_a_storm_of_kills_ends_with_the_same_bytes(seed, toy_file, out, whole, tmp_path) -> None:
     """Each run loses two workers, then is killed, each at a drawn number of shards; the last one ends."""
     draws = random.Random(seed)
     for last in (False, False, True):
-        process = start(tmp_path, toy_recording, out)
+        process = start(tmp_path, toy_file, out)
         for victim in ("worker", "worker", "job"):
             wanted = len(shard_sizes(out)) + draws.choice([0, 1])
             while process.poll() is None and (len(shard_sizes(out)) < wanted or not workers_of(process.pid)):
@@ -172,18 +172,18 @@ def test_an_episode_that_crashes_or_hangs_its_reader_is_refused_and_the_rest_kep
 
 
 @pytest.mark.parametrize("out", [S3], indirect=True)
-def test_two_equal_jobs_at_once_only_waste_work(toy_recording, out, whole, tmp_path) -> None:
-    for process in [start(tmp_path, toy_recording, out, workers=0) for _ in range(2)]:
+def test_two_equal_jobs_at_once_only_waste_work(toy_file, out, whole, tmp_path) -> None:
+    for process in [start(tmp_path, toy_file, out, workers=0) for _ in range(2)]:
         ends(process)
     assert files(out) == whole
 
 
 @pytest.mark.parametrize("out", [S3], indirect=True)
 def test_of_two_jobs_of_different_plans_at_once_one_is_refused(
-    toy_arm, toy_recording, out, whole, tmp_path
+    toy_arm, toy_file, out, whole, tmp_path
 ) -> None:
-    run(toy_arm, toy_recording, tmp_path / "other", settings=replace(SMALL, seed=3))
-    jobs = {seed: start(tmp_path, toy_recording, out, workers=0, seed=seed) for seed in (0, 3)}
+    run(toy_arm, toy_file, tmp_path / "other", settings=replace(SMALL, seed=3))
+    jobs = {seed: start(tmp_path, toy_file, out, workers=0, seed=seed) for seed in (0, 3)}
     said = {seed: process.communicate(timeout=100)[1] for seed, process in jobs.items()}
     (winner,) = (seed for seed, process in jobs.items() if process.returncode == 0)
     loser = 3 - winner

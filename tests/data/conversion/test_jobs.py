@@ -47,6 +47,7 @@ def test_only_who_tokenizes_opens_the_tokenizer(
     assert opened == devices
 
 
+@pytest.mark.slow
 def test_a_device_that_workers_lack_is_one_error(toy_arm, toy_recording, tmp_path) -> None:
     with pytest.raises(HMAError, match="cannot run on device 'no such'"):
         convert(toy_arm, toy_recording, "fsq-8", tmp_path / "out", device="no such", workers=1)
@@ -135,11 +136,11 @@ def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(
     assert not out.exists()
 
 
-def test_a_lock_left_by_a_killed_job_is_no_lock(toy_arm, toy_recording, tmp_path, whole) -> None:
+def test_a_lock_left_by_a_killed_job_is_no_lock(toy_arm, toy_file, tmp_path, whole) -> None:
     out = tmp_path / "out"
     out.mkdir()
     (out / LOCK).touch()
-    run(toy_arm, toy_recording, out)
+    run(toy_arm, toy_file, out)
     assert contents(out) == whole
 
 
@@ -147,7 +148,7 @@ def test_a_lock_left_by_a_killed_job_is_no_lock(toy_arm, toy_recording, tmp_path
 
 
 def test_a_read_error_that_goes_away_costs_nothing(
-    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
+    toy_arm: Embodiment, toy_file: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
 ) -> None:
     monkeypatch.setattr(reading, "WAITS_S", (0.0, 0.0, 0.0))
     failures = {"demo_3": [OSError(5, "Input/output error")] * 2, "demo_7": [TimeoutError("slow")] * 3}
@@ -159,13 +160,13 @@ def test_a_read_error_that_goes_away_costs_nothing(
         return read(self, uri, episode_id, embodiment)
 
     monkeypatch.setattr(Hdf5Source, "read", failing)
-    run(toy_arm, toy_recording, tmp_path / "out")
+    run(toy_arm, toy_file, tmp_path / "out")
     assert contents(tmp_path / "out") == whole
     assert not any(failures.values())
 
 
 def test_storage_that_stays_away_ends_the_job_and_quarantines_nobody(
-    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
+    toy_arm: Embodiment, toy_file: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
 ) -> None:
     monkeypatch.setattr(reading, "WAITS_S", (0.0,))
     read, away = Hdf5Source.read, True
@@ -177,14 +178,14 @@ def test_storage_that_stays_away_ends_the_job_and_quarantines_nobody(
 
     monkeypatch.setattr(Hdf5Source, "read", failing)
     with pytest.raises(OutputError, match=r"storage does not answer: by peer .* run the same command again"):
-        run(toy_arm, toy_recording, tmp_path / "out")
+        run(toy_arm, toy_file, tmp_path / "out")
     away = False
-    run(toy_arm, toy_recording, tmp_path / "out")
+    run(toy_arm, toy_file, tmp_path / "out")
     assert contents(tmp_path / "out") == whole
 
 
 def test_a_full_disk_is_one_error_and_what_was_made_is_kept(
-    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
+    toy_arm: Embodiment, toy_file: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
 ) -> None:
     add, calls = shard_work.ShardWriter.add, 0
 
@@ -197,10 +198,10 @@ def test_a_full_disk_is_one_error_and_what_was_made_is_kept(
 
     monkeypatch.setattr(shard_work.ShardWriter, "add", full)
     with pytest.raises(OutputError, match=r"No space left on device .* free space"):
-        run(toy_arm, toy_recording, tmp_path / "out")
+        run(toy_arm, toy_file, tmp_path / "out")
     assert list((tmp_path / "out").rglob("shard-*"))
     assert not list((tmp_path / "out").rglob("*.part"))
-    run(toy_arm, toy_recording, tmp_path / "out")
+    run(toy_arm, toy_file, tmp_path / "out")
     assert contents(tmp_path / "out") == whole
 
 

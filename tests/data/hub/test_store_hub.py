@@ -56,10 +56,8 @@ def published(hub: Hub) -> dict[str, bytes]:
     }
 
 
-def test_a_repository_gets_the_bytes_that_a_folder_gets_in_few_commits(
-    toy_arm, toy_recording, hub, whole
-) -> None:
-    summary = run(toy_arm, toy_recording)
+def test_a_repository_gets_the_bytes_that_a_folder_gets_in_few_commits(toy_arm, toy_file, hub, whole) -> None:
+    summary = run(toy_arm, toy_file)
     assert str(summary.out) == OUT
     assert published(hub) == whole
     _initial, *commits = dataset(hub).commits
@@ -69,15 +67,13 @@ def test_a_repository_gets_the_bytes_that_a_folder_gets_in_few_commits(
         *[False] * (len(commits) - 1),
         True,
     ]
-    assert run(toy_arm, toy_recording).made_shards == 0
+    assert run(toy_arm, toy_file).made_shards == 0
     assert len(dataset(hub).commits) == len(commits) + 1
 
 
-def test_a_set_on_the_hub_is_read_and_verified_by_its_uri(
-    toy_arm, toy_recording, hub, tmp_path, whole
-) -> None:
-    run(toy_arm, toy_recording)
-    here = ShardSet(tmp_path / "whole")
+def test_a_set_on_the_hub_is_read_and_verified_by_its_uri(toy_arm, toy_file, hub, toy_set) -> None:
+    run(toy_arm, toy_file)
+    here = ShardSet(toy_set)
     for cache in (False, True):
         there = ShardSet(OUT, cache=cache)
         assert there.episodes.equals(here.episodes)
@@ -89,55 +85,53 @@ def test_a_set_on_the_hub_is_read_and_verified_by_its_uri(
         ShardSet("hf://datasets/team/arm/none")
 
 
-def test_an_upload_that_was_cut_off_goes_on_with_what_is_missing(toy_arm, toy_recording, hub, whole) -> None:
+def test_an_upload_that_was_cut_off_goes_on_with_what_is_missing(toy_arm, toy_file, hub, whole) -> None:
     hub.fail("POST .*/commit/", 500, times=0)
     act = hub.before_commit
     act += [lambda: None, lambda: hub.fail("POST .*/commit/", 503, times=50)]
     with pytest.raises(HubError, match=f"{OUT}: .*503.*run the same command again"):
-        run(toy_arm, toy_recording)
+        run(toy_arm, toy_file)
     assert "manifest.json" not in published(hub) and published(hub)
     hub.faults.clear()
     before = len(dataset(hub).commits)
-    assert run(toy_arm, toy_recording).made_shards == 0
+    assert run(toy_arm, toy_file).made_shards == 0
     assert published(hub) == whole
     assert sum(whole[name] != b"" for name in whole) and len(dataset(hub).commits) > before
 
 
-def test_lost_staging_makes_the_same_shards_and_uploads_none_again(
-    toy_arm, toy_recording, hub, whole
-) -> None:
-    run(toy_arm, toy_recording)
+def test_lost_staging_makes_the_same_shards_and_uploads_none_again(toy_arm, toy_file, hub, whole) -> None:
+    run(toy_arm, toy_file)
     before = len(dataset(hub).commits)
     shutil.rmtree(cache_folder() / "staging")
-    run(toy_arm, toy_recording)
+    run(toy_arm, toy_file)
     assert published(hub) == whole and len(dataset(hub).commits) == before
 
 
 def test_another_conversion_is_refused_before_anything_is_made_and_overwrite_replaces_it(
-    toy_arm, toy_recording, hub, whole
+    toy_arm, toy_file, hub, whole
 ) -> None:
-    run(toy_arm, toy_recording, replace(SMALL, seed=3, shard_frames=30))
+    run(toy_arm, toy_file, replace(SMALL, seed=3, shard_frames=30))
     dataset(hub).commit({"README.md": b"# mine"})
     shutil.rmtree(cache_folder() / "staging")
     with pytest.raises(OutputError, match=f"{OUT}: belongs to another conversion; different: settings"):
-        run(toy_arm, toy_recording)
+        run(toy_arm, toy_file)
     assert not list((cache_folder() / "staging").rglob("shard-*"))
-    run(toy_arm, toy_recording, overwrite=True)
+    run(toy_arm, toy_file, overwrite=True)
     assert published(hub) == whole
     assert dataset(hub).files["README.md"] == b"# mine"
 
 
-def test_a_branch_gets_the_set_and_main_none_of_it(toy_arm, toy_recording, hub, whole) -> None:
+def test_a_branch_gets_the_set_and_main_none_of_it(toy_arm, toy_file, hub, whole) -> None:
     out = "hf://datasets/team/arm@dev/sets/one"
-    run(toy_arm, toy_recording, out=out)
+    run(toy_arm, toy_file, out=out)
     there = dataset(hub).at("dev").files
     assert {name: there[f"sets/one/{name}"] for name in whole} == whole
     assert set(dataset(hub).files) == {".gitattributes"}
     before = len(dataset(hub).commits)
-    run(toy_arm, toy_recording, out=out)
+    run(toy_arm, toy_file, out=out)
     assert len(dataset(hub).commits) == before
     with pytest.raises(OutputError, match=r"@dev/sets/one: belongs to another conversion"):
-        run(toy_arm, toy_recording, replace(SMALL, seed=3), out=out)
+        run(toy_arm, toy_file, replace(SMALL, seed=3), out=out)
 
 
 def test_a_lack_of_rights_is_known_before_anything_is_made(toy_arm, toy_recording, hub, monkeypatch) -> None:
@@ -155,7 +149,7 @@ def test_a_lack_of_rights_is_known_before_anything_is_made(toy_arm, toy_recordin
 @pytest.mark.parametrize(
     "fault", [{"status": 429, "headers": {"Retry-After": "7"}}, {"after": 10}], ids=["429", "cut"]
 )
-def test_passing_faults_stop_no_upload_and_cost_no_commit(toy_arm, toy_recording, hub, whole, fault) -> None:
+def test_passing_faults_stop_no_upload_and_cost_no_commit(toy_arm, toy_file, hub, whole, fault) -> None:
     hub.create("team/arm", "datasets")
     for request in (
         "repos/create",
@@ -167,14 +161,14 @@ def test_passing_faults_stop_no_upload_and_cost_no_commit(toy_arm, toy_recording
         "/arm$",
     ):
         hub.fail(request, **fault)
-    run(toy_arm, toy_recording)
+    run(toy_arm, toy_file)
     assert published(hub) == whole and all(fault.times == 0 for fault in hub.faults)
     assert len(dataset(hub).commits) == 1 + (sum("shard-" in name for name in whole) + 1) // 2
     assert fault.get("status") != 429 or max(hub.waits) >= 7
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_a_commit_whose_answer_was_lost_is_not_made_twice(toy_arm, toy_recording, hub, whole, number) -> None:
+def test_a_commit_whose_answer_was_lost_is_not_made_twice(toy_arm, toy_file, hub, whole, number) -> None:
     plain, lost = hub.create("team/arm", "datasets").commit, []
 
     def commit(files, message="by hand"):
@@ -185,16 +179,16 @@ def test_a_commit_whose_answer_was_lost_is_not_made_twice(toy_arm, toy_recording
         return made
 
     dataset(hub).commit = commit
-    run(toy_arm, toy_recording)
+    run(toy_arm, toy_file)
     assert published(hub) == whole and len(lost) == len(set(lost))
     assert len(dataset(hub).commits) == 1 + (sum("shard-" in name for name in whole) + 1) // 2
 
 
 @pytest.mark.parametrize("step", EVERY)
 def test_an_upload_cut_at_any_request_is_ended_by_the_same_command(
-    toy_arm, toy_recording, hub, whole, monkeypatch, step
+    toy_arm, toy_file, hub, whole, monkeypatch, step
 ) -> None:
-    run(toy_arm, toy_recording)
+    run(toy_arm, toy_file)
     output, commits = HubOutput.of(place(OUT)), len(dataset(hub).commits)
     for at in range(0, 200, step):
         hub.repositories.clear()
@@ -220,15 +214,15 @@ def other_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def test_two_jobs_of_one_conversion_at_once_make_it_together(
-    toy_arm, toy_recording, hub, whole, monkeypatch, tmp_path
+    toy_arm, toy_file, hub, whole, monkeypatch, tmp_path
 ) -> None:
     def other() -> None:
         other_machine(monkeypatch, tmp_path)
-        run(toy_arm, toy_recording)
+        run(toy_arm, toy_file)
         monkeypatch.setenv("HMA_CACHE", str(tmp_path / "hma"))
 
     hub.before_commit = [lambda: None, other]
-    run(toy_arm, toy_recording)
+    run(toy_arm, toy_file)
     assert published(hub) == whole
     assert len(dataset(hub).commits) == 1 + (sum("shard-" in name for name in whole) + 1) // 2
 

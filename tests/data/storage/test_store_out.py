@@ -42,13 +42,13 @@ def out() -> RemotePath:
 # -- the same bytes
 
 
-def test_a_store_gets_the_bytes_that_a_folder_gets(toy_arm, toy_recording, out, whole) -> None:
-    summary = run(toy_arm, toy_recording, Path(str(out)))
+def test_a_store_gets_the_bytes_that_a_folder_gets(toy_arm, toy_file, out, whole) -> None:
+    summary = run(toy_arm, toy_file, Path(str(out)))
     assert summary.out == out
     assert files(out) == whole
     assert verify(out) == []
     assert not [path for path in cache_folder().rglob("*") if path.is_file()]
-    assert run(toy_arm, toy_recording, out).made_shards == 0
+    assert run(toy_arm, toy_file, out).made_shards == 0
 
 
 def test_extension_and_merge_go_into_a_store(toy_arm, tmp_path, out) -> None:
@@ -64,22 +64,20 @@ def test_extension_and_merge_go_into_a_store(toy_arm, tmp_path, out) -> None:
     assert files(out.with_name("merged")) == files(tmp_path / "merged")
 
 
-def test_overwrite_starts_anew_and_foreign_files_are_never_touched(
-    toy_arm, toy_recording, out, whole
-) -> None:
-    run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
+def test_overwrite_starts_anew_and_foreign_files_are_never_touched(toy_arm, toy_file, out, whole) -> None:
+    run(toy_arm, toy_file, out, settings=replace(SMALL, seed=3))
     with pytest.raises(OutputError, match="belongs to another conversion"):
-        run(toy_arm, toy_recording, out)
-    run(toy_arm, toy_recording, out, overwrite=True)
+        run(toy_arm, toy_file, out)
+    run(toy_arm, toy_file, out, overwrite=True)
     assert files(out) == whole
     put_bytes(b"mine", out.with_name("other") / "notes.txt")
     with pytest.raises(OutputError, match=r"is not a shard set: it holds notes\.txt"):
-        run(toy_arm, toy_recording, out.with_name("other"), overwrite=True)
+        run(toy_arm, toy_file, out.with_name("other"), overwrite=True)
     assert files(out.with_name("other")) == {"notes.txt": b"mine"}
 
 
-def test_a_manifest_is_restored_in_place(toy_arm, toy_recording, out, whole) -> None:
-    run(toy_arm, toy_recording, out)
+def test_a_manifest_is_restored_in_place(toy_arm, toy_file, out, whole) -> None:
+    run(toy_arm, toy_file, out)
     (out / "manifest.json").unlink()
     restat(Path(str(out)))
     assert set(out.listing()) == set(whole)
@@ -90,7 +88,7 @@ def test_a_manifest_is_restored_in_place(toy_arm, toy_recording, out, whole) -> 
 
 
 def test_uploads_that_fail_now_and_then_change_nothing(
-    toy_arm, toy_recording, out, whole, monkeypatch: pytest.MonkeyPatch
+    toy_arm, toy_file, out, whole, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     draws, failed = random.Random(0), 0
 
@@ -109,14 +107,14 @@ def test_uploads_that_fail_now_and_then_change_nothing(
     monkeypatch.setattr(store, "WAITS_S", (0.0,) * 12)
     for name in ("put_file", "pipe_file", "cat_file", "info", "find", "ls"):
         sometimes(name)
-    run(toy_arm, toy_recording, out)
+    run(toy_arm, toy_file, out)
     monkeypatch.undo()
     assert failed > 20
     assert files(out) == whole
 
 
 def test_a_store_that_goes_away_is_one_error_and_what_was_put_is_kept(
-    toy_arm, toy_recording, out, whole, monkeypatch: pytest.MonkeyPatch
+    toy_arm, toy_file, out, whole, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real, left = MemoryFileSystem.put_file, 2
 
@@ -130,9 +128,9 @@ def test_a_store_that_goes_away_is_one_error_and_what_was_put_is_kept(
     with monkeypatch.context() as patch:
         patch.setattr(MemoryFileSystem, "put_file", away)
         with pytest.raises(StorageAwayError, match="cannot be written: .* run the same command again"):
-            run(toy_arm, toy_recording, out)
+            run(toy_arm, toy_file, out)
     assert {name.split("/")[0] for name in out.listing()} <= {"train", "val", PLAN}
-    assert run(toy_arm, toy_recording, out).kept_shards == 2
+    assert run(toy_arm, toy_file, out).kept_shards == 2
     assert files(out) == whole
 
 
@@ -166,16 +164,16 @@ def once(act):
     return on_progress
 
 
-def test_another_plan_is_refused_while_a_job_runs(toy_arm, toy_recording, out, whole) -> None:
+def test_another_plan_is_refused_while_a_job_runs(toy_arm, toy_file, out, whole) -> None:
     def differ() -> None:
         assert not [name for name in out.listing() if "shard-" in name]
         said = (
             rf"{out}: another conversion is being written there; different: settings .* delete {out}/\.plan"
         )
         with pytest.raises(OutputError, match=said):
-            run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
+            run(toy_arm, toy_file, out, settings=replace(SMALL, seed=3))
 
-    run(toy_arm, toy_recording, out, on_progress=once(differ))
+    run(toy_arm, toy_file, out, on_progress=once(differ))
     assert files(out) == whole
 
 
@@ -185,8 +183,8 @@ def test_a_damaged_claim_is_one_error(toy_arm, toy_recording, out) -> None:
         run(toy_arm, toy_recording, out)
 
 
-def test_an_equal_job_at_the_same_time_only_wastes_work(toy_arm, toy_recording, out, whole) -> None:
-    run(toy_arm, toy_recording, out, on_progress=once(lambda: run(toy_arm, toy_recording, out)))
+def test_an_equal_job_at_the_same_time_only_wastes_work(toy_arm, toy_file, out, whole) -> None:
+    run(toy_arm, toy_file, out, on_progress=once(lambda: run(toy_arm, toy_file, out)))
     assert files(out) == whole
 
 
@@ -247,12 +245,12 @@ def test_a_part_of_a_running_process_is_left(out: RemotePath) -> None:
     assert [path.name for path in folder.iterdir()] == [f".shard-00000.parquet.{os.getpid()}.part"]
 
 
-def test_a_card_beside_a_set_of_a_store_stays(toy_arm, toy_recording, out, whole) -> None:
-    run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
+def test_a_card_beside_a_set_of_a_store_stays(toy_arm, toy_file, out, whole) -> None:
+    run(toy_arm, toy_file, out, settings=replace(SMALL, seed=3))
     put_bytes(b"my notes", out / "README.md")
-    run(toy_arm, toy_recording, out, overwrite=True)
+    run(toy_arm, toy_file, out, overwrite=True)
     assert files(out) == whole | {"README.md": b"my notes"}
     assert verify(out) == []
     put_bytes(b"mine", out / "notes.txt")
     with pytest.raises(OutputError, match=r"holds a file that is not of the set: notes\.txt — move it out"):
-        run(toy_arm, toy_recording, out)
+        run(toy_arm, toy_file, out)

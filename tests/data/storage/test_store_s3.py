@@ -28,12 +28,12 @@ def out(s3_out: RemotePath) -> RemotePath:
 
 
 def test_s3_gets_the_bytes_that_a_folder_gets_and_gives_them_back(
-    toy_arm, toy_recording, out, whole, tmp_path
+    toy_arm, toy_file, out, whole, toy_set
 ) -> None:
-    run(toy_arm, toy_recording, out)
+    run(toy_arm, toy_file, out)
     assert files(out) == whole
     assert verify(out) == []
-    here = ShardSet(tmp_path / "whole")
+    here = ShardSet(toy_set)
     for cache in (True, False):
         there = ShardSet(str(out), cache=cache)
         for index in here.episodes["episode_index"].to_pylist():
@@ -75,13 +75,11 @@ def test_a_large_shard_goes_up_in_parts_and_appears_whole(out, proxy, tmp_path) 
 
 
 @pytest.mark.slow
-def test_forked_readers_of_a_dataloader_see_the_same_batches(
-    toy_arm, toy_recording, out, tmp_path, whole
-) -> None:
+def test_forked_readers_of_a_dataloader_see_the_same_batches(toy_arm, toy_file, out, toy_set) -> None:
     from hma_data.loading.dataset import WindowDataset
 
-    run(toy_arm, toy_recording, out)
-    ours, theirs = WindowDataset(tmp_path / "whole", "train", 4), WindowDataset(str(out), "train", 4)
+    run(toy_arm, toy_file, out)
+    ours, theirs = WindowDataset(toy_set, "train", 4), WindowDataset(str(out), "train", 4)
     _ = theirs[0]  # the parent has connections already
     batches = torch.utils.data.DataLoader(
         theirs, batch_size=None, num_workers=1, multiprocessing_context="fork"
@@ -94,7 +92,7 @@ def test_forked_readers_of_a_dataloader_see_the_same_batches(
 
 
 def test_busy_answers_and_lost_connections_change_nothing(
-    toy_arm, toy_recording, out, whole, proxy, monkeypatch
+    toy_arm, toy_file, out, whole, proxy, monkeypatch
 ) -> None:
     monkeypatch.setattr(store, "WAITS_S", (0.0,) * 9)
     draws = random.Random(1)
@@ -108,7 +106,7 @@ def test_busy_answers_and_lost_connections_change_nothing(
         return what
 
     proxy.trouble = sometimes
-    run(toy_arm, toy_recording, out)
+    run(toy_arm, toy_file, out)
     proxy.trouble = lambda *asked: None
     assert len(failed) >= 5
     assert files(out) == whole
@@ -150,7 +148,7 @@ def test_a_shard_cut_short_is_an_error_and_no_hang(toy_arm, toy_recording, out, 
     assert any("the manifest says" in problem for problem in verify(out))
 
 
-def test_a_claim_whose_answer_was_lost_is_ones_own(toy_arm, toy_recording, out, whole, proxy) -> None:
+def test_a_claim_whose_answer_was_lost_is_ones_own(toy_arm, toy_file, out, whole, proxy) -> None:
     lost = []
 
     def lose_first(method: str, path: str, number: int) -> str | None:
@@ -160,5 +158,5 @@ def test_a_claim_whose_answer_was_lost_is_ones_own(toy_arm, toy_recording, out, 
         return None
 
     proxy.trouble = lose_first
-    run(toy_arm, toy_recording, out)
+    run(toy_arm, toy_file, out)
     assert lost and files(out) == whole

@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -71,7 +72,9 @@ CUTS = {  # changes of the recipe, the step after which the run is killed, chang
 }
 
 
-@pytest.mark.parametrize("cut", CUTS)
+@pytest.mark.parametrize(
+    "cut", [pytest.param(cut, marks=pytest.mark.slow) if cut == "late" else cut for cut in CUTS]
+)
 def test_a_killed_run_goes_on_bit_for_bit(recipe, tmp_path, cut):
     changes, killed_after, later = CUTS[cut]
     changes = changes | {
@@ -95,17 +98,14 @@ def test_evaluating_more_often_changes_no_weight(recipe, tmp_path):
     assert same(seldom.checkpoint, often.checkpoint)
 
 
-def test_another_seed_gives_another_run(recipe, tmp_path):
-    one = train(recipe(steps=2), out=tmp_path / "one", show=False)
-    other = train(recipe(steps=2, seed=43), out=tmp_path / "other", show=False)
-    assert one.losses != other.losses
+def test_another_seed_gives_another_run(recipe, finished, tmp_path):
+    assert train(recipe(seed=43), out=tmp_path / "other", show=False).losses != finished.losses
 
 
-def test_a_finished_run_is_not_begun_again(recipe, tmp_path):
-    first = train(recipe(), out=tmp_path / "run", show=False)
+def test_a_finished_run_is_not_begun_again(recipe, finished):
     calls = []
-    second = train(recipe(), out=tmp_path / "run", show=False, on_progress=calls.append)
-    assert not calls and second == first
+    again = train(recipe(), out=finished.out, show=False, on_progress=calls.append)
+    assert not calls and again == finished
 
 
 def test_only_the_last_checkpoints_are_kept(recipe, tmp_path):
@@ -114,15 +114,14 @@ def test_only_the_last_checkpoints_are_kept(recipe, tmp_path):
     assert names == ["step-00000005", "step-00000006"]
 
 
-def test_a_changed_recipe_is_refused_with_the_difference(recipe, tmp_path):
-    train(recipe(), out=tmp_path / "run", show=False)
+def test_a_changed_recipe_is_refused_with_the_difference(recipe, finished):
     with pytest.raises(RecipeError, match=r"lr: 0\.003, now 0\.004; steps: 6, now 8"):
-        train(recipe(lr=4e-3, steps=8), out=tmp_path / "run", show=False)
+        train(recipe(lr=4e-3, steps=8), out=finished.out, show=False)
 
 
-def test_force_goes_on_with_a_changed_recipe(recipe, tmp_path):
-    train(recipe(), out=tmp_path / "run", show=False)
-    result = train(recipe(lr=4e-3, steps=8, batch_size=2), out=tmp_path / "run", show=False, force=True)
+def test_force_goes_on_with_a_changed_recipe(recipe, finished, tmp_path):
+    out = shutil.copytree(finished.out, tmp_path / "run")
+    result = train(recipe(lr=4e-3, steps=8, batch_size=2), out=out, show=False, force=True)
     assert [step for step, _ in result.losses] == list(range(1, 9))
 
 
@@ -179,9 +178,7 @@ def test_a_budget_of_cpu_seconds_ends_the_run_and_bends_the_rate(recipe, tmp_pat
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_saves_and_the_run_goes_on_bit_for_bit(recipe, tmp_path, number):
-    whole = train(recipe(checkpoint_every=0), out=tmp_path / "whole", show=False)
-
+def test_a_signal_saves_and_the_run_goes_on_bit_for_bit(recipe, finished, tmp_path, number):
     def send(facts) -> None:
         if facts["step"] == 3:
             os.kill(os.getpid(), number)
@@ -189,8 +186,8 @@ def test_a_signal_saves_and_the_run_goes_on_bit_for_bit(recipe, tmp_path, number
     cut = train(recipe(checkpoint_every=0), out=tmp_path / "cut", show=False, on_progress=send)
     assert cut.interrupted and cut.step == 3 and cut.checkpoint.name == "step-00000003"
     again = train(recipe(checkpoint_every=0), out=tmp_path / "cut", show=False)
-    assert not again.interrupted and again.losses == whole.losses
-    assert same(whole.checkpoint, again.checkpoint)
+    assert not again.interrupted and again.losses == finished.losses
+    assert same(finished.checkpoint, again.checkpoint)
 
 
 def test_the_folder_of_something_else_is_refused(recipe, tmp_path):

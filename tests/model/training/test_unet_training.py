@@ -116,7 +116,14 @@ def test_two_ranks_give_the_curve_and_the_weights_of_one(shards, tmp_path, mode)
     close(alone.checkpoint, resolve(tmp_path / "run"))
 
 
-@pytest.mark.parametrize("objective", ["forward", "passive", "policy", "inverse", "full"])
+@pytest.mark.parametrize(
+    "objective",
+    [
+        "forward",
+        "policy",
+        *(pytest.param(one, marks=pytest.mark.slow) for one in ("passive", "inverse", "full")),
+    ],
+)
 def test_the_loss_of_each_objective_falls(shards, tmp_path, objective):
     changes = {"objectives": {objective: 1}, "steps": 40, "lr": 1e-2, "schedule": "constant_with_warmup"}
     done = train(recipe(shards[:1], checkpoint_every=40, **changes), out=tmp_path / "run", show=False)
