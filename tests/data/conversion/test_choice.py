@@ -69,56 +69,54 @@ def arm_yaml(tmp_path: Path) -> Path:
     return path
 
 
-def run(robot: Embodiment, source: Path, out: Path, tokenizer: BlockTokenizer, **settings):
-    return convert(robot, source, tokenizer, out, settings=Settings(val_fraction=0, **settings))
+def run(robot: Embodiment, source: Path, out: Path, **settings):
+    return convert(robot, source, BlockTokenizer(), out, settings=Settings(val_fraction=0, **settings))
 
 
 def ids(folder: Path) -> list[str]:
     return sorted(ShardSet(folder).episodes["id"].to_pylist())
 
 
-def test_command_and_yaml_choose_together(tmp_path, toy_recording, block_tokenizer) -> None:
+def test_command_and_yaml_choose_together(tmp_path, toy_recording) -> None:
     robot = Embodiment.from_yaml(ARM_YAML.replace("format: hdf5", "format: hdf5, exclude: [demo_1*]"))
-    chosen = run(robot, toy_recording, tmp_path / "out", block_tokenizer, exclude=("demo_2",), limit=3)
+    chosen = run(robot, toy_recording, tmp_path / "out", exclude=("demo_2",), limit=3)
     assert ids(tmp_path / "out") == ["demo_0", "demo_3", "demo_4"]
     assert chosen.left_out == 4
     assert verify(tmp_path / "out") == []
     with pytest.raises(RegistryError, match=r"embodiment toy_arm: source.only: 'demo_77' matches no episode"):
         wrong = Embodiment.from_yaml(ARM_YAML.replace("format: hdf5", "format: hdf5, only: [demo_77]"))
-        run(wrong, toy_recording, tmp_path / "none", block_tokenizer)
+        run(wrong, toy_recording, tmp_path / "none")
 
 
 def test_another_choice_is_another_plan_and_extend_adds_what_was_left_out(
-    tmp_path, toy_arm, toy_recording, block_tokenizer
+    tmp_path, toy_arm, toy_recording
 ) -> None:
-    first = run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, exclude=("demo_3", "demo_4"))
-    again = run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, exclude=("demo_3", "demo_4"))
+    first = run(toy_arm, toy_recording, tmp_path / "out", exclude=("demo_3", "demo_4"))
+    again = run(toy_arm, toy_recording, tmp_path / "out", exclude=("demo_3", "demo_4"))
     assert (first.left_out, again.made_shards) == (2, 0)
     with pytest.raises(OutputError, match="--exclude demo_3, demo_4 there, demo_3 now"):
-        run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, exclude=("demo_3",))
+        run(toy_arm, toy_recording, tmp_path / "out", exclude=("demo_3",))
     settings = Settings(val_fraction=0)
-    convert(toy_arm, toy_recording, block_tokenizer, tmp_path / "out", settings=settings, extend=True)
+    convert(toy_arm, toy_recording, BlockTokenizer(), tmp_path / "out", settings=settings, extend=True)
     assert len(ids(tmp_path / "out")) == 12
 
 
-def test_a_set_of_chosen_episodes_can_be_split_and_merged(
-    tmp_path, toy_arm, toy_recording, block_tokenizer
-) -> None:
-    run(toy_arm, toy_recording, tmp_path / "a", block_tokenizer, only=("demo_1", "demo_2"))
-    run(toy_arm, toy_recording, tmp_path / "b", block_tokenizer, exclude=("demo_1", "demo_2"))
+def test_a_set_of_chosen_episodes_can_be_split_and_merged(tmp_path, toy_arm, toy_recording) -> None:
+    run(toy_arm, toy_recording, tmp_path / "a", only=("demo_1", "demo_2"))
+    run(toy_arm, toy_recording, tmp_path / "b", exclude=("demo_1", "demo_2"))
     split(tmp_path / "a", tmp_path / "c", val_fraction=0.5)
     merge([tmp_path / "a", tmp_path / "b"], tmp_path / "d")
     assert ids(tmp_path / "c") == ["demo_1", "demo_2"]
     assert len(ids(tmp_path / "d")) == 12
     assert verify(tmp_path / "c") == verify(tmp_path / "d") == []
-    shown = preview(tmp_path / "d", tmp_path / "p", tokenizer=block_tokenizer, only=["demo_1*"], frames=1)
+    shown = preview(tmp_path / "d", tmp_path / "p", tokenizer=BlockTokenizer(), only=["demo_1*"], frames=1)
     assert shown.episodes == ("demo_1", "demo_10", "demo_11")
 
 
-def test_a_plan_without_a_choice_states_none(tmp_path, toy_arm, toy_recording, block_tokenizer) -> None:
+def test_a_plan_without_a_choice_states_none(tmp_path, toy_arm, toy_recording) -> None:
     (tmp_path / "bad.txt").write_text("demo_1\n")
-    run(toy_arm, toy_recording, tmp_path / "a", block_tokenizer)
-    run(toy_arm, toy_recording, tmp_path / "b", block_tokenizer, exclude=(f"@{tmp_path}/bad.txt", "demo_2"))
+    run(toy_arm, toy_recording, tmp_path / "a")
+    run(toy_arm, toy_recording, tmp_path / "b", exclude=(f"@{tmp_path}/bad.txt", "demo_2"))
     plain, chosen = (ShardSet(tmp_path / name).manifest.plan for name in "ab")
     assert list(plain["settings"]) == ["frames", "cameras", "val_fraction", "seed", "limit", "shard_frames"]
     assert chosen["settings"]["exclude"] == ["@bad.txt", "demo_2"]

@@ -4,129 +4,107 @@ import json
 import os
 import re
 import shutil
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import OutputError, RegistryError, SourceError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
-from hma_data.storage.locks import locked
-from tests.conftest import SMALL, BlockTokenizer, contents, write_toy
+from tests.conftest import BlockTokenizer, contents, write_toy
+from tests.conftest import convert_toy as run
 
 
-def run(
-    arm: Embodiment,
-    recording: Path,
-    out: Path,
-    tokenizer: BlockTokenizer,
-    settings: Settings = SMALL,
-    **options,
-):
-    return convert(arm, str(recording), tokenizer, out, settings=settings, **options)
-
-
-def test_rows_are_the_recording(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
-    summary = run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
-    assert verify(tmp_path / "out") == []
-    assert summary.manifest.splits["train"]["episodes"] + summary.manifest.splits["val"]["episodes"] == 12
-    shards = ShardSet(tmp_path / "out")
-    with h5py.File(toy_recording) as file:
+def test_rows_are_the_recording(toy_set, toy_file, block_tokenizer) -> None:
+    shards = ShardSet(toy_set)
+    assert verify(toy_set) == []
+    assert sum(split["episodes"] for split in shards.manifest.splits.values()) == 12
+    with h5py.File(toy_file) as file:
         for row in shards.episodes.to_pylist():
             values = shards.episode_rows(row["episode_index"])
             recorded = file[f"data/{row['id']}"]
+            decoded = block_tokenizer.decode(shards.tokens(values["tokens"]))
             np.testing.assert_array_equal(values["action"], recorded["actions"][()])
-            np.testing.assert_array_equal(
-                block_tokenizer.decode(shards.tokens(values["tokens"])), recorded["obs/image"][()]
-            )
+            np.testing.assert_array_equal(decoded, recorded["obs/image"][()])
             np.testing.assert_allclose(values["timestamp"], np.arange(row["length"]) / 10)
 
 
-def test_shards_open_with_plain_pyarrow(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
-    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
-    table = pq.read_table(tmp_path / "out" / "train")
+def test_shards_open_with_plain_pyarrow(toy_set) -> None:
+    table = pq.read_table(toy_set / "train")
     assert table.column_names == ["episode_index", "frame_index", "timestamp", "tokens", "action"]
-    metadata = pq.read_metadata(tmp_path / "out" / "train" / "shard-00000.parquet").metadata
+    metadata = pq.read_metadata(toy_set / "train" / "shard-00000.parquet").metadata
     assert metadata[b"hma.embodiment"] == b"toy_arm"
     assert metadata[b"hma.tokenizer"] == b"block"
 
 
-def test_running_again_does_nothing_and_changes_nothing(
-    toy_arm, toy_recording, tmp_path, block_tokenizer
-) -> None:
-    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+def test_running_again_does_nothing_and_changes_nothing(toy_arm, toy_recording, tmp_path) -> None:
+    run(toy_arm, toy_recording, tmp_path / "out")
     before = contents(tmp_path / "out")
-    again = run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    again = run(toy_arm, toy_recording, tmp_path / "out")
     assert again.made_shards == 0
     assert contents(tmp_path / "out") == before
 
 
-def test_the_shards_of_one_file_or_another_path_are_the_same(
-    toy_arm, toy_recording, tmp_path, block_tokenizer
-) -> None:
-    run(toy_arm, toy_recording, tmp_path / "a", block_tokenizer)
+def test_the_shards_of_one_file_or_another_path_are_the_same(toy_arm, toy_recording, tmp_path) -> None:
+    run(toy_arm, toy_recording, tmp_path / "a")
     (tmp_path / "else where").mkdir()
     moved = tmp_path / "else where" / toy_recording.name
     shutil.copy(toy_recording, moved)
-    run(toy_arm, moved, tmp_path / "b", block_tokenizer)
+    run(toy_arm, moved, tmp_path / "b")
     first, second = contents(tmp_path / "a"), contents(tmp_path / "b")
     assert {k: v for k, v in first.items() if "shard-" in k} == {
         k: v for k, v in second.items() if "shard-" in k
     }
 
 
-def test_a_bad_episode_goes_to_quarantine_and_the_rest_goes_on(
-    toy_arm, toy_recording, tmp_path, block_tokenizer
-) -> None:
+def test_a_bad_episode_goes_to_quarantine_and_the_rest_goes_on(toy_arm, toy_recording, tmp_path) -> None:
     with h5py.File(toy_recording, "a") as file:
         file["data/demo_3/actions"][4, 1] = np.nan
-    summary = run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    summary = run(toy_arm, toy_recording, tmp_path / "out")
     line = json.loads((tmp_path / "out" / "quarantine.jsonl").read_text())
     assert line["id"] == "demo_3"
     assert "not finite at frame 4" in line["message"]
     assert summary.too_many
     assert summary.manifest.quarantined == 1
     assert verify(tmp_path / "out") == []
-    assert not run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, max_quarantine=0.1).too_many
+    assert not run(toy_arm, toy_recording, tmp_path / "out", max_quarantine=0.1).too_many
 
 
 def test_another_embodiment_or_tokenizer_is_refused_and_nothing_touched(
-    toy_arm, toy_recording, tmp_path, block_tokenizer
+    toy_arm, toy_recording, tmp_path
 ) -> None:
-    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    run(toy_arm, toy_recording, tmp_path / "out")
     before = contents(tmp_path / "out")
     other = toy_arm.model_copy(update={"id": "other_arm"})
     with pytest.raises(OutputError, match="toy_arm there, other_arm now"):
-        run(other, toy_recording, tmp_path / "out", block_tokenizer)
+        run(other, toy_recording, tmp_path / "out")
     from dataclasses import replace
 
     class Other(BlockTokenizer):
         spec = replace(BlockTokenizer.spec, name="blob")
 
     with pytest.raises(OutputError, match="tokenizer"):
-        run(toy_arm, toy_recording, tmp_path / "out", Other())
+        run(toy_arm, toy_recording, tmp_path / "out", tokenizer=Other())
     assert contents(tmp_path / "out") == before
 
 
 @pytest.mark.parametrize(("limit", "empty"), [(2, True), (3, False), (1, False)])
-def test_a_limit_that_leaves_val_empty_is_told(limit, empty, toy_arm, tmp_path, block_tokenizer) -> None:
+def test_a_limit_that_leaves_val_empty_is_told(limit, empty, toy_arm, tmp_path) -> None:
     path = tmp_path / "split.hdf5"
     write_toy(path, [20, 20, 20])
     with h5py.File(path, "a") as file:  # robomimic's masks are a split of the recording's own
         file["mask/train"] = np.array(["demo_0", "demo_1"], "S")
         file["mask/valid"] = np.array(["demo_2"], "S")
-    summary = run(toy_arm, path, tmp_path / "out", block_tokenizer, Settings(limit=limit))
+    summary = run(toy_arm, path, tmp_path / "out", Settings(limit=limit))
     assert any("val is empty" in note and "--limit" in note for note in summary.notes) == empty
 
 
-def test_it_is_said_how_many_episodes_are_held_out_and_why(toy_arm, tmp_path, block_tokenizer) -> None:
+def test_it_is_said_how_many_episodes_are_held_out_and_why(toy_arm, tmp_path) -> None:
     path = tmp_path / "eight.hdf5"
     write_toy(path, [20] * 8)
     few = "fewer than 5 say little about a model: record more episodes"
@@ -136,52 +114,43 @@ def test_it_is_said_how_many_episodes_are_held_out_and_why(toy_arm, tmp_path, bl
         (0.0, "0 of 8 episodes held out for validation, by --val-fraction 0$"),
     ):
         out = tmp_path / f"out-{fraction}"
-        summary = run(toy_arm, path, out, block_tokenizer, Settings(val_fraction=fraction))
+        summary = run(toy_arm, path, out, Settings(val_fraction=fraction))
         assert re.match(wanted, summary.held_out), summary.held_out
     with h5py.File(path, "a") as file:
         file["mask/train"] = np.array([f"demo_{i}" for i in range(5)], "S")
         file["mask/valid"] = np.array([f"demo_{i}" for i in range(5, 8)], "S")
-    summary = run(toy_arm, path, tmp_path / "masks", block_tokenizer, Settings(val_fraction=0.5))
+    summary = run(toy_arm, path, tmp_path / "masks", Settings(val_fraction=0.5))
     assert summary.held_out.startswith(
         "3 of 8 episodes held out for validation, by the recording's own split, which goes before"
     )
 
 
-def test_overwrite_starts_anew_but_never_deletes_what_is_not_ours(
-    toy_arm, toy_recording, tmp_path, block_tokenizer
-) -> None:
-    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
-    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, Settings(limit=4), overwrite=True)
+def test_overwrite_starts_anew_but_never_deletes_what_is_not_ours(toy_arm, toy_recording, tmp_path) -> None:
+    run(toy_arm, toy_recording, tmp_path / "out")
+    run(toy_arm, toy_recording, tmp_path / "out", Settings(limit=4), overwrite=True)
     assert Manifest.load(tmp_path / "out").plan["settings"]["limit"] == 4
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     with pytest.raises(OutputError, match="thesis.tex"):
-        run(toy_arm, toy_recording, tmp_path / "mine", block_tokenizer, overwrite=True)
+        run(toy_arm, toy_recording, tmp_path / "mine", overwrite=True)
     assert (tmp_path / "mine" / "thesis.tex").read_text() == "years of work"
 
 
-def test_two_jobs_on_one_folder_are_refused(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
-    with locked(tmp_path / "out"), pytest.raises(OutputError, match="another job"):
-        run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
-
-
-def test_progress_reaches_its_total_in_encoded_frames(
-    toy_arm, toy_recording, tmp_path, block_tokenizer
-) -> None:
+def test_progress_reaches_its_total_in_encoded_frames(toy_arm, toy_file, tmp_path) -> None:
     seen = []
     settings = Settings(frames="strided", cameras=("top", "side"))
-    out = tmp_path / "out"
-    convert(
-        toy_arm, toy_recording, block_tokenizer, out, settings=settings,
-        on_progress=lambda state: seen.append((state.frames, state.total_frames)),
-    )  # fmt: skip
+
+    def note(state) -> None:
+        seen.append((state.frames, state.total_frames))
+
+    run(toy_arm, toy_file, tmp_path / "out", settings, on_progress=note)
     rows = sum(length // 2 for length in range(20, 32)) * 2
     assert seen[0] == (0, rows)
     assert seen[-1] == (rows, rows)
 
 
-def test_strided_rows_carry_the_whole_chunk(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
-    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, Settings(frames="strided"))
+def test_strided_rows_carry_the_whole_chunk(toy_arm, toy_recording, tmp_path) -> None:
+    run(toy_arm, toy_recording, tmp_path / "out", Settings(frames="strided"))
     assert verify(tmp_path / "out") == []
     shards = ShardSet(tmp_path / "out")
     values = shards.episode_rows(0)
@@ -191,44 +160,41 @@ def test_strided_rows_carry_the_whole_chunk(toy_arm, toy_recording, tmp_path, bl
     assert shards.row_stride == 1
 
 
-def test_statistics_are_over_train_only(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
-    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
-    shards = ShardSet(tmp_path / "out")
+def test_statistics_are_over_train_only(toy_set, toy_file) -> None:
+    shards = ShardSet(toy_set)
     train = [row["id"] for row in shards.episodes.to_pylist() if row["split"] == "train"]
-    with h5py.File(toy_recording) as file:
+    with h5py.File(toy_file) as file:
         actions = np.concatenate([file[f"data/{name}/actions"][()] for name in train]).astype(np.float64)
     np.testing.assert_allclose(shards.manifest.stats["action"]["mean"], actions.mean(0), rtol=1e-12)
     np.testing.assert_allclose(shards.manifest.stats["action"]["std"], actions.std(0), rtol=1e-9)
 
 
-def test_an_action_of_the_wrong_width_is_one_clear_reason(toy_arm, tmp_path, block_tokenizer) -> None:
+def test_an_action_of_the_wrong_width_is_one_clear_reason(toy_arm, tmp_path) -> None:
     write_toy(tmp_path / "toy.hdf5", [12, 12])
     wide = Embodiment.from_yaml(
         toy_arm.to_yaml().replace("dims: 3", "dims: 4").replace("  - c\n", "  - c\n    - d\n")
     )
     with pytest.raises(SourceError, match="2 × .*has 3 values, the embodiment says 4"):
-        run(wide, tmp_path / "toy.hdf5", tmp_path / "out", block_tokenizer)
+        run(wide, tmp_path / "toy.hdf5", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unknown_rate_is_refused_with_how_to_give_it(
-    toy_arm, toy_recording, tmp_path, block_tokenizer
-) -> None:
+def test_an_unknown_rate_is_refused_with_how_to_give_it(toy_arm, toy_recording, tmp_path) -> None:
     unknown = Embodiment.from_yaml(toy_arm.to_yaml().replace("frequency_hz: 10.0", "frequency_hz: unknown"))
     with pytest.raises(RegistryError, match="set frequency_hz"):
-        run(unknown, toy_recording, tmp_path / "out", block_tokenizer)
+        run(unknown, toy_recording, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_a_truncated_recording_writes_nothing(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
+def test_a_truncated_recording_writes_nothing(toy_arm, toy_recording, tmp_path) -> None:
     toy_recording.write_bytes(toy_recording.read_bytes()[:5000])
     with pytest.raises(SourceError, match="toy.hdf5"):
-        run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+        run(toy_arm, toy_recording, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_an_unwritable_folder_is_one_clear_error(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
+def test_an_unwritable_folder_is_one_clear_error(toy_arm, toy_recording, tmp_path) -> None:
     (tmp_path / "shut").mkdir(mode=0o500)
     with pytest.raises(OutputError, match="cannot be written"):
-        run(toy_arm, toy_recording, tmp_path / "shut" / "out", block_tokenizer)
+        run(toy_arm, toy_recording, tmp_path / "shut" / "out")

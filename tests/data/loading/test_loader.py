@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from hma_data.conversion.plan import Settings
-from hma_data.errors import ShardError, UsageError
+from hma_data.errors import ShardError
 from hma_data.loading.dataset import Batch, MixtureDataset, WindowDataset
 from hma_data.loading.mixture import Mixture
 from hma_data.shards import writer
@@ -118,12 +118,6 @@ def test_narrow_actions_are_padded_with_zeros(sets: list[Path]) -> None:
     assert (batch.actions[narrow, :, 2:] == 0).all()
     assert batch.tokens.dtype == torch.int64
     assert batch.action_mask.all()
-
-
-def test_a_state_of_another_run_is_refused(sets: list[Path]) -> None:
-    state = MixtureDataset(sets, 4, FRAMES).state_dict()
-    with pytest.raises(UsageError, match="batch_size 4"):
-        MixtureDataset(sets, 5, FRAMES).load_state_dict(state)
 
 
 def test_no_window_at_all_is_refused_with_what_to_do(sets: list[Path]) -> None:

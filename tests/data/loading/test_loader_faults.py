@@ -217,7 +217,7 @@ def test_windows_that_are_not_there_are_an_index_error(made: Path, windows: list
 @pytest.mark.parametrize(
     ("key", "value"),
     [("world", 2), ("lanes", 3), ("seed", 9), ("counts", [1, 2]), ("p", [0.1, 0.9]), ("pools", [1, 1]),
-     ("frames", 7)],
+     ("frames", 7), ("batch_size", 5)],
 )  # fmt: skip
 def test_a_state_of_another_run_is_refused_with_what_differs(made: Path, key: str, value: Any) -> None:
     data = MixtureDataset([made / "0", made / "1"], 4, 6)
