@@ -106,20 +106,24 @@ def ros_message(store: Any, item: Item) -> Any:
     return types[ROS_TYPES[CAMERA]](header, height, width, "rgb8", 0, width * 3, item.value.reshape(-1))
 
 
-def write_ros1(path: Path, recording: Recording, compression: str | None = None) -> Path:
-    """A ROS 1 bag by rosbags."""
-    store = get_typestore(Stores.ROS1_NOETIC)
-    writer = Ros1Writer(path)
-    if compression:
-        writer.set_compression(Ros1Writer.CompressionFormat[compression])
+def write_by_rosbags(
+    writer: Ros1Writer | Ros2Writer, recording: Recording, store: Any, serialize: Callable[..., Any]
+) -> None:
     with writer:
         connections = {
             topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in ROS_TYPES.items()
         }
         for item in items(recording):
-            message = ros_message(store, item)
-            data = store.serialize_ros1(message, ROS_TYPES[item.topic])
+            data = serialize(ros_message(store, item), ROS_TYPES[item.topic])
             writer.write(connections[item.topic], item.log_ns, data)
+
+
+def write_ros1(path: Path, recording: Recording, compression: str | None = None) -> Path:
+    """A ROS 1 bag by rosbags."""
+    store, writer = get_typestore(Stores.ROS1_NOETIC), Ros1Writer(path)
+    if compression:
+        writer.set_compression(Ros1Writer.CompressionFormat[compression])
+    write_by_rosbags(writer, recording, store, store.serialize_ros1)
     return path
 
 
@@ -130,14 +134,7 @@ def write_ros2(
     store = get_typestore(Stores.ROS2_HUMBLE)
     writer = Ros2Writer(path, version=9, storage_plugin=StoragePlugin[plugin])
     writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        connections = {
-            topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in ROS_TYPES.items()
-        }
-        for item in items(recording):
-            message = ros_message(store, item)
-            data = store.serialize_cdr(message, ROS_TYPES[item.topic])
-            writer.write(connections[item.topic], item.log_ns, data)
+    write_by_rosbags(writer, recording, store, store.serialize_cdr)
     return path
 
 
@@ -170,28 +167,34 @@ def write_mcap(path: Path, recording: Recording, how: dict[str, Encoded], **opti
 def as_ros1() -> dict[str, Encoded]:
     """ROS 1 messages."""
     store = get_typestore(Stores.ROS1_NOETIC)
-    return {
-        topic: Encoded(
-            kind.replace("/msg/", "/"),
-            "ros1msg",
-            store.generate_msgdef(kind)[0].encode(),
-            "ros1",
-            lambda item, kind=kind: bytes(store.serialize_ros1(ros_message(store, item), kind)),
-        )
-        for topic, kind in ROS_TYPES.items()
-    }
+    names = {kind: kind.replace("/msg/", "/") for kind in ROS_TYPES.values()}
+    return as_ros(store, "ros1msg", "ros1", store.serialize_ros1, names)
 
 
 def as_cdr() -> dict[str, Encoded]:
     """ROS 2 messages."""
     store = get_typestore(Stores.ROS2_HUMBLE)
+    return as_ros(store, "ros2msg", "cdr", store.serialize_cdr, {}, ros_version=2)
+
+
+def as_ros(
+    store: Any,
+    schema: str,
+    encoding: str,
+    serialize: Callable[..., Any],
+    names: dict[str, str],
+    **version: int,
+) -> dict[str, Encoded]:
+    def encode(item: Item) -> bytes:
+        return bytes(serialize(ros_message(store, item), ROS_TYPES[item.topic]))
+
     return {
         topic: Encoded(
-            kind,
-            "ros2msg",
-            store.generate_msgdef(kind, ros_version=2)[0].encode(),
-            "cdr",
-            lambda item, kind=kind: bytes(store.serialize_cdr(ros_message(store, item), kind)),
+            names.get(kind, kind),
+            schema,
+            store.generate_msgdef(kind, **version)[0].encode(),
+            encoding,
+            encode,
         )
         for topic, kind in ROS_TYPES.items()
     }

@@ -1,6 +1,8 @@
 """Small weights' files of the network tokenizers, with random numbers; drawn pictures to train on."""
 
+import json
 import runpy
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,38 @@ def drawn_corpus(folder: Path, count: int) -> dict[str, object]:
     rng = np.random.default_rng([1, 2])
     write_pictures(folder / "drawn", (draw_scene(rng) for _ in range(count)))
     return {"kind": "drawn", "pictures": count}
+
+
+def write_recipe(folder: Path, network: dict[str, object], pictures: int = 4, **training: object) -> Path:
+    """Write the recipe of a training of six steps on drawn scenes."""
+    steps = {"steps": 6, "batch": 4, "crop": 32, "learning_rate": 0.02, "adam_learning_rate": 0.001}
+    values = {
+        "job": "tokenizer",
+        "name": "small",
+        "seed": 1,
+        "corpus": str(folder),
+        "network": network,
+        "training": {**steps, "warmup_steps": 2, **training},
+        "loss": {"l2": 10.0, "l1": 0.3, "gradient": 0.3, "ssim": 0.05},
+        "sources": [drawn_corpus(folder, pictures)],
+    }
+    path = folder / "recipe.yaml"
+    path.write_text(json.dumps(values))
+    return path
+
+
+class Stopped(Exception):
+    """What `stop_at` raises."""
+
+
+def stop_at(step: int) -> Callable[[str], None]:
+    """Return a `report` that stops a training after a step."""
+
+    def stop(line: str) -> None:
+        if line.startswith(f"step {step}"):
+            raise Stopped
+
+    return stop
 
 
 def frames(count: int, seed: int = 0, size: int = 256) -> np.ndarray:

@@ -1,6 +1,5 @@
 """The laboratory's LeRobotDataset: what lerobot wrote of the planar arm, read by lerobot and by us."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,6 @@ import pytest
 
 from hma_data.conversion.job import convert
 from hma_data.episodes.episode import Episode
-from hma_data.errors import MissingDependencyError
 from hma_data.lab import record
 from hma_data.lab.planar_arm import STEPS, TASK
 from hma_data.registry.embodiment import find
@@ -84,10 +82,3 @@ def test_it_is_found_to_be_lerobots_and_converts(recorded, block_tokenizer, tmp_
     kept = [shards.episode_rows(index)["action"] for index in range(EPISODES)]
     for values, episode in zip(kept, episodes_of("planar_arm_lerobot", recorded), strict=True):
         np.testing.assert_array_equal(values, episode.actions[0].values)
-
-
-def test_without_lerobot_one_line_says_how_to_install_it(tmp_path, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "lerobot.datasets.lerobot_dataset", None)
-    with pytest.raises(MissingDependencyError, match=r"lerobot: .*uv sync") as found:
-        record("planar_arm_lerobot", tmp_path, 1)
-    assert "\n" not in str(found.value) and list(tmp_path.iterdir()) == []

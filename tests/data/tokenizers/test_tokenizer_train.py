@@ -1,6 +1,5 @@
 """The training of the embedded tokenizers: recipes, crops, optimizers, stopping and going on."""
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -22,7 +21,8 @@ from hma_data.tokenizers.training.frames import draw_batch, load_pools
 from hma_data.tokenizers.training.muon import Muon, orthogonal
 from hma_data.tokenizers.training.recipe import DrawnSource, load_recipe
 from hma_data.tokenizers.training.train import start_from, train
-from tests.data.tokenizer_files import draw_scene, drawn_corpus
+from tests.data import tokenizer_files
+from tests.data.tokenizer_files import Stopped, draw_scene, drawn_corpus, stop_at
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
 SMALL = FsqConfig(width=(8, 8), hidden=8, encoder_blocks=(1, 1), decoder_blocks=(1, 1, 1), fine_width=4)
@@ -34,29 +34,7 @@ def scenes(count: int, size: int) -> np.ndarray:
 
 
 def write_recipe(folder: Path, **training: object) -> Path:
-    import yaml
-
-    values = {
-        "job": "tokenizer",
-        "name": "small",
-        "seed": 1,
-        "corpus": str(folder),
-        "network": SMALL.model_dump(),
-        "training": {
-            "steps": 6,
-            "batch": 4,
-            "crop": 32,
-            "learning_rate": 0.02,
-            "adam_learning_rate": 0.001,
-            "warmup_steps": 2,
-            **training,
-        },
-        "loss": {"l2": 10.0, "l1": 0.3, "gradient": 0.3, "ssim": 0.05},
-        "sources": [drawn_corpus(folder, 4)],
-    }
-    path = folder / "recipe.yaml"
-    path.write_text(yaml.safe_dump(json.loads(json.dumps(values))))
-    return path
+    return tokenizer_files.write_recipe(folder, SMALL.model_dump(), **training)
 
 
 def test_training_makes_weights_that_tokenize(tmp_path):
@@ -100,20 +78,21 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_read(tmp_path)
         train(tmp_path / "gone.yaml", tmp_path / "w", device="abacus")
 
 
+SMALL_VAE = {"width": 8, "hidden": 8, "encoder_blocks": 1, "decoder_blocks": [1, 1], "fine_width": 4}
+FALL = {"steps": 8, "weight_decay": 0.1, "fall": [[2, 1], [8, 0]]}  # the noise of the latents differs by step
+
+
 @pytest.mark.slow
-def test_a_stopped_training_goes_on_as_if_it_had_not_been(tmp_path):
-    recipe = write_recipe(tmp_path, fall=[[4, 1], [6, 0]])
+@pytest.mark.parametrize(
+    ("network", "training", "step"),
+    [(SMALL.model_dump(), {"fall": [[4, 1], [6, 0]]}, 4), (SMALL_VAE, FALL, 5)],
+    ids=["fsq", "vae"],
+)
+def test_a_stopped_training_goes_on_as_if_it_had_not_been(tmp_path, network, training, step):
+    recipe = tokenizer_files.write_recipe(tmp_path, network, **training)
     train(recipe, tmp_path / "whole", report=lambda _: None)
-
-    class Stopped(Exception):
-        pass
-
-    def stop(line: str) -> None:
-        if line.startswith("step 4"):
-            raise Stopped
-
     with pytest.raises(Stopped):
-        train(recipe, tmp_path / "parts", report=stop, report_every=1)
+        train(recipe, tmp_path / "parts", report=stop_at(step), report_every=1)
     train(recipe, tmp_path / "parts", report=lambda _: None)
     whole, parts = load_file(tmp_path / "whole"), load_file(tmp_path / "parts")
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
@@ -121,16 +100,9 @@ def test_a_stopped_training_goes_on_as_if_it_had_not_been(tmp_path):
 
 @pytest.mark.slow
 def test_a_stopped_training_may_be_given_another_end_but_no_other_past(tmp_path):
-    class Stopped(Exception):
-        pass
-
-    def stop(line: str) -> None:
-        if line.startswith("step 4"):
-            raise Stopped
-
     recipe, out = write_recipe(tmp_path, fall=[[2, 1], [6, 0]]), tmp_path / "w"
     with pytest.raises(Stopped):
-        train(recipe, out, report=stop, report_every=1)
+        train(recipe, out, report=stop_at(4), report_every=1)
     with pytest.raises(RecipeError, match="other settings"):
         train(recipe, out, {"training.fall": [[3, 1], [6, 0]]}, report=lambda _: None)
     sooner = {"training.steps": 5, "training.fall": [[2, 1], [4, 0.5], [5, 0]]}
@@ -163,19 +135,10 @@ def test_a_larger_network_is_no_start(tmp_path):
 
 def test_a_decoder_that_learns_alone_leaves_the_tokens_as_they_are(tmp_path):
     train(write_recipe(tmp_path), tmp_path / "first", report=lambda _: None)
-    settings = {
-        "start": str(tmp_path / "first"),
-        **GROWN,
-        "network.hidden": SMALL.hidden,
-        "training.decoder_only": True,
-    }
-    train(write_recipe(tmp_path), tmp_path / "second", settings, report=lambda _: None)
-    train(
-        write_recipe(tmp_path),
-        tmp_path / "third",
-        {**settings, "start": str(tmp_path / "second")},
-        report=str,
-    )
+    settings = {**GROWN, "network.hidden": SMALL.hidden, "training.decoder_only": True}
+    for before, after in (("first", "second"), ("second", "third")):
+        start = {"start": str(tmp_path / before)}
+        train(write_recipe(tmp_path), tmp_path / after, settings | start, report=str)
     first, *later = (get_tokenizer("fsq-8", weights=tmp_path / name) for name in ("first", "second", "third"))
     pictures = scenes(3, 128)
     ids = first.encode(pictures)

@@ -1,25 +1,21 @@
 """The embedded continuous tokenizer: its latents, its file, its training."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from hma_data.errors import TokenizerError
-from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 from hma_data.tokenizers.catalog import EMBEDDED
 from hma_data.tokenizers.checkpoints import read_weights, save_weights
 from hma_data.tokenizers.embedded import VaeAutoencoder
 from hma_data.tokenizers.shapes import VaeConfig
 from hma_data.tokenizers.training.eval import evaluate, psnr_db
-from hma_data.tokenizers.training.recipe import load_recipe
 from hma_data.tokenizers.training.train import train
-from tests.data.tokenizer_files import draw_scene, drawn_corpus
+from tests.data.tokenizer_files import draw_scene, write_recipe
 
-RECIPE = shipped("recipes") / "tokenizer" / "vae.yaml"
 FORMAT, WEIGHTS = VaeConfig.format, EMBEDDED / "vae.safetensors"
 SMALL = VaeConfig(width=8, hidden=8, encoder_blocks=1, decoder_blocks=(1, 1), fine_width=4)
 
@@ -89,34 +85,9 @@ def test_the_scale_belongs_to_the_spec(tmp_path):
     assert len(digests) == 2
 
 
-def _recipe(folder: Path) -> Path:
-    network = {key: value for key, value in SMALL.model_dump().items() if key != "latent_scale"}
-    values = {
-        "job": "tokenizer",
-        "name": "small",
-        "seed": 1,
-        "corpus": str(folder),
-        "network": network,
-        "training": {
-            "steps": 8,
-            "batch": 4,
-            "crop": 32,
-            "learning_rate": 0.02,
-            "adam_learning_rate": 0.001,
-            "weight_decay": 0.1,
-            "warmup_steps": 2,
-            "fall": [[2, 1], [8, 0]],
-        },
-        "loss": {"l2": 10.0, "l1": 0.3, "gradient": 0.3, "ssim": 0.05},
-        "sources": [drawn_corpus(folder, 6)],
-    }
-    path = folder / "recipe.yaml"
-    path.write_text(json.dumps(values))
-    return path
-
-
 def test_training_measures_the_scale_of_the_latents(tmp_path):
-    recipe = _recipe(tmp_path)
+    network = SMALL.model_dump(exclude={"latent_scale"})
+    recipe = write_recipe(tmp_path, network, pictures=6, steps=8)
     train(recipe, tmp_path / "w", report=lambda _: None)
     config, _, _ = read_weights(tmp_path / "w", FORMAT, VaeConfig)
     assert config.latent_scale != 1.0
@@ -125,37 +96,6 @@ def test_training_measures_the_scale_of_the_latents(tmp_path):
         [np.stack([draw_scene(np.random.default_rng(1), 256)])],
     )
     assert 0.3 < result["latent_std_scaled"] < 3
-
-
-@pytest.mark.slow
-@pytest.mark.slow
-def test_a_training_stopped_while_its_rate_falls_goes_on_with_the_same_noise(tmp_path):
-    recipe = _recipe(tmp_path)
-    train(recipe, tmp_path / "whole", report=lambda _: None)
-
-    class Stopped(Exception):
-        pass
-
-    def stop(line: str) -> None:
-        if line.startswith("step 5"):
-            raise Stopped
-
-    with pytest.raises(Stopped):
-        train(recipe, tmp_path / "parts", report=stop, report_every=1)
-    train(recipe, tmp_path / "parts", report=lambda _: None)
-    whole, parts = (read_weights(tmp_path / name, FORMAT, VaeConfig)[1] for name in ("whole", "parts"))
-    assert all(torch.equal(whole[name], parts[name]) for name in whole)
-
-
-def test_the_shipped_weights_are_of_the_shipped_recipe():
-    from safetensors import safe_open
-
-    with safe_open(WEIGHTS, "pt") as file:
-        facts = json.loads(file.metadata()["training"])
-    recipe = load_recipe(RECIPE)
-    assert facts["recipe_sha256"] == recipe.digest()
-    assert (facts["steps"], facts["seed"]) == (recipe.training.steps, recipe.seed)
-    assert facts["seconds"] > 0 and facts["machine"]
 
 
 @pytest.mark.real
