@@ -9,30 +9,23 @@ from hma_data import console
 from hma_data.errors import Interrupted, SourceError, UsageError
 
 
-def test_progress_tells_elapsed_from_remaining_time(monkeypatch, capsys) -> None:
+@pytest.mark.parametrize(
+    ("begun_s", "ended_s", "shown"),
+    [(0.0, 12.0, "12 s so far, 36 s left, 3/9 episodes"), (50.0, 62.0, "1 min 02 s so far, 36 s left")],
+    ids=["at once", "after preparation"],
+)
+def test_progress_tells_elapsed_from_remaining_time(monkeypatch, capsys, begun_s, ended_s, shown) -> None:
     clock = [0.0]
     monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
     with console.progress("convert arm", unit="frames") as update:
-        update(0, total=400)
-        clock[0] = 12.0
-        update(100, "3/9 episodes", total=400)
-        assert capsys.readouterr().err == (
-            "convert arm: 100/400 frames, 8.3/s, 12 s so far, 36 s left, 3/9 episodes\n"
-        )
-    assert capsys.readouterr().err == ""  # what has been shown is not shown again at the end
-
-
-def test_preparation_does_not_slow_the_rate(monkeypatch, capsys) -> None:
-    clock = [0.0]
-    monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
-    with console.progress("episodes") as update:
         update(0, "training the judge", total=400)
-        clock[0] = 50.0
+        clock[0] = begun_s
         update(0, total=400)
         capsys.readouterr()
-        clock[0] = 62.0
-        update(100, total=400)
-    assert capsys.readouterr().err == "episodes: 100/400 frames, 8.3/s, 1 min 02 s so far, 36 s left\n"
+        clock[0] = ended_s
+        update(100, shown.partition("left, ")[2], total=400)
+        assert capsys.readouterr().err == f"convert arm: 100/400 frames, 8.3/s, {shown}\n"
+    assert capsys.readouterr().err == ""  # what has been shown is not shown again at the end
 
 
 def test_bytes_have_their_own_unit_and_an_unknown_total_is_left_out(capsys) -> None:

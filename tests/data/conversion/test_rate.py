@@ -124,31 +124,31 @@ def test_the_line_follows_the_step_of_the_model() -> None:
     assert pause_remedy(find("pusht_fast"), 30) == ""
 
 
-def test_a_set_without_a_window_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "toy.hdf5"
-    write_toy(path, [14] * 2)
-    (note,) = made(path, tmp_path / "out", yaml=ARM_YAML).notes
-    assert "no window to train on: 12 frames need 24 rows, the longest episode has 14" in note
-    assert note.endswith(
-        "set target_hz: 10 in its YAML and convert again with --overwrite, or train with windows of fewer "
-        "frames (frames=7)"
-    )
+STRIDE_5 = ARM_YAML.replace("frequency_hz: 10", "frequency_hz: 10\nstride: 5")
 
 
-def test_the_rate_that_is_named_gives_nine_of_ten_episodes_a_window(tmp_path: Path) -> None:
-    path = tmp_path / "toy.hdf5"
-    write_toy(path, [59] * 2 + [25] * 18)
-    (note,) = made(
-        path, tmp_path / "out", yaml=ARM_YAML.replace("frequency_hz: 10", "frequency_hz: 10\nstride: 5")
-    ).notes
-    assert "the longest episode has 59 — set target_hz: 5 " in note
-
-
-def test_a_set_without_a_window_at_any_rate_is_told_to_take_fewer_frames(tmp_path: Path) -> None:
-    path = tmp_path / "toy.hdf5"
-    write_toy(path, [8] * 2)
-    (note,) = made(path, tmp_path / "out", yaml=ARM_YAML).notes
-    assert note.endswith("has 8 — train with windows of fewer frames (frames=4)")
+@pytest.mark.parametrize(
+    ("lengths", "yaml", "said"),
+    [
+        (
+            [14] * 2,
+            ARM_YAML,
+            "no window to train on: 12 frames need 24 rows, the longest episode has 14 — set target_hz: "
+            "10 in its YAML and convert again with --overwrite, or train with windows of fewer frames "
+            "(frames=7)",
+        ),
+        (
+            [59] * 2 + [25] * 18,
+            STRIDE_5,
+            "the longest episode has 59 — set target_hz: 5 ",
+        ),  # fits nine of ten
+        ([8] * 2, ARM_YAML, "has 8 — train with windows of fewer frames (frames=4)"),
+    ],
+)
+def test_a_set_without_a_window_is_told_with_what_gives_one(lengths, yaml, said, tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", lengths)
+    (note,) = made(tmp_path / "toy.hdf5", tmp_path / "out", yaml=yaml).notes
+    assert said in note
 
 
 @pytest.mark.parametrize("frames", ["all", "strided"])

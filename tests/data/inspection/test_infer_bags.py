@@ -80,21 +80,35 @@ def test_both_arms_and_their_grippers_form_the_action(tmp_path: Path, form: str)
     assert first_clip(path, values).actions.shape[1] == 5
 
 
-def test_a_gripper_that_is_commanded_more_often_does_not_replace_its_arm(tmp_path: Path) -> None:
-    topics = {
-        "/camera/image": (picture_of(), 20),
-        "/gripper/command": (joints_of("gripper"), 21),
-        "/servo/command": (twist(), 20),
-        "/joint_states": (joints_of("a"), 20),
-    }
-    path = bag(tmp_path / "run", topics)
+CHOICES = {  # topics; keys of the action; what the question about the action names, if there is one
+    "a gripper that is commanded more often does not replace its arm": (
+        {"/gripper/command": (joints_of("gripper"), 21), "/servo/command": (twist(), 20)},
+        ["/servo/command.linear", "/servo/command.angular", "/gripper/command.position"],
+        None,
+    ),
+    "several commands are a question that names the others": (
+        {"/cmd_vel": (twist(), 10), "/desired_pose": (pose(), 10)},
+        ["/cmd_vel.linear", "/cmd_vel.angular"],
+        "/desired_pose.pose.position",
+    ),
+    "without a commanding topic joint states are proposed": (
+        {"/pose": (pose(), 10)},
+        ["/joint_states.position"],
+        "no topic drives the robot",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CHOICES)
+def test_what_commands(tmp_path: Path, case: str) -> None:
+    topics, action, question = CHOICES[case]
+    seen = {"/camera/image": (picture_of(), 20), "/joint_states": (joints_of("a"), 50)}
+    path = bag(tmp_path / "run", seen | topics)
     values = inferred(path)
-    assert keys(values, "action") == [
-        "/servo/command.linear",
-        "/servo/command.angular",
-        "/gripper/command.position",
-    ]
-    assert first_clip(path, values).actions.shape[1] == 7
+    assert keys(values, "action") == action and (question or "") in questions(values).get(
+        "provenance.action", ""
+    )
+    first_clip(path, values)
 
 
 def test_a_gripper_that_opens_and_closes_keeps_its_two_values(tmp_path: Path) -> None:
@@ -107,23 +121,6 @@ def test_a_gripper_that_opens_and_closes_keeps_its_two_values(tmp_path: Path) ->
         arm, gripper = inferred(bag(tmp_path / f"{high}_{low}", topics))["action"]["components"]
         assert gripper["key"] == "/gripper/command.data" and "normalize" not in arm
         assert gripper.get("normalize", True) is not kept
-
-
-def test_several_commands_are_a_question_that_names_the_others(tmp_path: Path) -> None:
-    path = bag(
-        tmp_path / "run",
-        {
-            "/camera/color/image_raw": (picture_of(), 15),
-            "/cmd_vel": (twist(), 10),
-            "/desired_pose": (pose(), 10),
-            "/joint_states": (joints_of("a"), 20),
-        },
-    )
-    values = inferred(path)
-    assert keys(values, "action") == ["/cmd_vel.linear", "/cmd_vel.angular"]
-    assert "/desired_pose.pose.position" in questions(values)["provenance.action"]
-    assert keys(values, "state") == ["/joint_states.position"]
-    first_clip(path, values)
 
 
 def test_values_of_two_keys_have_names_of_their_own(tmp_path: Path) -> None:
@@ -175,15 +172,6 @@ def test_a_trajectory_commands_by_its_first_point(tmp_path: Path) -> None:
         {"key": "/arm_controller/joint_trajectory.points[0].positions", "dims": 2, "names": ["a", "b"]}
     ]
     assert (first_clip(path, values).actions == 1).all()
-
-
-def test_without_a_commanding_topic_joint_states_are_proposed(tmp_path: Path) -> None:
-    topics = {"/image": (picture_of(), 10), "/joint_states": (joints_of("a", "b"), 50), "/pose": (pose(), 10)}
-    path = bag(tmp_path / "run", topics)
-    values = inferred(path)
-    assert keys(values, "action") == ["/joint_states.position"]
-    assert "no topic drives the robot" in questions(values)["provenance.action"]
-    first_clip(path, values)
 
 
 def test_stamps_of_another_clock_make_it_receive_times(tmp_path: Path) -> None:

@@ -19,16 +19,13 @@ def pictures() -> tuple[np.ndarray, np.ndarray]:
     return truth, np.clip(truth.astype(int) + noise, 0, 255).astype(np.uint8)
 
 
-def test_psnr_is_scikit_images(pictures):
-    truth, other = pictures
-    expected = [peak_signal_noise_ratio(a, b, data_range=255) for a, b in zip(truth, other)]
-    np.testing.assert_allclose(psnr(truth, other), expected, rtol=1e-12)
-
-
-def test_ssim_is_scikit_images_default(pictures):
-    truth, other = pictures
-    expected = [structural_similarity(a, b, data_range=255, channel_axis=2) for a, b in zip(truth, other)]
-    np.testing.assert_allclose(ssim(truth, other), expected, rtol=1e-9)
+@pytest.mark.parametrize(
+    ("ours", "theirs", "options"),
+    [(psnr, peak_signal_noise_ratio, {}), (ssim, structural_similarity, {"channel_axis": 2})],
+)
+def test_psnr_and_ssim_are_scikit_images(pictures, ours, theirs, options):
+    expected = [theirs(a, b, data_range=255, **options) for a, b in zip(*pictures)]
+    np.testing.assert_allclose(ours(*pictures), expected, rtol=1e-9)
 
 
 def test_ssim_of_a_smooth_picture_on_a_bright_ground_is_scikit_images():

@@ -48,12 +48,22 @@ def said(found: Inspection) -> dict[str, str]:
     return {one.message: one.severity for one in found.findings if one.check == "files"}
 
 
+@pytest.mark.parametrize(
+    ("link", "below", "said"),
+    [
+        (
+            "day1",
+            ".",
+            "day1 is a link to a folder outside {root}, not followed — give the path of that folder",
+        ),
+        ("gone", "no/such", "gone is a link to .*such, which is not there — copy the file in"),
+    ],
+)
 @each_format
-def test_a_linked_folder_that_holds_all_there_is_is_named_in_the_error(name, elsewhere, root) -> None:
-    (root / "day1").symlink_to(elsewhere)
-    wanted = f"day1 is a link to a folder outside {root}, not followed — give the path of that folder"
+def test_a_folder_of_links_alone_is_told(name, elsewhere, root, link, below, said) -> None:
+    (root / link).symlink_to(elsewhere / below)
     for look in (detect, open_source(name).episode_ids):
-        with pytest.raises(SourceError, match=wanted):
+        with pytest.raises(SourceError, match=said.format(root=root)):
             look(str(root))
 
 
@@ -74,13 +84,3 @@ def test_inspect_tells_of_linked_folders_and_of_links_to_nothing(name, elsewhere
         f"{root}/day3 is a link to {tmp_path}/lost, which is not there": "warn",
     }
     assert source.inspect(str(root / "day1")).episodes == 1
-
-
-@each_format
-def test_a_folder_of_links_to_nothing_is_told(name: str, elsewhere: Path, root: Path) -> None:
-    (root / "gone").symlink_to(elsewhere / "no" / "such")
-    for look in (detect, open_source(name).episode_ids):
-        with pytest.raises(
-            SourceError, match=r"gone is a link to .*such, which is not there — copy the file in"
-        ):
-            look(str(root))

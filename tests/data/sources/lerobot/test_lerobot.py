@@ -203,37 +203,32 @@ def test_a_missing_video_is_one_refused_episode(copy: Callable[[str], Path], nam
     assert f"1 of {len(videos)} videos of {CAMERA} are missing" in said and videos[0].name in said
 
 
-@pytest.mark.parametrize("shown", [11, 13])
-def test_a_video_of_another_length_is_refused(copy: Callable[[str], Path], shown: int) -> None:
+ROWS, FILM = "data/chunk-000/episode_000000.parquet", f"videos/chunk-000/{CAMERA}/episode_000000.mp4"
+MISMATCHES = {
+    "short video": (lambda folder: encode(folder / FILM, range(11)), "has 11 frames for 12 rows"),
+    "long video": (lambda folder: encode(folder / FILM, range(13)), "has 13 frames for 12 rows"),
+    "another rate": (lambda folder: encode(folder / FILM, range(12), fps=15), "disagree on time"),
+    "a row less": (
+        lambda folder: pq.write_table(pq.read_table(folder / ROWS).slice(1), folder / ROWS),
+        "has 11 rows of episode_000000, its metadata says 12",
+    ),
+    "too many rows": (
+        lambda folder: pq.write_table(pa.table({"episode_index": [0] * 1001}), folder / ROWS),
+        r"'episode_index' claims 1,001 values of 1,001 rows",
+    ),
+}
+
+
+@pytest.mark.parametrize("mismatch", MISMATCHES)
+def test_a_film_or_rows_that_do_not_fit_are_refused(copy, monkeypatch, mismatch: str) -> None:
     folder, source = copy("v2"), open_source("lerobot")
-    encode(folder / f"videos/chunk-000/{CAMERA}/episode_000000.mp4", range(shown))
-    with pytest.raises(EpisodeError, match=f"has {shown} frames for 12 rows"):
-        source.read(str(folder), "episode_000000", embodiment())
-    assert f"has {shown} frames for 12 rows" in source.inspect(str(folder)).problems[0]
-
-
-def test_a_video_of_another_rate_is_refused(copy: Callable[[str], Path]) -> None:
-    folder = copy("v2")
-    encode(folder / f"videos/chunk-000/{CAMERA}/episode_000000.mp4", range(12), fps=15)
-    with pytest.raises(EpisodeError, match="disagree on time"):
-        open_source("lerobot").read(str(folder), "episode_000000", embodiment())
-
-
-def test_rows_that_metadata_does_not_count_are_refused(copy: Callable[[str], Path]) -> None:
-    folder = copy("v2")
-    path = folder / "data/chunk-000/episode_000000.parquet"
-    pq.write_table(pq.read_table(path).slice(1), path)
-    with pytest.raises(EpisodeError, match="has 11 rows of episode_000000, its metadata says 12"):
-        open_source("lerobot").read(str(folder), "episode_000000", embodiment())
-
-
-def test_a_run_of_more_rows_than_any_recording_is_refused(copy, monkeypatch) -> None:
-    folder = copy("v2")
+    change, said = MISMATCHES[mismatch]
     monkeypatch.setattr("hma_data.sources.lerobot.rows.MAX_VALUES", 1000)
-    path = folder / "data/chunk-000/episode_000000.parquet"
-    pq.write_table(pa.table({"episode_index": np.zeros(1001, np.int64)}), path)
-    with pytest.raises(EpisodeError, match=r"'episode_index' claims 1,001 values of 1,001 rows"):
-        open_source("lerobot").read(str(folder), "episode_000000", embodiment())
+    change(folder)
+    with pytest.raises(EpisodeError, match=said):
+        source.read(str(folder), "episode_000000", embodiment())
+    if "video" in mismatch:
+        assert said in source.inspect(str(folder)).problems[0]
 
 
 def test_a_key_that_is_no_feature_names_the_nearest(originals: dict[str, Path]) -> None:
