@@ -58,25 +58,25 @@ def _of_windows(name: str, path: str, digits: int, meaning: str, within: tuple[f
 
 
 FIGURES = (
-    Figure("loss", "loss", 3, "nats a token (or a square of tokens), given the true past", detail=True),
+    Figure("loss", "loss", 3, "nats per token (or square of tokens), given the recorded past", detail=True),
     Figure("loss, shuffled", "shuffled_loss", 3, "the same with shuffled actions", detail=True),
-    Figure("loss, frequencies", "baseline_loss", 3, "the same of token frequencies alone", detail=True),
+    Figure("loss, frequencies", "baseline_loss", 3, "the same from token frequencies alone", detail=True),
     Figure(
         "perplexity", "perplexity", 2,
-        "of whole masked frames, given the true past; of squares, where the model takes squares",
+        "of fully masked frames, given the recorded past; per square if the model takes squares",
         by_window="loss", within=NATURAL, exponential=True,
     ),
-    Figure("nats/token", "stored_loss", 3, "loss a stored token: comparable between models of a tokenizer"),
+    Figure("nats/token", "stored_loss", 3, "loss per stored token, comparable between models of a tokenizer"),
     Figure(
-        "masked", "masked_perplexity", 2, "perplexity of the tokens that training masks, among its masks",
+        "masked", "masked_perplexity", 2, "perplexity of the tokens that training masks, under its masks",
         by_window="masked_loss", within=NATURAL, exponential=True,
     ),
-    Figure("masked accuracy", "masked_accuracy", 3, "share of these tokens predicted right", detail=True),
-    _of_windows("accuracy", "accuracy", 3, "share of tokens (or of their squares), true past", SHARE),
+    Figure("masked accuracy", "masked_accuracy", 3, "share of these tokens that are correct", detail=True),
+    _of_windows("accuracy", "accuracy", 3, "share of correct tokens (or squares), recorded past", SHARE),
     _of_windows("PSNR", "true.psnr", 2, "dB, mean over the horizon of rollouts", PSNR_RANGE),
     _of_windows("PSNR last", "true.psnr_last", 2, "dB, last frame", PSNR_RANGE),
     _of_windows(
-        "ΔPSNR", "psnr_action_gain_last", 2, "dB, last frame, true less shuffled actions", PSNR_GAIN_RANGE
+        "ΔPSNR", "psnr_action_gain_last", 2, "dB, last frame, recorded vs shuffled actions", PSNR_GAIN_RANGE
     ),
     _of_windows("SSIM", "true.ssim", 3, "mean over the horizon", SSIM_RANGE),
     _of_windows("LPIPS", "true.lpips", 3, "AlexNet, mean over the horizon", NATURAL),
@@ -84,9 +84,9 @@ FIGURES = (
     Figure("FVD", "true.fvd", 1, "of the predicted parts of windows"),
     _of_windows(
         "ΔPSNR (paper)", "paper.delta_psnr", 2,
-        "dB, last frame after the true past, true less Gaussian actions", PSNR_GAIN_RANGE,
+        "dB, last frame after the recorded past, recorded vs Gaussian actions", PSNR_GAIN_RANGE,
     ),
-    Figure("PSNR last (paper)", "paper.psnr_last", 2, "dB, the same frame, true actions", detail=True),
+    Figure("PSNR last (paper)", "paper.psnr_last", 2, "dB, the same frame, recorded actions", detail=True),
     Figure("PSNR Gaussian (paper)", "paper.gaussian_psnr_last", 2, "dB, Gaussian actions", detail=True),
     Figure("perplexity (paper)", "paper.perplexity", 2, "mean over batches of four windows", detail=True),
     Figure("state px", "state.true.error_px_last", 2, "error of the robot's place, last frame, px of 128"),
@@ -251,7 +251,7 @@ def markdown(parts: Sequence[Part], command: str) -> str:
     text += [*(f"- {whose} {said}" for whose, said in verdicts(parts)), ""]
     text += [f"- {name}: {MEANINGS[name]}" for name in table.columns if name in MEANINGS]
     if said := absences(parts):
-        text += ["", "Not measured, or to be known:", ""]
+        text += ["", "Not measured, and notes:", ""]
         text += [f"- {name}: {words}" for name, words in said]
     return "\n".join(text) + "\n"
 
@@ -265,9 +265,9 @@ def conditions(found: Mapping[str, Any]) -> str:
     episodes = human_count(found["episodes"], "episode")
     given = human_count(found["prompt"], "frame")
     return (
-        f"{windows} of {found['frames']} frames out of {episodes} of {found['split']}, {given} given; "
+        f"{windows} of {found['frames']} frames from {episodes} of {found['split']}, prompt of {given}; "
         f"camera {found['cameras']}; {found['draws']} draws of shuffled actions; "
-        f"images that never change: in {human_count(found['unmoved_windows'], 'window')}"
+        f"images do not change in {human_count(found['unmoved_windows'], 'window')}"
     )
 
 

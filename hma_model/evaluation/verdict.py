@@ -1,8 +1,8 @@
 """Decide whether a model follows its actions: one rule for every command, page and card.
 
-A model follows its actions if the last frame of its rollouts is nearer to the truth with their own actions
-than with other ones: by FOLLOWS_DB or more in the mean, and the 95 % interval of the mean lies above 0. The
-interval is over held-out episodes, so that a single episode decides nothing.
+The measure is the PSNR gain of a rollout's last frame, recorded vs shuffled actions. A model follows its
+actions if the mean gain is FOLLOWS_DB or more and its 95 % interval lies above 0. The interval is over
+held-out episodes, so one episode gives no verdict.
 """
 
 from collections.abc import Mapping
@@ -11,9 +11,9 @@ from typing import Any
 from hma_data.console import human_count
 from hma_model.config import token_words
 
-FOLLOWS_DB = 0.5  # least mean gain of the last frame's PSNR
-SENSITIVE = 1.2  # times the loss with shuffled actions, from which a model is said to be sensitive to them
-FEW_EPISODES = 5  # fewer are said to be few
+FOLLOWS_DB = 0.5  # least mean PSNR gain of the last frame
+SENSITIVE = 1.2  # least ratio of the losses with shuffled and recorded actions for a sensitive model
+FEW_EPISODES = 5  # with fewer, the verdict says "only"
 
 
 def follows(found: Mapping[str, Any]) -> bool:
@@ -32,13 +32,13 @@ def verdict(found: Mapping[str, Any]) -> str:
     if follows(found):
         return f"follows its actions: {said}"
     if found["psnr_action_gain_last"] >= FOLLOWS_DB:
-        return f"may follow its actions: {said}, too few to be sure"
+        return f"may follow its actions (inconclusive): {said}"
     loss, shuffled_loss = found.get("loss"), found.get("shuffled_loss")
     if loss and shuffled_loss and shuffled_loss >= SENSITIVE * loss:
         unit = token_words(found.get("merge") or 1)
-        nats = f"{loss:.2f} nats a {unit}, {shuffled_loss:.2f} with shuffled ones"
-        return f"is sensitive to its actions ({nats}), but its rollouts show little of it yet: {said}"
-    return f"does not follow its actions yet ({said})"
+        nats = f"loss {loss:.2f} nats per {unit}, {shuffled_loss:.2f} with shuffled actions"
+        return f"is sensitive to its actions ({nats}), but its rollouts do not follow them yet: {said}"
+    return f"does not follow its actions yet: {said}"
 
 
 def horizon(found: Mapping[str, Any]) -> float | None:
@@ -49,25 +49,24 @@ def horizon(found: Mapping[str, Any]) -> float | None:
 
 
 def _unjudged(found: Mapping[str, Any]) -> str:
-    """Return why nothing can be said about the actions; empty if it can."""
+    """Return why there is no verdict; empty if there is one."""
     if not found.get("sees_actions", True):
         return "was trained without actions"
     if 2 * found.get("unmoved_windows", 0) > found.get("windows", 0):
-        return "cannot be judged: most of the true images never change"
+        return "cannot be judged: most recorded images do not change"
     if found["psnr_action_gain_last"] is None or found.get("loss", 0.0) is None:
         return "cannot be judged: its predictions are not finite"
     return ""
 
 
 def _measured(found: Mapping[str, Any]) -> str:
-    """Return the gain, its horizon and its interval in words."""
+    """Return the gain with its interval, horizon and episodes in words."""
     seconds, ends = horizon(found), found.get("psnr_action_gain_last_95")
     count = found.get("episodes", 0)
     after = "" if seconds is None else f", {seconds:.1f} s after the prompt"
-    said = f"{found['psnr_action_gain_last']:+.1f} dB on the last frame{after}, true less shuffled actions"
+    bounds = f"95 % CI {ends[0]:+.1f} to {ends[1]:+.1f}" if ends else "no CI"
+    gain = f"last-frame PSNR gain {found['psnr_action_gain_last']:+.1f} dB ({bounds})"
     few = "only " if count < FEW_EPISODES else ""
     held_out = "held-out " if found.get("split", "val") == "val" else ""
-    of_episodes = f"{few}{human_count(count, f'{held_out}episode')}"
-    if not ends:
-        return f"{said}, no interval from {of_episodes}"
-    return f"{said}, 95 %: {ends[0]:+.1f} to {ends[1]:+.1f} over {of_episodes}"
+    episodes = f"{few}{human_count(count, f'{held_out}episode')}"
+    return f"{gain}, recorded vs shuffled actions{after}, {episodes}"

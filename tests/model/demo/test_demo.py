@@ -91,7 +91,7 @@ def test_the_report_opens_with_decibels_and_time_under_the_rule_of_evaluate(tmp_
     assert "nats" not in shown
     for found in (FOUND, wide):
         assert f"The model {verdict(found)}." in shown
-    assert "+2.1 dB on the last frame, 0.6 s after the prompt" in shown and "may follow" in shown
+    assert "recorded vs shuffled actions, 0.6 s after the prompt" in shown and "may follow" in shown
 
 
 def test_a_film_has_a_dark_version_for_dark_mode_with_the_same_images() -> None:

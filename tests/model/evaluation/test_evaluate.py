@@ -308,33 +308,34 @@ NO_GAIN = GAIN | {"psnr_action_gain_last": 0.1, "psnr_action_gain_last_95": [-0.
 
 def test_the_verdict_says_whether_the_model_follows_its_actions() -> None:
     said = (
-        "+2.1 dB on the last frame, true less shuffled actions, 95 %: +1.2 to +6.2 over 8 held-out episodes"
+        "last-frame PSNR gain +2.1 dB (95 % CI +1.2 to +6.2), recorded vs shuffled actions, "
+        "8 held-out episodes"
     )
     assert follows(GAIN) and verdict(GAIN) == f"follows its actions: {said}"
     assert not follows(NO_GAIN)
-    assert verdict(NO_GAIN).startswith("does not follow its actions yet (+0.1 dB")
+    assert verdict(NO_GAIN).startswith("does not follow its actions yet: last-frame PSNR gain +0.1 dB")
     heard = NO_GAIN | {"loss": 2.0, "shuffled_loss": 4.0}
     assert verdict(heard).startswith(
-        "is sensitive to its actions (2.00 nats a token, 4.00 with shuffled ones), but"
+        "is sensitive to its actions (loss 2.00 nats per token, 4.00 with shuffled actions), but"
     )
-    assert "(2.00 nats a square of 2×2 tokens, 4.00" in verdict(heard | {"merge": 2})
+    assert "(loss 2.00 nats per square of 2×2 tokens, 4.00" in verdict(heard | {"merge": 2})
     assert verdict(heard | {"shuffled_loss": 2.1}).startswith("does not follow its actions yet")
 
 
 def test_the_verdict_states_its_horizon_and_says_when_the_episodes_are_few() -> None:
     timed = GAIN | {"frames": 8, "prompt": 2, "seconds_a_frame": 0.1}
-    assert "+2.1 dB on the last frame, 0.6 s after the prompt, true" in verdict(timed)
-    assert verdict(GAIN | {"episodes": 4}).endswith("over only 4 held-out episodes")
-    assert verdict(GAIN | {"split": "train"}).endswith("over 8 episodes")
+    assert "recorded vs shuffled actions, 0.6 s after the prompt, 8 held-out" in verdict(timed)
+    assert verdict(GAIN | {"episodes": 4}).endswith(", only 4 held-out episodes")
+    assert verdict(GAIN | {"split": "train"}).endswith("actions, 8 episodes")
 
 
 def test_no_model_follows_without_an_interval_above_zero() -> None:
     wide = GAIN | {"psnr_action_gain_last_95": [-2.59, 8.77], "episodes": 3}
-    assert not follows(wide) and verdict(wide).startswith("may follow its actions: +2.1 dB")
-    assert verdict(wide).endswith("95 %: -2.6 to +8.8 over only 3 held-out episodes, too few to be sure")
+    assert not follows(wide) and verdict(wide).startswith("may follow its actions (inconclusive): ")
+    assert "(95 % CI -2.6 to +8.8)" in verdict(wide) and verdict(wide).endswith("only 3 held-out episodes")
     one = GAIN | {"psnr_action_gain_last_95": None, "episodes": 1}
-    assert not follows(one) and verdict(one).startswith("may follow its actions: +2.1 dB")
-    assert verdict(one).endswith("no interval from only 1 held-out episode, too few to be sure")
+    assert not follows(one) and verdict(one).startswith("may follow its actions (inconclusive): ")
+    assert "+2.1 dB (no CI)" in verdict(one) and verdict(one).endswith("only 1 held-out episode")
 
 
 # -- intervals, other commands, words

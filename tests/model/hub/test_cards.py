@@ -64,7 +64,7 @@ def test_the_cards_code_runs_as_pasted(tokenizer, views, tmp_path, monkeypatch) 
     assert made["film"].shape == (6, spec.image_size, spec.image_size, 3) and made["film"].dtype == np.uint8
 
 
-NOT_YET = "does not follow its actions yet (+0.1 dB on the last frame)"
+NOT_YET = "does not follow its actions yet: last-frame PSNR gain +0.1 dB"
 
 
 def test_a_card_opens_with_the_verdict_of_the_evaluation(folder: Path, tmp_path: Path, capsys) -> None:

@@ -25,8 +25,8 @@ def test_the_bundled_models_robots_were_measured() -> None:
 @pytest.mark.parametrize(
     ("verdict", "follows"),
     [
-        ("follows its actions: +4.1 dB", True),
-        ("does not follow its actions yet (+0.1 dB)", False),
+        ("follows its actions: last-frame PSNR gain +4.1 dB", True),
+        ("does not follow its actions yet: last-frame PSNR gain +0.1 dB", False),
         ("", None),
     ],
 )
