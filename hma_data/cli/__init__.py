@@ -33,8 +33,8 @@ def mount(app: typer.Typer) -> None:
 
 
 def bench(
-    name: Annotated[str | None, Argument(help="Which one; all are listed without it.")] = None,
-    settings: Annotated[list[str] | None, Argument(metavar="KEY=VALUE", help="Its settings.")] = None,
+    name: Annotated[str | None, Argument(help="Benchmark; default: list all.")] = None,
+    settings: Annotated[list[str] | None, Argument(metavar="KEY=VALUE", help="Benchmark settings.")] = None,
     json: Json = False,
 ) -> None:
     """Run a benchmark on generated data; nothing is downloaded.

@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 REASONS_PRINTED = 20  # of quarantine, the most frequent first
 # Options that few people need stand in panels of their own below the others in --help.
-_data = partial(Option, rich_help_panel="What is kept, and the split")
-_bad = partial(Option, rich_help_panel="Episodes that cannot be used")
+_data = partial(Option, rich_help_panel="Selection and split")
+_bad = partial(Option, rich_help_panel="Bad episodes")
 _existing = partial(Option, rich_help_panel="If --out holds a shard set")
 _jobs = partial(Option, rich_help_panel="Several machines")
 _rare = partial(Option, rich_help_panel="Rarely needed")
-_chosen = partial(choice_option, metavar="ID|GLOB|@FILE", rich_help_panel="What is kept, and the split")
+_chosen = partial(choice_option, metavar="ID|GLOB|@FILE", rich_help_panel="Selection and split")
 
 
 def convert(
@@ -47,34 +47,32 @@ def convert(
     out: Annotated[Path, Option(help="Folder of the shard set, or of the LeRobotDataset.")],
     to: Annotated[
         Literal["shards", "lerobot"],
-        Option("--to", help="What to make."),
+        Option("--to", help="Output format."),
     ] = "shards",
-    source: Annotated[str | None, Option(help="The same as DATA.")] = None,
+    source: Annotated[str | None, Option(help="Same as DATA.")] = None,
     tokenizer: Annotated[
         str, Option(help="Name of the tokenizer; see hma tokenizer list.", autocompletion=tokenizers)
     ] = "fsq-16",
-    weights: Annotated[str | None, _rare(help="The tokenizer's weights, if not the usual ones.")] = None,
-    device: Annotated[str, Option(help="Where the tokenizer runs: cpu, cuda, mps.")] = "cpu",
-    workers: Annotated[int, Option(min=0, help="Processes; 0 works in this one and survives no crash.")] = 1,
-    engine: Annotated[Literal["local", "ray"], _jobs(help="What runs the workers.")] = "local",
-    worker_cpus: Annotated[float, _jobs(min=0, help="CPUs that a worker of Ray reserves.")] = 1.0,
+    weights: Annotated[str | None, _rare(help="Tokenizer weights other than the default.")] = None,
+    device: Annotated[str, Option(help="Device of the tokenizer: cpu, cuda, mps.")] = "cpu",
+    workers: Annotated[int, Option(min=0, help="Processes; 0: this one, without crash protection.")] = 1,
+    engine: Annotated[Literal["local", "ray"], _jobs(help="Engine that runs the workers.")] = "local",
+    worker_cpus: Annotated[float, _jobs(min=0, help="CPUs per Ray worker.")] = 1.0,
     worker_gpus: Annotated[
-        float | None, _jobs(min=0, help="GPUs of a worker of Ray; default: 1 with --device cuda.")
+        float | None, _jobs(min=0, help="GPUs per Ray worker; default: 1 with --device cuda.")
     ] = None,
-    limit: Annotated[
-        int | None, Option(min=1, help="Convert only so many episodes, from the first on.")
-    ] = None,
+    limit: Annotated[int | None, Option(min=1, help="Convert only the first N episodes.")] = None,
     only: Annotated[list[str] | None, _chosen("Episode to take")] = None,
     exclude: Annotated[list[str] | None, _chosen("Episode to leave out")] = None,
     frames: Annotated[
-        Literal["all", "strided"], _data(help="Keep all rows, or only those of the model's grid.")
+        Literal["all", "strided"], _data(help="Keep all rows, or one per stride of the model.")
     ] = "all",
     drop_idle: Annotated[
         bool,
         _data("--drop-idle", help="With --to lerobot, leave out frames in which nothing moves."),
     ] = False,
     frequency_hz: Annotated[
-        float | None, _data(help="Rate of the recording, where the YAML does not know it.")
+        float | None, _data(help="Rate of the recording, if unknown in the YAML.")
     ] = None,
     cameras: Annotated[
         list[str] | None,
@@ -85,11 +83,11 @@ def convert(
             help="Cameras to store; default: the YAML's first, with --to lerobot all.",
         ),
     ] = None,
-    shard_frames: Annotated[int | None, _rare(min=1, help="Frames in a shard, about.")] = None,
+    shard_frames: Annotated[int | None, _rare(min=1, help="Approximate frames per shard.")] = None,
     val_fraction: Annotated[
         float | None,
         _data(
-            help="Share of episodes for validation; default: 5 %, of small sets 5 episodes or a quarter, "
+            help="Validation share of episodes; default: 5 %, for small sets 5 episodes or a quarter, "
             "with --to lerobot none."
         ),
     ] = None,
@@ -105,13 +103,13 @@ def convert(
     ] = False,
     overwrite: Annotated[bool, _existing("--overwrite", help="Delete the shard set in --out first.")] = False,
     shard_index: Annotated[
-        int | None, _jobs(min=0, help="Which share of the shards this job makes, of --shard-count.")
+        int | None, _jobs(min=0, help="Index of this job among --shard-count jobs.")
     ] = None,
     shard_count: Annotated[
-        int | None, _jobs(min=1, help="Jobs that share the work, for example a Slurm array.")
+        int | None, _jobs(min=1, help="Number of jobs that share the work, such as a Slurm array.")
     ] = None,
     dry_run: Annotated[
-        bool, Option("--dry-run", help="Only print the plan, its size and its time; write nothing.")
+        bool, Option("--dry-run", help="Print the plan, the output size and the time; write nothing.")
     ] = False,
     json: Json = False,
 ) -> None:
@@ -336,7 +334,7 @@ def _report_share(done: "UnfinishedShare", share: "Share | None", json: bool) ->
     missing, made = human_count(done.missing, "shard"), human_count(done.made_shards, "shard")
     name = f"share {share.name} " if share else ""
     print(f"{done.out}: {name}made {made} ({done.kept_shards} were there already)", end="")
-    print(f", {human_seconds(done.seconds)}; {missing} left to the other shares; the last of them", end="")
+    print(f", {human_seconds(done.seconds)}; {missing} left for other shares; the last to finish", end="")
     print(" writes the manifest")
 
 

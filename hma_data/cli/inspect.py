@@ -25,9 +25,9 @@ def inspect(
     fail_on: FailOn = "error",
     json: Json = False,
 ) -> None:
-    """Show what is in a recording, or list the recordings in a folder.
+    """Show the contents of a recording, or list the recordings in a folder.
 
-    Exits with 1 as hma doctor does: if there is a finding of the severity of --fail-on or worse.
+    Exits with 1 if there is a finding of severity --fail-on or worse, as hma doctor does.
 
     Example: hma inspect ./demo.hdf5
     """
@@ -130,12 +130,12 @@ def _print_checks(report: dict[str, Any]) -> None:
 
 def doctor(
     target: Annotated[str, Argument(help="A recording, or the folder of a shard set.")],
-    embodiment: Annotated[str | None, robot_option("Look into the episodes as this robot's.")] = None,
+    embodiment: Annotated[str | None, robot_option("Check the episodes against this robot's YAML.")] = None,
     episodes: Episodes = 20,
     fail_on: FailOn = "error",
     json: Json = False,
 ) -> None:
-    """Check the health of a recording or shard set: report what in it will hurt training.
+    """Check a recording or shard set for problems that hurt training.
 
     Example: hma doctor ./demo.hdf5 -e my_arm.yaml --fail-on warn
     """

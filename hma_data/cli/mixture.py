@@ -16,17 +16,19 @@ if TYPE_CHECKING:
     from hma_data.shards.windows import WindowIndex
 
 Pairs = list[str] | None
-_share = partial(Option, rich_help_panel="Other shares than the temperature's")
+_share = partial(Option, rich_help_panel="Weights, groups and caps")
 
 
 def mixture(
     folders: Annotated[list[str], Argument(help="Shard sets.")],
     temperature: Annotated[
-        float | None, Option(help="τ: 1 is proportional, a large one uniform; default 3, for val 4.")
+        float | None, Option(help="Temperature τ: 1 is proportional, large is uniform; default 3, for val 4.")
     ] = None,
-    frames: Annotated[int, Option(min=1, help="Frames T of a window.")] = 12,
+    frames: Annotated[int, Option(min=1, help="Frames T per window.")] = 12,
     split: Annotated[Literal["train", "val"], Option(help="Split to draw from.")] = "train",
-    short: Annotated[Literal["drop", "pad"], Option(help="What to do with short episodes.")] = "drop",
+    short: Annotated[
+        Literal["drop", "pad"], Option(help="Rule for episodes shorter than a window.")
+    ] = "drop",
     weight: Annotated[
         Pairs,
         _share(
@@ -42,7 +44,7 @@ def mixture(
     samples: Annotated[
         int | None, Option(min=1, help="Planned draws; default: the number of windows.")
     ] = None,
-    plot: Annotated[Path | None, Option(help="PNG, SVG or PDF to draw.")] = None,
+    plot: Annotated[Path | None, Option(help="Plot file: PNG, SVG or PDF.")] = None,
     json: Json = False,
 ) -> None:
     """Show how often each embodiment is drawn when a model trains on several shard sets.
@@ -80,7 +82,7 @@ def mixture(
         return
     columns = ["windows", "episodes", "too short", "frames", "proportional", f"p at τ = {tau:g}"]
     print_table(["embodiment", *columns, "p uniform", "epochs"], [list(row.values()) for row in rows])
-    print(f"epochs: passes over a set's windows while {planned:,} samples are drawn in all")
+    print(f"epochs: passes over a set's windows if {planned:,} samples are drawn in total")
 
 
 def _rows(

@@ -48,8 +48,8 @@ def choice_option(text: str, **options: Any) -> Any:
 
 Json = Annotated[bool, Option("--json", help="Print JSON.")]
 Folder = Annotated[Path, Argument(help="A shard set.")]
-Weights = Annotated[str | None, Option(help="The tokenizer's weights, if not the usual ones.")]
-Episodes = Annotated[int, Option(min=1, help="Number of episodes to look into.")]
+Weights = Annotated[str | None, Option(help="Tokenizer weights other than the default.")]
+Episodes = Annotated[int, Option(min=1, help="Number of episodes to read.")]
 FailOn = Annotated[
     Literal["info", "warn", "error", "never"],
     Option(help="Exit with 1 if there is a finding of this severity or worse."),

@@ -16,7 +16,7 @@ from hma_data.registry import FORMATS
 if TYPE_CHECKING:
     from hma_data.registry.catalog import RegistryEntry
 
-registry_app = typer.Typer(no_args_is_help=True, help="Look at embodiments, check and write their YAML.")
+registry_app = typer.Typer(no_args_is_help=True, help="List, check and write embodiment YAMLs.")
 Id = Annotated[str, Argument(help="Registry id, or a YAML file.", autocompletion=robots)]
 Out = Annotated[Path | None, Option(help="File to write; default: print.")]
 SCHEMA = "embodiment.schema.json"  # the first line of a YAML names it for editors
@@ -36,14 +36,14 @@ LISTED = {  # column -> fact
 @registry_app.command("list")
 def registry_list(
     words: Annotated[
-        list[str] | None, Argument(help="Only those with all these words in id, robot or description.")
+        list[str] | None, Argument(help="Only embodiments with all these words in id, robot or description.")
     ] = None,
     source: Annotated[
-        str | None, Option(help=f"Only this format: {', '.join(FORMATS)}, or a package's.")
+        str | None, Option(help=f"Only this format: {', '.join(FORMATS)}, or a plug-in's.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """List every embodiment that can be found by its id.
+    """List all embodiments of the registry.
 
     Example: hma registry list franka --source rlds
     """
@@ -109,11 +109,11 @@ def _known(value: Any) -> str:
 @registry_app.command("validate")
 def registry_validate(
     paths: Annotated[
-        list[Path] | None, Argument(help="Files or folders; the whole registry without any.")
+        list[Path] | None, Argument(help="Files or folders; default: the whole registry.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """List every problem of every YAML.
+    """Check YAMLs and list all problems.
 
     Example: hma registry validate my_robot.yaml
     """
@@ -176,7 +176,7 @@ def registry_schema(out: Out = None) -> None:
         print_json(schema())
         return
     _write_json(out, schema())
-    print(f"wrote {out}; an editor completes a YAML beside it that begins with the line")
+    print(f"wrote {out}; editors complete a YAML in the same folder if it starts with the line")
     print(f"# yaml-language-server: $schema={out.name}")
 
 

@@ -22,11 +22,9 @@ from hma_data.errors import UsageError
 if TYPE_CHECKING:
     from hma_data.shards.manifest import Manifest
 
-shards_app = typer.Typer(
-    no_args_is_help=True, help="Look at shard sets, verify them, and make new sets from them."
-)
+shards_app = typer.Typer(no_args_is_help=True, help="Inspect, verify, merge, split and export shard sets.")
 
-Workers = Annotated[int | None, Option(min=1, help="Threads; default: one a core.")]
+Workers = Annotated[int | None, Option(min=1, help="Threads; default: one per core.")]
 Out = Annotated[Path, Option(help="Folder of the new shard set.")]
 
 
@@ -113,7 +111,7 @@ def _successes(episodes: dict[str, Any]) -> str:
     if not episodes["success"] and not episodes["failure"]:
         return "success not recorded"
     parts = [f"{episodes['success']:,} succeed, {episodes['failure']:,} fail"]
-    return ", ".join(parts + ([f"{episodes['not_told']:,} not told"] if episodes["not_told"] else []))
+    return ", ".join(parts + ([f"{episodes['not_told']:,} unknown"] if episodes["not_told"] else []))
 
 
 @shards_app.command("verify")
@@ -226,16 +224,16 @@ def shards_split(
     folder: Folder,
     out: Out,
     val_fraction: Annotated[
-        float | None, Option(help="Share of episodes for validation; default: as of hma convert.")
+        float | None, Option(help="Share of episodes for validation; default: as in hma convert.")
     ] = None,
     seed: Annotated[int, Option(help="Seed of the split.")] = 0,
     by: Annotated[
-        Literal["episode", "instruction", "source"], Option(help="What stays together in one split.")
+        Literal["episode", "instruction", "source"], Option(help="Unit that stays in one split.")
     ] = "episode",
     workers: Workers = None,
     json: Json = False,
 ) -> None:
-    """Divide the episodes of a set into train and val again, as a new set.
+    """Split the episodes of a set into train and val again, as a new set.
 
     Example: hma shards split shards/my_arm --val-fraction 0.1 --out shards/my_arm_10
     """
@@ -250,7 +248,7 @@ def shards_split(
 
 @shards_app.command("restat")
 def shards_restat(folder: Folder, workers: Workers = None, json: Json = False) -> None:
-    """Write the manifest and the other derived files anew from the shards, which stay as they are.
+    """Rebuild the manifest and the other derived files from the shards.
 
     Example: hma shards restat shards/my_arm
     """
@@ -264,12 +262,12 @@ def shards_restat(folder: Folder, workers: Workers = None, json: Json = False) -
 @shards_app.command("export")
 def shards_export(
     folder: Folder,
-    out: Annotated[Path, Option(help="New folder; each split gets a folder in it.")],
+    out: Annotated[Path, Option(help="New folder, with a subfolder per split.")],
     to: Annotated[Literal["memmap"], Option(help="memmap: the layout of the paper's code.")] = "memmap",
-    split: Annotated[str | None, Option(help="Only this split, straight into --out.")] = None,
-    camera: Annotated[str | None, Option(help="Camera to take; default: the first.")] = None,
+    split: Annotated[str | None, Option(help="Only this split, directly into --out.")] = None,
+    camera: Annotated[str | None, Option(help="Camera to export; default: the first.")] = None,
 ) -> None:
-    """Export flat files as the paper's code reads them: video.bin, actions, segment_ids.bin, metadata.json.
+    """Export flat files for the paper's code: video.bin, actions, segment_ids.bin, metadata.json.
 
     Example: hma shards export shards/my_arm --to memmap --out flat/my_arm
     """

@@ -11,12 +11,12 @@ from hma_data.console import human_bytes, interruptible, print_json, print_table
 from hma_data.errors import MissingDependencyError, RecipeError, UsageError
 
 tokenizer_app = typer.Typer(no_args_is_help=True, help="List, train and measure tokenizers.")
-Device = Annotated[str, Option(help="Where the network runs: cpu, cuda, mps.")]
+Device = Annotated[str, Option(help="Device of the network: cpu, cuda, mps.")]
 
 
 @tokenizer_app.command("list")
 def tokenizer_list(json: Json = False) -> None:
-    """List the names that --tokenizer takes: what is usable here, what is downloaded, sizes, licences.
+    """List the names that --tokenizer takes, with availability, sizes and licences.
 
     Example: hma tokenizer list
     """
@@ -46,16 +46,16 @@ def _print_list(entries: list[Any]) -> None:
         ]
         for entry in entries
     ]
-    print_table(["name", "kind", "image", "grid", "here", "weights", "licence", "what it is"], rows)
+    print_table(["name", "kind", "image", "grid", "here", "weights", "licence", "description"], rows)
 
 
 @tokenizer_app.command("train")
 def tokenizer_train(
     recipe: Annotated[Path, Argument(help="A YAML of recipes/tokenizer.")],
-    overrides: Annotated[list[str] | None, Argument(metavar="KEY=VALUE", help="Dotted overrides.")] = None,
-    out: Annotated[Path, Option(help="The weights' file.")] = Path("tokenizer.safetensors"),
+    overrides: Annotated[list[str] | None, Argument(metavar="KEY=VALUE", help="Dotted recipe keys.")] = None,
+    out: Annotated[Path, Option(help="Output weights.")] = Path("tokenizer.safetensors"),
     device: Device = "cpu",
-    workers: Annotated[int, Option(min=0, help="Threads that draw crops ahead.")] = 0,
+    workers: Annotated[int, Option(min=0, help="Threads that prefetch crops.")] = 0,
 ) -> None:
     """Train a tokenizer; run it again to continue.
 
@@ -92,17 +92,17 @@ def tokenizer_eval(
     tokenizer: Annotated[str, Argument(help="Name of the tokenizer.", autocompletion=tokenizers)],
     data: Annotated[list[str], Argument(help="Images, videos, folders of them, recordings, shard sets.")],
     embodiment: Annotated[str | None, robot_option("DATA are recordings of this robot: id or YAML.")] = None,
-    weights: Annotated[str | None, Option(help="Its weights, if not the usual ones.")] = None,
+    weights: Annotated[str | None, Option(help="Tokenizer weights other than the default.")] = None,
     frames: Annotated[int, Option(min=1, help="Frames of each video or episode, evenly spaced.")] = 64,
     lpips: Annotated[
-        bool | None, Option(help="Measure LPIPS; default: if nothing has to be downloaded for it.")
+        bool | None, Option(help="Measure LPIPS; default: only if it needs no download.")
     ] = None,
     worst: Annotated[int, Option(min=0, help="Worst frames to draw with --out.")] = 6,
     out: Annotated[Path | None, Option(help="Folder for eval.md, eval.json, worst.png.")] = None,
     device: Device = "cpu",
     json: Json = False,
 ) -> None:
-    """Measure a tokenizer: PSNR, SSIM, LPIPS, use of the vocabulary, bits, speed, and the worst frames.
+    """Measure a tokenizer: PSNR, SSIM, LPIPS, codebook usage, bits, speed, and the worst frames.
 
     Example: hma tokenizer eval fsq-16 ./videos --out eval
     """

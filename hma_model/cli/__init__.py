@@ -61,7 +61,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Robot recordings to tokenized shards, to a world model, to the hub. Add --debug for tracebacks.",
+    help="Convert robot recordings to shards, train a world model, publish it. Add --debug for tracebacks.",
 )
 _Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[2]  # ClickException of typer's click
 _TAG = re.compile(r"\[(?=[a-z#/@][^\[]*\])")  # the beginning of what rich takes for markup
@@ -143,18 +143,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         if debug:
             raise
         text = f"{type(fault).__name__}: {fault}".splitlines()[0]
-        return fail(f"{text} — this should have been a clearer error; --debug shows where it happened", 1)
+        return fail(f"{text} — unexpected error, please report it; --debug shows the traceback", 1)
     return code if isinstance(code, int) else 0
 
 
 @app.command()
 def demo(
-    out: Annotated[Path, Option(help="Folder for everything the demo makes.")] = Path("hma-demo"),
+    out: Annotated[Path, Option(help="Output folder.")] = Path("hma-demo"),
     episodes: Annotated[int, Option(min=4, help="Episodes of each of the two robots.")] = 32,
-    steps: Annotated[int | None, Option(min=1, help="Steps of each training at most.")] = None,
-    seed: Annotated[int, Option(min=0, help="Seed of recording and training.")] = 0,
+    steps: Annotated[int | None, Option(min=1, help="Maximum steps of each training.")] = None,
+    seed: Annotated[int, Option(min=0, help="Random seed of recording and training.")] = 0,
 ) -> None:
-    """Show a world model two new robots: record, convert, finetune, publish, roll out, report.
+    """Finetune the bundled world model on two new robots: record, convert, finetune, publish, report.
 
     It takes a few minutes and downloads nothing.
 
@@ -181,13 +181,13 @@ app.command("evaluate", rich_help_panel=MODELS)(evaluate)
 def generate(
     checkpoint: Checkpoint,
     data: Data,
-    out: Annotated[Path, Option(help="The video: .mp4, .webp or .gif.")],
+    out: Annotated[Path, Option(help="Output video: .mp4, .webp or .gif.")],
     split: Split = "val",
-    window: Annotated[int, Option(min=0, help="Number of the window to start at.")] = 0,
+    window: Annotated[int, Option(min=0, help="Index of the window to start at.")] = 0,
     frames: Annotated[
-        int | None, Option(min=1, help="Frames to predict; by default to the end of the window.")
+        int | None, Option(min=1, help="Frames to predict; default: to the end of the window.")
     ] = None,
-    prompt: Annotated[int, Option(min=1, help="Number of true frames to start from.")] = 2,
+    prompt: Annotated[int, Option(min=1, help="Number of recorded frames to start from.")] = 2,
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
     temperature: Temperature = None,
@@ -197,7 +197,7 @@ def generate(
     seed: Annotated[int, Option(min=0, help="Seed of the rollout.")] = 0,
     cameras: Cameras = None,
 ) -> None:
-    """Write a video: the truth, and beside it what the model predicts from a few frames and the actions.
+    """Write a video of the recording next to the prediction from its first frames and its actions.
 
     Example: hma generate runs/first shards/my_arm --out rollout.mp4
     """

@@ -33,12 +33,12 @@ def evaluate(
     checkpoint: Checkpoint,
     data: Annotated[list[Path], Argument(help="Shard sets.")],
     compare: Annotated[
-        list[str] | None, Option(help="Another checkpoint to compare; repeat for more.")
+        list[str] | None, Option(help="Another checkpoint to compare; repeat it for more.")
     ] = None,
     split: Split = "val",
     windows: Annotated[int, Option(min=1, help="Number of windows, evenly spaced.")] = 64,
-    frames: Annotated[int | None, Option(min=2, help="Frames of a window; by default the model's.")] = None,
-    prompt: Annotated[int | None, Option(min=1, help="Number of true frames to start from.")] = None,
+    frames: Annotated[int | None, Option(min=2, help="Frames per window; default: the model's.")] = None,
+    prompt: Annotated[int | None, Option(min=1, help="Number of recorded frames to start from.")] = None,
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
     precision: Precision = "float32",
@@ -47,17 +47,17 @@ def evaluate(
     seed: Annotated[int, Option(min=0, help="Seed of the rollouts.")] = 0,
     cameras: Cameras = None,
     paper: Annotated[
-        bool, Option("--paper", help="Also follow the paper's protocol: Gaussian actions, true past.")
+        bool, Option("--paper", help="Also use the paper's protocol: Gaussian actions, recorded past.")
     ] = False,
     state: Annotated[
         bool,
         Option(
             "--state",
-            help="Measure what the robot does in the frames, against its recorded or simulated state.",
+            help="Compare the robot's state in the predicted frames with the recorded or simulated one.",
         ),
     ] = False,
     episodes: Annotated[
-        int, Option(min=2, help="Episodes that --state simulates of a laboratory robot.")
+        int, Option(min=2, help="Episodes that --state simulates for a simulated robot.")
     ] = 32,
     lpips: Annotated[
         str | None, Option(metavar="FILE#SHA256", help="TorchScript of LPIPS, with its hash.")
@@ -66,12 +66,12 @@ def evaluate(
     fvd: Annotated[str | None, Option(metavar="FILE#SHA256", help="TorchScript of FVD's I3D.")] = None,
     out: Annotated[Path | None, Option(help="Folder for results.json, results.md and report.html.")] = None,
     json: Annotated[
-        bool, Option("--json", help="Print one JSON object a line, for each checkpoint and set.")
+        bool, Option("--json", help="Print one line of JSON for each checkpoint and set.")
     ] = False,
 ) -> None:
-    """Measure how well rollouts predict: with the true actions, another window's, none, and beside a copy.
+    """Measure rollouts with recorded, shuffled and no actions, vs a copy of the prompt's last frame.
 
-    With --out, what is finished is kept, and the same command continues.
+    With --out, finished parts are kept, and the same command continues.
 
     Example: hma evaluate runs/first shards/my_arm --out evaluation
     """

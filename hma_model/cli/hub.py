@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from hma_model.checkpoint.folder import Checkpoint
 
 Embodiments = Annotated[
-    list[str] | None, Option("--embodiment", "-e", help="Only this robot; repeat for more.")
+    list[str] | None, Option("--embodiment", "-e", help="Only this robot; repeat it for more.")
 ]
 Saved = Annotated[Path, Argument(help="A checkpoint, or a run's folder.")]
 Revision = Annotated[str | None, Option("--revision", help="Branch, tag or commit.")]
-Private = Annotated[bool, Option("--private", help="Create a new repository as a private one.")]
+Private = Annotated[bool, Option("--private", help="Create new repositories as private.")]
 hub_app = typer.Typer(no_args_is_help=True, help="Publish and pull checkpoints, one robot at a time.")
 
 
@@ -29,10 +29,10 @@ def push(
     target: Annotated[str, Argument(help="A folder, or org/name on the hub.")],
     embodiment: Embodiments = None,
     sample: Annotated[
-        list[Path] | None, Option(help="Shard set to roll out for the card's film; default: the run's.")
+        list[Path] | None, Option(help="Shard set to roll out for the card's video; default: the run's.")
     ] = None,
     film: Annotated[
-        bool, Option("--film/--no-film", help="Make a film for the card if the run's shards are here.")
+        bool, Option("--film/--no-film", help="Make a video for the card if the run's shards exist.")
     ] = True,
     private: Private = False,
 ) -> None:
@@ -51,7 +51,7 @@ def push(
     for name, card in opened.cards(embodiment).items():
         judged = card.get("evaluation")
         if judged and not judged["follows"]:
-            print(f"{name} {judged['verdict']}: the model card opens with this")
+            print(f"{name} {judged['verdict']}; the model card starts with this verdict")
     robots = "".join(f" -e {shlex.quote(name)}" for name in embodiment or ())
     print(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {_folder_for(target)}")
 
@@ -73,14 +73,14 @@ def _add_films(checkpoint: "Checkpoint", sample: list[Path] | None, embodiments:
         try:
             add_samples(checkpoint, [folder])
         except HMAError as fault:  # a film is no condition of publishing
-            print(f"no film: {fault}", file=sys.stderr)
+            print(f"no video: {fault}", file=sys.stderr)
 
 
 @hub_app.command("pull")
 def pull(
     source: Annotated[str, Argument(help="A folder, or org/name on the hub.")],
     embodiment: Embodiments = None,
-    out: Annotated[Path | None, Option(help="Folder; by default the local cache.")] = None,
+    out: Annotated[Path | None, Option(help="Folder; default: the local cache.")] = None,
     revision: Revision = None,
 ) -> None:
     """Fetch the trunk and only the chosen robots.
@@ -156,8 +156,10 @@ def import_released(
     source: Annotated[str, Argument(help="A released checkpoint: a folder, or org/name on the hub.")],
     out: Annotated[Path, Option(help="Folder of the new checkpoint.")],
     embodiment: Embodiments = None,
-    grid: Annotated[tuple[int, int] | None, Option(help="Height and width, if not square.")] = None,
-    tokenizer: Annotated[str | None, Option(help="By default the paper's.")] = None,
+    grid: Annotated[
+        tuple[int, int] | None, Option(help="Height and width of the grid, if not square.")
+    ] = None,
+    tokenizer: Annotated[str | None, Option(help="Tokenizer; default: the paper's.")] = None,
     revision: Revision = None,
     json: Json = False,
 ) -> None:
@@ -204,7 +206,7 @@ def _summary(facts: dict[str, Any]) -> str:
     trunk = f"trunk {_cell(sha256)[:12]}, " if isinstance(sha256, str) else "weights "
     parts.append(trunk + ("not in the cache" if size is None else f"{size} MB"))
     if facts["from_cache"]:
-        parts.append("the hub is out of reach, this is what the cache has")
+        parts.append("the hub is unreachable, listed from the cache")
     return f"{_cell(facts['checkpoint'], 1000)}: {'; '.join(parts)}; {_state(facts)}"
 
 

@@ -19,45 +19,44 @@ Checkpoint = Annotated[
 ]
 OfCheckpoint = Annotated[str, Option("--checkpoint", help="A checkpoint, a run's folder, or a hub repo.")]
 Data = Annotated[Path, Argument(help="A shard set.")]
-Split = Annotated[Literal["train", "val"], Option("--split", help="Split to take windows from.")]
+Split = Annotated[Literal["train", "val"], Option("--split", help="Split of the windows.")]
 UnmaskSteps = Annotated[
-    int, Option("--unmask-steps", min=1, help="Passes in which a discrete model decodes a frame.")
+    int, Option("--unmask-steps", min=1, help="Decoding passes per frame of a discrete model.")
 ]
 Temperature = Annotated[
     float | None,
-    Option("--temperature", min=0, help="0 takes the likeliest token; default 0.5, of latents 0."),
+    Option("--temperature", min=0, help="Sampling temperature; 0 is greedy; default 0.5, for latents 0."),
 ]
 SampleSteps = Annotated[
-    int | None, Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own.")
+    int | None, Option("--sample-steps", min=1, help="DDIM steps of a continuous model; default: its own.")
 ]
 Precision = Annotated[
     Literal["float32", "bf16", "int8"],
     Option(
         "--precision",
-        help="Of the products in rollouts; bf16 and int8 want a processor that has them, bf16 also a GPU.",
+        help="Precision of products in rollouts; bf16 needs a CPU or GPU with bf16, int8 a CPU with VNNI.",
     ),
 ]
 Compile = Annotated[
-    bool, Option("--compile", help="Compile the trunk for rollouts; pays on a GPU, after a minute or more.")
+    bool, Option("--compile", help="Compile the trunk for rollouts; takes a minute, faster on a GPU.")
 ]
 Device = Annotated[
-    str, Option("--device", help="Of model and tokenizer: auto (a GPU if there is one), cpu, cuda or mps.")
+    str,
+    Option("--device", help="Device of model and tokenizer: auto (a GPU if available), cpu, cuda or mps."),
 ]
 Cameras = Annotated[
     str | None,
-    Option(
-        "--cameras", metavar="NAME[,NAME…]", help="Cameras to show the model; default: those of its training."
-    ),
+    Option("--cameras", metavar="NAME[,NAME…]", help="Input cameras of the model; default: as in training."),
 ]
 
 
-Seed = Annotated[int, Option(min=0, help="Seed of everything.")]
+Seed = Annotated[int, Option(min=0, help="Random seed.")]
 
 
 def kept(what: str, out: Path | None) -> str:
     """Return what a Ctrl-C leaves in the folder of --out, and how to go on."""
     if out is None:
-        return f"nothing is kept; with --out, finished {what} are"
+        return f"nothing is kept; use --out to keep finished {what}"
     return f"finished {what} are kept in {out}; run the same command again to continue"
 
 
@@ -68,7 +67,7 @@ def device_name(device: str) -> str:
     try:
         return str(choose_device(device))
     except (HMAError, RuntimeError) as fault:
-        said = fault.fault if isinstance(fault, HMAError) else f"{device!r} is no device"
+        said = fault.fault if isinstance(fault, HMAError) else f"{device!r} is not a device"
         raise UsageError("--device", said, "use auto or cpu") from fault
 
 

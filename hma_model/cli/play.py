@@ -20,31 +20,33 @@ def play(
     checkpoint: Annotated[
         str,
         Argument(
-            help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]); by default the one that "
-            "comes along."
+            help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]); default: the bundled "
+            "model."
         ),
     ] = "embedded",
     data: Annotated[
-        list[Path] | None, Argument(help="Shard sets, whose held-out episodes give more scenes.")
+        list[Path] | None, Argument(help="Shard sets whose held-out episodes are offered as scenes.")
     ] = None,
     prompt: Annotated[
-        list[Path] | None, Option(help="An image to begin from; repeat it for several, in their order.")
+        list[Path] | None, Option(help="Initial image; repeat it for several frames in order.")
     ] = None,
     embodiment: Annotated[
         str | None,
         Option(
-            "-e", "--embodiment", help="The robot that the page opens with.", autocompletion=embedded_robots
+            "-e", "--embodiment", help="Robot that the page selects first.", autocompletion=embedded_robots
         ),
     ] = None,
-    port: Annotated[int, Option(min=0, max=65535, help="0 takes a free one.")] = 0,
-    host: Annotated[str, Option(help="Address to listen on; any but loopback needs a token.")] = "127.0.0.1",
-    token: Annotated[str | None, Option(help="What the address must carry; made up with --host.")] = None,
+    port: Annotated[int, Option(min=0, max=65535, help="Port; 0 picks a free one.")] = 0,
+    host: Annotated[
+        str, Option(help="Address to listen on; all but loopback require a token.")
+    ] = "127.0.0.1",
+    token: Annotated[str | None, Option(help="Access token; by default generated with --host.")] = None,
     device: Device = "auto",
     precision: Precision = "float32",
     compile: Compile = False,
     browser: Annotated[bool, Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
 ) -> None:
-    """Drive robots in a world model, in the browser, beside their true simulators.
+    """Drive robots in a world model in the browser, side by side with their simulators.
 
     Example: hma play
     """
@@ -71,7 +73,7 @@ def play(
     robots = drivable(opened, sets, tokenizer, images)
     first = opening(robots, embodiment, "images" if images else "recordings" if sets else None)
     if len(opened.embodiments) > 1 and images and embodiment is None:
-        print("the image is offered for every robot; -e ROBOT opens the page with yours", file=sys.stderr)
+        print("every robot can start from the image; -e ROBOT selects yours", file=sys.stderr)
     from hma_model.play.server import LOOPBACK, serve
 
     listener = _listen(host, port)
@@ -91,7 +93,7 @@ def play(
     try:
         asyncio.run(serve(opened, name, robots, tokenizer(), listener, host, token, ready, **settings))
     except KeyboardInterrupt:
-        print("stopped; what was not saved is lost")
+        print("stopped; unsaved sessions are lost")
 
 
 def _listen(host: str, port: int) -> socket.socket:

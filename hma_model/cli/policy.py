@@ -24,21 +24,21 @@ from hma_model.cli.options import (
 def policy_eval(
     embodiment: Annotated[
         str,
-        Argument(help="A robot of the laboratory that the checkpoint has.", autocompletion=embedded_robots),
+        Argument(help="A simulated robot of the checkpoint.", autocompletion=embedded_robots),
     ],
     policies: Annotated[
         list[str],
         Argument(
             metavar="POLICY…",
-            help="scripted, reach, either with :noise=SHARE, random, still, hma:CHECKPOINT, plan:cem, "
-            "lerobot:FOLDER_OR_REPO, or MODULE:NAME of a Python function or class: image to action.",
+            help="scripted or reach (both take :noise=SHARE), random, still, hma:CHECKPOINT, plan:cem, "
+            "lerobot:FOLDER_OR_REPO, or MODULE:NAME, a Python function or class from image to action.",
         ),
     ],
     checkpoint: OfCheckpoint = "embedded",
     episodes: Annotated[int, Option(min=1, help="Episodes of each policy.")] = 32,
     frames: Annotated[int, Option(min=4, help="Frames of an episode.")] = 40,
     judge: Annotated[
-        str, Option(help="What success is: moved, reached, placed, or with px: moved=8.")
+        str, Option(help="Success criterion: moved, reached or placed; moved=8 sets the limit in px.")
     ] = "moved",
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
@@ -46,7 +46,7 @@ def policy_eval(
     compile: Compile = False,
     seed: Seed = 0,
     device: Device = "auto",
-    out: Annotated[Path | None, Option(help="Folder for the page and the figures.")] = None,
+    out: Annotated[Path | None, Option(help="Folder for the report and the results.")] = None,
     json: Json = False,
 ) -> None:
     """Score policies in a robot's simulator and inside the world model, and compare the two.
@@ -87,24 +87,22 @@ def policy_eval(
 
 
 def augment(
-    embodiment: Annotated[
-        str, Argument(help="A robot that the checkpoint has.", autocompletion=embedded_robots)
-    ],
+    embodiment: Annotated[str, Argument(help="A robot of the checkpoint.", autocompletion=embedded_robots)],
     out: Annotated[Path, Argument(help="Folder for the shard set.")],
     checkpoint: OfCheckpoint = "embedded",
     source: Annotated[
-        Path | None, Option("--from", help="Shard set of first frames and commands; else the simulator's.")
+        Path | None, Option("--from", help="Shard set of first frames and actions; default: the simulator.")
     ] = None,
-    episodes: Annotated[int, Option(min=1, help="Episodes to make.")] = 64,
+    episodes: Annotated[int, Option(min=1, help="Episodes to generate.")] = 64,
     frames: Annotated[
-        int, Option(min=4, help="Frames to generate of each; the last, without commands, is not stored.")
+        int, Option(min=4, help="Frames to generate per episode; the last has no action and is not stored.")
     ] = 40,
     commands: Annotated[
-        str, Option(help="replay, perturb=SHARE of their spread, or a policy as of hma policy-eval.")
+        str, Option(help="Actions: replay, perturb=SHARE of their deviation, or a policy of hma policy-eval.")
     ] = "replay",
-    keep: Annotated[float, Option(help="Share to keep: the episodes of which the model is surest.")] = 0.5,
-    judge: Annotated[str, Option(help="Keep only successes at this: moved, reached, placed, moved=PX.")] = "",
-    lerobot: Annotated[Path | None, Option(help="Folder for them as a LeRobotDataset v3.0 as well.")] = None,
+    keep: Annotated[float, Option(help="Share of episodes to keep, lowest uncertainty first.")] = 0.5,
+    judge: Annotated[str, Option(help="Keep only these successes: moved, reached, placed, moved=PX.")] = "",
+    lerobot: Annotated[Path | None, Option(help="Also write a LeRobotDataset v3.0 to this folder.")] = None,
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
     precision: Precision = "float32",
@@ -113,7 +111,7 @@ def augment(
     device: Device = "auto",
     json: Json = False,
 ) -> None:
-    """Make synthetic episodes with the world model, as shards and as a LeRobotDataset.
+    """Generate synthetic episodes with the world model, as shards and as a LeRobotDataset.
 
     Example: hma augment rails_03 synthetic/rails_03 --episodes 64 --commands perturb=0.3
     """
@@ -149,13 +147,13 @@ def augment(
     stored = ShardSet(out).episodes
     begun = len(set(stored["group"].to_pylist()))
     said = f"kept {human_count(count, 'episode')} of {episodes} in {out}"
-    print(f"{before}{said}, begun in {human_count(begun, 'real one')}; synthetic: true in every file")
+    print(f"{before}{said}, from {human_count(begun, 'recorded episode')}; synthetic: true in every file")
     if keep < 1 and not any("milli" in flags for flags in stored["flags"].to_pylist()):
-        print(f"  --keep {keep:g} was not applied: a model with video_loss: regression states no uncertainty")
+        print(f"  --keep {keep:g} was not applied: a model with video_loss: regression has no uncertainty")
     if lerobot:
-        print(f"the same as a LeRobotDataset: {lerobot}")
+        print(f"also written as a LeRobotDataset: {lerobot}")
         state = Embodiment.load(lerobot / "embodiment.yaml").provenance.get("state")
-        few = "none: the shards have none, or too few episodes to learn it from; policies of lerobot need it"
+        few = "none: the shards have no state, or too few episodes to learn it; lerobot's policies need it"
         print(f"  observation.state: {state or few}")
 
 
@@ -163,16 +161,16 @@ def label_actions(
     film: Annotated[str, Argument(help="A shard set, or a folder of video files.")],
     checkpoint: Annotated[str, Option(help="A run with the objective `inverse`.")],
     embodiment: Annotated[
-        str, Option("-e", "--embodiment", help="The robot of the checkpoint whose commands they are.")
+        str, Option("-e", "--embodiment", help="Robot of the checkpoint whose actions are inferred.")
     ],
     out: Annotated[Path, Option(help="Folder for the labelled shards.")],
     check: Annotated[
-        str | None, Option(help="Labelled shards for the error; else those that the training run held out.")
+        str | None, Option(help="Shards to measure the error on; default: the run's held-out episodes.")
     ] = None,
     device: Device = "auto",
     json: Json = False,
 ) -> None:
-    """Infer the commands of film that has none, as shards that say so, with the error on labelled film.
+    """Label action-free video: write shards with inferred actions, print the error on recorded ones.
 
     Example: hma label-actions film --checkpoint runs/inverse -e mover_04 --out labelled/mover_04
     """
@@ -188,7 +186,7 @@ def label_actions(
     if json:
         print_json({"out": str(out), "splits": made.manifest.splits, "plan": made.manifest.plan})
         return
-    print(f"error on {error.commands:,} commands of {error.source} ({error.split}):")
+    print(f"error on {error.commands:,} actions of {error.source} ({error.split}):")
     for name, rmse, share in zip(error.names, error.rmse, error.explained, strict=True):
         said = "does not vary there" if share is None else f"{share:.0%} of the variance explained"
         worse = "; no better than the mean: do not use it" if share is not None and share <= 0 else ""

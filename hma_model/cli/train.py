@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 Words = Annotated[
     list[str] | None,
-    Argument(metavar="DATA|KEY=VALUE", help="Shard sets; keys of the recipe, with dots: model.layers=4."),
+    Argument(metavar="DATA|KEY=VALUE", help="Shard sets, and recipe keys such as model.layers=4."),
 ]
 Out = Annotated[Path | None, Option("--out", help="The run's folder.")]
-Force = Annotated[bool, Option("--force", help="Resume although the recipe or the shards changed.")]
+Force = Annotated[bool, Option("--force", help="Resume even if the recipe or the shards changed.")]
 MODELS = "Models"  # the panel of `hma --help`
 STOPPED = "the run's checkpoints are kept; the same command continues from the newest"
-recipe_app = typer.Typer(no_args_is_help=True, help="List the recipes of training, and show one.")
+recipe_app = typer.Typer(no_args_is_help=True, help="List and show training recipes.")
 
 
 def mount(app: typer.Typer) -> None:
@@ -102,14 +102,13 @@ def finetune(
         str, Option("--from", help="A checkpoint, a run's folder, a URI, or ORG/NAME[@REVISION].")
     ],
     words: Words = None,
-    data: Annotated[
-        list[str] | None, Option(help="The same as DATA, of which it takes one; repeat it for more.")
-    ] = None,
+    data: Annotated[list[str] | None, Option(help="Same as DATA, one shard set; repeat it for more.")] = None,
     freeze_trunk: Annotated[
-        bool, Option("--freeze-trunk", help="Train stems and heads; keep the trunk as it is.")
+        bool, Option("--freeze-trunk", help="Train only stems and heads; freeze the trunk.")
     ] = False,
     recipe: Annotated[
-        str | None, Option(help="Name or YAML file; finetune_tiny for the embedded model, else finetune.")
+        str | None,
+        Option(help="Recipe name or YAML file; default: finetune_tiny for embedded, else finetune."),
     ] = None,
     out: Out = None,
     force: Force = False,
@@ -165,7 +164,7 @@ def _print(result: "TrainResult") -> None:
         from hma_model.config import token_words
 
         unit = token_words(Checkpoint.open(result.checkpoint).config.merge)
-        print(f"held-out loss {found:.4f} nats a {unit}; token frequencies alone {base:.4f}")
+        print(f"held-out loss {found:.4f} nats per {unit}; token frequencies alone {base:.4f}")
     if result.skipped:
         print(f"{result.skipped} steps were skipped; see skipped in {result.out}/metrics.jsonl")
     if (result.out / "report.html").is_file():
@@ -177,7 +176,7 @@ def _print(result: "TrainResult") -> None:
 
 @recipe_app.command("list")
 def recipe_list(json: Json = False) -> None:
-    """List the recipes that come with the toolkit.
+    """List the bundled recipes.
 
     Example: hma recipe list
     """

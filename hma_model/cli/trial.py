@@ -30,7 +30,7 @@ UNLIMITED_STEPS = 1_000_000  # the time ends the training
 def try_recording(
     data: Annotated[str, Argument(help="A recording of your robot: file, folder or URI.")],
     embodiment: Annotated[
-        str | None, robot_option("The robot, if its YAML is there: a registry id, or a file.")
+        str | None, robot_option("Robot, if its YAML exists: a registry id or a file.")
     ] = None,
     answer: Annotated[
         list[str] | None,
@@ -38,11 +38,11 @@ def try_recording(
     ] = None,
     only: Annotated[list[str] | None, choice_option("Episode to take")] = None,
     minutes: Annotated[float, Option(min=0.1, help="Minutes of training.")] = 5.0,
-    out: Annotated[Path | None, Option(help="Folder for everything; default: hma-try-NAME.")] = None,
+    out: Annotated[Path | None, Option(help="Output folder; default: hma-try-NAME.")] = None,
 ) -> None:
-    """Show your robot in the model: inspect, infer, convert, finetune, evaluate, and a film with a page.
+    """Finetune the bundled model on a recording: inspect, infer, convert, finetune, evaluate, report.
 
-    What a recording cannot say is asked in a terminal; elsewhere --answer says it. Run it again to continue.
+    In a terminal it asks what the recording does not state; elsewhere, use --answer. Run again to continue.
 
     Example: hma try ./demo.hdf5 --minutes 5 --answer action.space=joint_delta
     """
@@ -128,7 +128,7 @@ def _answer(path: Path, given: list[str]) -> None:
     if open_questions:
         asked = "; ".join(f"{key}: {question}" for key, question in open_questions)
         flags = " ".join(f"--answer {key}=…" for key, _ in open_questions)
-        raise RegistryError(path, f"has open questions: {asked}", f"answer by {flags}, or in the file")
+        raise RegistryError(path, f"has open questions: {asked}", f"use {flags}, or edit the file")
     write_atomic(path, write_yaml(values))
 
 
@@ -144,7 +144,7 @@ def _set(values: Any, key: str, value: Any) -> None:
             values = values[part]
         values[last] = value
     except (KeyError, IndexError, TypeError) as fault:
-        raise UsageError("--answer", f"{key} is not a key of the YAML", "the file has them") from fault
+        raise UsageError("--answer", f"{key} is not a key of the YAML", "see the keys in the file") from fault
 
 
 def _parts(key: str) -> Iterator[str | int]:
@@ -168,7 +168,7 @@ def _write_page(folder: Path, shards: Path, film: Path, done: list[list[str]]) -
     page.picture(webp_bytes(frames, fps), "webp", caption)
     for found in kept_findings(ShardSet(shards)):
         page.text(f"Tokens of {found}.")
-    page.section("Files", f"{film.name} is this film. evaluation/report.html has all figures and charts.")
+    page.section("Files", f"{film.name} is this video. evaluation/report.html has all figures and charts.")
     page.section("Commands")
     page.commands("\n".join(shlex.join(["hma", *words]) for words in done))
     path = folder / "index.html"

@@ -16,21 +16,21 @@ if TYPE_CHECKING:
 def view(
     place: Annotated[str, Argument(help="A recording (with -e), a shard set, or a training run.")],
     data: Annotated[
-        list[Path] | None, Argument(help="Of a run: shard sets, if those of its recipe were moved.")
+        list[Path] | None, Argument(help="For a run: its shard sets, if they were moved.")
     ] = None,
     embodiment: Annotated[
         str | None, robot_option("Robot of a recording: a registry id, or a YAML file.")
     ] = None,
     episode: Annotated[
-        int, Option(min=0, help="Number of the episode; of a run, of the held-out window.")
+        int, Option(min=0, help="Index of the episode; for a run, of the held-out window.")
     ] = 0,
-    tokenizer: Annotated[str | None, Option(help="Of a recording: show its decoded tokens too.")] = None,
+    tokenizer: Annotated[str | None, Option(help="For a recording: also show its decoded tokens.")] = None,
     out: Annotated[Path | None, Option(help="The .rrd file; by default the viewer opens.")] = None,
 ) -> None:
     """Show an episode in Rerun: cameras, decoded tokens, actions, states and skew on one clock.
 
-    A run is shown by its losses and rates, and by a held-out window beside its prediction. Without a display,
-    the file is written to the present folder.
+    For a run, it shows losses, rates, and a held-out window next to its prediction. Without a display, it
+    writes the file to the current folder.
 
     Example: hma view shards/my_arm --out my_arm.rrd
     """

@@ -35,7 +35,7 @@ def test_what_the_recording_cannot_say_is_asked_and_answered_by_flags(
     monkeypatch.setattr("sys.stdin.isatty", lambda: False)
     out = tmp_path / "out"
     asked = hma("try", str(recording), "--out", str(out))
-    assert asked.returncode == 1 and "answer by --answer action.space=…" in asked.stderr
+    assert asked.returncode == 1 and "use --answer action.space=…" in asked.stderr
     fails(hma("try", str(recording), "--out", str(out), "--answer", "no.such=1"), 2, "no.such is not a key")
     assert hma("try", str(recording), "--out", str(out), *ANSWER).returncode == 3
     robot = Embodiment.load(out / "robot.yaml")

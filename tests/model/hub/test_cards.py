@@ -70,7 +70,7 @@ NOT_YET = "does not follow its actions yet: last-frame PSNR gain +0.1 dB"
 def test_a_card_opens_with_the_verdict_of_the_evaluation(folder: Path, tmp_path: Path, capsys) -> None:
     record_evaluation(Checkpoint.open(folder), "arm", {"verdict": NOT_YET, "follows": False})
     assert main(["hub", "push", str(folder), str(tmp_path / "hub")]) == 0
-    assert f"arm {NOT_YET}: the model card opens with this" in capsys.readouterr().out
+    assert f"arm {NOT_YET}; the model card starts with this verdict" in capsys.readouterr().out
     for page in (folder / "README.md", tmp_path / "hub" / "README.md"):
         text = ModelCard.load(page).text.strip().splitlines()
         assert text[0].startswith("# ") and text[2].startswith("> **arm** does not follow its actions yet")

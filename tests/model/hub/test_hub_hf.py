@@ -236,7 +236,7 @@ def test_a_listing_from_the_cache_says_so(published, monkeypatch):
     hub.pull(REPO, ["arm"])
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     shown = CliRunner().invoke(app, ["hub", "list", REPO]).output
-    assert "the hub is out of reach, this is what the cache has" in shown and " 0.0 " not in shown
+    assert "the hub is unreachable, listed from the cache" in shown and " 0.0 " not in shown
     rows = json.loads(CliRunner().invoke(app, ["hub", "list", REPO, "--json"]).output)
     assert rows["from_cache"] and [bool(row["bytes"]) for row in rows["embodiments"]] == [True, False]
     assert [row["problems"][:1] for row in rows["embodiments"]] == [[], ["the cache lacks stem.safetensors"]]

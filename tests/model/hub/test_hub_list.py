@@ -200,7 +200,7 @@ def test_a_runs_own_shards_make_the_film_while_they_are_there(folder, tmp_path, 
     assert not list((tmp_path / "plain").rglob("*.gif"))
     assert main(["hub", "push", str(run), str(tmp_path / "hub")]) == 0
     assert [path.parent.name for path in (tmp_path / "hub").rglob("*.gif")] == ["arm"]
-    assert capsys.readouterr().err.count("no film: ") == 1
+    assert capsys.readouterr().err.count("no video: ") == 1
 
 
 def test_a_push_tells_how_to_fetch_it(folder, tmp_path, capsys):
