@@ -27,10 +27,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.errors import UsageError
 from hma_data.lab import truth
 from hma_data.lab.simulator import embodiment
 from recipes.bench.drift import SHEET_ROLLOUTS, opened, rolled, write_sheet
 from recipes.bench.harness import Bench
+from recipes.lab.pushes import contact_episode
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -70,6 +72,9 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     robots = [name.strip() for name in settings["robots"].split(",")]
     for robot in robots:
         embodiment(robot)
+        if settings["driver"] == "contact" and robot != "pusht_fast":
+            fault = f"driver=contact is of pusht_fast, not of {robot}"
+            raise UsageError("bench holds", fault, "give robots=pusht_fast, or another driver")
     model, tokenizer = opened(settings["checkpoint"], robots, settings["device"])
     found = [measure(model, tokenizer, robot, settings) for robot in robots]
     if settings["sheet"]:
@@ -87,7 +92,10 @@ def measure(model: "HMA", tokenizer: "Tokenizer", robot: str, settings: dict[str
 
     begun, prompt, seed = time.monotonic(), settings["prompt"], settings["seed"]
     stride, length = model.embodiments[robot].stride, prompt + settings["frames"]
-    simulated = partial(truth.episode, robot, length, stride, seed, wander=settings["driver"] == "wander")
+    if settings["driver"] == "contact":
+        simulated = partial(contact_episode, length, stride, seed)
+    else:
+        simulated = partial(truth.episode, robot, length, stride, seed, wander=settings["driver"] == "wander")
     episodes = [simulated(number) for number in range(settings["rollouts"])]
     size, (camera, *_) = tokenizer.spec.image_size, embodiment(robot).cameras
     seen = np.stack([prepare(one.pictures, camera, size, tokenizer.spec.resize_filter) for one in episodes])
@@ -242,7 +250,8 @@ BENCH = Bench(
         "robots": "pusht_fast,arm2_07,mover_10",
         "frames": 60,
         "rollouts": 12,  # of each robot
-        "driver": "own",  # of the pushers: own pushes the T to its goal; wander moves at random
+        # Of pushers: own pushes the T to its goal, wander moves at random, contact as recipes/lab/pushes.py.
+        "driver": "own",
         "prompt": 3,  # true frames
         "device": "auto",
         "seed": 4949,
@@ -250,5 +259,5 @@ BENCH = Bench(
         "record": False,  # write the figures into the cards of the checkpoint's folder
     },
     run,
-    choices={"driver": ("own", "wander")},
+    choices={"driver": ("own", "wander", "contact")},
 )

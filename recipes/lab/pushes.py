@@ -24,9 +24,11 @@ from typing import Any
 import numpy as np
 
 from hma_data.console import run_script
+from hma_data.errors import UsageError
 from hma_data.lab import pusht
 from hma_data.lab.pusher import Planned, Wandering
 from hma_data.lab.tee_table import TICK_S
+from hma_data.lab.truth import TrueEpisode
 from hma_data.lab.writers import Demo
 from hma_data.storage.files import part_of
 
@@ -88,6 +90,24 @@ def contact_demo(seed: int, episode: int) -> Demo:
     images, positions, states, actions, rewards = map(np.stack, zip(*rows, strict=True))
     observations = {"image": images, "agent_pos": positions}
     return Demo(actions, observations, states, rewards, arena.success, {"start": "contact", "seed": seed})
+
+
+def contact_episode(frames: int, stride: int, seed: int, episode: int) -> TrueEpisode:
+    """Return a recorded episode of contact with the places of its parts; `seed` is that of its recording.
+
+    Raises:
+        UsageError: an episode has fewer frames.
+    """
+    if frames * stride > CONTACT_STEPS:
+        most = CONTACT_STEPS // stride
+        raise UsageError("driver=contact", f"has {most} frames an episode, not {frames}", "give fewer frames")
+    demo = contact_demo(seed, episode)
+    rows = slice(0, frames * stride, stride)
+    tees = [pusht.tee_places(state[2:5]) for state in demo.states[rows]]
+    disc = demo.observations["agent_pos"][rows, None] * pusht.PX
+    parts = np.concatenate([disc, np.stack(tees)], axis=1)
+    chunks = demo.actions[: frames * stride].reshape(frames, -1).astype(np.float32)
+    return TrueEpisode(demo.observations["image"][rows], chunks, parts, demo.states[rows], driven=1)
 
 
 def record_contact(part: Path, episodes: Iterable[int], seed: int) -> None:

@@ -1,10 +1,12 @@
 """What `hma bench holds` says of objects that stay, turn, melt, or lie elsewhere."""
 
+import h5py
 import numpy as np
 import pytest
 
 from hma_data.errors import UsageError
 from recipes.bench import holds
+from recipes.lab import pushes
 
 RED, BLUE, GREY = (200, 20, 20), (20, 20, 200), (230, 230, 230)
 SIDE, FRAMES = 64, 3
@@ -69,3 +71,25 @@ def test_what_melted_or_what_nobody_touched_is_told() -> None:
 def test_a_robot_without_a_simulator_is_named() -> None:
     with pytest.raises(UsageError, match="bridge: has no simulator in the laboratory"):
         holds.run({**holds.BENCH.defaults, "robots": "bridge"})
+
+
+def test_contact_episodes_are_those_of_the_recording_with_the_places_of_the_parts(tmp_path) -> None:
+    pushes.record_contact(tmp_path / "part.hdf5", range(1), seed=912)
+    episode = pushes.contact_episode(20, 2, seed=912, episode=0)
+    with h5py.File(tmp_path / "part.hdf5") as file:
+        demo = file["data/demo_0"]
+        np.testing.assert_array_equal(demo["obs/image"][:40:2], episode.pictures)
+        np.testing.assert_array_equal(demo["actions"][:40].reshape(20, 4), episode.chunks)
+    places = episode.parts.round().astype(int)
+    disc, tee = (
+        {tuple(frame[y, x]) for frame, (x, y) in zip(episode.pictures, places[:, part], strict=True)}
+        for part in (0, 1)
+    )
+    assert len(disc) == 1 and disc != tee
+
+
+def test_contact_is_of_one_robot_and_as_long_as_its_recording() -> None:
+    with pytest.raises(UsageError, match="driver=contact is of pusht_fast, not of arm1_02"):
+        holds.run(holds.BENCH.defaults | {"driver": "contact", "robots": "arm1_02"})
+    with pytest.raises(UsageError, match="has 50 frames an episode, not 51"):
+        pushes.contact_episode(51, 2, seed=0, episode=0)
