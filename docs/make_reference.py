@@ -232,7 +232,6 @@ _OBVIOUS = {
     "eps": "of AdamW",
     "weight_decay": "of AdamW",
     "seed": "of everything: order of the data, masks, new weights",
-    "precision": "of the network's products",
     "device": "`auto`, `cpu`, `mps`, `cuda` or `cuda:N`",
     "temperature": "τ of p ∝ n^(1/τ); 1 goes by size, larger is flatter",
     "draw": "the robot is drawn for each window, or for each batch",

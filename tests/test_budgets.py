@@ -40,7 +40,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_040, 14_400, 12),
     "hma_model/released": (830, 7_200, 4),
     "hma_model/synthetic": (1_210, 9_000, 5),
-    "hma_model/training": (3_440, 28_500, 18),
+    "hma_model/training": (3_520, 28_900, 18),
     "hma_model/worlds": (1_530, 11_500, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 61_700, 486_500

@@ -160,7 +160,9 @@ class Recipe(_Settings):
     self_forward_from: Steps = Field(0, description="first step with such windows, counted from 0")
 
     seed: Count = Field(42, ge=0, lt=2**63)
-    precision: Literal["fp32", "bf16"] = "fp32"
+    precision: Literal["auto", "fp32", "bf16"] = Field(
+        "auto", description="of the network's products; auto: bf16 where it is faster"
+    )
     device: str = Field("auto", pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")
     parallel: Literal["ddp", "fsdp"] = Field("ddp", description="with torchrun: how ranks hold the network")
     compile: bool = Field(False, description="torch.compile of the trunk's blocks")

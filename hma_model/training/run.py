@@ -18,7 +18,7 @@ from torch import Tensor
 from hma_data.errors import CheckpointError, RecipeError, TrainingError, UsageError
 from hma_data.loading.dataset import Batch, open_sets
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import remove_partial, to_json, write_atomic
+from hma_data.storage.files import read_json, remove_partial, to_json, write_atomic
 from hma_data.storage.paths import addressed, is_repository
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import Checkpoint, action_stats, training_checkpoints
@@ -43,7 +43,13 @@ from hma_model.training.resume import (
     seed_for,
     write_state,
 )
-from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment
+from hma_model.training.runtime import (
+    ENVIRONMENT,
+    RECIPE,
+    attention_form,
+    choose_precision,
+    environment,
+)
 from hma_model.training.scheduled_sampling import forwarded
 from hma_model.training.start import Start
 
@@ -68,9 +74,9 @@ class Run:
             raise RecipeError("recipe: freeze", fault, "name a trained checkpoint with start=…")
         if self.start and "frames" not in recipe.model_fields_set:
             recipe = recipe.model_copy(update={"frames": self.start.checkpoint.config.frames})
-        self.recipe = recipe
+        self.recipe = recipe = self._with_precision(recipe)
         if recipe.parallel == "fsdp" and self.ranks.size > 1:
-            require_shardable(recipe, self._config())
+            require_shardable(recipe, self._config(recipe))
         often = max(recipe.objectives, key=lambda name: recipe.objectives[name])
         self.objective = OBJECTIVES[often]  # whose loss the evaluations compute
         self.train_data = TrainData(recipe, self.sets, self.ranks)
@@ -91,13 +97,26 @@ class Run:
         self.notes: list[str] = []  # texts for the user that nobody has shown yet
         self._twin: HMA | None = None
 
-    def _config(self) -> HMAConfig:
+    def _with_precision(self, recipe: Recipe) -> Recipe:
+        """Return the recipe with its precision resolved; of a run that is resumed, recipe.json has it."""
+        config, written = self._config(recipe), self.out / RECIPE
+
+        def choose() -> tuple[str, str]:
+            begun = read_json(written).get("precision") if written.is_file() else None
+            return choose_precision(recipe, config, self.device, begun)
+
+        precision, reason = self.ranks.once(choose)
+        chosen = recipe.model_copy(update={"precision": precision})
+        self.arithmetic = f"precision {precision}: {reason}; {attention_form(chosen, config, self.device)}"
+        return chosen
+
+    def _config(self, recipe: Recipe) -> HMAConfig:
         if self.start:
-            return self.start.network(self.recipe)
-        return self.recipe.network(next(iter(self.sets.values())).spec)
+            return self.start.network(recipe)
+        return recipe.network(next(iter(self.sets.values())).spec)
 
     def _network(self) -> HMA:
-        model = HMA(self._config())
+        model = HMA(self._config(self.recipe))
         for name, shards in self.sets.items():
             space = ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name))
             waves = self.start.waves(shards.embodiment, self.recipe) if self.start else None
@@ -127,6 +146,7 @@ class Run:
     def note_settings(self) -> None:
         """Note what the user may not expect of the recipe and the data."""
         recipe = self.recipe
+        self.notes.insert(0, self.arithmetic)
         if missing := self.held_out.missing:
             self.notes.append(f"no validation windows of {recipe.frames} frames: {', '.join(missing)}")
         if recipe.warmup > recipe.steps:

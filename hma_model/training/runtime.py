@@ -20,9 +20,16 @@ import torch
 
 import hma_data
 from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
+from hma_model.config import HMAConfig
+from hma_model.generation.packed import has_bfloat16
+from hma_model.network.trunks.transformer import PRODUCT_KEYS
+from hma_model.training.recipe import Recipe
 
 RECIPE, ENVIRONMENT = "recipe.json", "environment.json"
 LOCK, START = ".lock", ".start"  # START: the checkpoint that the run starts from
+# A transformer's width and a U-Net's finest channels from which steps in bf16 are faster on a processor with
+# AVX512-BF16 (docs/results.md, Training). At width 64 a transformer's take as long.
+LEAST_WIDTH, LEAST_CHANNELS = 128, 32
 _NO_MEMORY = re.compile("out of memory|can't allocate memory|not enough memory|bad_alloc", re.IGNORECASE)
 
 
@@ -40,6 +47,56 @@ def choose_device(name: str) -> torch.device:
     if not there[device.type]:
         raise RecipeError("recipe: device", f"this machine has no {name}", "use device=auto or device=cpu")
     return device
+
+
+def choose_precision(
+    recipe: Recipe, config: HMAConfig, device: torch.device, begun: str | None = None
+) -> tuple[str, str]:
+    """Return the precision of a run's products, fp32 or bf16, and the reason in words.
+
+    Args:
+        recipe: whose `precision` may be auto.
+        config: of the network.
+        device: of the run.
+        begun: the precision with which the run began, if it is resumed.
+
+    Raises:
+        RecipeError: bf16 is asked for, and the device has no products of bfloat16.
+    """
+    cuda, auto = device.type == "cuda", recipe.precision == "auto"
+    processor = "GPU" if cuda else "processor"
+    if cuda:
+        there = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        there = device.type != "cpu" or has_bfloat16()
+    asked = begun if auto else recipe.precision
+    lacks = f"this {processor} has no products of bfloat16"
+    if asked == "bf16" and not there:
+        remedy = "resume it where it began" if auto else "use precision=auto, or fp32"
+        raise RecipeError("recipe: precision=bf16", lacks, remedy)
+    if asked:
+        return asked, "as the run began" if auto else "as the recipe says"
+    if not there:
+        return "fp32", lacks
+    if cuda:
+        return "bf16", f"this {processor} has products of bfloat16"
+    if device.type != "cpu" or recipe.compile:
+        return "fp32", f"bf16 was not measured {'compiled' if recipe.compile else f'on {device.type}'}"
+    size, least = config.width, LEAST_WIDTH
+    if config.trunk == "unet":
+        size, least = config.levels[0], LEAST_CHANNELS
+    if size < least:
+        return "fp32", f"a network of width {size} is no faster in bf16 on a CPU"
+    return "bf16", f"this {processor} has products of bfloat16, and width {size} is faster with them"
+
+
+def attention_form(recipe: Recipe, config: HMAConfig, device: torch.device) -> str:
+    """Return in words how a run computes attention (`hma_model.network.trunks.transformer.attend`)."""
+    if config.trunk == "unet":
+        return "no attention"
+    if device.type == "cpu" and recipe.precision == "bf16" and not recipe.compile:
+        return f"attention by products up to {PRODUCT_KEYS} keys, above by torch's float32 kernel"
+    return "attention by torch's fused kernels"
 
 
 def environment(device: torch.device) -> dict[str, Any]:

@@ -37,21 +37,38 @@ COMMON: dict[str, Any] = {
     "compile": False,
     "action_dims": 35,  # of a chunk
     "threads": 0,  # 0: torch's choice
+    "trunk": "transformer",  # transformer | unet (on raw-128 pixels in patches of 4, `kind` does not matter)
+    "levels": [48, 96, 192],  # of a U-Net
+    "grid": 0,  # side of the tokenizer's grid; 0: 16 of tokens, 32 of latents
     **NETWORK,
 }
 ATTENTION = ("attention", "flash", "fmha")  # in the names of operators and kernels
+UNET: dict[str, Any] = {  # as in recipes/train/unet_tiny.yaml
+    "grid": (128, 128),
+    "channels": 3,
+    "patch": 4,
+    "latent_scale": 1 / 255,
+    "training_pass": "pairs",
+    "whole_share": 1.0,
+    "video_loss": "regression",
+    "shared_modulation": True,
+    "copy_previous": True,
+    "motion_weight": 6.0,
+    "history_probability": 0.0,
+}
+TRUNKS, PRECISIONS = ("transformer", "unet"), ("fp32", "bf16")
 KINDS = {"both": ["discrete", "continuous"], "discrete": ["discrete"], "continuous": ["continuous"]}
 PRODUCTS = ("::mm", "addmm", "bmm", "gemm", "cutlass", "mkldnn")
 
 
 def check_settings(bench: str, settings: dict[str, Any], **allowed: tuple[Any, ...]) -> None:
     """Raise UsageError for a setting that is not allowed."""
-    allowed = {"kind": tuple(KINDS), "precision": ("fp32", "bf16"), **allowed}
+    allowed = {"kind": tuple(KINDS), "precision": PRECISIONS, **allowed}
     for key, value in settings.items():
         if value not in allowed.get(key, (value,)):
             names = ", ".join(str(one) for one in allowed[key] if one is not None)
             raise UsageError(f"bench {bench}", f"{key}={value} is not allowed", f"give one of {names}")
-        if type(value) is int and value < 1 and key != "threads":
+        if type(value) is int and value < 1 and key not in ("threads", "grid"):
             raise UsageError(f"bench {bench}", f"{key}={value} is not allowed", "give at least 1")
 
 
@@ -88,9 +105,13 @@ def make_model(settings: dict[str, Any], kind: str = "discrete") -> "HMA":
 
     set_threads(settings)
     torch.manual_seed(0)
-    grid = (32, 32) if kind == "continuous" else (16, 16)
     network = {key: settings[key] for key in NETWORK} | {"training_pass": settings.get("pass", "window")}
-    model = HMA(HMAConfig(kind=kind, frames=settings["window"], grid=grid, **network))
+    side = settings["grid"] or (32 if kind == "continuous" else 16)
+    network["grid"] = (side, side)
+    if settings["trunk"] == "unet":
+        kind = "continuous"
+        network |= {"trunk": "unet", "levels": tuple(settings["levels"]), **UNET}
+    model = HMA(HMAConfig(kind=kind, frames=settings["window"], **network))
     dims = settings["action_dims"]
     model.add_embodiment(ActionSpace(ROBOT, dims, 1, (0.0,) * dims, (1.0,) * dims, (True,) * dims))
     return model.to(choose_device(settings["device"]))
@@ -137,31 +158,85 @@ def memory(device: "torch.device") -> dict[str, float]:
 
 def train(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Return one result for each kind; raise UsageError for a wrong setting."""
-    check_settings("train", settings, **{"pass": ("window", "pairs")})
-    return [in_fresh_process(measure_steps, settings, kind) for kind in KINDS[settings["kind"]]]
+    allowed = {"pass": ("window", "pairs"), "precision": (*PRECISIONS, "both"), "trunk": TRUNKS}
+    check_settings("train", settings, **allowed)
+    kinds = ["continuous"] if settings["trunk"] == "unet" else KINDS[settings["kind"]]
+    return [row for kind in kinds for row in in_fresh_process(measure_steps, settings, kind)]
 
 
-def measure_steps(settings: dict[str, Any], kind: str) -> dict[str, Any]:
-    """Return the figures of one case of `train`."""
-    model = make_model(settings, kind).train()
-    model.trunk.checkpointing = settings["checkpointing"]
-    if settings["compile"]:
-        model.trunk.compile()
-    seconds = step_seconds(model, settings)
-    told = ("precision", "batch", "window", "pass", "optimizer", "compile", "checkpointing")
-    return {
-        "kind": kind,
-        "device": device_name(model.device),
-        **{key: settings[key] for key in told},
-        "seconds_per_step": round(min(seconds), 4),
-        "median_seconds_per_step": round(median(seconds), 4),
-        "windows_per_second": round(settings["batch"] / min(seconds), 4),
-        **_shares(model, settings),
-        **memory(model.device),
-    }
+def measure_steps(settings: dict[str, Any], kind: str) -> list[dict[str, Any]]:
+    """Return the figures of one case of `train`; of both precisions, their steps alternate."""
+    precisions = PRECISIONS if settings["precision"] == "both" else (settings["precision"],)
+    ways = list[Steps]()
+    for precision in precisions:
+        model = make_model(settings, kind).train()
+        model.trunk.checkpointing = settings["checkpointing"]
+        if settings["compile"]:
+            model.trunk.compile()
+        ways.append(Steps(model, settings | {"precision": precision}))
+    for _ in range(1 + settings["steps"]):
+        for steps in ways:
+            steps.once()
+    return [{"kind": kind, **steps.figures()} for steps in ways]
 
 
-def _shares(model: "HMA", settings: dict[str, Any]) -> dict[str, float]:
+def step_seconds(model: "HMA", settings: dict[str, Any]) -> list[float]:
+    """Return the seconds of each measured training step."""
+    steps = Steps(model, settings)
+    for _ in range(1 + settings["steps"]):
+        steps.once()
+    return steps.seconds[1:]
+
+
+class Steps:
+    """Training steps of one model in one precision; the first is a warm-up."""
+
+    def __init__(self, model: "HMA", settings: dict[str, Any]) -> None:
+        import torch
+
+        self.model, self.settings = model, settings
+        fused = model.device.type == "cuda"
+        adamw = torch.optim.AdamW(model.parameters(), lr=1e-4, fused=fused)
+        self.optimizer = adamw if settings["optimizer"] else None
+        self.generator = torch.Generator().manual_seed(0)
+        self.seconds, self.cpu_seconds = list[float](), list[float]()
+
+    def once(self) -> None:
+        """Make one step, and keep its time."""
+        import torch
+
+        model, half = self.model, self.settings["precision"] == "bf16"
+        batch = _windows(model, self.settings, self.generator)
+        finish(model.device)
+        began, cpu_began = time.perf_counter(), time.process_time()
+        with torch.autocast(model.device.type, torch.bfloat16, enabled=half):
+            loss = model(batch, generator=self.generator).loss
+        loss.backward()
+        if self.optimizer is not None:
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+            self.optimizer.step()
+        model.zero_grad()
+        finish(model.device)
+        self.seconds.append(time.perf_counter() - began)
+        self.cpu_seconds.append(time.process_time() - cpu_began)
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of all steps after the warm-up."""
+        settings, seconds = self.settings, self.seconds[1:]
+        told = ("trunk", "precision", "batch", "window", "pass", "optimizer", "compile", "checkpointing")
+        return {
+            "device": device_name(self.model.device),
+            **{key: settings[key] for key in told},
+            "seconds_per_step": round(min(seconds), 4),
+            "median_seconds_per_step": round(median(seconds), 4),
+            "cpu_seconds_per_step": round(min(self.cpu_seconds[1:]), 4),
+            "windows_per_second": round(settings["batch"] / min(seconds), 4),
+            **_shares(self),
+            **memory(self.model.device),
+        }
+
+
+def _shares(steps: Steps) -> dict[str, float]:
     """Return the shares of a step's time in matrix products, in attention, and in everything else.
 
     They are the profiler's self times of operators, on a GPU those of kernels.
@@ -169,10 +244,10 @@ def _shares(model: "HMA", settings: dict[str, Any]) -> dict[str, float]:
     from torch.profiler import ProfilerActivity, profile
 
     os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # it calls a machine without a GPU an error
-    cuda = model.device.type == "cuda"
+    cuda = steps.model.device.type == "cuda"
     device = ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU
     with profile(activities=[device], acc_events=True) as found:
-        step_seconds(model, {**settings, "steps": 0})
+        steps.once()
     spent = {"products": 0.0, "attention": 0.0, "other": 0.0}
     for one in found.key_averages():
         name = one.key.lower()
@@ -181,30 +256,6 @@ def _shares(model: "HMA", settings: dict[str, Any]) -> dict[str, float]:
             kind = "products"
         spent[kind] += one.self_device_time_total if cuda else one.self_cpu_time_total
     return {f"share_of_{kind}": round(time / sum(spent.values()), 3) for kind, time in spent.items()}
-
-
-def step_seconds(model: "HMA", settings: dict[str, Any]) -> list[float]:
-    """Return the seconds of each measured training step."""
-    import torch
-
-    fused = model.device.type == "cuda"
-    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, fused=fused) if settings["optimizer"] else None
-    generator = torch.Generator().manual_seed(0)
-    seconds = []
-    for _ in range(1 + settings["steps"]):
-        batch = _windows(model, settings, generator)
-        finish(model.device)
-        began = time.perf_counter()
-        with torch.autocast(model.device.type, torch.bfloat16, enabled=settings["precision"] == "bf16"):
-            loss = model(batch, generator=generator).loss
-        loss.backward()
-        if optimizer is not None:
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-            optimizer.step()
-        model.zero_grad()
-        finish(model.device)
-        seconds.append(time.perf_counter() - began)
-    return seconds[1:]
 
 
 def _windows(model: "HMA", settings: dict[str, Any], generator: "torch.Generator") -> "Batch":
@@ -230,7 +281,7 @@ TRAIN = Bench(
     "seconds and memory of a training step",
     {
         "kind": "discrete",
-        **COMMON,
+        **COMMON,  # precision may also be both, whose steps alternate
         "steps": 3,  # measured, after a warm-up
         "batch": 2,
         "pass": "window",  # window | pairs, see HMAConfig.training_pass

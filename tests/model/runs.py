@@ -15,6 +15,7 @@ TINY = {
     "frames": 4, "batch_size": 4, "model": {"layers": 1, "width": 16, "heads": 2}, "device": "cpu",
     "steps": 6, "lr": 3e-3, "warmup": 2, "schedule": "cosine", "eval_every": 3, "eval_windows": 6,
     "checkpoint_every": 2, "report": False, "pictures": 0, "track": [],
+    "precision": "fp32",
 }  # fmt: skip
 
 

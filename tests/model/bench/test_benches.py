@@ -133,9 +133,16 @@ def test_viewers_of_the_page_get_frames_under_their_commands() -> None:
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
 @pytest.mark.parametrize("changes", [{}, {"checkpointing": True, "optimizer": False, "precision": "bf16"}])
 def test_a_training_step_is_measured(kind: str, changes: dict[str, Any]) -> None:
-    result = speed.measure_steps(speed.TRAIN.defaults | SMALL | {"steps": 1} | changes, kind)
+    (result,) = speed.measure_steps(speed.TRAIN.defaults | SMALL | {"steps": 1} | changes, kind)
     assert result["windows_per_second"] == pytest.approx(2 / result["seconds_per_step"], rel=0.05)
     assert result["kind"] == kind
+
+
+def test_steps_of_both_precisions_and_of_a_unet_are_measured() -> None:
+    small = SMALL | {"steps": 1, "trunk": "unet", "levels": [8, 16], "precision": "both"}
+    results = speed.measure_steps(speed.TRAIN.defaults | small, "continuous")
+    assert [(one["trunk"], one["precision"]) for one in results] == [("unet", "fp32"), ("unet", "bf16")]
+    assert all(one["cpu_seconds_per_step"] > 0 for one in results)
 
 
 def test_ways_of_waiting_are_measured_each_in_its_own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
