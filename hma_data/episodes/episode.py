@@ -15,7 +15,7 @@ from hma_data.errors import EpisodeError
 
 Floats = NDArray[np.float64]
 Known = NDArray[np.bool_] | None
-Decode = Callable[[int], NDArray[np.uint8]]  # index -> (H, W, 3) RGB
+Decode = Callable[..., NDArray[np.uint8]]  # index -> (H, W, 3) RGB
 
 
 class Stream(Protocol):
@@ -32,8 +32,11 @@ class Stream(Protocol):
 class OneByOne(Protocol):
     """A Stream that can give its pictures one by one, so that large ones are not in memory together."""
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
-        """Yield (H, W, 3) RGB of each of those indices in order; each is valid until the next request."""
+    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[NDArray[np.uint8]]:
+        """Yield (H, W, 3) RGB of each of those indices in order; each is valid until the next request.
+
+        With `least`, JPEG is decoded at a reduced size, as `hma_data.episodes.images.decode_image` does.
+        """
         ...
 
 
@@ -149,11 +152,12 @@ class Pictures:
     Args:
         timestamps: (T,) seconds.
         decode: index -> (H, W, 3) uint8 RGB.
+        reduces: whether `decode` takes `least` too, as `OneByOne.each` does.
     """
 
-    def __init__(self, timestamps: Floats, decode: Decode) -> None:
+    def __init__(self, timestamps: Floats, decode: Decode, reduces: bool = False) -> None:
         self.timestamps = timestamps
-        self._decode = decode
+        self._decode, self._reduces = decode, reduces
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return pictures by index; see Stream."""
@@ -172,9 +176,10 @@ class Pictures:
             pictures[i] = picture
         return pictures
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
+    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[NDArray[np.uint8]]:
         """Yield pictures one by one; see OneByOne."""
-        return (self._decode(int(index)) for index in indices)
+        more = (least,) if self._reduces else ()
+        return (self._decode(int(index), *more) for index in indices)
 
 
 def rate_times(length: int, hz: float) -> Floats:

@@ -16,7 +16,9 @@ from hma_data.errors import EpisodeError, MissingDependencyError
 from hma_data.registry.components import Camera, Quality
 
 Images = NDArray[np.uint8]
-Filter = Literal["area", "linear"]
+Filter = Literal["area", "linear", "antialias"]
+_REDUCED = ((8, 64), (4, 32), (2, 16))  # share of a JPEG's sides, and the flag of cv2.IMREAD_REDUCED_*
+BATCH = 16  # pictures that `antialias` resizes in one call
 MAX_PIXELS = 64_000_000  # a picture that claims more is a decompression bomb or an error
 FINE_BLOCKS, COARSE_BLOCKS = (16, 16), (8, 8)  # blocks
 BLANK_LEVELS = 8  # levels from the darkest to the brightest coarse block: 3 % of full scale
@@ -36,14 +38,20 @@ def opencv() -> Any:
     return cv2
 
 
-def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
-    """Decode a JPEG, PNG or other still picture to (H, W, 3) RGB."""
+def decode_image(data: bytes | NDArray[np.uint8], where: str, least: int = 0) -> Images:
+    """Decode a JPEG, PNG or other still picture to (H, W, 3) RGB.
+
+    With `least`, a JPEG is decoded at 1/8, 1/4 or 1/2 of its size, the smallest with so many pixels a side.
+    """
     cv2 = opencv()
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
     head = buffer[:26].tobytes()
     if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:] in (b"\x10\0", b"\x10\4"):
         raise EpisodeError(where, "a picture has 16 bits of grey: depth, not colour", "name another camera")
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+    if least and head[:2] == b"\xff\xd8":
+        side = _short_side(memoryview(buffer))
+        flags |= next((flag for share, flag in _REDUCED if side >= share * least), 0)
     fault = ""
     try:
         picture = cv2.imdecode(buffer, flags) if len(buffer) else None
@@ -52,6 +60,17 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
     if picture is None:
         raise EpisodeError(where, f"a picture of {len(buffer)} bytes cannot be decoded{fault}")
     return picture
+
+
+def _short_side(jpeg: memoryview) -> int:
+    """Return the pixels of a JPEG's short side, as its frame header states; 0 where there is none."""
+    at = 2
+    while at + 9 <= len(jpeg) and jpeg[at] == 0xFF:
+        marker = jpeg[at + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            return min(int.from_bytes(jpeg[at + 5 : at + 7]), int.from_bytes(jpeg[at + 7 : at + 9]))
+        at += 1 if marker == 0xFF else 2 + int.from_bytes(jpeg[at + 2 : at + 4])
+    return 0
 
 
 class FrameToRGB:
@@ -134,7 +153,9 @@ def prepared(
         return prepare(stream.frames(indices), camera, size, resize_filter)
     distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
     squares = np.empty((len(distinct), size, size, 3), np.uint8)
-    for i, picture in enumerate(stream.each(distinct)):
+    # A crop counts the pixels of the whole picture.
+    reduces = resize_filter == "antialias" and not camera.crop
+    for i, picture in enumerate(stream.each(distinct, size) if reduces else stream.each(distinct)):
         prepare(picture[None], camera, size, resize_filter, squares[i : i + 1])
     return squares if np.array_equal(inverse, np.arange(len(squares))) else squares[inverse]
 
@@ -151,7 +172,8 @@ def resize(
     Args:
         rule: short_side_crop (short side to `size`, centre crop), letterbox (long
             side to `size`, black borders) or stretch.
-        resize_filter: area averages when shrinking and is linear when enlarging; linear is always linear.
+        resize_filter: area averages when shrinking and is linear when enlarging; linear is always linear;
+            antialias is linear, and when shrinking its triangle is as much wider (docs/format.md).
         out: (N, size, size, 3) to write the result to; new memory by default.
     """
     cv2 = opencv()
@@ -172,19 +194,32 @@ def resize(
         inner_h, inner_w = max(1, round(height * scale)), max(1, round(width * scale))
     else:
         inner_h = inner_w = size
-    shrinks = inner_h < height or inner_w < width
-    interpolation = cv2.INTER_AREA if resize_filter == "area" and shrinks else cv2.INTER_LINEAR
     if (inner_h, inner_w) != (size, size):
         out[:] = 0
     top, left = (size - inner_h) // 2, (size - inner_w) // 2
-    for frame, square in zip(frames, out):
-        inner = square[top : top + inner_h, left : left + inner_w]
+    inner = out[:, top : top + inner_h, left : left + inner_w]
+    if resize_filter == "antialias":
+        _resize_antialiased(frames, inner)
+        return out
+    shrinks = inner_h < height or inner_w < width
+    interpolation = cv2.INTER_AREA if resize_filter == "area" and shrinks else cv2.INTER_LINEAR
+    for frame, square in zip(frames, inner):
         # OpenCV takes gaps between rows, but not between pixels or backwards.
         rows, *pixel = frame.strides
         if rows <= 0 or pixel != [3, 1]:
             frame = np.ascontiguousarray(frame)
-        cv2.resize(frame, (inner_w, inner_h), dst=inner, interpolation=interpolation)
+        cv2.resize(frame, (inner_w, inner_h), dst=square, interpolation=interpolation)
     return out
+
+
+def _resize_antialiased(frames: Images, out: Images) -> None:
+    """Resize pictures (N, H, W, 3) into (N, h, w, 3) by torch's antialiased bilinear filter for bytes."""
+    import torch  # here, because only a tokenizer asks for this filter
+
+    for start in range(0, len(frames), BATCH):
+        some = torch.from_numpy(np.ascontiguousarray(frames[start : start + BATCH])).permute(0, 3, 1, 2)
+        made = torch.nn.functional.interpolate(some, out.shape[1:3], mode="bilinear", antialias=True)
+        out[start : start + BATCH] = made.permute(0, 2, 3, 1).numpy()
 
 
 def describe_resize(camera: Camera, height: int, width: int, size: int) -> str:

@@ -35,7 +35,7 @@ from hma_data.shards.windows import WINDOW, WindowIndex
 from hma_data.sources.common.choice import chosen_ids
 from hma_data.sources.common.survey import sampled
 from hma_data.storage.paths import StrPath, as_path
-from hma_data.tokenizers.base import Tokenizer, get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, full_name, get_tokenizer
 
 THUMB_SIDE, FILM_SIDE = 144, 256  # pixels of an image in the sheet and in the video
 FRAMES_DECODED = 16  # frames decoded at a time
@@ -137,7 +137,7 @@ def tokenizer_of(shards: ShardSet, weights: StrPath | None = None, device: str =
     Raises:
         TokenizerError: the tokenizer on this machine would give other tokens.
     """
-    tokenizer = get_tokenizer(shards.spec.name, weights=weights, device=device)
+    tokenizer = get_tokenizer(full_name(shards.spec.to_json()), weights=weights, device=device)
     if tokenizer.spec != shards.spec:
         made, here = shards.spec.weights_sha256[:12], tokenizer.spec.weights_sha256[:12]
         fault = f"was made by {shards.spec.name} with weights {made}, and the weights here are {here}"

@@ -7,13 +7,16 @@ A module of this package makes one tokenizer or a family; `get_tokenizer` import
 import hashlib
 import json
 import math
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.episodes.images import Filter
 from hma_data.errors import MissingDependencyError, TokenizerError
 from hma_data.plugins import TOKENIZER_GROUP, installed
 from hma_data.storage.paths import StrPath, as_text
@@ -53,7 +56,7 @@ class TokenizerSpec:
     channels: int | None = None
     latent_scale: float = 1.0
     dtype: str = "uint32"
-    resize_filter: Literal["area", "linear"] = "area"
+    resize_filter: Filter = "area"
     weights_sha256: str = ""
 
     @classmethod
@@ -116,7 +119,7 @@ def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, devi
     """Return the tokenizer of that name, ready to use: `load` of its module makes it.
 
     Args:
-        name_or_path: a name of `hma tokenizer list`.
+        name_or_path: a name of `hma tokenizer list`; `NAME:FILTER` gives its spec another `resize_filter`.
         weights: str or path of a file (or folder) to take the weights from instead of the usual place, or
             `hf://[datasets/]ORGANISATION/NAME[@REVISION]/FILE`.
         device: device that runs the network: cpu, cuda, mps.
@@ -129,10 +132,25 @@ def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, devi
     name, given = as_text(name_or_path), None if weights is None else as_text(weights)
     entry = usable_entry(name)
     keywords = {"weights": given, "device": device, **entry.arguments}
-    if name not in CATALOG:
-        return _of_package(entry, keywords)
-    tokenizer: Tokenizer = import_module(entry.module).load(name, **keywords)
+    if entry.name in CATALOG:
+        tokenizer: Tokenizer = import_module(entry.module).load(entry.name, **keywords)
+    else:
+        tokenizer = _of_package(entry, keywords)
+    spec = filtered(tokenizer.spec, name)
+    if spec != tokenizer.spec:  # the filter is applied before `encode`, so only the spec states it
+        tokenizer = copy(tokenizer)
+        tokenizer.spec = spec
     return tokenizer
+
+
+def filtered(spec: TokenizerSpec, name: str) -> TokenizerSpec:
+    """Return the spec with the filter in which a tokenizer's name ends, if it ends in one."""
+    return replace(spec, resize_filter=cast(Filter, name.partition(":")[2] or spec.resize_filter))
+
+
+def full_name(spec: Mapping[str, Any]) -> str:
+    """Return the name, with its filter, by which `get_tokenizer` makes the tokenizer of a spec's values."""
+    return f"{spec['name']}:{spec.get('resize_filter', 'area')}"
 
 
 def usable_entry(name: str) -> Entry:

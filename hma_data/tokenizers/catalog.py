@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
+from hma_data.episodes.images import Filter
 from hma_data.errors import PluginError, TokenizerError, install_command
 from hma_data.plugins import TOKENIZER_GROUP, Plugin, installed
 from hma_data.storage.files import file_sha256
@@ -204,10 +205,16 @@ def other_weights(spec: Mapping[str, Any]) -> str:
 def find_entry(name: str) -> Entry:
     """Return the tokenizer of that name: built in, or of an installed package.
 
+    The name may end in a filter for resizing, as in `raw-128:antialias`.
+
     Raises:
-        TokenizerError: there is none.
+        TokenizerError: there is no such tokenizer, or no such filter.
         PluginError: the package that adds it is broken.
     """
+    name, chosen, resize_filter = name.partition(":")
+    if chosen and resize_filter not in get_args(Filter):
+        known = " or ".join(f"{name}:{one}" for one in get_args(Filter))
+        raise TokenizerError(name, f"has no filter {resize_filter!r} for resizing", f"write {known}")
     if name in CATALOG:
         return CATALOG[name]
     plugin = installed(TOKENIZER_GROUP).get(name)

@@ -19,7 +19,7 @@ from hma_data.errors import TokenizerError
 from hma_data.storage.files import file_sha256
 from hma_data.storage.kinds import unreadable
 from hma_data.storage.paths import StrPath, as_text
-from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer, usable_entry
+from hma_data.tokenizers.base import TokenizerSpec, filtered, get_tokenizer, usable_entry
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 
 VERSION = 1
@@ -147,7 +147,7 @@ def get_spec(name_or_path: StrPath, *, weights: StrPath | None = None) -> Tokeni
     if entry.weights == "embedded" and weights is None and entry.name in CATALOG:
         kind: type[FsqConfig | VaeConfig] = FsqConfig if entry.name.startswith("fsq") else VaeConfig
         shape, sha256 = read_shape(EMBEDDED / entry.file, kind.format, kind)
-        return shape.spec(entry.name, entry.image_size, sha256)
+        return filtered(shape.spec(entry.name, entry.image_size, sha256), as_text(name_or_path))
     if "torch" in entry.imports and "torch" not in sys.modules:
         with suppress(BrokenProcessPool), ProcessPoolExecutor(1, get_context("spawn")) as apart:
             return apart.submit(_open_spec, name_or_path, weights).result()

@@ -278,6 +278,9 @@ def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -
         if "name" in differing:
             raise CheckpointError(where, fault, f"convert the recordings with --tokenizer {name}")
         fault = f"{fault}: {key} is {ours.get(key)!r} there and {theirs.get(key)!r} here"
+        if differing == ["resize_filter"]:
+            remedy = f"convert the recordings with --tokenizer {name}:{ours.get(key)}"
+            raise CheckpointError(where, fault, remedy)
         raise CheckpointError(where, fault, f"use the tokenizer described in its {CONFIG}")
 
 

@@ -65,9 +65,9 @@ def play(
 
     @cache
     def tokenizer() -> Any:
-        from hma_data.tokenizers.base import get_tokenizer
+        from hma_data.tokenizers.base import full_name, get_tokenizer
 
-        return get_tokenizer(opened.config.tokenizer["name"], device=device)
+        return get_tokenizer(full_name(opened.config.tokenizer), device=device)
 
     sets = sets or trained_on(opened)
     robots = drivable(opened, sets, tokenizer, images)

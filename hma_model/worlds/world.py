@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hma_data.errors import HMAError
 from hma_data.storage.paths import StrPath
-from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.base import full_name, get_tokenizer
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import POLICY
 from hma_model.generation.commands import Commands, described
@@ -349,4 +349,4 @@ def load_world(checkpoint: StrPath = "embedded", *, device: str = "cpu", **setti
     from hma_model.network.model import HMA
 
     model = HMA.from_pretrained(checkpoint, device=device)
-    return World(model, get_tokenizer(model.config.tokenizer["name"], device=device), **settings)
+    return World(model, get_tokenizer(full_name(model.config.tokenizer), device=device), **settings)

@@ -19,17 +19,18 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from threading import Barrier
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.cpu import usable_cores
-from hma_data.episodes.images import Images
+from hma_data.episodes.images import Filter, Images
 from hma_data.errors import HMAError, UsageError
 from hma_data.registry.embodiment import Embodiment
 from recipes.bench.harness import Bench, make_robot, peak_rss_mib
@@ -101,15 +102,19 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
         with tempfile.TemporaryDirectory(prefix="hma-bench-") as folder:
             uri = CASES[name].write(Path(folder), episodes, length, settings["seed"])
             size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
-            for processes in dict.fromkeys((1, min(usable_cores(), episodes))):
-                about = {"format": name, "processes": processes}
-                figures = measure(name, str(uri), processes)
+            readers = ["hma", "pyav"] if settings["peer"] and CASES[name].format == "lerobot" else ["hma"]
+            counts = dict.fromkeys((1, min(usable_cores(), episodes)))
+            for processes, resize, reader in product(counts, settings["filters"], readers):
+                about = {"format": name, "reader": reader, "filter": resize, "processes": processes}
+                figures = measure(name, str(uri), processes, resize, reader)
                 figures["recorded_bytes_per_frame"] = round(size / (episodes * length))
                 results.append(about | figures)
     return results
 
 
-def measure(name: str, uri: str, processes: int) -> dict[str, Any]:
+def measure(
+    name: str, uri: str, processes: int, resize: Filter = "area", reader: str = "hma"
+) -> dict[str, Any]:
     """Return frames per second of wall time and of CPU time, and the most memory that one process held.
 
     Every process opens the source for itself and takes its episodes: read, align, decode, resize.
@@ -118,7 +123,9 @@ def measure(name: str, uri: str, processes: int) -> dict[str, Any]:
     context = get_context("spawn")
     with context.Manager() as manager, ProcessPoolExecutor(processes, context) as pool:
         start = manager.Barrier(processes)  # each process waits for the others, so that none takes two tasks
-        jobs = [pool.submit(_work, name, uri, share, processes, start) for share in range(processes)]
+        work = _work_plainly if reader == "pyav" else _work
+        shares = range(processes)
+        jobs = [pool.submit(work, name, uri, share, processes, start, resize) for share in shares]
         found = [job.result() for job in jobs]
     frames = sum(one["frames"] for one in found)
     wall = max(one["stop"] for one in found) - min(one["start"] for one in found)
@@ -130,27 +137,57 @@ def measure(name: str, uri: str, processes: int) -> dict[str, Any]:
     }
 
 
-def _work(name: str, uri: str, share: int, shares: int, start: Barrier) -> dict[str, Any]:
+def _one_thread() -> None:
+    import torch
+
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+
+
+def _work_plainly(
+    name: str, uri: str, share: int, shares: int, start: Barrier, resize: Filter
+) -> dict[str, Any]:
+    """Do as `_work` in the loop that one writes first: every frame of a video to RGB, cropped, resized."""
+    import av
+
+    from hma_data.episodes.images import resize as resized
+
+    _one_thread()
+    paths = sorted(Path(uri).rglob("*.mp4"))[share::shares]
+    resized(np.zeros((1, *VGA, 3), np.uint8), SIZE, resize_filter=resize)
+    start.wait(DEADLINE_S)
+    began, cpu, frames = time.monotonic(), time.process_time(), 0
+    for path in paths:
+        with av.open(str(path)) as container:
+            container.streams.video[0].codec_context.thread_count = 1
+            for frame in container.decode(video=0):
+                resized(frame.to_ndarray(format="rgb24")[None], SIZE, resize_filter=resize)
+                frames += 1
+    stop, used = time.monotonic(), time.process_time() - cpu
+    return {"frames": frames, "start": began, "stop": stop, "cpu": used, "peak_rss_mib": peak_rss_mib()}
+
+
+def _work(name: str, uri: str, share: int, shares: int, start: Barrier, resize: Filter) -> dict[str, Any]:
     """Read every `shares`th episode from the `share`th on, and return the figures."""
     from hma_data.sources.base import open_source
 
-    cv2.setNumThreads(1)
+    _one_thread()
     robot = CASES[name].embodiment()
     try:
         source = open_source(robot.source.format)
         names = [ref.id for ref in source.index(uri, robot)]
-        _episode(source, uri, names[share % len(names)], robot, limit=1)
+        _episode(source, uri, names[share % len(names)], robot, resize, limit=1)
     except HMAError:
         start.abort()  # the others need not wait
         raise
     start.wait(DEADLINE_S)
     began, cpu = time.monotonic(), time.process_time()
-    frames = sum(_episode(source, uri, one, robot) for one in names[share::shares])
+    frames = sum(_episode(source, uri, one, robot, resize) for one in names[share::shares])
     stop, used = time.monotonic(), time.process_time() - cpu
     return {"frames": frames, "start": began, "stop": stop, "cpu": used, "peak_rss_mib": peak_rss_mib()}
 
 
-def _episode(source: Any, uri: str, name: str, robot: Any, limit: int | None = None) -> int:
+def _episode(source: Any, uri: str, name: str, robot: Any, resize: Filter, limit: int | None = None) -> int:
     """Bring one episode to pictures of the tokenizer's size; return the number of frames."""
     from hma_data.episodes.align import to_clip
     from hma_data.episodes.images import prepared
@@ -160,7 +197,7 @@ def _episode(source: Any, uri: str, name: str, robot: Any, limit: int | None = N
     camera = robot.primary_camera
     for at in range(0, len(grid), BATCH):
         indices = clip.frame_indices[camera.name][grid[at : at + BATCH]]
-        prepared(clip.episode.streams[camera.name], indices, camera, SIZE)
+        prepared(clip.episode.streams[camera.name], indices, camera, SIZE, resize)
     return len(grid)
 
 
@@ -291,8 +328,16 @@ CASES = {
 
 BENCH = Bench(
     "recordings of every robot format to 256×256 RGB, with one process and with all cores",
-    {"formats": ["all"], "frames": 600, "episodes": 6, "seed": 0},
+    {
+        "formats": ["all"],
+        "filters": ["area"],
+        "peer": False,  # of video also a plain loop of PyAV, with the same filter
+        "frames": 600,
+        "episodes": 6,
+        "seed": 0,
+    },
     run,
+    choices={"filters": get_args(Filter)},
 )
 
 

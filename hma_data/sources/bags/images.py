@@ -118,11 +118,12 @@ def encoding(message: Any, kind: str) -> str:
     return before if separator else ""
 
 
-def picture(message: Any, kind: str, where: str, levels: Levels | None = None) -> Images:
+def picture(message: Any, kind: str, where: str, levels: Levels | None = None, least: int = 0) -> Images:
     """Return a raw or still image as (H, W, 3) RGB.
 
     Args:
         levels: the values of 16-bit grey that become 0 and 255.
+        least: as in `decode_image`.
 
     Raises:
         EpisodeError: it is not colour or grey of 8 bits, its sizes do not fit, or its bytes are no image;
@@ -141,7 +142,7 @@ def picture(message: Any, kind: str, where: str, levels: Levels | None = None) -
             return _raw(message, where)
         if pattern := _mosaic(message):
             return _demosaiced(payload(message), pattern, where)
-        return decode_image(payload(message), where)
+        return decode_image(payload(message), where, least)
     except (KeyError, TypeError, ValueError) as fault:
         raise EpisodeError(where, f"a message is not an image: {fault!r}") from fault
 
@@ -516,10 +517,10 @@ class StillStream:
         stacked = _stack(self.each(distinct), len(distinct))
         return stacked if np.array_equal(inverse, np.arange(len(stacked))) else stacked[inverse]
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[Images]:
+    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""
         where, read = self._messages.where, self._messages.read(indices)
-        return _of_one_size((picture(m, self._kind, where, self._levels) for m in read), where)
+        return _of_one_size((picture(m, self._kind, where, self._levels, least) for m in read), where)
 
 
 class VideoStream:

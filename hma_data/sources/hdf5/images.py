@@ -152,7 +152,7 @@ class ImageRows:
         if self._kind == "raw":
             axes_of(found.shape, layout, self._where)
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Images | list[Images]:
+    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Images | list[Images]:
         """Return the images of those frames, which may differ in size where each is encoded."""
         with explained(self._place):
             group = self._finder.group(self._place)
@@ -162,7 +162,7 @@ class ImageRows:
                 as_bytes(found, self._layout, self._where), axes_of(found.shape, self._layout, self._where)
             )
         return [
-            decode_image(encoded(row), f"{self._where}[{index}]")
+            decode_image(encoded(row), f"{self._where}[{index}]", least)
             for row, index in zip(found, indices, strict=True)
         ]
 

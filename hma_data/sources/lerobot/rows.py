@@ -3,7 +3,7 @@
 T rows of an episode.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -212,10 +212,18 @@ class StillImages:
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
         """See Stream."""
-        images = [decode_image(self._bytes(int(index)), self._where(int(index))) for index in indices]
-        if len({image.shape for image in images}) > 1:
-            raise EpisodeError(self._rows.path, f"{self._key!r} has images of several sizes")
+        images = list(self.each(indices))
         return np.stack(images) if images else np.zeros((0, 1, 1, 3), np.uint8)
+
+    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
+        """See episode.OneByOne."""
+        shape: tuple[int, ...] = ()
+        for index in map(int, indices):
+            image = decode_image(self._bytes(index), self._where(index), least)
+            if shape and image.shape != shape:
+                raise EpisodeError(self._rows.path, f"{self._key!r} has images of several sizes")
+            shape = image.shape
+            yield image
 
     def codec(self) -> str | None:
         """Return png or jpeg, from the first image; None for anything else."""

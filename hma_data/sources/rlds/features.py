@@ -186,11 +186,13 @@ class Steps:
         feature, where = self.features[key], f"{self.name}: {key}"
         if feature.kind == "number" and (feature.encoding == "none" or feature.shape.count(None) > 1):
             whole = cache(lambda: self.numbers(key))  # decoded when the first image is asked for
-            return lambda index: whole()[index]
+            return lambda index, least=0: whole()[index]
         blobs = self.blobs(key)
         if feature.kind == "number":
-            return lambda index: _tensor_of(blobs[index], feature, feature.shape, self.name)
-        return lambda index: decode_image(np.frombuffer(blobs[index], np.uint8), f"{where}, step {index}")
+            return lambda index, least=0: _tensor_of(blobs[index], feature, feature.shape, self.name)
+        return lambda index, least=0: decode_image(
+            np.frombuffer(blobs[index], np.uint8), f"{where}, step {index}", least
+        )
 
     def _rows(self, feature: RldsFeature) -> int | None:
         """Return the number of steps of a feature, if it can be known without the other features."""

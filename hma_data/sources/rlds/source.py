@@ -97,7 +97,7 @@ class RldsSource:
         cameras = {camera.name: steps.decoder(camera.key) for camera in embodiment.cameras}
         return Episode(
             id=episode_id,
-            streams={name: Pictures(times, decode) for name, decode in cameras.items()},
+            streams={name: Pictures(times, decode, reduces=True) for name, decode in cameras.items()},
             actions=_signals(steps, embodiment.action, times),
             states=_signals(steps, embodiment.state, times),
             instruction=_instruction(folder, steps, embodiment.source.instruction),

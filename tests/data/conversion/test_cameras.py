@@ -11,16 +11,17 @@ import pyarrow.parquet as pq
 import pytest
 
 from hma_data.conversion.job import convert
-from hma_data.conversion.plan import Settings
-from hma_data.episodes.images import describe_resize
+from hma_data.conversion.plan import Settings, read_clip
+from hma_data.episodes.images import describe_resize, prepare
 from hma_data.errors import RegistryError
 from hma_data.registry.components import Camera
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.memmap import export
-from hma_data.shards.preview import preview
+from hma_data.shards.preview import preview, tokenizer_of
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import read_footer
 from hma_data.shards.verify import verify
+from hma_data.sources.base import open_source
 from tests.command import hma
 from tests.conftest import BlockTokenizer, write_toy
 from tests.data.cameras import LENGTHS, SIZES, arm, write_dataset, write_hdf5
@@ -64,6 +65,20 @@ def test_each_camera_is_a_column_of_what_it_would_be_alone(made, recording, tmp_
         for ours, theirs in zip(frames(made, camera), frames(alone, camera), strict=True):
             np.testing.assert_array_equal(ours, theirs)
         assert ShardSet(alone).manifest.stats == shards.manifest.stats  # actions count once
+
+
+def test_a_set_of_another_filter_holds_its_pictures_and_opens_with_it(recording, tmp_path) -> None:
+    out, settings = tmp_path / "set", Settings(cameras=("wrist",))
+    convert(arm(), recording, "raw-64:antialias", out, settings=settings, workers=0)
+    assert verify(out) == []
+    shards = ShardSet(out)
+    assert tokenizer_of(shards).spec == shards.spec and shards.spec.resize_filter == "antialias"
+    row = shards.episodes.to_pylist()[0]
+    clip = read_clip(open_source("hdf5"), str(recording), row["id"], arm(), ("wrist",))
+    raw = clip.frames_at("wrist", np.arange(len(clip)))
+    expected = prepare(raw, arm().camera("wrist"), 64, "antialias").transpose(0, 3, 1, 2)
+    stored = EpisodeReader(shards, shards.columns()).episode(row, "wrist")
+    assert np.array_equal(np.asarray(stored["latents"]).reshape(expected.shape), expected)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import json
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from hma_data.errors import TokenizerError
 from hma_data.storage.paths import shipped
-from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, full_name, get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 from hma_data.tokenizers.checkpoints import read_weights, save_weights
 from hma_data.tokenizers.embedded import FsqAutoencoder, Quantizer
@@ -57,6 +58,16 @@ def test_the_spec_of_embedded_weights_needs_no_torch() -> None:
         "import sys; from hma_data.conversion.job import get_spec\n"
         "assert get_spec('fsq-16').grid == (16, 16) and 'torch' not in sys.modules"
     )
+
+
+def test_a_name_may_end_in_another_filter_for_resizing() -> None:
+    usual, other = get_tokenizer("raw-64"), get_tokenizer("raw-64:antialias")
+    assert other.spec == replace(usual.spec, resize_filter="antialias") and usual.spec != other.spec
+    for name in (other.spec.name, "fsq-8"):
+        assert get_spec(f"{name}:antialias") == get_tokenizer(f"{name}:antialias").spec
+    assert get_tokenizer(full_name(other.spec.to_json())).spec == other.spec
+    with pytest.raises(TokenizerError, match="has no filter 'cubic' for .* — write raw-64:area"):
+        get_spec("raw-64:cubic")
 
 
 def test_the_spec_of_other_weights_is_theirs(tmp_path: Path) -> None:
