@@ -34,7 +34,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/export": (850, 6_500, 6),
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_200, 6),
-    "hma_model/lerobot_env": (410, 3_300, 2),
+    "hma_model/lerobot_env": (570, 4_600, 3),
     "hma_model/network": (3_250, 27_700, 16),
     "hma_model/play": (1_650, 11_900, 8),
     "hma_model/policies": (2_040, 14_400, 12),

@@ -92,12 +92,7 @@ class HMAEnvConfig(EnvConfig):
         if self.horizon < 1:
             raise UsageError("horizon", f"is {self.horizon}", "give 1 or more")
         if not self.embodiment:
-            if len(checkpoint.embodiments) != 1:
-                there = ", ".join(checkpoint.embodiments)
-                raise UsageError(
-                    "embodiment", "is not given", f"give --env.embodiment=ID; the model has: {there}"
-                )
-            (self.embodiment,) = checkpoint.embodiments
+            self.embodiment = only_embodiment(checkpoint, "--env.embodiment")
         if self.judge is not None:
             judged_task(self.embodiment, self.judge)
         robot = checkpoint.embodiment(self.embodiment)
@@ -119,6 +114,15 @@ class HMAEnvConfig(EnvConfig):
         own = {"pixels": "observation.image", "agent_pos": "observation.state"}
         own[SYNTHETIC] = f"observation.{SYNTHETIC}"
         self.features_map = {key: own.get(key, key) for key in self.features}
+
+
+def only_embodiment(checkpoint: Checkpoint, option: str) -> str:
+    """Return the one embodiment of a checkpoint; a UsageError asks for the option if there are more."""
+    if len(checkpoint.embodiments) != 1:
+        there = ", ".join(checkpoint.embodiments)
+        raise UsageError("embodiment", "is not given", f"give {option}=ID; the model has: {there}")
+    (found,) = checkpoint.embodiments
+    return found
 
 
 def made(

@@ -1,0 +1,158 @@
+"""Offer a model that was trained to act to lerobot as a policy: `lerobot-eval --policy.type=hma`.
+
+    lerobot-eval --policy.type=hma --policy.checkpoint=RUN --policy.embodiment=ID --env.type=pusht \\
+        --policy.discover_packages_path=hma_model.lerobot_env
+
+lerobot finds the policy and its processors in this module by their names. `--policy.path` does not work: it
+reads a config.json of lerobot's own form, and a checkpoint has one of ours.
+
+N environments, A action dims.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.processor import (
+    PolicyProcessorPipeline,
+    policy_action_to_transition,
+    transition_to_policy_action,
+)
+from torch import Tensor
+
+from hma_data.errors import UsageError
+from hma_model.hub.publish import located
+from hma_model.lerobot_env import in_one_line, only_embodiment
+from hma_model.lerobot_env.vector import camera_names
+from hma_model.worlds.world import load_world, require_actor
+
+NO_TRAINING = "is trained by hma train with objectives={policy: 1.0}, and not by lerobot"
+
+
+@PreTrainedConfig.register_subclass("hma")
+@dataclass
+class WorldModelConfig(PreTrainedConfig):
+    """A model as a policy.
+
+    Attributes:
+        checkpoint: as `HMA.from_pretrained` takes it.
+        embodiment: an id of it; may be left out if it has one.
+        unmask_steps, temperature: as of `load_world`.
+    """
+
+    checkpoint: str = ""
+    embodiment: str = ""
+    unmask_steps: int = 2
+    temperature: float | None = None
+
+    observation_delta_indices = action_delta_indices = reward_delta_indices = None
+
+    def validate_features(self) -> None:
+        """Check nothing: the images are found when they come."""
+
+    def get_optimizer_preset(self) -> Any:
+        """Refuse to train."""
+        raise UsageError(self.checkpoint, NO_TRAINING)
+
+    def get_scheduler_preset(self) -> None:
+        """Return no scheduler."""
+
+
+class WorldModelPolicy(PreTrainedPolicy):
+    """A model with the objective `policy` or `full` as a policy in N environments."""
+
+    config_class = WorldModelConfig
+    name = "hma"
+
+    def __init__(self, config: WorldModelConfig, **unused: Any) -> None:
+        super().__init__(config)
+        with in_one_line():
+            checkpoint, _ = located(config.checkpoint, [config.embodiment] if config.embodiment else None)
+            self._embodiment = config.embodiment or only_embodiment(checkpoint, "--policy.embodiment")
+            self._cameras = camera_names(checkpoint, self._embodiment)
+            self._world = load_world(
+                config.checkpoint,
+                device=config.device or "cpu",
+                unmask_steps=config.unmask_steps,
+                temperature=config.temperature,
+            )
+            require_actor(self._world.model.config, config.checkpoint)
+            self._commands = self._world.action_spec(self._embodiment)
+        self.network = self._world.model  # lerobot moves it and counts its parameters
+        self._sessions: list[int] = []
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the episodes."""
+        for session in self._sessions:
+            self._world.close(session)
+        self._sessions = []
+        self._ahead: deque[np.ndarray[Any, Any]] = deque()  # actions (N, A) that are still to be given
+        self._taken: list[np.ndarray[Any, Any]] = []  # actions (N, A) since the last image
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **unused: Any) -> Tensor:
+        """Return the next actions (N, A); the model looks once for the actions of a chunk."""
+        if not self._ahead:
+            self._ahead.extend(self._chunk(batch))
+        action = self._ahead.popleft()
+        self._taken.append(action)
+        return torch.from_numpy(action)
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **unused: Any) -> Tensor:
+        """Return the actions (N, stride, A) from the newest images on."""
+        return torch.from_numpy(np.stack(self._chunk(batch), axis=1))
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any] | None]:
+        """Refuse to train."""
+        raise UsageError(self._embodiment, NO_TRAINING)
+
+    def get_optim_params(self) -> dict[str, Any]:
+        """Refuse to train."""
+        raise UsageError(self._embodiment, NO_TRAINING)
+
+    def _chunk(self, batch: dict[str, Tensor]) -> list[np.ndarray[Any, Any]]:
+        images = self._images(batch)
+        if not self._sessions:
+            self._sessions = [
+                self._world.open(self._embodiment, image[None], seed=row) for row, image in enumerate(images)
+            ]
+        else:
+            chunks = np.stack(self._taken, axis=1)
+            by_session = zip(self._sessions, images, chunks, strict=True)
+            seen, taken = {}, {}
+            for session, image, chunk in by_session:
+                seen[session], taken[session] = image, chunk
+            self._world.observe(seen, taken)
+        self._taken = []
+        said = self._world.act(self._sessions)
+        given = np.stack([self._commands.clip(said[session]) for session in self._sessions])
+        return list(given.astype(np.float32).swapaxes(0, 1))
+
+    def _images(self, batch: dict[str, Tensor]) -> np.ndarray[Any, Any]:
+        """Return the images (N, H, W, 3) uint8 of the model's cameras, side by side."""
+        keys = [f"observation.images.{name}" for name in self._cameras]
+        if len(keys) == 1 and keys[0] not in batch:
+            keys = ["observation.image"]
+        if missing := [key for key in keys if key not in batch]:
+            there = ", ".join(key for key in batch if key.startswith("observation.image")) or "none"
+            fault = f"needs {', '.join(missing)}; the images are {there}"
+            with in_one_line():
+                raise UsageError(f"policy {self._embodiment}", fault, "rename them with --rename_map")
+        views = torch.cat([batch[key] for key in keys], dim=3)
+        pixels = (views * 255).round().clamp(0, 255).to(torch.uint8)
+        return pixels.permute(0, 2, 3, 1).numpy(force=True)
+
+
+def make_hma_pre_post_processors(
+    config: WorldModelConfig, **unused: Any
+) -> tuple[PolicyProcessorPipeline[Any, Any], PolicyProcessorPipeline[Any, Any]]:
+    """Return processors that change nothing: the model takes images and gives actions as recorded."""
+    after: PolicyProcessorPipeline[Any, Any] = PolicyProcessorPipeline(
+        steps=[], to_transition=policy_action_to_transition, to_output=transition_to_policy_action
+    )
+    return PolicyProcessorPipeline(steps=[]), after
