@@ -43,7 +43,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_520, 28_900, 18),
     "hma_model/worlds": (1_530, 11_500, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 61_700, 486_500
+PRODUCT_LINES, PRODUCT_NODES = 61_900, 488_500
 TEST_LINES = 45_260
 DOC_WORDS = 38_000
 
