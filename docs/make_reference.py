@@ -39,7 +39,7 @@ def table(heads: list[str], rows: list[list[str]]) -> str:
 def cli_page() -> str:
     """Return the page of all commands, from the application itself."""
     parts = [
-        f"{MADE}# Command line\n\nEach command is here as its `--help` has it. Each also takes `--help` and, "
+        f"{MADE}# Command line\n\nThe `--help` of every command. Each also takes `--help` and, "
         "before or after it, `--debug`, which shows tracebacks."
     ]
     root = typer.main.get_command(app)
@@ -225,16 +225,16 @@ def _meaning(name: str, field: Any) -> str:
 
 _OBVIOUS = {
     "mixture": "[below](#mixture)",
-    "steps": "updates of the weights",
+    "steps": "optimizer steps",
     "lr": "learning rate",
-    "schedule": "how the learning rate goes on after `warmup`",
+    "schedule": "learning rate after `warmup`",
     "betas": "of AdamW",
     "eps": "of AdamW",
     "weight_decay": "of AdamW",
-    "seed": "of everything: order of the data, masks, new weights",
+    "seed": "random seed of data order, masks and new weights",
     "device": "`auto`, `cpu`, `mps`, `cuda` or `cuda:N`",
-    "temperature": "τ of p ∝ n^(1/τ); 1 goes by size, larger is flatter",
-    "draw": "the robot is drawn for each window, or for each batch",
+    "temperature": "τ of p ∝ n^(1/τ); 1 is proportional to size, larger is flatter",
+    "draw": "sample the robot per window, or per batch",
 }
 
 

@@ -72,27 +72,27 @@ class Component(SpecModel):
     state conventions and change nothing.
     """
 
-    key: str = Field(min_length=1, description="where the recording has the values: a path or a topic field")
+    key: str = Field(min_length=1, description="location in the recording: a path or a topic field")
     dims: Count = Field(ge=1, le=4096, description="the number of values")
     slice: tuple[Start, Count] | None = Field(None, description="[from, to) of the vector found at key")
     names: tuple[str, ...] | None = Field(
         None, description="one name for each value; messages with names are read by these names"
     )
     unit: str | None = Field(None, description="of the values, such as m or rad; for plots")
-    normalize: bool = Field(
-        True, description="false leaves the values as they are, as of an open/close gripper"
+    normalize: bool = Field(True, description="false keeps raw values, such as of an open/close gripper")
+    sign: Number | tuple[Number, ...] = Field(1.0, description="factor: one value, or one per dim")
+    offset: Number | tuple[Number, ...] = Field(
+        0.0, description="added after `sign`: one value, or one per dim"
     )
-    sign: Number | tuple[Number, ...] = Field(1.0, description="factor of the values, one or one each")
-    offset: Number | tuple[Number, ...] = Field(0.0, description="added after `sign`, one or one each")
     range: tuple[Number, Number] | None = Field(
         None, description="[low, high] of the values; changes nothing"
     )
     representation: Representation | None = Field(None, description="of an angle or a rotation")
     gripper: Gripper | None = Field(
         None,
-        description="how a value opens it; opening_ and closing_is_high are for commands that move it a bit",
+        description="meaning of a high value; opening_ and closing_is_high are for relative actions",
     )
-    stamp: Literal["header", "receive"] | None = Field(None, description="as `sync.stamp`, for this alone")
+    stamp: Literal["header", "receive"] | None = Field(None, description="overrides `sync.stamp`")
 
     @field_validator("slice", "names", "sign", "offset")
     @classmethod
@@ -133,24 +133,24 @@ class Vector(SpecModel):
 
 
 class Action(Vector):
-    """The action vector: the command to the robot at each step."""
+    """The action vector at each step."""
 
-    space: Space = Field(description="what the numbers are")
+    space: Space = Field(description="the control space")
 
 
 class Camera(SpecModel):
-    """A camera stream and how its pictures are brought to a square."""
+    """A camera stream and its image preprocessing."""
 
     name: str = Field(
-        min_length=1, pattern=r"^[A-Za-z0-9_.-]+$", description="its name in shards and commands"
+        min_length=1, pattern=r"^[A-Za-z0-9_.-]+$", description="name in shards and on the command line"
     )
-    key: str = Field(min_length=1, description="where the recording has its pictures")
+    key: str = Field(min_length=1, description="location of the images in the recording")
     size: tuple[Positive, Positive] | None = Field(
-        None, description="[height, width] of the recorded picture in pixels; changes nothing"
+        None, description="[height, width] of recorded images in pixels; changes nothing"
     )
     color: Literal["rgb", "bgr"] = Field("rgb", description="order of the channels as recorded")
     resize: Literal["short_side_crop", "letterbox", "stretch"] = Field(
-        "short_side_crop", description="how a picture becomes the tokenizer's square"
+        "short_side_crop", description="how an image becomes the tokenizer's square"
     )
     rotate: Literal[0, 90, 180, 270] = Field(0, description="degrees clockwise")
     flip: Literal["vertical", "horizontal"] | None = Field(
@@ -159,9 +159,9 @@ class Camera(SpecModel):
     crop: tuple[Start, Start, Positive, Positive] | None = Field(
         None, description="[x, y, width, height] in pixels, after flip and rotate"
     )
-    stamp: Literal["header", "receive"] | None = Field(None, description="as `sync.stamp`, for this alone")
+    stamp: Literal["header", "receive"] | None = Field(None, description="overrides `sync.stamp`")
     levels: tuple[Number, Number] | None = Field(
-        None, description="[black, white] of a bag's 16-bit grey pictures: the values that become 0 and 255"
+        None, description="[black, white] of a bag's 16-bit grey images: the values mapped to 0 and 255"
     )
 
     @model_validator(mode="after")
@@ -180,26 +180,24 @@ class Sync(SpecModel):
     rate_hz: Number | None = Field(
         None, gt=0, le=100_000, description="a fixed grid instead of a camera's frames; for bags and videos"
     )
-    images: Method = Field("nearest", description="which picture a time gets")
-    actions: Method = Field("hold", description="which command a time gets")
-    states: Method = Field("interpolate", description="which state a time gets")
-    max_skew_ms: Number | None = Field(
-        None, gt=0, description="the largest time by which a sample may be moved"
-    )
+    images: Method = Field("nearest", description="alignment of images to the grid")
+    actions: Method = Field("hold", description="alignment of actions to the grid")
+    states: Method = Field("interpolate", description="alignment of states to the grid")
+    max_skew_ms: Number | None = Field(None, gt=0, description="maximum skew of a sample")
     tolerance_ms: Number | None = Field(
-        None, gt=0, description="a held action stamped at most so much after a frame is in force at it"
+        None, gt=0, description="a held action up to this long after a frame belongs to it"
     )
     beyond: Literal["refuse", "mask"] = Field(
         "refuse",
-        description="beyond max_skew_ms, refuse the episode, or mask numbers; pictures always refuse it",
+        description="beyond max_skew_ms: refuse the episode, or mask numbers; images always refuse it",
     )
     action_shift: Count = Field(
         0,
         ge=-100,
         le=100,
-        description="in steps: the command of frame t is recorded at t + action_shift; not for bags, RH20T",
+        description="in steps: the action of frame t is recorded at t + action_shift; not for bags, RH20T",
     )
-    stamp: Literal["header", "receive"] = Field("header", description="which of a message's times counts")
+    stamp: Literal["header", "receive"] = Field("header", description="which timestamp of a message to use")
 
     @field_validator("beyond")
     @classmethod
@@ -274,25 +272,25 @@ class Hdf5Layout(SourceLayout):
     """The place of an HDF5 file's episodes, and what the numbers of its pictures mean."""
 
     episodes: str | None = Field(
-        None, description="pattern of the groups that are episodes; / for one file an episode"
+        None, description="pattern of the episode groups; / for one file per episode"
     )
     timestamps: str | None = Field(
-        None, description="key of the times (s, ms, µs or ns), where the rate is not even"
+        None, description="key of the timestamps (s, ms, µs or ns), if the rate varies"
     )
     axes: Literal["THWC", "TCHW"] | None = Field(
-        None, description="of pictures, where the shape leaves it open"
+        None, description="axes of images, if the shape is ambiguous"
     )
     pixels: Literal["0-1", "0-255", "0-65535"] | None = Field(
-        None, description="range of pictures that are not uint8"
+        None, description="range of images that are not uint8"
     )
     last_observation: Literal["drop"] | None = Field(
-        None, description="drop: the observation after the last action is left out"
+        None, description="drop: omit the observation after the last action"
     )
     metadata: str | None = Field(
         None, description="JSON file beside each file; its values replace {names} in a camera's key"
     )
     frames_missing: int = Field(
-        0, ge=0, description="most rows at the end for which a video has no frame; they are left out"
+        0, ge=0, description="maximum number of rows at the end without a video frame; they are dropped"
     )
 
 
@@ -301,7 +299,7 @@ class LeRobotLayout(SourceLayout):
 
     pairing: Literal["time", "index"] | None = Field(
         None,
-        description="by the stamps, if the whole film fits its episodes; time: by the stamps, whatever the "
+        description="default: by timestamp, if the video fits its episodes; time: by timestamp, whatever the "
         "number of frames; index: row i has frame i, whatever the stamps say",
     )
 
@@ -331,7 +329,7 @@ class HandsLayout(SourceLayout):
 
     labels: Literal[
         "detector", "landmarks", "epic_kitchens_hand_objects", "ego4d_fho", "egoexo4d_hand_pose"
-    ] = Field("detector", description="who says where the hands are")
+    ] = Field("detector", description="source of the hand positions")
     annotations: str | None = Field(
         None, description="file or folder of the labels, absolute or below the videos' folder, the default"
     )
@@ -339,15 +337,15 @@ class HandsLayout(SourceLayout):
         None, description="of the detector: folder of .tflite files or a .task bundle; else $HMA_HAND_MODELS"
     )
     missing: Literal["split", "hold", "mask"] = Field(
-        "split", description="what a frame without a needed hand does"
+        "split", description="rule for a frame without a required hand"
     )
     max_hold: int | None = Field(
-        None, ge=0, description="most labelled frames in a row for which the last position is held"
+        None, ge=0, description="maximum number of consecutive labelled frames for which a position is held"
     )
-    min_frames: int = Field(12, ge=0, description="runs with fewer frames (with hands) are left out")
+    min_frames: int = Field(12, ge=0, description="runs with fewer frames (with hands) are dropped")
     min_score: FiniteFloat = Field(0.5, ge=0, description="labels with a lower score are ignored")
     max_gap_s: FiniteFloat = Field(
-        3.0, ge=0, description="most seconds between labels of one run, where labels are irregular"
+        3.0, ge=0, description="maximum gap between labels of a run, in seconds, for irregular labels"
     )
     pictures: Literal["labelled", "every"] = Field(
         "labelled", description="frames with a label, or every frame from the first to the last of a run"
@@ -355,12 +353,10 @@ class HandsLayout(SourceLayout):
     first_frame: int | None = Field(
         None, ge=0, description="a video's first frame in the labels; by default 1 for EPIC-KITCHENS, else 0"
     )
-    label_size: Size = Field(
-        None, description="WIDTHxHEIGHT of the pictures that were labelled; by default the video's"
-    )
+    label_size: Size = Field(None, description="WIDTHxHEIGHT of the labelled images; default: the video's")
     camera: str = Field("cam01", description="Ego-Exo4D: which camera's labels and videos")
     mirrored: bool = Field(
-        False, description="for mirrored pictures (front cameras): swaps the detector's left and right"
+        False, description="for mirrored images (front cameras): swaps the detector's left and right"
     )
 
     @property
@@ -406,24 +402,24 @@ def keys_schema() -> list[dict[str, Any]]:
 
 
 class SourceSpec(SpecModel):
-    """The place and the layout of the recordings."""
+    """The location and layout of the recordings."""
 
     model_config = ConfigDict(json_schema_extra=_by_format)
 
-    format: Format = Field(description="of the recordings; rosbag is ROS 1, ROS 2 and MCAP")
+    format: Format = Field(description="format of the recordings; rosbag is ROS 1, ROS 2 and MCAP")
     uri: str | None = Field(None, description="file, folder or URI of the recordings")
-    split: str | None = Field(None, description="the source's own split to read")
+    split: str | None = Field(None, description="split of the source to read")
     episodes: Count | None = Field(None, ge=1, description="the published number of episodes")
     instruction: str | None = Field(None, description="key of the language instruction")
     layout: dict[str, Annotated[str, BeforeValidator(_as_text)]] | None = Field(
-        None, description="where a file has its data; the keys depend on the format"
+        None, description="layout of the data in a file; the keys depend on the format"
     )
-    segments: Segments | None = Field(None, description="how one bag is divided into episodes")
+    segments: Segments | None = Field(None, description="division of one bag into episodes")
     only: tuple[Pattern, ...] = Field(
-        (), description="take only these episodes: ids, globs, or @FILE, a file with one of them a line"
+        (), description="use only these episodes: ids, globs, or @FILE with one per line"
     )
     exclude: tuple[Pattern, ...] = Field(
-        (), description="leave these episodes out: ids, globs, or @FILE, a file with one of them a line"
+        (), description="exclude these episodes: ids, globs, or @FILE with one per line"
     )
 
     @field_validator("layout")
@@ -443,11 +439,11 @@ class SourceSpec(SpecModel):
 
 
 class Quality(SpecModel):
-    """The rule for an episode whose camera shows nothing that a model could learn."""
+    """The rules for blank, still and repeated images."""
 
     blank: Verdict = Field("refuse", description="a camera shows one colour throughout, such as black")
-    still: Verdict = Field("flag", description="a camera shows one picture throughout")
+    still: Verdict = Field("flag", description="a camera shows one image throughout")
     repeated: Verdict = Field(
-        "flag", description="more than repeated_share of a camera's pictures repeat the picture before"
+        "flag", description="more than repeated_share of a camera's images repeat the previous one"
     )
     repeated_share: Number = Field(0.5, ge=0, le=1, description="the share above which `repeated` counts")

@@ -64,31 +64,31 @@ _DECIDES: Any = {
 class Embodiment(SpecModel):
     """A robot as one dataset recorded it. Frozen; made from YAML by `load` or `find`."""
 
-    id: str = Field(description="its name; the file is <id>.yaml")
-    description: str = Field("", description="what was recorded, in a line")
-    robot: str | None = Field(None, description="which robot it is, in words")
+    id: str = Field(description="its id; the file is <id>.yaml")
+    description: str = Field("", description="one line about the recordings")
+    robot: str | None = Field(None, description="name of the robot")
     kind: Literal["real", "simulation", "human"] = Field(description="who or what was recorded")
     frequency_hz: Number | Literal["unknown"] | None = Field(
-        description="control rate of the recording in Hz; unknown; null only where recordings have times"
+        description="control rate in Hz; unknown; null only if the recordings have timestamps"
     )
     target_hz: Number = Field(
-        2.0, ge=0.001, le=100_000, description="frames a second that the model sees; the stride follows"
+        2.0, ge=0.001, le=100_000, description="frame rate of the model; determines the stride"
     )
     stride_override: Count | None = Field(
         None, alias="stride", ge=1, description="recorded steps from one frame of the model to the next"
     )
-    action: Action = Field(description="the command to the robot at each step")
-    state: Vector | None = Field(None, description="the robot's measurements of itself")
-    cameras: tuple[Camera, ...] = Field(min_length=1, description="the first is the default everywhere")
-    sync: Sync = Field(Sync(), description="how streams of different rates meet")
-    source: SourceSpec = Field(description="where the recordings are, and in which format")
-    quality: Quality = Field(Quality(), description="what happens to an episode that shows nothing")
+    action: Action = Field(description="the action vector at each step")
+    state: Vector | None = Field(None, description="the robot's own measurements")
+    cameras: tuple[Camera, ...] = Field(min_length=1, description="cameras; the first is the default")
+    sync: Sync = Field(Sync(), description="alignment of streams of different rates")
+    source: SourceSpec = Field(description="location and format of the recordings")
+    quality: Quality = Field(Quality(), description="rules for episodes with blank or still images")
     stats_key: str | None = Field(
         None, description="name shared by embodiments of one robot and control mode: statistics and stem"
     )
-    license: str | None = Field(None, description="of the recordings, with the name of who says so")
+    license: str | None = Field(None, description="license of the recordings, with its source")
     provenance: dict[str, str] = Field(default_factory=dict, description="key of this file -> its source")
-    notes: str | None = Field(None, description="what the next user should know")
+    notes: str | None = Field(None, description="notes for other users")
 
     @field_validator("id")
     @classmethod

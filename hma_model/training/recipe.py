@@ -119,44 +119,46 @@ class MixtureSettings(_Settings):
 class Recipe(_Settings):
     """The settings of a training run. `load_recipe` makes it and explains its errors."""
 
-    data: Places = Field((), description="folders of shards, one an embodiment")
-    cameras: CameraChoice = Field("first", description="first, drawn, a name, or a list of stacked views")
+    data: Places = Field((), description="shard sets, one per embodiment")
+    cameras: CameraChoice = Field(
+        "first", description="first, drawn (one per window), a name, or a list of stacked views"
+    )
     mixture: MixtureSettings = MixtureSettings()
-    frames: Count = Field(12, ge=2, le=4096, description="T of a window")
+    frames: Count = Field(12, ge=2, le=4096, description="frames T per window")
     short: Literal["drop", "pad"] = Field("drop", description="episodes shorter than a window")
-    batch_size: Count = Field(8, ge=1, description="windows a forward pass")
-    accumulate: Count = Field(1, ge=1, description="forward passes a step")
+    batch_size: Count = Field(8, ge=1, description="windows per forward pass")
+    accumulate: Count = Field(1, ge=1, description="forward passes per step")
     model: dict[str, Any] = Field({}, description="fields of HMAConfig")
-    objectives: dict[str, Number] = Field({"forward": 1.0}, description="how often each is drawn")
+    objectives: dict[str, Number] = Field({"forward": 1.0}, description="objective -> sampling weight")
 
     start: Place | None = Field(None, description="a checkpoint to start from: folder, run, URI or hub repo")
-    freeze: Literal["nothing", "trunk"] = Field("nothing", description="what keeps the checkpoint's weights")
+    freeze: Literal["nothing", "trunk"] = Field("nothing", description="part whose weights stay fixed")
     new_stem: Literal["like", "fresh"] = Field(
-        "like", description="with start: a new robot begins with the stem of its like, or with a fresh one"
+        "like", description="with start: a new robot's stem starts from a similar robot's, or fresh"
     )
     # a token's digits: the tokenizer's, or split into this many values (FSQ's levels) or joined up to them
     digits: Count = Field(0, ge=0, description="0: the tokenizer's; 8 splits 512 into 8 · 8 · 8; 512 joins")
     # model.merge or model.patch, unless the recipe gives it, is the least that leaves so few
-    places: Count = Field(0, ge=0, description="of the trunk in a camera's frame, at most; 0 has no limit")
+    places: Count = Field(0, ge=0, description="maximum trunk tokens per camera frame; 0: no limit")
 
     steps: Count = Field(1000, ge=1, le=10**12)
     # an end by time: of a rank's process in steps, all its threads; lr then falls by the share that is spent
-    cpu_seconds: Number = Field(0.0, ge=0, description="CPU seconds of steps at most; 0 has no limit")
+    cpu_seconds: Number = Field(0.0, ge=0, description="maximum CPU seconds of training steps; 0: no limit")
     lr: Number = Field(3e-4, gt=0, le=1e6)
-    optimizer: Literal["adamw", "muon"] = Field("adamw", description="muon: of the blocks' matrices")
-    muon_lr: Number = Field(0.02, gt=0, le=1e3, description="muon: the spectral norm of a step at most")
+    optimizer: Literal["adamw", "muon"] = Field("adamw", description="muon: for the matrices of the blocks")
+    muon_lr: Number = Field(0.02, gt=0, le=1e3, description="muon: maximum spectral norm of a step")
     lr_rule: Literal["plain", "paper"] = Field("plain", description="paper: see optim.learning_rate")
-    warmup: Steps = Field(100, description="steps in which lr rises from 0")
+    warmup: Steps = Field(100, description="warm-up steps of lr from 0")
     schedule: Literal["constant_with_warmup", "cosine"] = "constant_with_warmup"
-    lr_end: Share = Field(0.1, description="cosine: the last step's share of lr")
+    lr_end: Share = Field(0.1, description="cosine: final lr as a share of lr")
     betas: tuple[Beta, Beta] = (0.9, 0.95)
     eps: Number = Field(1e-8, gt=0, le=1e6)
     weight_decay: Number = Field(0.05, ge=0, le=1e6)
-    clip: Number = Field(1.0, gt=0, description="limit of the gradient's norm")
-    nonfinite: Literal["stop", "skip"] = Field("stop", description="at a loss that is not finite")
-    ema: Beta = Field(0.0, description="decay of averaged weights, which are evaluated and saved; 0 without")
-    self_forward: Share = Field(0.0, description="share of windows whose past is the model's prediction")
-    self_forward_frames: Count = Field(2, ge=1, description="frames in a row of such a past")
+    clip: Number = Field(1.0, gt=0, description="limit of the gradient norm")
+    nonfinite: Literal["stop", "skip"] = Field("stop", description="action at a non-finite loss")
+    ema: Beta = Field(0.0, description="decay of averaged weights, which are evaluated and saved; 0: off")
+    self_forward: Share = Field(0.0, description="share of windows with a self-predicted past")
+    self_forward_frames: Count = Field(2, ge=1, description="consecutive self-predicted frames")
     self_forward_from: Steps = Field(0, description="first step with such windows, counted from 0")
 
     seed: Count = Field(42, ge=0, lt=2**63)
@@ -164,16 +166,18 @@ class Recipe(_Settings):
         "auto", description="of the network's products; auto: bf16 where it is faster"
     )
     device: str = Field("auto", pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")
-    parallel: Literal["ddp", "fsdp"] = Field("ddp", description="with torchrun: how ranks hold the network")
+    parallel: Literal["ddp", "fsdp"] = Field("ddp", description="with torchrun: parallelism of the network")
     compile: bool = Field(False, description="torch.compile of the trunk's blocks")
     checkpointing: bool = Field(False, description="recompute activations: less memory, a third more time")
-    workers: Count = Field(1, ge=0, le=512, description="threads that make batches ahead, a rank")
+    workers: Count = Field(1, ge=0, le=512, description="prefetch threads per rank")
     eval_every: Steps = Field(250, description="steps between evaluations; 0 only at the end")
-    eval_windows: Count = Field(64, ge=1, description="validation windows an embodiment")
-    pictures: Steps = Field(1, description="windows of a robot that an evaluation rolls out for a picture")
-    pictures_share: Number = Field(0.05, ge=0, description="share of the time for pictures before the last")
+    eval_windows: Count = Field(64, ge=1, description="validation windows per embodiment")
+    pictures: Steps = Field(1, description="windows per robot that an evaluation rolls out as images")
+    pictures_share: Number = Field(
+        0.05, ge=0, description="maximum share of time for these images before the last evaluation"
+    )
     checkpoint_every: Steps = Field(250, description="steps between checkpoints; 0 only at the end")
-    keep_last: Count = Field(3, ge=1, description="number of checkpoints that are kept")
+    keep_last: Count = Field(3, ge=1, description="number of checkpoints to keep")
     report: bool = Field(True, description="write report.html")
     track: Trackers = Field((), description="trackers of the figures; each needs its package")
     project: str = Field("hma", description="the name under which trackio and wandb file the run")
