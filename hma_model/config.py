@@ -107,7 +107,7 @@ class HMAConfig:
 
     kind: str = "discrete"  # discrete: VQ tokens, cross-entropy; continuous: latents, diffusion head
     trunk: str = "transformer"  # see `hma_model.network.trunks`
-    layers: int = 32  # of a U-Net: blocks at each resolution, down and up
+    layers: int = 32  # U-Net: blocks at each resolution, down and up
     width: int = 256
     levels: tuple[int, ...] = (
         48,
@@ -128,14 +128,14 @@ class HMAConfig:
 
     conditioning: tuple[str, ...] = ("modulation",)  # any of CONDITIONINGS together
     shared_modulation: bool = False  # False: modulation weights per embodiment (paper); True: in the trunk
-    action_tokens: int = 1  # copies of the action embedding put after a frame's tokens (concat)
+    action_tokens: int = 1  # copies of the action embedding appended to a frame's tokens (concat)
     # The conditioning of a pass without any actions. "embedding": a learned embedding replaces each action;
     # "skip": no conditioning (released); "tokens": only learned action tokens (released, actions predicted
     # too). With "tokens", a single hidden chunk is hidden only in the action tokens; modulation still sees
     # it, as in the released code.
     absent_action: str = "embedding"
-    # Octaves of sines and cosines of each value of a chunk, beside the values: a sharp sense of where a
-    # command points. The longest wave is 8 standard deviations of the value.
+    # Octaves of sines and cosines of each value of a chunk, as inputs with the values, for higher action
+    # resolution. The longest wave is 8 standard deviations of the value.
     action_waves: int = 0
     action_alignment: str = "previous"  # chunk k conditions frame k+1; "current": frame k (released)
 
@@ -157,26 +157,26 @@ class HMAConfig:
     # continuous: the standard deviation of the noise in a visible frame, in units of its corruption, which is
     # drawn as that of digits, so corrupt_max and the history below count here too
     latent_noise: float = 0.0
-    told_noise: bool = False  # tell the model each frame's corruption; 0 for what it is shown after training
+    told_noise: bool = False  # the model's input has each frame's corruption; 0 after training
     # The share of samples whose longer history stays unmasked, with later frames corrupted more.
     history_probability: float = 0.2
     # The frames of a training pass that predicts video. "window": the window's, masked (paper). "pairs": the
-    # true frames, and a masked copy of each from the second on, which sees the true frames before it.
+    # recorded frames, and a masked copy of each from the second on, which attends to the earlier ones.
     training_pass: str = "window"
-    whole_share: float = 0.5  # pairs: the share of copies that are wholly masked
-    # What a masked token is to the trunk. "learned": one vector (paper). "previous": that vector, added to
-    # the embedding of the frame before at its place.
+    whole_share: float = 0.5  # pairs: the share of fully masked copies
+    # The input embedding of a masked token. "learned": one vector (paper). "previous": that vector plus the
+    # embedding of the same position in the previous frame.
     masked_input: str = "learned"
-    position_init: str = "random"  # of places in a frame; "sinusoid": 2-D sinusoids
+    position_init: str = "random"  # of positions in a frame; "sinusoid": 2-D sinusoids
     # discrete: how a token's digits are predicted. "together": independently of one another (paper).
-    # "chain": one after the other, the low one first, each given those before it.
+    # "chain": autoregressively, the low digit first.
     digit_order: str = "together"
-    # How likely each digit stays as in the frame before is predicted beside its value; of latents, the share
-    # of each value that stays.
+    # Predict for each digit the probability that it keeps the previous frame's value; for latents, the kept
+    # share of each value.
     copy_previous: bool = False
 
-    # continuous: "diffusion", the head below; "regression": the change since the frame before, by squared and
-    # absolute error, of which what moves weighs up to 1 + motion_weight
+    # continuous: "diffusion", the head below; "regression": the change since the previous frame, by squared
+    # and absolute error, where moving values weigh up to 1 + motion_weight
     video_loss: str = "diffusion"
     motion_weight: float = 6.0
     diffusion_target: str = "velocity"  # what the head predicts: defined at full noise too; "noise" (paper)
