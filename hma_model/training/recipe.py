@@ -120,9 +120,7 @@ class Recipe(_Settings):
     """The settings of a training run. `load_recipe` makes it and explains its errors."""
 
     data: Places = Field((), description="shard sets, one per embodiment")
-    cameras: CameraChoice = Field(
-        "first", description="first, drawn (one per window), a name, or a list of stacked views"
-    )
+    cameras: CameraChoice = Field("first", description="first, drawn, a name, or a list of stacked views")
     mixture: MixtureSettings = MixtureSettings()
     frames: Count = Field(12, ge=2, le=4096, description="frames T per window")
     short: Literal["drop", "pad"] = Field("drop", description="episodes shorter than a window")
@@ -173,9 +171,7 @@ class Recipe(_Settings):
     eval_every: Steps = Field(250, description="steps between evaluations; 0 only at the end")
     eval_windows: Count = Field(64, ge=1, description="validation windows per embodiment")
     pictures: Steps = Field(1, description="windows per robot that an evaluation rolls out as images")
-    pictures_share: Number = Field(
-        0.05, ge=0, description="maximum share of time for these images before the last evaluation"
-    )
+    pictures_share: Number = Field(0.05, ge=0, description="maximum share of time for these images")
     checkpoint_every: Steps = Field(250, description="steps between checkpoints; 0 only at the end")
     keep_last: Count = Field(3, ge=1, description="number of checkpoints to keep")
     report: bool = Field(True, description="write report.html")
