@@ -33,7 +33,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/evaluation": (3_990, 31_700, 21),
     "hma_model/export": (850, 6_500, 6),
     "hma_model/generation": (1_720, 14_100, 10),
-    "hma_model/hub": (1_060, 8_200, 6),
+    "hma_model/hub": (1_060, 8_300, 6),
     "hma_model/lerobot_env": (570, 4_600, 3),
     "hma_model/network": (3_250, 27_700, 16),
     "hma_model/play": (1_650, 11_900, 8),
@@ -43,8 +43,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_520, 28_900, 18),
     "hma_model/worlds": (1_530, 11_500, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 61_900, 488_500
-TEST_LINES = 45_260
+PRODUCT_LINES, PRODUCT_NODES = 62_000, 488_500
+TEST_LINES = 45_500
 DOC_WORDS = 38_000
 
 

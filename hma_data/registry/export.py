@@ -123,8 +123,9 @@ def packed_components(vector: dict[str, Any], key: str) -> list[dict[str, Any]]:
     parts = []
     start = 0
     for part in vector["components"]:
-        kept = ("names", "unit", "range", "normalize", "representation", "gripper")
-        facts = {name: part[name] for name in kept if name in part}
+        facts = {
+            name: part[name] for name in ("names", "unit", "range", "normalize", "gripper") if name in part
+        }
         stop = start + part["dims"]
         parts.append({"key": key, "dims": part["dims"], "slice": [start, stop], **facts})
         start = stop

@@ -38,6 +38,7 @@ def render(
     *,
     repo: str | None = None,
     samples: Collection[str] = (),
+    page: bool = False,
 ) -> bytes:
     """Return the model card as bytes.
 
@@ -46,6 +47,7 @@ def render(
         cards: id -> the values of card.json.
         repo: the name of the checkpoint for a reader; None for the folder that the card lies in.
         samples: files that are there of `ID/sample.gif` (a film) and `ID/sample.png`; the film is shown.
+        page: a page that drives the robots is there too.
     """
     model, tokenizer = config["model"], config["tokenizer"]
     example, merge = min(cards, default="ID"), model.get("merge", 1)
@@ -76,6 +78,7 @@ def render(
         grid="×".join(str(side) for side in model.get("grid", ())),
         weights=line(other_weights(tokenizer)),
         trunk=line(config.get("trunk_sha256")),
+        page=page,
         rows=[_row(name, card) for name, card in sorted(cards.items())],
         loss_unit=token_words(merge if isinstance(merge, int) else 1) if says_baseline else "",
         pictures=pictures,

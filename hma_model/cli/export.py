@@ -1,4 +1,4 @@
-"""Define the verb `hma export`: ONNX graphs of a checkpoint."""
+"""Define the verb `hma export`: ONNX graphs of a checkpoint, and a page that drives them without a server."""
 
 from functools import cache
 from pathlib import Path
@@ -6,8 +6,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
-from hma_model.cli.hub import Embodiments
-from hma_model.cli.options import Checkpoint, UnmaskSteps, require_checkpoint
+from hma_model.cli.options import Checkpoint, Embodiments, UnmaskSteps, require_checkpoint
 
 
 def export(
@@ -22,13 +21,22 @@ def export(
     half: Annotated[
         bool, Option("--half/--float32", help="Weights in float16 if that costs less than 0.1 dB.")
     ] = True,
+    runtime: Annotated[
+        Path | None,
+        Option(
+            "--with-runtime", metavar="PACKAGE",
+            help="Copy ONNX Runtime Web from this npm package (node_modules/onnxruntime-web) to the page; by "
+            "default the page takes it from a CDN.",
+        ),
+    ] = None,
 ) -> None:  # fmt: skip
-    """Write ONNX graphs of a model, which run without torch.
+    """Write ONNX graphs of a model, and a page that drives its robots in a browser without a server.
 
     Example: hma export embedded --out page -e rails_03
     """
     made = export_checkpoint(
         checkpoint, data or [], out, embodiment, starts=starts, unmask_steps=unmask_steps, half=half,
+        runtime=runtime,
     )  # fmt: skip
     parts = [made["step"], *(robot["stem"] for robot in made["robots"])]
     size = sum(part["bytes"] for part in parts) / 1e6
@@ -37,10 +45,16 @@ def export(
     if made["float16_loss_db"] is not None:
         said += f" (float16 costs {made['float16_loss_db']:.2f} dB)"
     print(f"wrote {out}: {said}")
+    print(f"drive it: python -m http.server --bind 127.0.0.1 -d {out}")
 
 
 def export_checkpoint(
-    checkpoint: str, data: list[Path], out: Path, embodiments: list[str] | None, **settings: Any
+    checkpoint: str,
+    data: list[Path],
+    out: Path,
+    embodiments: list[str] | None,
+    name: str | None = None,
+    **settings: Any,
 ) -> dict[str, Any]:
     """Export robots of a checkpoint; return the manifest."""
     import sys
@@ -75,10 +89,10 @@ def export_checkpoint(
     from hma_model.export.folder import export_folder
 
     model = load(opened, list(chosen), "cpu").eval()
-    name = "the bundled model" if opened.name == "embedded" else Path(checkpoint).name
+    shown = name or ("the bundled model" if opened.name == "embedded" else Path(checkpoint).name)
     robots = list(chosen.values())
 
     def report(said: str) -> None:
         print(f"export: {said}", file=sys.stderr)
 
-    return export_folder(model, tokenizer(), robots, out, name=name, report=report, **settings)
+    return export_folder(model, tokenizer(), robots, out, name=shown, report=report, **settings)

@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,13 +11,11 @@ from typer import Argument, Option
 
 from hma_data.cli.options import Folder, Json
 from hma_data.console import print_json, print_table
+from hma_model.cli.options import Embodiments
 
 if TYPE_CHECKING:
     from hma_model.checkpoint.folder import Checkpoint
 
-Embodiments = Annotated[
-    list[str] | None, Option("--embodiment", "-e", help="Only this robot; repeat it for more.")
-]
 Saved = Annotated[Path, Argument(help="A checkpoint, or a run's folder.")]
 Revision = Annotated[str | None, Option("--revision", help="Branch, tag or commit.")]
 Private = Annotated[bool, Option("--private", help="Create new repositories as private.")]
@@ -34,6 +33,9 @@ def push(
     film: Annotated[
         bool, Option("--film/--no-film", help="Make a video for the card if the run's shards exist.")
     ] = True,
+    page: Annotated[
+        bool, Option("--page", help="Publish a page too that drives these robots, as hma export writes it.")
+    ] = False,
     private: Private = False,
 ) -> None:
     """Publish a checkpoint, whole or robot by robot.
@@ -41,12 +43,18 @@ def push(
     Example: hma hub push runs/first ./my-hub/team/model -e my_arm
     """
     from hma_model.checkpoint.folder import Checkpoint
+    from hma_model.cli.export import export_checkpoint
     from hma_model.hub import publish as hub
 
     opened = Checkpoint.open(checkpoint)
     if film or sample:
         _add_films(opened, sample, embodiment)
-    address = hub.push(opened, target, embodiment, private)
+    with tempfile.TemporaryDirectory() as folder:
+        exported = None
+        if page:
+            exported = Path(folder) / "page"
+            export_checkpoint(opened.name, [], exported, embodiment, target.rstrip("/").rsplit("/", 1)[-1])
+        address = hub.push(opened, target, embodiment, private, exported)
     print(f"published to {address}")
     for name, card in opened.cards(embodiment).items():
         judged = card.get("evaluation")

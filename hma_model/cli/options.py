@@ -17,6 +17,9 @@ def embedded_robots(incomplete: str) -> list[str]:
 Checkpoint = Annotated[
     str, Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
 ]
+Embodiments = Annotated[
+    list[str] | None, Option("--embodiment", "-e", help="Only this robot; repeat it for more.")
+]
 OfCheckpoint = Annotated[str, Option("--checkpoint", help="A checkpoint, a run's folder, or a hub repo.")]
 Data = Annotated[Path, Argument(help="A shard set.")]
 Split = Annotated[Literal["train", "val"], Option("--split", help="Split of the windows.")]

@@ -1,4 +1,4 @@
-"""Write a folder that holds a model, its robots, and frames to start from.
+"""Write a folder that holds a model, its robots, frames to start from, and a page that drives them.
 
     manifest.json            what is in the folder; written last
     step.onnx                one frame of any robot
@@ -6,6 +6,7 @@
     robots/ID/frames.npy     (starts, P, …) known frames, as the step takes them
     robots/ID/chunks.npy     (starts, P - 1, K) commands between them; NaN where they are unknown
     robots/ID/start-0.png    the last known frame of each start
+    index.html, *.js, *.css  the page; ort/ if its runtime was copied
 
 P frames of a start, K = stride * action dim.
 """
@@ -23,6 +24,7 @@ from hma_data.errors import OutputError
 from hma_data.storage.files import new_folder, read_json, to_json, write_atomic
 from hma_model.export.files import require_onnx, write_graph
 from hma_model.export.graphs import Port, StemGraph, StepGraph, require_exportable
+from hma_model.export.page import require_runtime, write_page
 from hma_model.export.starts import Start, round_weights, take_starts
 from hma_model.play.holding import UNKNOWN, holdings
 from hma_model.play.pads import describe
@@ -47,6 +49,7 @@ def export_folder(
     starts: int = 3,
     unmask_steps: int = 2,
     half: bool = True,
+    runtime: Path | None = None,
     report: Callable[[str], None] = lambda said: None,
 ) -> dict[str, Any]:
     """Export a model; return the manifest.
@@ -56,20 +59,24 @@ def export_folder(
         tokenizer: the model's, on the CPU; likewise.
         robots: those to export, one for each embodiment.
         out: the folder; an older export there is replaced.
-        name: of the model.
+        name: of the model, shown on the page.
         starts: scenes of each robot to begin from.
         unmask_steps: passes in which a frame is decoded.
         half: store weights in float16 if that costs little.
+        runtime: the npm package onnxruntime-web as installed; None for a CDN.
         report: is told what is done next.
 
     Raises:
         CheckpointError: no graph can be written of such a model.
         MissingDependencyError: the extra `export` is not installed.
         OutputError: `out` holds something else.
+        UsageError: `runtime` is not that package.
     """
     require_onnx()
     require_exportable(model, tokenizer)
     _require_own(out)
+    if runtime is not None:
+        require_runtime(runtime)
     world = World(model, tokenizer)
     taken = {robot.embodiment.id: take_starts(world, robot, starts) for robot in robots}
     loss, halved = round_weights(model, tokenizer, taken) if half else (None, False)
@@ -98,6 +105,7 @@ def export_folder(
             held = known.get(robot.embodiment.id, UNKNOWN)
             about = describe(robot) | {"holds": held.words, "follows": held.follows is not False}
             manifest["robots"].append(about | _write_robot(folder, model, robot, taken[robot.embodiment.id]))
+        manifest["runtime"] = write_page(folder, runtime)
         write_atomic(folder / MANIFEST, to_json(manifest))
     return manifest
 

@@ -155,7 +155,8 @@ class StepGraph(nn.Module):
 
     @property
     def _embed(self) -> Any:
-        return self.trunk.embed
+        trunk: Any = self.trunk  # that of a discrete model embeds tokens
+        return trunk.embed
 
     def _memory(self) -> Any:
         config = self.config

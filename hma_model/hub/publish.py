@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 Content = Path | bytes
+PAGE = "page/"  # begins the names of the files of a page
 ENV = "env.py"  # lerobot's EnvHub reads it
 ENV_CODE = '''"""Offer this checkpoint to lerobot as environments of its robots; pip install hma-toolkit."""
 
@@ -65,6 +66,7 @@ def push(
     target: StrPath,
     embodiments: Iterable[str] | None = None,
     private: bool | None = None,
+    page: Path | None = None,
 ) -> str:
     """Publish embodiments of a checkpoint, and its trunk if the hub has none yet.
 
@@ -73,6 +75,7 @@ def push(
         target: str or path of a folder, a URI, or a repository; it is made if it does not exist.
         embodiments: ids; None for all.
         private: make a new repository a private one.
+        page: a folder of `hma export`, published as `page/` in the place of an older one.
 
     Returns:
         The address of the published checkpoint: a path, URI or web address.
@@ -87,7 +90,7 @@ def push(
     _require_publishable(source, ids)
     store = open_store(target, write=True, private=private)
     message = f"Add {', '.join(ids)}" if ids else "Add the trunk"
-    return store.publish(lambda: _changes(source, ids, store), message)
+    return store.publish(lambda: _changes(source, ids, store, page), message)
 
 
 def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None = None) -> str:
@@ -143,7 +146,9 @@ def _require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None
             raise CheckpointError(source.path(name, CARD), fault, "save the checkpoint again")
 
 
-def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content | None]:
+def _changes(
+    source: Checkpoint, ids: list[str], store: Store, page: Path | None
+) -> dict[str, Content | None]:
     """Return what a push writes (contents) and deletes (None), by name, on top of what the hub has now."""
     from hma_data.shards.manifest import MANIFEST  # imports pyarrow
 
@@ -169,6 +174,10 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
         changes[TRUNK] = inside(source.folder, TRUNK)
     if not {CONFIG, ENV} <= files.keys():
         changes[ENV] = ENV_CODE.format(repo=store.repo).encode()
+    if page is not None:
+        changes |= {name: None for name in files if name.startswith(PAGE)}
+        parts = [path for path in page.rglob("*") if path.is_file()]
+        changes |= {f"{PAGE}{path.relative_to(page).as_posix()}": path for path in parts}
     for name in ids:
         shown = source.pictures(name)
         for part in (*shown, *PARTS):
@@ -187,7 +196,8 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
     after = {path for path in {*files, *changes} if changes.get(path, b"") is not None}
     samples = {path.removeprefix("embodiments/") for path in after if path.endswith(PICTURES)}
     config = checkpoints.config_json(source.config, source.trunk_sha256)
-    changes[README] = render(config, cards, repo=store.repo, samples=samples)
+    paged = f"{PAGE}index.html" in after
+    changes[README] = render(config, cards, repo=store.repo, samples=samples, page=paged)
     return changes
 
 

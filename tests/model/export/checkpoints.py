@@ -70,11 +70,15 @@ class Driver:
         )
         self.frames = np.load(folder / self.robot["frames"])[start]
         self.chunks = np.load(folder / self.robot["chunks"])[start]
+        self.begin(self.draws(np.random.default_rng(0)))
+
+    def begin(self, draws: dict[str, NDArray[Any]]) -> None:
+        """Begin anew from the start."""
         self.state = {one["name"]: np.zeros(one["shape"], one["dtype"]) for one in self.about["state"]}
         self._before = np.full(self.chunks.shape[1], np.nan, np.float32)
         for frame, chunk in zip(self.frames, self.chunks):
             self.put(frame)
-            self.advance(chunk, self.draws(np.random.default_rng(0)))
+            self.advance(chunk, draws)
         self.put(self.frames[-1])
 
     def put(self, frame: NDArray[Any]) -> None:

@@ -3,6 +3,8 @@
 import hashlib
 import json
 import re
+import shutil
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import onnx
 import pytest
 import torch
 
-from hma_data.errors import CheckpointError, OutputError
+from hma_data.errors import CheckpointError, OutputError, UsageError
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.checkpoint.io import load
@@ -22,28 +24,10 @@ from hma_model.generation.decode import decode
 from hma_model.generation.rollout import Rollout
 from hma_model.play.session import psnr
 from tests.command import hma
-from tests.model.export.checkpoints import ROBOT, Driver, drawn_as_torch, save_pixels, save_tokens
+from tests.model.export.checkpoints import ROBOT, Driver, drawn_as_torch
 from tests.model.true_world import BlockLatents, latent_model
 
 FRAMES = 100
-
-
-@pytest.fixture(scope="session")
-def tokens(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A discrete transformer, exported; the checkpoint lies beside it."""
-    folder = tmp_path_factory.mktemp("tokens")
-    save_tokens(folder / "model")
-    export_checkpoint(str(folder / "model"), [], folder / "page", None)
-    return folder / "page"
-
-
-@pytest.fixture(scope="session")
-def pixels(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A U-Net of pixels, likewise."""
-    folder = tmp_path_factory.mktemp("pixels")
-    save_pixels(folder / "model")
-    export_checkpoint(str(folder / "model"), [], folder / "page", None)
-    return folder / "page"
 
 
 def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[Any, Any, float]]:
@@ -139,6 +123,12 @@ def test_another_folder_is_not_replaced(tokens: Path, tmp_path: Path) -> None:
     assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
+def test_a_wrong_runtime_is_refused_before_anything_is_computed(tokens: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="npm install onnxruntime-web@"):
+        export_checkpoint(str(tokens.with_name("model")), [], tmp_path / "page", None, runtime=tmp_path)
+    assert not (tmp_path / "page").exists()
+
+
 def test_a_tokenizer_without_a_network_is_refused() -> None:
     with pytest.raises(CheckpointError, match="no network to export"):
         require_exportable(latent_model(ROBOT), BlockLatents())
@@ -148,3 +138,22 @@ def test_an_unknown_robot_is_one_line(tokens: Path, tmp_path: Path) -> None:
     ended = hma("export", str(tokens.with_name("model")), "--out", str(tmp_path / "page"), "-e", "nobody")
     assert ended.returncode == 1 and len(ended.stderr.strip().splitlines()) == 1
     assert "has no embodiment 'nobody'" in ended.stderr
+
+
+def test_a_pushed_page_lies_beside_the_checkpoint_and_replaces_an_older_one(
+    tokens: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def copy(checkpoint: str, data: list[Path], out: Path, *rest: Any) -> None:
+        shutil.copytree(tokens, out)
+
+    monkeypatch.setattr(import_module("hma_model.cli.export"), "export_checkpoint", copy)
+    model, published = tokens.with_name("model"), tmp_path / "hub" / "model"
+    assert hma("hub", "push", model, published, "--page").returncode == 0
+    names = {path.relative_to(tokens) for path in tokens.rglob("*") if path.is_file()}
+    assert {path.relative_to(published / "page") for path in (published / "page").rglob("*.*")} >= names
+    assert "(page/index.html)" in (published / "README.md").read_text()
+    (published / "page" / "old.js").write_text("old")
+    assert hma("hub", "push", model, published, "--page").returncode == 0
+    assert hma("hub", "push", model, published).returncode == 0  # without --page it stays
+    assert (published / "page" / "index.html").is_file() and not (published / "page" / "old.js").exists()
+    assert "(page/index.html)" in (published / "README.md").read_text()

@@ -1,0 +1,225 @@
+// The page of an exported model: choose a robot and a start, and drive.
+
+import { Controls, cap, fill } from "./controls.js";
+import { Loader, World, openRuntime, readManifest } from "./world.js";
+
+const $ = (id) => document.getElementById(id);
+const asked = new URLSearchParams(location.search);
+let manifest, ort, step, backend, robot, world = null, start = 0;
+let paused = true, begun = false, wanted = 0, frame = 0, times = [], due = 0, opening = 0;
+let making = Promise.resolve();  // one frame at a time
+const loader = new Loader((done, total) => {
+  $("bar").max = Math.max(total, done); $("bar").value = done;
+  $("veil-text").textContent = `Loading: ${(done / 1e6).toFixed(1)} MB`;
+});
+
+const controls = new Controls({ stage: $("stage"), knob: $("knob"), dims: $("dims"), hint: $("hint") }, {
+  paused: () => paused, replays: () => false, begun: () => begun, blocked: () => $("about").open || !world,
+  takeOver: () => { if (world && !begun && paused) run(true); },
+  drive: () => {},
+  buttons: { p: "run", n: "step", r: "reset", c: "scene" },
+});
+
+// -- loading
+
+async function main() {
+  if (await isolate()) return;  // it loads again
+  manifest = await readManifest();
+  await prune();
+  document.title = $("model").textContent = manifest.model;
+  $("robot").replaceChildren(...manifest.robots.map((one) => new Option(one.id + (one.about && " — " + one.about) + (one.holds && " · " + one.holds), one.id)));
+  $("temperature-row").hidden = manifest.temperature === null;
+  backend = asked.get("backend") === "webgpu" && await hasGpu() ? "webgpu" : "wasm";
+  const named = manifest.robots.find((one) => one.id === asked.get("robot"));
+  robot = named || manifest.robots[0];
+  await poster();
+  const graph = loader.part(manifest.step);
+  graph.catch(() => {});  // it is awaited below
+  ort = await openRuntime(manifest, loader, backend, Number(asked.get("threads")));
+  step = await ort.InferenceSession.create(await graph, { executionProviders: backend === "webgpu" ? ["webgpu", "wasm"] : ["wasm"] });
+  document.body.dataset.backend = backend;
+  $("backend").textContent = backend === "webgpu" ? "WebGPU" : `WASM, ${ort.env.wasm.numThreads} thread${ort.env.wasm.numThreads > 1 ? "s" : ""}`;
+  await openRobot();
+  loop();
+}
+
+async function isolate() {  // a service worker keeps files for offline use; loaded once more, the page may use threads
+  if (!("serviceWorker" in navigator)) return false;
+  try {
+    await navigator.serviceWorker.register("sw.js");
+    await Promise.race([navigator.serviceWorker.ready, new Promise((done) => setTimeout(done, 4000))]);
+  } catch { return false; }
+  if (navigator.serviceWorker.controller && crossOriginIsolated || sessionStorage.getItem("isolated")) return false;
+  sessionStorage.setItem("isolated", "1");
+  location.reload();
+  return true;
+}
+
+async function prune() {  // forget the files of an older export
+  if (!self.caches) return;
+  const versions = new Set([manifest.runtime.version, ...[manifest.step, ...manifest.robots.map((one) => one.stem)].map((part) => part.sha256.slice(0, 12))]);
+  const cache = await caches.open("hma-export");
+  for (const request of await cache.keys()) {
+    const version = new URL(request.url).searchParams.get("v");
+    if (version && !versions.has(version)) await cache.delete(request);
+  }
+}
+
+async function hasGpu() {
+  try { return Boolean(navigator.gpu && await navigator.gpu.requestAdapter()); } catch { return false; }
+}
+
+async function poster() {  // show the start at once
+  const image = new Image();
+  image.src = robot.pictures[start];
+  await image.decode().catch(() => {});
+  if (image.width) { size(image.width, image.height); $("view").getContext("2d").drawImage(image, 0, 0); }
+}
+
+async function openRobot() {
+  const turn = ++opening;
+  world = null; run(false);
+  veil("Loading …");
+  $("robot").value = robot.id;
+  start = 0;
+  await making;
+  const opened = await World.open(ort, manifest, robot, loader, step);
+  if (turn !== opening) return;  // another robot was chosen meanwhile
+  opened.temperature = manifest.temperature === null ? null : Number($("temperature").value);
+  world = opened;
+  $("rate").textContent = `${+robot.hz.toPrecision(3)} actions/s, ${robot.stride} a frame`;
+  $("scene").hidden = robot.pictures.length < 2;
+  if (!robot.follows) note(robot.id + " does not follow its actions in this model: drive another robot to see it answer.");
+  await begin(0);
+}
+
+async function begin(number) {
+  start = number;
+  run(false);
+  begun = false; frame = 0; wanted = 0;
+  await making;
+  await poster();
+  await world.begin(start);
+  controls.open(robot, robot.held[start]);
+  counted();
+  showStart();
+  veil("");
+}
+
+// -- frames
+
+async function loop() {
+  for (;;) {
+    const now = performance.now();
+    if (world && (wanted > 0 || !paused) && now >= due) {
+      making = make().catch(fail);
+      await making;
+    }
+    await pause(world && !paused ? Math.min(due - performance.now(), 20) : 20);
+  }
+}
+
+// Timers of a page wait 4 ms or more; a message does not.
+const channel = new MessageChannel();
+function pause(ms) {
+  return new Promise((done) => {
+    if (ms > 4) return setTimeout(done, ms);
+    channel.port1.onmessage = done;
+    channel.port2.postMessage(0);
+  });
+}
+
+async function make() {
+  const current = world, action = controls.action.length ? controls.action : controls.targets, number = controls.input;
+  const chunk = Array.from({ length: robot.stride }, () => action).flat();
+  const begunAt = performance.now(), period = 1000 * robot.stride / robot.hz;
+  const image = await current.advance(chunk);
+  if (current !== world) return;
+  wanted = Math.max(0, wanted - 1);
+  const now = performance.now();
+  due = $("fast").checked ? now : Math.max(due + period, now);
+  begun = true;
+  frame += 1;
+  draw(image);
+  controls.used(number);
+  times = [...times.filter((time) => now - time < 4000), now];
+  $("fps").textContent = times.length > 1 ? (1000 * (times.length - 1) / (now - times[0])).toFixed(1) : "–";
+  $("fps").title = `The model took ${(now - begunAt).toFixed(0)} ms`;
+  counted();
+  document.dispatchEvent(new CustomEvent("frame", { detail: { number: frame, chunk, image, ms: now - begunAt } }));
+}
+
+function size(width, height) { const view = $("view"); if (view.width !== width || view.height !== height) { view.width = width; view.height = height; } }
+
+function draw(rgb) {
+  const [height, width] = manifest.image, pixels = new Uint8ClampedArray(4 * width * height).fill(255);
+  for (let i = 0, j = 0; i < rgb.length; i += 3, j += 4) { pixels[j] = rgb[i]; pixels[j + 1] = rgb[i + 1]; pixels[j + 2] = rgb[i + 2]; }
+  size(width, height);
+  $("view").getContext("2d").putImageData(new ImageData(pixels, width, height), 0, 0);
+}
+
+function counted() {
+  $("clock").textContent = (frame * robot.stride / robot.hz).toFixed(1) + " s";
+  document.body.dataset.frame = frame;
+}
+
+function run(on) {
+  paused = !on;
+  if (on) begun = true;
+  times = []; due = performance.now();
+  if (paused) { controls.forget(); $("fps").textContent = "–"; }
+  $("run").firstChild.textContent = paused ? "Run " : "Pause ";
+  showStart();
+}
+
+// -- what is said
+
+function showStart() {
+  const hint = $("start"), touch = matchMedia("(pointer: coarse)").matches;
+  hint.hidden = !paused || !world;
+  if (hint.hidden) return;
+  if (frame) return hint.replaceChildren(touch ? "Paused: tap Run" : "Paused: Run or P goes on");
+  if (touch) return hint.replaceChildren("Drag here to drive");
+  hint.replaceChildren(...robot.keys.flat().slice(0, 4).map(cap), robot.pads.length ? " or drag here to drive" : " drive");
+}
+
+function veil(text, again = false) {
+  $("veil").hidden = !text;
+  $("veil-text").textContent = text;
+  $("again").hidden = !again;
+  $("bar").hidden = again;
+}
+
+function fail(fault) {
+  world = null; paused = true;
+  loader.show = () => {};  // other downloads go on, and must not cover what is said
+  veil(fault.message || String(fault), true);
+}
+
+let noteTimer = 0;
+function note(text) {
+  clearTimeout(noteTimer);
+  $("note").textContent = text;
+  $("note").hidden = !text;
+  if (text) noteTimer = setTimeout(() => note(""), 9000);
+}
+
+// -- buttons
+
+$("robot").onchange = () => { robot = manifest.robots.find((one) => one.id === $("robot").value); openRobot().catch(fail); };
+$("run").onclick = () => { if (world) run(paused); };
+$("step").onclick = () => { if (world) { run(false); wanted += 1; } };
+$("reset").onclick = () => { if (world) begin(start).catch(fail); };
+$("scene").onclick = () => { if (world) begin((start + 1) % robot.pictures.length).catch(fail); };
+$("again").onclick = () => location.reload();
+$("temperature").oninput = () => {
+  $("temperature-out").value = $("temperature").value;
+  fill($("temperature"), 0);
+  if (world) world.temperature = Number($("temperature").value);
+};
+for (const radio of document.querySelectorAll("input[name=pixels]")) radio.onchange = () => $("left").classList.toggle("crisp", radio.value === "crisp");
+$("help").onclick = () => { controls.release(); $("about").showModal(); };
+$("close").onclick = () => { $("about").close(); $("stage").focus({ preventScroll: true, focusVisible: false }); };
+$("about").onclick = (event) => { if (event.target === $("about")) $("about").close(); };  // beside it
+fill($("temperature"), 0);
+main().catch(fail);

@@ -1,0 +1,141 @@
+// Run an exported model in this browser: load the runtime and the graphs, and make frame after frame.
+
+const TYPES = { int32: Int32Array, float32: Float32Array };
+const BUILDS = {
+  webgpu: ["ort.webgpu.min.mjs", "ort-wasm-simd-threaded.asyncify"],
+  wasm: ["ort.wasm.min.mjs", "ort-wasm-simd-threaded"],
+};
+// The smallest module with an instruction of 128 bits: a browser that refuses it has no SIMD.
+const SIMD = [0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253, 15, 253, 98, 11];
+
+export class Loader {  // downloads, and says how many bytes there are
+  constructor(show) { this.show = show; this.done = 0; this.total = 0; }
+
+  async bytes(url, { size = 0, sha256 = "", integrity = "" } = {}) {
+    this.total += size;
+    let answer;
+    try { answer = await fetch(url, integrity ? { integrity } : {}); }
+    catch (fault) { throw new Error(`${named(url)} cannot be loaded${integrity ? ", or is not the file that it should be" : ""}: ${fault.message}`); }
+    if (!answer.ok) throw new Error(`${named(url)} cannot be loaded: the host answers ${answer.status}`);
+    const parts = [], reader = answer.body.getReader();
+    for (;;) {
+      let step;
+      try { step = await reader.read(); }
+      catch (fault) { throw new Error(`${named(url)} was cut off: ${fault.message}`); }
+      if (step.done) break;
+      parts.push(step.value);
+      this.done += step.value.length;
+      this.show(this.done, this.total);
+    }
+    const content = new Uint8Array(await new Blob(parts).arrayBuffer());
+    let fault = size && content.length !== size ? `has ${content.length} bytes instead of ${size}` : "";
+    if (!fault && sha256 && crypto.subtle && await digest(content) !== sha256) fault = "is damaged";
+    if (!fault) return content;
+    if (self.caches) await (await caches.open("hma-export")).delete(new URL(url, location));  // do not keep it
+    throw new Error(`${named(url)} ${fault}: copy the exported folder again`);
+  }
+
+  part(part) { return this.bytes(`${part.file}?v=${part.sha256.slice(0, 12)}`, { size: part.bytes, sha256: part.sha256 }); }
+}
+
+function named(url) { return String(url).split("?")[0]; }
+
+async function digest(content) {
+  const found = new Uint8Array(await crypto.subtle.digest("SHA-256", content));
+  return [...found].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+export async function readManifest() {
+  let answer;
+  try { answer = await fetch("manifest.json", { cache: "no-cache" }); }
+  catch { throw new Error("manifest.json cannot be loaded: is the host reachable?"); }
+  if (!answer.ok) throw new Error("manifest.json is missing here: this page belongs into a folder of hma export");
+  const manifest = await answer.json().catch(() => ({}));
+  if (manifest.format !== "hma-export" || manifest.format_version !== 1) throw new Error("manifest.json is not that of an export which this page reads");
+  return manifest;
+}
+
+export async function openRuntime(manifest, loader, backend, threads) {
+  if (!WebAssembly.validate(new Uint8Array(SIMD))) throw new Error("This browser has no WebAssembly with SIMD: use one of 2021 or later (Safari 16.4)");
+  const [library, engine] = BUILDS[backend], { base, files, version } = manifest.runtime;
+  const load = (name) => loader.bytes(`${base}${name}?v=${version}`, { integrity: files[name] });
+  const [script, glue, binary] = await Promise.all([load(library), load(`${engine}.mjs`), load(`${engine}.wasm`)]);
+  const address = (content) => URL.createObjectURL(new Blob([content], { type: "text/javascript" }));
+  const ort = await import(address(script));
+  ort.env.wasm.wasmPaths = { mjs: address(glue) };
+  ort.env.wasm.wasmBinary = binary;
+  ort.env.wasm.numThreads = crossOriginIsolated ? threads || Math.min(4, navigator.hardwareConcurrency || 1) : 1;
+  ort.env.logLevel = "error";
+  return ort;
+}
+
+export async function readNumbers(url, loader) {  // a .npy file: its numbers and their shape
+  const content = await loader.bytes(url);
+  const size = content[8] + 256 * content[9];
+  const header = new TextDecoder().decode(content.subarray(10, 10 + size));
+  const kind = { "<i4": Int32Array, "<f4": Float32Array, "|u1": Uint8Array }[/'descr': '([^']+)'/.exec(header)[1]];
+  return { values: new kind(content.buffer, 10 + size), shape: /'shape': \(([^)]*)\)/.exec(header)[1].split(",").filter((one) => one.trim()).map(Number) };
+}
+
+function rows({ values, shape }, size) {  // the numbers of each place of the first axes
+  return Array.from({ length: values.length / size }, (_, i) => values.slice(i * size, (i + 1) * size));
+}
+
+const product = (shape) => shape.reduce((one, other) => one * other, 1);
+
+function normal() { return Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random()); }
+
+export class World {  // one robot
+  static async open(ort, manifest, robot, loader, step) {
+    const [graph, frames, chunks] = await Promise.all([loader.part(robot.stem), readNumbers(robot.frames, loader), readNumbers(robot.chunks, loader)]);
+    const stem = await ort.InferenceSession.create(graph, { executionProviders: ["wasm"] });  // too small for a GPU
+    return new World(ort, manifest, stem, step, frames, chunks);
+  }
+
+  constructor(ort, manifest, stem, step, frames, chunks) {
+    Object.assign(this, { ort, manifest, stem, step, temperature: manifest.temperature });
+    const [starts, known] = frames.shape;
+    this.width = chunks.shape[2];
+    this.frames = rows(frames, frames.values.length / starts / known);
+    this.chunks = rows(chunks, this.width);
+    this.known = known;
+  }
+
+  async begin(start) {  // give the model the known frames of a start
+    this.before = new Float32Array(this.width).fill(NaN);
+    this.state = Object.fromEntries(this.manifest.state.map((one) => [one.name, this.tensor(one)]));
+    for (let i = 0; i < this.known; i++) {
+      this.put(this.frames[start * this.known + i]);
+      if (i < this.known - 1) await this.advance(this.chunks[start * (this.known - 1) + i]);
+    }
+  }
+
+  put(frame) {
+    const port = this.manifest.state.find((one) => one.name === "frame");
+    this.state.frame = this.tensor(port, TYPES[port.dtype].from(frame));
+  }
+
+  tensor(port, values = new TYPES[port.dtype](product(port.shape))) { return new this.ort.Tensor(port.dtype, values, port.shape); }
+
+  draws() {
+    const made = {};
+    for (const port of this.manifest.draws) {
+      const values = new Float32Array(product(port.shape));
+      const draw = port.law === "normal" ? normal : Math.random;
+      for (let i = 0; i < values.length; i++) values[i] = draw();
+      made[port.name] = this.tensor(port, values);
+    }
+    if (this.temperature !== null) made.temperature = this.tensor({ dtype: "float32", shape: [] }, Float32Array.of(this.temperature));
+    return made;
+  }
+
+  async advance(chunk) {  // returns the next image as RGB bytes
+    const pair = new Float32Array(2 * this.width);
+    pair.set(this.before); pair.set(chunk, this.width);
+    const { actions } = await this.stem.run({ chunks: this.tensor({ dtype: "float32", shape: [2, this.width] }, pair) });
+    const made = await this.step.run({ actions, ...this.state, ...this.draws() });
+    for (const name of Object.keys(this.state)) this.state[name] = made["next_" + name];
+    this.before = Float32Array.from(chunk);
+    return made.image.data;
+  }
+}

@@ -1,0 +1,26 @@
+"""Fixtures: exports of a tiny checkpoint of each trunk, made once in a session."""
+
+from pathlib import Path
+
+import pytest
+
+from hma_model.cli.export import export_checkpoint
+from tests.model.export.checkpoints import save_pixels, save_tokens
+
+
+@pytest.fixture(scope="session")
+def tokens(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A discrete transformer, exported; the checkpoint lies beside it."""
+    folder = tmp_path_factory.mktemp("tokens")
+    save_tokens(folder / "model")
+    export_checkpoint(str(folder / "model"), [], folder / "page", None)
+    return folder / "page"
+
+
+@pytest.fixture(scope="session")
+def pixels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A U-Net of pixels, likewise."""
+    folder = tmp_path_factory.mktemp("pixels")
+    save_pixels(folder / "model")
+    export_checkpoint(str(folder / "model"), [], folder / "page", None)
+    return folder / "page"

@@ -1,0 +1,179 @@
+"""The exported page in a real browser, from a plain static server in a sub-folder."""
+
+import base64
+import functools
+import http.server
+import json
+import os
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from hma_model.export.page import VERSION, write_page
+from tests.model.export.checkpoints import ROBOT, Driver
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
+
+PATIENCE = 300_000  # ms: machines of tests are busy
+FLAGS = (
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+# All draws are equal, so the likeliest tokens are taken in the order of their places.
+KEEP_FRAMES = """
+Math.random = () => 0.5;
+window.kept = [];
+document.addEventListener("frame", ({ detail: { chunk, image } }) => {
+  kept.push([[...chunk], btoa(String.fromCharCode(...image))]);
+});
+"""
+
+
+@pytest.fixture(scope="session")
+def runtime(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The npm package onnxruntime-web."""
+    if stated := os.environ.get("HMA_ORT_WEB"):
+        return Path(stated)
+    if not shutil.which("npm"):
+        pytest.skip("no npm, which brings onnxruntime-web")
+    folder = tmp_path_factory.mktemp("npm")
+    words = ["npm", "install", "--ignore-scripts", "--prefix", str(folder), f"onnxruntime-web@{VERSION}"]
+    if subprocess.run(words, capture_output=True, timeout=600, check=False).returncode:
+        pytest.skip("npm has no onnxruntime-web here")
+    return folder / "node_modules" / "onnxruntime-web"
+
+
+@pytest.fixture
+def site(tokens: Path, runtime: Path, tmp_path: Path) -> Path:
+    """A folder whose sub-folder `sub/page` is an export with the runtime."""
+    page = Path(shutil.copytree(tokens, tmp_path / "site" / "sub" / "page"))
+    manifest = json.loads((page / "manifest.json").read_text())
+    manifest["runtime"] = write_page(page, runtime)
+    (page / "manifest.json").write_text(json.dumps(manifest))
+    return tmp_path / "site"
+
+
+@pytest.fixture
+def server(site: Path) -> Iterator[http.server.ThreadingHTTPServer]:
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *arguments: Any) -> None:
+            pass
+
+    made = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(site)))
+    threading.Thread(target=made.serve_forever, daemon=True).start()
+    yield made
+    made.shutdown()
+    made.server_close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator["Browser"]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        found = shutil.which("chromium") or playwright.chromium.executable_path
+        if not shutil.which(found):
+            pytest.skip("no Chromium: playwright install chromium")
+        launched = playwright.chromium.launch(executable_path=found, args=list(FLAGS))
+        yield launched
+        launched.close()
+
+
+@pytest.fixture
+def page(browser: "Browser") -> Iterator["Page"]:
+    context = browser.new_context(viewport={"width": 390, "height": 844}, color_scheme="dark")
+    context.set_default_timeout(PATIENCE)
+    made = context.new_page()
+    made.on("pageerror", lambda fault: pytest.fail(str(fault)))
+    made.add_init_script(KEEP_FRAMES)
+    yield made
+    context.close()
+
+
+def address(server: http.server.ThreadingHTTPServer) -> str:
+    return f"http://127.0.0.1:{server.server_port}/sub/page/?backend=wasm&threads=1"
+
+
+def frames(page: "Page", least: int) -> None:
+    page.wait_for_function("(least) => Number(document.body.dataset.frame) >= least", arg=least)
+
+
+def said(page: "Page") -> str:
+    page.wait_for_selector("#again:visible")
+    return page.text_content("#veil-text") or ""
+
+
+def test_200_frames_driven_by_keys_are_those_of_onnxruntime_and_it_works_offline(
+    page: "Page", server: Any, site: Path
+) -> None:
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(address(server))
+    page.wait_for_selector("#veil", state="hidden")
+    assert page.evaluate("crossOriginIsolated")  # threads are allowed
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.focus("#fast")
+    page.keyboard.press("Space")  # by the keyboard alone
+    page.focus("#stage")
+    page.keyboard.down("ArrowUp")
+    frames(page, 100)
+    page.keyboard.up("ArrowUp")
+    page.keyboard.down("w")
+    frames(page, 200)
+    page.keyboard.press("p")
+    assert float(page.evaluate("document.getElementById('clock').textContent.split(' ')[0]")) > 10
+    kept = page.evaluate("kept")[:200]
+    driver = Driver(site / "sub" / "page", ROBOT)
+    half = {one["name"]: np.full(one["shape"], 0.5, np.float32) for one in driver.about["draws"]}
+    half["temperature"] = np.array(driver.about["temperature"], np.float32)
+    driver.begin(half)
+    chunks = [np.float32(chunk) for chunk, _ in kept]
+    shown = [np.frombuffer(base64.b64decode(image), np.uint8) for _, image in kept]
+    assert len({chunk.tobytes() for chunk in chunks}) > 2
+    own = [driver.advance(chunk, half).reshape(-1) for chunk in chunks]
+    far = [np.abs(one.astype(int) - other.astype(int)).max() for one, other in zip(shown, own)]
+    assert max(far) <= 1, f"frame {int(np.argmax(np.array(far) > 1))} is another"
+    origin = f"http://127.0.0.1:{server.server_port}/"
+    assert all(url.startswith((origin, f"blob:{origin}", "data:")) for url in asked)
+
+    server.shutdown()
+    server.server_close()
+    page.reload()
+    page.wait_for_selector("#veil", state="hidden")
+    page.keyboard.press("n")
+    frames(page, 1)
+
+
+def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(
+    page: "Page", server: Any, site: Path
+) -> None:
+    folder = site / "sub" / "page"
+    whole = (folder / "step.onnx").read_bytes()
+    (folder / "step.onnx").write_bytes(whole[:-1000])
+    page.goto(address(server))
+    expected = (
+        f"step.onnx has {len(whole) - 1000} bytes instead of {len(whole)}: copy the exported folder again"
+    )
+    assert said(page) == expected
+    (folder / "step.onnx").write_bytes(whole)
+    page.click("#again")
+    page.wait_for_selector("#veil", state="hidden")
+    (folder / "manifest.json").unlink()
+    page.evaluate("caches.delete('hma-export')")
+    page.reload()
+    assert said(page) == "manifest.json is missing here: this page belongs into a folder of hma export"
+
+
+def test_a_browser_without_simd_is_one_clear_line(page: "Page", server: Any) -> None:
+    page.add_init_script("WebAssembly.validate = () => false;")
+    page.goto(address(server))
+    assert said(page).startswith("This browser has no WebAssembly with SIMD")
