@@ -349,3 +349,49 @@ def test_frames_in_which_nothing_moves_are_left_out_and_counted(tmp_path: Path) 
     times = np.array([dataset[row]["recorded_time"].item() for row in range(7)])
     np.testing.assert_allclose(times, np.array([0, 3, 4, 5, 6, 7, 8]) / 10)
     assert len(dataset) == 27 - 6
+
+
+# -- lerobot's own tools
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("tool", "words"),
+    [
+        (
+            "train",
+            "--dataset.repo_id=lab/robot --dataset.root={out} --dataset.video_backend=pyav --policy.type=act "
+            "--policy.device=cpu --policy.push_to_hub=false --policy.pretrained_backbone_weights=null "
+            "--policy.chunk_size=4 --policy.n_action_steps=4 --policy.dim_model=32 --policy.n_heads=2 "
+            "--policy.dim_feedforward=32 --steps=2 --batch_size=2 --num_workers=0 --output_dir={made}",
+        ),
+        (
+            "edit_dataset",
+            "--repo_id=lab/robot --root={out} --new_repo_id=lab/less --new_root={made} "
+            "--operation.type=delete_episodes --operation.episode_indices=[0]",
+        ),
+        (
+            "dataset_viz",
+            "--repo-id lab/robot --root {out} --episode-index 1 --save 1 --output-dir {made} --num-workers 0",
+        ),
+    ],
+)
+def test_tools_of_lerobot_take_the_dataset(tool: str, words: str, tmp_path: Path) -> None:
+    data, robot = rlds(tmp_path)
+    to_lerobot(robot, data, tmp_path / "out")
+    made = tmp_path / "made"
+    given = words.format(out=tmp_path / "out", made=made).split()
+    done = subprocess.run(
+        [sys.executable, "-m", f"lerobot.scripts.lerobot_{tool}", *given],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "HF_HUB_OFFLINE": "1"},
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    if tool == "train":
+        assert list(made.rglob("model.safetensors"))
+    elif tool == "edit_dataset":
+        assert opened(made).meta.total_episodes == 2
+    else:
+        assert [path.suffix for path in made.iterdir()] == [".rrd"]
