@@ -39,6 +39,7 @@ from hma_data.conversion.reading import (
     UnitNotes,
     signs_of_life,
 )
+from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import PictureCheck, picture_flags, prepare, upright
 from hma_data.errors import EpisodeError, HMAError, OutputError, SourceError, UsageError
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment
@@ -98,14 +99,18 @@ def _seen(plan: Plan, uri: str, robot: Embodiment, layout: RowLayout) -> dict[st
         try:
             clip = read_clip(source, uri, ref.id, robot, layout.cameras)
             success = success or clip.episode.success is not None
-            for name in layout.cameras if not sizes and len(clip) else ():
-                frames = upright(clip.frames_at(name, np.zeros(1, np.int64)), robot.camera(name))
-                sizes[name] = [int(side) for side in frames.shape[1:3]]
+            if not sizes and len(clip):
+                sizes = {name: _size(clip, name, robot) for name in layout.cameras}
         except (HMAError, OSError, ValueError) as refused:
             fault = str(refused)
-    if len(sizes) < len(layout.cameras):
+    if not sizes:
         raise SourceError(uri, f"none of the first episodes can be read: {fault or 'they are empty'}")
     return {"sizes": sizes, "success": success}
+
+
+def _size(clip: Clip, camera: str, robot: Embodiment) -> list[int]:
+    frames = upright(clip.frames_at(camera, np.zeros(1, np.int64)), robot.camera(camera))
+    return [int(side) for side in frames.shape[1:3]]
 
 
 @dataclass(frozen=True)
@@ -378,7 +383,7 @@ class LeRobotHolder:
 
     def clear(self) -> None:
         """Delete the dataset and the parts; refuse what else is there."""
-        self._dataset()
+        self._conversion()
         shutil.rmtree(self.out, ignore_errors=True)
         for item in self.folder.iterdir() if self.folder.is_dir() else ():
             if not item.name.startswith(LOCK):
@@ -479,12 +484,19 @@ class LeRobotHolder:
 
     def _dataset(self) -> Manifest | None:
         """Return what the dataset in `out` says of its conversion; None where there is none."""
+        path = self._conversion()
+        if path is None:
+            return None
+        return Manifest.from_text(path.read_bytes(), path, "--overwrite makes the dataset anew")
+
+    def _conversion(self) -> Path | None:
+        """Return the file of a dataset of ours in `out`; None where nothing is there."""
         if not self.out.is_dir() or not any(self.out.iterdir()):
             return None
         path = self.out / CONVERSION
-        if not path.is_file():
+        if not path.is_file() or not (self.out / "meta" / "info.json").is_file():
             raise OutputError(self.out, "holds something else", "choose an empty or new --out")
-        return Manifest.from_text(path.read_bytes(), path, "--overwrite makes the dataset anew")
+        return path
 
 
 def _footer(part: Path) -> Footer:

@@ -20,7 +20,8 @@ from hma_data.registry.embodiment import Embodiment
 
 STILL = 0.005
 NOISE = 0.001
-MOTIONS = ("eef_delta", "joint_delta", "joint_velocity", "base_velocity")  # action spaces
+# Action spaces whose commands are motions; in a mixed one, those in a unit a second are.
+MOTIONS = ("eef_delta", "joint_delta", "joint_velocity", "base_velocity")
 
 
 def idle_frames(clip: Clip, embodiment: Embodiment) -> NDArray[np.bool_]:
@@ -49,7 +50,7 @@ def idle_rows(clip: Clip, embodiment: Embodiment, kept: NDArray[np.int64], strid
 def _is_motion(part: Component, action: Action) -> bool:
     if part.gripper is not None:
         return part.gripper in ("opening_is_high", "closing_is_high")
-    return action.space in MOTIONS
+    return action.space in MOTIONS or (part.unit or "").endswith("/s")
 
 
 def _numbers(clip: Clip, embodiment: Embodiment) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

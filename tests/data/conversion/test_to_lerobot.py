@@ -21,7 +21,7 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.report import Summary
 from hma_data.episodes.images import prepare
-from hma_data.errors import OutputError, SourceError, UsageError
+from hma_data.errors import OutputError, ShardError, SourceError, UsageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import get_tokenizer
@@ -298,6 +298,26 @@ def test_what_is_no_dataset_of_ours_is_left_alone(tmp_path: Path) -> None:
     assert opened(out).meta.total_episodes == 3
 
 
+def test_a_dataset_whose_record_is_damaged_can_be_made_anew(tmp_path: Path) -> None:
+    data, robot = hdf5(tmp_path)
+    out = tmp_path / "out"
+    to_lerobot(robot, data, out, replace(SMALL, limit=1))
+    (out / "conversion.json").write_text("{")
+    with pytest.raises(ShardError, match=r"conversion\.json: is damaged.*--overwrite"):
+        to_lerobot(robot, data, out)
+    to_lerobot(robot, data, out, replace(SMALL, limit=1), overwrite=True)
+    assert opened(out).meta.total_episodes == 1
+
+
+def test_a_first_episode_without_one_of_its_cameras_is_refused_alone(tmp_path: Path) -> None:
+    data, robot = hdf5(tmp_path)
+    with h5py.File(data, "a") as file:
+        del file["data/demo_0/obs/wrist"]
+        file["data/demo_0/obs/wrist"] = np.array([b"\xff\xd8 no image"] * 9)
+    summary = to_lerobot(robot, data, tmp_path / "out")
+    assert summary.manifest.quarantined == 1 and opened(tmp_path / "out").meta.total_episodes == 2
+
+
 def test_without_a_usable_episode_nothing_is_written(tmp_path: Path) -> None:
     data, robot = hdf5(tmp_path)
     values = robot.to_dict() | {"sync": {"action_shift": 50}}
@@ -349,6 +369,20 @@ def test_frames_in_which_nothing_moves_are_left_out_and_counted(tmp_path: Path) 
     times = np.array([dataset[row]["recorded_time"].item() for row in range(7)])
     np.testing.assert_allclose(times, np.array([0, 3, 4, 5, 6, 7, 8]) / 10)
     assert len(dataset) == 27 - 6
+
+
+def test_a_velocity_in_a_mixed_space_is_a_motion_while_it_stays_the_same(tmp_path: Path) -> None:
+    data, robot = hdf5(tmp_path)
+    values = robot.to_dict()
+    values["action"]["space"] = "mixed"
+    for part in values["action"]["components"]:
+        part["unit"] = "m/s"
+    with h5py.File(data, "a") as file:
+        for demo in file["data"].values():
+            demo["actions"][...] = 0.5
+    mixed = Embodiment.from_values(values, "mixed")
+    summary = to_lerobot(mixed, data, tmp_path / "out", replace(SMALL, drop_idle=True))
+    assert "idle_frames" not in summary.flags
 
 
 # -- lerobot's own tools
