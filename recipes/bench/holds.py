@@ -153,6 +153,15 @@ def colors_of(found: Found) -> NDArray[np.float64]:
     return np.stack([np.median(pixels, axis=0) for pixels in taken])
 
 
+def distinct(colors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the colours (C, 3) without those near an earlier one: places of one object differ a little."""
+    kept: list[NDArray[np.float64]] = []
+    for color in colors:
+        if all(np.linalg.norm(color - other) >= NEAR for other in kept):
+            kept.append(color)
+    return np.reshape(kept, (-1, 3))
+
+
 def masks_of(images: Images, colors: NDArray[np.float64]) -> Masks:
     """Return the pixels (C, …, S, S) that have each of the colours (C, 3) and no other one rather."""
     far = np.stack([np.linalg.norm(images.astype(np.float32) - color, axis=-1) for color in colors])
@@ -161,8 +170,8 @@ def masks_of(images: Images, colors: NDArray[np.float64]) -> Masks:
 
 def _row(found: Found, mark: int) -> dict[str, Any]:
     colors = colors_of(found)
-    own, loose = colors[: found.driven], np.unique(colors[found.driven :], axis=0)
-    palette = np.concatenate([loose, np.unique(own, axis=0)])
+    own, loose = distinct(colors[: found.driven]), distinct(colors[found.driven :])
+    palette = np.concatenate([loose, own])
     first, true, made = (
         masks_of(x, palette) for x in (found.true[:, 0], found.true[:, mark], found.made[:, mark])
     )

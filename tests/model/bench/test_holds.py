@@ -57,6 +57,18 @@ def test_an_object_that_is_turned_keeps_its_shape_and_one_that_lost_a_limb_does_
     assert limb["shape"] < 0.75 and limb["left"] == pytest.approx(64 / 96, abs=0.01)
 
 
+def test_two_places_of_one_object_are_one_object_though_one_lies_on_its_edge() -> None:
+    shaded = scene(PLACES)
+    for frame, (x, y) in enumerate(PLACES):
+        shaded[0, frame, y + 12 : y + 16, x : x + 12] = (180, 20, 20)
+    corner = np.array(PLACES, float) + 1
+    foot = np.array(PLACES, float) + np.array([9, 14])
+    own = np.broadcast_to((54.0, 54.0), corner.shape)
+    parts = np.stack([own, corner, foot], axis=1)[None] * 2
+    judged = holds._row(holds.Found("toy", shaded, scene(PLACES), parts, driven=1), FRAMES - 1)
+    assert (judged["moved"], judged["overlap"], judged["shape"], judged["left"]) == (1, 1, 1, 1)
+
+
 def test_what_melted_or_what_nobody_touched_is_told() -> None:
     gone = scene(PLACES)
     gone[gone == RED[0]] = GREY[0]
