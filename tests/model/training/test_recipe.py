@@ -223,6 +223,15 @@ def test_overrides_of_one_mapping_gather():
     assert parse_overrides(["model.layers=2", "model.width=64"]) == {"model": {"layers": 2, "width": 64}}
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [{"video_loss": "regression"}, {"video_loss": "diffusion"}, {"levels": [8]}, {"levels": [8, 16, 24]}],
+)
+def test_a_unet_needs_no_further_key_and_takes_either_loss(changes):
+    model = {"trunk": "unet", "shared_modulation": True, "copy_previous": True} | changes
+    assert make_recipe({"data": ["x"], "model": model}).model["trunk"] == "unet"
+
+
 # -- what is shipped
 
 SHIPPED = sorted(path.stem for path in (shipped("recipes") / "train").glob("*.yaml"))
