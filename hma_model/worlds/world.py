@@ -199,7 +199,8 @@ class World:
 
     def shown(self, frames: NDArray[Any]) -> Image:
         """Return the images (P, S, V·S, 3) of frames as a prompt takes them; images stay as they are."""
-        if frames.ndim == 4 and frames.dtype == np.uint8:
+        stored = frames.shape[1:] == self.model.config.frame_shape  # of pixels in uint8 too
+        if frames.ndim == 4 and frames.dtype == np.uint8 and not stored:
             return frames
         return decode(self.tokenizer, torch.from_numpy(np.asarray(frames)).unsqueeze(0))[0]
 

@@ -41,6 +41,13 @@ def test_an_environment_steps_and_resets(world: World, tmp_path: Path) -> None:
     assert np.array_equal(image, first)  # untrained, it repeats the frame
 
 
+def test_stored_pixels_of_a_prompt_are_shown_as_images(world: World) -> None:
+    images = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
+    stored = world.tokenizer.encode(images)
+    assert stored.dtype == np.uint8
+    assert np.array_equal(world.shown(stored), images) and world.shown(images) is images
+
+
 def test_how_unsure_it_is_is_not_measured_rather_than_nothing(world: World) -> None:
     arena = TrueArena(Scenes.of(world, ROBOT, 1, 0), 64)
     session = world.open(ROBOT, arena.prompts[0].frames, arena.prompts[0].chunks)
