@@ -440,6 +440,8 @@ def _showing(seen: Choice, findings: Iterable[Finding]) -> tuple[Choice, list[st
 
 def _framing(key: KeyInfo) -> Framing | None:
     """Return what of the image the YAML should show a tokenizer, where that is not the middle square."""
+    if key.moves_in is None:
+        return None
     return framing(Camera(name="camera", key=key.key), key.moves_in, *key.shape[:2])
 
 

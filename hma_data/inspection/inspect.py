@@ -327,7 +327,8 @@ def _for_robot(inspection: Inspection, robot: Embodiment) -> Iterator[Finding]:
             said = f"camera {camera.name} is {size} pixels, its YAML says {stated}"
             yield Finding("size", "info", said, key=camera.key)
         upright = camera and not camera.flip and not camera.rotate
-        if camera and upright and (framed := framing(camera, info.moves_in, *info.shape[:2])):
+        box = info.moves_in if upright else None
+        if camera and box and (framed := framing(camera, box, *info.shape[:2])):
             said = f"camera {camera.name}: {framed.fault}"
             yield Finding("crop", "warn", said, f"set {framed.words} in the YAML", camera.key)
         if camera and camera.color == "bgr" and info.swapped == "no":

@@ -87,6 +87,13 @@ def test_a_crop_that_cuts_the_robot_off_is_told_before_converting(tmp_path: Path
     assert not [one for one in examine(recording, robot(recording, f", {crop}")) if one.check == "crop"]
 
 
+def test_a_camera_whose_key_holds_no_images_is_a_finding_and_no_crash(tmp_path: Path) -> None:
+    recording = record(tmp_path / "arm.hdf5", 200)
+    path = robot(recording)
+    path.write_text(path.read_text().replace("key: obs/image", "key: actions"))
+    assert any(one.severity == "error" for one in examine(recording, path))
+
+
 # -- what tokens keep of it
 
 
