@@ -40,8 +40,8 @@ def forwarded(
         model: the model in training; its mode is restored afterwards.
         batch: a batch on the model's device.
         share: the probability that a window gets predicted frames.
-        depth: D, the number of consecutive frames that are replaced. Their start is drawn; the first and the
-            last frame of the window stay true.
+        depth: D, the frames that are replaced, from a drawn start on; the first and the last stay true. A
+            model of whole latent frames replaces all later ones too, by at most D predictions in a row.
 
     Returns:
         The batch with `context`; the same batch if no window was drawn.
