@@ -123,9 +123,8 @@ def packed_components(vector: dict[str, Any], key: str) -> list[dict[str, Any]]:
     parts = []
     start = 0
     for part in vector["components"]:
-        facts = {
-            name: part[name] for name in ("names", "unit", "range", "normalize", "gripper") if name in part
-        }
+        kept = ("names", "unit", "range", "normalize", "representation", "gripper")
+        facts = {name: part[name] for name in kept if name in part}
         stop = start + part["dims"]
         parts.append({"key": key, "dims": part["dims"], "slice": [start, stop], **facts})
         start = stop

@@ -8,7 +8,7 @@ import pytest
 
 from hma_data.registry.catalog import entries
 from hma_data.registry.embodiment import Embodiment, find
-from hma_data.registry.export import component_names, lerobot_features, modality
+from hma_data.registry.export import component_names, lerobot_features, modality, packed_components
 
 YAML = """id: {id}
 kind: real
@@ -192,6 +192,14 @@ def test_component_names_are_never_the_same() -> None:
     parts = [{"key": "a/x", "dims": 1}, {"key": "b/x", "dims": 1}, {"key": "c", "dims": 2}]
     vector = robot("hdf5", action={"space": "mixed", "components": parts}).action
     assert component_names(vector) == ["x_1", "x_2", "c"]
+
+
+def test_packed_components_keep_what_the_values_mean() -> None:
+    pose = {"key": "pose", "dims": 4, "representation": "quaternion_xyzw", "sign": -1.0, "unit": "rad"}
+    (packed,) = packed_components({"components": [pose]}, "state")
+    assert packed == {
+        "key": "state", "dims": 4, "slice": [0, 4], "representation": "quaternion_xyzw", "unit": "rad"
+    }  # fmt: skip
 
 
 def test_lerobot_features_have_the_widths_names_and_picture_sizes() -> None:
