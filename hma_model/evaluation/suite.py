@@ -258,7 +258,7 @@ def _keep(folder: Path, mark: str, part: Part) -> None:
 def _kept(folder: Path, mark: str, label: str, shards: ShardSet) -> Part | None:
     """Return a part that is done, under the names of this command; None if it is not done, or damaged."""
     arrays = kept_arrays(_path(folder, mark, shards.embodiment.id))
-    if arrays is None:
+    if arrays is None or "found" not in arrays:
         return None
     found = json.loads(str(arrays.pop("found"))) | {"checkpoint": label, "data": str(shards.folder)}
     sorted_out: dict[str, dict[str, Any]] = {"predicted": {}, "by_window": {}}
