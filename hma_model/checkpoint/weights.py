@@ -118,15 +118,16 @@ def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: 
                 raise CheckpointError(where, f"model.{key} is {value!r}: no size of a network", _REMEDY)
     values = sum(tensor.numel() for tensor in state.values())
     width, hidden = config.width, config.mlp_ratio * config.width
-    needed: dict[str, float] = {
-        "grid": config.tokens_per_frame * width,
-        "frames": config.frames * width if config.released else 0,
-    }
+    needed: dict[str, float] = {}
     if config.trunk == "unet":
+        finest = config.levels[0]
         needed["levels"] = config.layers * sum(18 * channels**2 for channels in config.levels)
-        del needed["grid"]  # its places have the channels of the finest resolution
+        needed["grid"] = config.tokens_per_frame // config.views * finest
+        needed["frames"] = config.frames * config.views * width * finest
     else:
         needed["layers"] = config.layers * width * max(width, hidden)
+        needed["grid"] = config.tokens_per_frame * width
+        needed["frames"] = config.frames * width if config.released else 0
     if config.kind == "discrete":
         needed["factored"] = sum(config.digits) * width
     else:

@@ -92,7 +92,12 @@ def fitted(edit: Edit) -> Edit:
     return lambda path: (edit(path), fit(path.parents[2]))
 
 
+UNET = {
+    "kind": "continuous", "trunk": "unet", "video_loss": "regression", "copy_previous": True,
+    "shared_modulation": True, "levels": [8],
+}  # fmt: skip
 MODEL = [
+    UNET | {"frames": 10**6}, UNET | {"grid": [2**13, 2**13]},
     {"layers": 10**9}, {"width": 2**40, "heads": 8}, {"width": 2**19, "heads": 8},
     {"factored": [10**6, 10**6]}, {"grid": [10**5, 10**5]}, {"frames": 10**6, "layout": "released"},
     {"mlp_ratio": 1e300}, {"layers": 1.5}, {"layers": "9" * 999}, {"grid": None}, {"frames": 10**30},
