@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_530, 11_500, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 62_000, 488_500
-TEST_LINES = 45_500
+TEST_LINES = 45_900
 DOC_WORDS = 38_000
 
 
