@@ -47,7 +47,7 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.skip("no npm, which brings onnxruntime-web")
     folder = tmp_path_factory.mktemp("npm")
     words = ["npm", "install", "--ignore-scripts", "--prefix", str(folder), f"onnxruntime-web@{VERSION}"]
-    if subprocess.run(words, capture_output=True, timeout=600, check=False).returncode:
+    if subprocess.run(words, capture_output=True, timeout=300, check=False).returncode:
         pytest.skip("npm has no onnxruntime-web here")
     return folder / "node_modules" / "onnxruntime-web"
 
