@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
     from hma_data.sources.common.checks import Finding
 
+TOKENIZER = "fsq-16"  # by default
 REASONS_PRINTED = 20  # of quarantine, the most frequent first
 # Options that few people need stand in panels of their own below the others in --help.
 _data = partial(Option, rich_help_panel="Selection and split")
@@ -52,7 +53,7 @@ def convert(
     source: Annotated[str | None, Option(help="Same as DATA.")] = None,
     tokenizer: Annotated[
         str, Option(help="Name of the tokenizer; see hma tokenizer list.", autocompletion=tokenizers)
-    ] = "fsq-16",
+    ] = TOKENIZER,
     weights: Annotated[str | None, _rare(help="Tokenizer weights other than the default.")] = None,
     device: Annotated[str, Option(help="Device of the tokenizer: cpu, cuda, mps.")] = "cpu",
     workers: Annotated[int, Option(min=0, help="Processes; 0: this one, without crash protection.")] = 1,
@@ -125,6 +126,9 @@ def convert(
     source = data if source is None else source
     if extend and overwrite:
         raise UsageError("hma convert", "--extend keeps what --overwrite deletes", "give one of them")
+    if to == "lerobot" and (tokenizer != TOKENIZER or weights):
+        fault = "a LeRobotDataset holds frames as recorded, not tokens"
+        raise UsageError("--to lerobot", fault, "leave out --tokenizer and --weights")
     settings = Settings(
         frames=frames,
         cameras=tuple(name.strip() for word in cameras or () for name in word.split(",") if name.strip()),

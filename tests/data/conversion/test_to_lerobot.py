@@ -25,6 +25,7 @@ from hma_data.errors import OutputError, ShardError, SourceError, UsageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import get_tokenizer
+from hma_model.cli import main
 from tests.command import ROOT, hma_process
 from tests.conftest import contents
 from tests.data import bag_files, rlds_files
@@ -334,6 +335,14 @@ def test_a_store_and_an_extension_are_refused(tmp_path: Path) -> None:
         to_lerobot(robot, data, tmp_path / "out", extend=True)
     with pytest.raises(UsageError, match="--drop-idle"):
         convert(robot, str(data), "raw-64", tmp_path / "out", settings=Settings(drop_idle=True))
+
+
+def test_a_tokenizer_for_frames_that_stay_as_they_are_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["convert", "x.hdf5", "-e", "rails_03", "--to", "lerobot", "--out", str(tmp_path / "out")]
+    assert main([*words, "--tokenizer", "fsq-lab"]) == 2
+    assert "leave out --tokenizer and --weights" in capsys.readouterr().err
 
 
 # -- what else comes along
