@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (700, 4_100, 7),
-    "hma_data/cli": (1_540, 10_900, 8),
+    "hma_data/cli": (1_550, 10_950, 8),
     "hma_data/conversion": (4_020, 29_900, 14),
     "hma_data/episodes": (1_660, 14_550, 9),
     "hma_data/hub": (520, 3_800, 3),

@@ -74,9 +74,9 @@ class Run:
             raise RecipeError("recipe: freeze", fault, "name a trained checkpoint with start=…")
         if self.start and "frames" not in recipe.model_fields_set:
             recipe = recipe.model_copy(update={"frames": self.start.checkpoint.config.frames})
-        self.recipe = recipe = self._with_precision(recipe)
         if recipe.parallel == "fsdp" and self.ranks.size > 1:
             require_shardable(recipe, self._config(recipe))
+        self.recipe = recipe = self._with_precision(recipe)
         often = max(recipe.objectives, key=lambda name: recipe.objectives[name])
         self.objective = OBJECTIVES[often]  # whose loss the evaluations compute
         self.train_data = TrainData(recipe, self.sets, self.ranks)

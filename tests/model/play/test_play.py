@@ -76,7 +76,7 @@ def test_the_page_opens_with_the_robot_that_was_named_or_the_image_that_was_give
     words, last = ["play", REPO, "--prompt", image, "--no-browser"], list(ROBOTS)[-1]
     assert main([*words, "-e", last]) == 0
     assert main(words) == 0
-    assert "-e ROBOT opens the page with yours" in capsys.readouterr().err
+    assert "-e ROBOT selects yours" in capsys.readouterr().err
     assert main(["play", "-e", "mover_04", "--no-browser"]) == 0
     assert main(["play", "--no-browser"]) == 0
     assert [kept[-1]["first"] for kept in served] == [
