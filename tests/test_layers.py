@@ -4,6 +4,8 @@ No modules import each other in a circle, inside a package either.
 """
 
 import ast
+import importlib
+import importlib.util
 import re
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -96,3 +98,19 @@ def test_the_architecture_page_lists_the_rooms_in_their_order() -> None:
 def test_a_room_says_what_it_is_for() -> None:
     silent = [name for name in MODULES if not ast.get_docstring(tree(name))]
     assert not silent
+
+
+def test_every_name_that_a_recipe_imports_exists() -> None:
+    """Most recipes run only by hand, so a name that moved would be found late."""
+    missing = []
+    for path in sorted((ROOT / "recipes").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(("hma_data", "hma_model")):
+                module = importlib.import_module(str(node.module))
+                for name in (alias.name for alias in node.names):
+                    if (
+                        not hasattr(module, name)
+                        and importlib.util.find_spec(f"{node.module}.{name}") is None
+                    ):
+                        missing.append(f"{path.name}:{node.lineno} {node.module}.{name}")
+    assert not missing

@@ -208,14 +208,14 @@ def _scores(model: Any, shards: ShardSet, row: Row) -> dict[str, Any]:
     """Return the figures of a trained model; None where one is not measured."""
     from hma_data.tokenizers.base import get_tokenizer
     from hma_model.evaluation.losses import masked_val_loss, windows
-    from hma_model.evaluation.perceptual import Networks
+    from hma_model.evaluation.perceptual import FeatureCollector, Networks
     from hma_model.evaluation.rollouts import rollout
-    from hma_model.evaluation.scores import Judge, Rolled, Scores
+    from hma_model.evaluation.scores import Rolled, Scores
     from hma_model.evaluation.simulated import measure_state
 
     tokenizer = get_tokenizer(shards.spec.name)
     batches = list(windows(shards, "val", FRAMES, WINDOWS))
-    rolled = Rolled(PROMPT, Judge(Networks()))
+    rolled = Rolled(PROMPT, FeatureCollector(Networks()))
     for number, batch in enumerate(batches):
         rolled.add(batch, partial(rollout, model, tokenizer, prompt=PROMPT, seed=number), DRAWS, seed=0)
     last = {kind: float(Scores.join(parts).psnr[:, -1].mean()) for kind, parts in rolled.scores.items()}
