@@ -1,5 +1,6 @@
 """Fixtures: exports of a tiny checkpoint of each trunk, made once in a session."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -8,19 +9,20 @@ from hma_model.cli.export import export_checkpoint
 from tests.model.export.checkpoints import save_pixels, save_tokens
 
 
-@pytest.fixture(scope="session")
-def tokens(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A discrete transformer, exported; the checkpoint lies beside it."""
-    folder = tmp_path_factory.mktemp("tokens")
-    save_tokens(folder / "model")
+def exported(folder: Path, save: Callable[[Path], object]) -> Path:
+    """Export a checkpoint that `save` writes; it lies beside the export."""
+    save(folder / "model")
     export_checkpoint(str(folder / "model"), [], folder / "page", None)
     return folder / "page"
+
+
+@pytest.fixture(scope="session")
+def tokens(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A discrete transformer, exported."""
+    return exported(tmp_path_factory.mktemp("tokens"), save_tokens)
 
 
 @pytest.fixture(scope="session")
 def pixels(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A U-Net of pixels, likewise."""
-    folder = tmp_path_factory.mktemp("pixels")
-    save_pixels(folder / "model")
-    export_checkpoint(str(folder / "model"), [], folder / "page", None)
-    return folder / "page"
+    """A U-Net of pixels, exported."""
+    return exported(tmp_path_factory.mktemp("pixels"), save_pixels)

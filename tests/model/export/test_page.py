@@ -21,13 +21,10 @@ from tests.model.export.checkpoints import ROBOT, Driver
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
+pytest_plugins = ["tests.browser_fixtures"]
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
 PATIENCE = 300_000  # ms: machines of tests are busy
-FLAGS = (
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
-)  # fmt: skip
 # All draws are equal, so the likeliest tokens are taken in the order of their places.
 KEEP_FRAMES = """
 Math.random = () => 0.5;
@@ -73,19 +70,6 @@ def server(site: Path) -> Iterator[http.server.ThreadingHTTPServer]:
     yield made
     made.shutdown()
     made.server_close()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator["Browser"]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        found = shutil.which("chromium") or playwright.chromium.executable_path
-        if not shutil.which(found):
-            pytest.skip("no Chromium: playwright install chromium")
-        launched = playwright.chromium.launch(executable_path=found, args=list(FLAGS))
-        yield launched
-        launched.close()
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import asyncio
 import re
-import shutil
 import socket
 import threading
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from tests.model.true_world import TrueWorld, lab_robots
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
+pytest_plugins = ["tests.browser_fixtures"]
 pytestmark = pytest.mark.slow
 
 
@@ -99,19 +99,6 @@ def serving(stepper: Stepper, port: int = 0) -> Iterator[int]:
     yield listener.getsockname()[1]
     servers[0].should_exit = True
     thread.join(20)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator["Browser"]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        found = shutil.which("chromium") or playwright.chromium.executable_path
-        if not shutil.which(found):
-            pytest.skip("no Chromium: playwright install chromium")
-        launched = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
-        yield launched
-        launched.close()
 
 
 @pytest.fixture
