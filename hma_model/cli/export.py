@@ -2,6 +2,7 @@
 
 from functools import cache
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any
 
 from typer import Argument, Option
@@ -45,7 +46,7 @@ def export(
     if made["float16_loss_db"] is not None:
         said += f" (float16 costs {made['float16_loss_db']:.2f} dB)"
     print(f"wrote {out}: {said}")
-    print(f"drive it: python -m http.server --bind 127.0.0.1 -d {out}")
+    print(f"drive it: python -m http.server --bind 127.0.0.1 -d {quote(str(out))}")
 
 
 def export_checkpoint(
