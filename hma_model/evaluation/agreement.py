@@ -1,7 +1,7 @@
-"""Measure how well two judgements agree: correlations, accuracies, precision and recall, with intervals.
+"""Measure how well two judgements agree: correlations, MMRV, AUROC, accuracies, precision and recall.
 
-Correlations have bootstrap intervals. Shares have those of Clopper and Pearson (1934), which stay honest for
-few episodes and for shares of 0 and 1: a bootstrap would call these certain.
+Correlations, MMRV and AUROC have bootstrap intervals. Shares have those of Clopper and Pearson (1934), which
+stay honest for few episodes and for shares of 0 and 1: a bootstrap would call these certain.
 
 M policies, N episodes, R resamples. All intervals hold 95 %.
 """
@@ -137,12 +137,55 @@ def correlations(one: Floats, other: Floats, seed: int = 0) -> dict[str, Estimat
     return found
 
 
-def _too_little(one: Floats, other: Floats) -> str:
-    policies, episodes = one.shape
+def rank_violation(true: ArrayLike, made: ArrayLike) -> Floats:
+    """Return the mean maximum rank violation (MMRV) over the last axis (…, M) of policies' figures.
+
+    A policy's violation is the largest true difference from a policy that the model orders otherwise. Ties
+    count as in SIMPLER (Li et al. 2024): only "greater" and "not greater" are compared.
+    """
+    true, made = np.asarray(true), np.asarray(made)
+    gaps = true[..., :, None] - true[..., None, :]
+    wrong = (gaps > 0) != (made[..., :, None] > made[..., None, :])
+    found: Floats = np.where(wrong, np.abs(gaps), 0.0).max(axis=-1).mean(axis=-1)
+    return found
+
+
+def mmrv(true: Floats, made: Floats, seed: int = 0) -> Estimate:
+    """Return the MMRV of the means of two judgements (M, N) of the same episodes.
+
+    A resample draws episodes, jointly for all policies and both judgements; the policies stay. Noise can only
+    add violations, so the interval is widened to hold the value.
+    """
+    reason = _too_few(true.shape)
+    if not reason and np.ptp(true.mean(axis=1)) < 1e-12:
+        reason = "all policies are alike in the simulator"
+    if reason:
+        return Estimate(None, reason=reason)
+    value = float(rank_violation(true.mean(axis=1), made.mean(axis=1)))
+    drawn = _drawn_episodes(true.shape[1], seed)  # sums of outcomes are exact, so equal policies stay equal
+    spread = rank_violation(drawn @ true.T, drawn @ made.T) / true.shape[1]
+    low, high = np.percentile(spread, [100 * TAIL, 100 * (1 - TAIL)])
+    return Estimate(value, min(float(low), value), max(float(high), value))
+
+
+def _drawn_episodes(count: int, seed: int) -> Floats:
+    """Return how often each of the episodes is drawn, (R, N)."""
+    drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), RESAMPLES)
+    return drawn.astype(float)
+
+
+def _too_few(shape: tuple[int, ...]) -> str:
+    policies, episodes = shape
     if policies < MIN_POLICIES:
         return f"{policies} of at least {MIN_POLICIES} policies"
     if episodes < MIN_EPISODES:
         return f"{episodes} of at least {MIN_EPISODES} episodes"
+    return ""
+
+
+def _too_little(one: Floats, other: Floats) -> str:
+    if reason := _too_few(one.shape):
+        return reason
     for values, where in ((one, "the simulator"), (other, "the model")):
         if np.ptp(values.mean(axis=1)) < 1e-12:
             return f"all policies are alike in {where}"
@@ -192,6 +235,43 @@ def precision_recall(true: Bools, judged: Bools) -> tuple[Estimate, Estimate]:
         else:
             found.append(Estimate(None, reason=missing))
     return found[0], found[1]
+
+
+def auroc(true: Bools, scores: Floats, seed: int = 0) -> Estimate:
+    """Return the chance that the score of a success is above that of a failure; equal scores count half.
+
+    A resample draws episodes, jointly for all policies. One without a success or a failure widens the
+    interval to both sides. Successes that all score above all failures are as certain as a share of as many.
+
+    Args:
+        true, scores: (M, N).
+        seed: of the resamples.
+    """
+    successes, failures = int(true.sum()), int((~true).sum())
+    count = true.shape[1]
+    if count < MIN_EPISODES:
+        return Estimate(None, reason=f"{count} of at least {MIN_EPISODES} episodes")
+    if not successes or not failures:
+        return Estimate(None, reason="all episodes end alike")
+    above, pairs = np.zeros((count, count)), np.zeros((count, count))  # by the episodes of both
+    for success, high in zip(true, scores, strict=True):
+        for other, low in zip(true, scores, strict=True):
+            compared = np.outer(success, ~other)
+            above += compared * (np.sign(high[:, None] - low) + 1) / 2
+            pairs += compared
+    value = float(above.sum() / pairs.sum())
+    drawn = _drawn_episodes(count, seed)
+    compared = ((drawn @ pairs) * drawn).sum(axis=1)
+    told = compared > 0
+    spread = ((drawn @ above) * drawn).sum(axis=1) / np.where(told, compared, 1)
+    least = float(np.percentile(np.where(told, spread, 0), 100 * TAIL))
+    most = float(np.percentile(np.where(told, spread, 1), 100 * (1 - TAIL)))
+    few = min(successes, failures)
+    if value > 1 - 1e-12:
+        least = min(least, share_interval(few, few)[0])
+    if value < 1e-12:
+        most = max(most, share_interval(0, few)[1])
+    return Estimate(value, least, most)
 
 
 def episode_correlation(one: Floats, other: Floats) -> Estimate:

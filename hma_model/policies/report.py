@@ -60,6 +60,7 @@ def _rate(row: dict[str, Any], name: str) -> str:
 def sentences(found: PolicyEvaluation) -> list[str]:
     """Return in words what the table means: the task, the judge, and what follows for the policies."""
     scores = "the way it moved" if found.judge.task.name == "moved" else "minus the distance, 0 is best"
+    paired = found.paired
     guessed = f"{found.generated.successes / found.generated.count:.0%}"
     said = [
         f"success: {found.judge.task.text}; shares with 95 % intervals over episodes; scores in px: {scores}",
@@ -70,7 +71,9 @@ def sentences(found: PolicyEvaluation) -> list[str]:
         f"precision: the simulator confirms {_share(found.precision)} of the successes seen in the model "
         f"({guessed} if guessed); recall: {_share(found.recall)} of its own are seen",
         f"scores of single episodes in the model and, under the same actions, in the simulator: "
-        f"correlation {found.followed}",
+        f"correlation {found.followed}; they tell its successes from its failures with AUROC {found.auroc}",
+        f"model against simulator, each under its own actions: precision {_share(paired['precision'])}, "
+        f"recall {_share(paired['recall'])}, AUROC of scores {paired['auroc']}",
     ]
     if found.refusal:
         said.append(refused(found))
@@ -80,7 +83,10 @@ def sentences(found: PolicyEvaluation) -> list[str]:
             if one["pearson"].reason:  # of the ranks it is the same
                 said.append(f"{what} over policies: no correlation, {one['pearson'].reason}")
             else:
-                said.append(f"{what} over policies: Pearson {one['pearson']}, ranks {one['spearman']}")
+                said.append(
+                    f"{what} over policies: Pearson {one['pearson']}, ranks {one['spearman']}, "
+                    f"MMRV {one['mmrv']}, 0 is best"
+                )
     return said + [_alike(found, where) for where in (TRUE, MODEL) if found.alike(where)]
 
 
@@ -143,6 +149,7 @@ def html(found: PolicyEvaluation) -> str:
         ),
         (_value(found.recall), f"of the simulator's successes are seen{_ends(found.recall)}"),
         (_value(found.followed), f"correlation of the scores of single episodes{_ends(found.followed)}"),
+        (_value(found.auroc), f"AUROC of the scores of single episodes{_ends(found.auroc)}"),
     ]
     if not found.refusal:
         pearson = found.success["pearson"]
@@ -150,6 +157,7 @@ def html(found: PolicyEvaluation) -> str:
         figures = [
             (_value(pearson), f"correlation of success rates{_ends(pearson)}"),
             (_value(ranks), f"correlation of their ranks{_ends(ranks)}"),
+            (_value(found.success["mmrv"]), f"mean maximum rank violation{_ends(found.success['mmrv'])}"),
             *figures,
         ]
     page.figures(figures)

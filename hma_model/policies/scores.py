@@ -36,8 +36,10 @@ from hma_model.evaluation.agreement import (
     Estimate,
     accuracy,
     alike_pairs,
+    auroc,
     correlations,
     episode_correlation,
+    mmrv,
     precision_recall,
     share_interval,
 )
@@ -90,12 +92,16 @@ class PolicyEvaluation:
 
     Attributes:
         sampling: how the world drew its frames.
-        success, score: correlations over policies of the success rates, and of the mean scores, by name.
+        success, score: agreement over policies of the success rates, and of the mean scores, by name: the
+            correlations "pearson" and "spearman", and "mmrv", the mean maximum rank violation.
         generated: accuracy of the judge on generated frames, against the simulator under the same actions.
         precision: share of the successes that it sees on generated frames which the simulator confirms.
         recall: share of the simulator's successes under these actions that it sees.
         followed: how the scores of single episodes, as judged on generated frames, correlate with the true
             ones under the same actions.
+        auroc: how well these scores tell the simulator's successes under these actions from its failures.
+        paired: "precision", "recall" and "auroc" of the episodes in the model, against the episodes of the
+            same start in the simulator, where the policy acted by itself.
     """
 
     embodiment: str
@@ -111,6 +117,8 @@ class PolicyEvaluation:
     precision: Estimate
     recall: Estimate
     followed: Estimate
+    auroc: Estimate
+    paired: dict[str, Estimate]
 
     @property
     def refusal(self) -> str:
@@ -168,9 +176,11 @@ class PolicyEvaluation:
                 "precision": asdict(self.precision),
                 "recall": asdict(self.recall),
                 "score_correlation": asdict(self.followed),
+                "auroc": asdict(self.auroc),
                 "generated_better_than_chance": self.generated.better_than_chance,
             },
             "refused": self.refusal,
+            "paired": {name: asdict(one) for name, one in self.paired.items()},
             "policies": self.rows(),
             "alike": {"simulator": self.alike(TRUE), "model": self.alike(MODEL)},
             "correlation": {
@@ -259,9 +269,12 @@ def evaluate_policies(
             score = partial(score, name, frames=frames, tell=tell)
             scored.append(Scored(name, **(score() if kept is None else kept.part(key, score))))
     success = np.stack([one.success for one in scored], axis=1)  # (3, M, N)
+    rates = success.astype(float)
     scores = np.stack([one.scores for one in scored], axis=1)
     judged = success[MODEL].ravel()
     replayed = success[REPLAYED].ravel()
+    precision, recall = precision_recall(success[TRUE].ravel(), judged)
+    paired = auroc(success[TRUE], scores[MODEL], seed)
     return PolicyEvaluation(
         embodiment,
         str(checkpoint),
@@ -270,11 +283,13 @@ def evaluate_policies(
         frames,
         judge,
         tuple(scored),
-        correlations(success[TRUE].astype(float), success[MODEL].astype(float), seed),
-        correlations(scores[TRUE], scores[MODEL], seed),
+        correlations(rates[TRUE], rates[MODEL], seed) | {"mmrv": mmrv(rates[TRUE], rates[MODEL], seed)},
+        correlations(scores[TRUE], scores[MODEL], seed) | {"mmrv": mmrv(scores[TRUE], scores[MODEL], seed)},
         accuracy(replayed, judged),
         *precision_recall(replayed, judged),
         episode_correlation(scores[MODEL].ravel(), scores[REPLAYED].ravel()),
+        auroc(success[REPLAYED], scores[MODEL], seed),
+        {"precision": precision, "recall": recall, "auroc": paired},
     )
 
 

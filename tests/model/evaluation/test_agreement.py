@@ -2,14 +2,20 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from scipy import stats
 
 from hma_model.evaluation.agreement import (
     accuracy,
     alike_pairs,
+    auroc,
     correlations,
     episode_correlation,
+    mmrv,
     precision_recall,
+    rank_violation,
     share_interval,
 )
 
@@ -121,3 +127,92 @@ def test_only_episodes_with_different_outcomes_tell_policies_apart() -> None:
     success = np.zeros((3, 24), bool)
     success[1, :5] = success[2, :6] = True
     assert alike_pairs(success) == [(0, 1), (1, 2)]  # five of five is a surprise of 1 in 16, six of 1 in 32
+
+
+def correlation_by_hand(one: list[float], other: list[float]) -> float:
+    middle, centre = sum(one) / len(one), sum(other) / len(other)
+    shared = sum((a - middle) * (b - centre) for a, b in zip(one, other, strict=True))
+    squares = sum((a - middle) ** 2 for a in one) * sum((b - centre) ** 2 for b in other)
+    return shared / squares**0.5
+
+
+def ranks_by_hand(values: list[float]) -> list[float]:
+    return [sum(b < a for b in values) + (sum(b == a for b in values) + 1) / 2 for a in values]
+
+
+def violation_by_hand(true: list[float], made: list[float]) -> float:
+    """Return SIMPLER's MMRV: for each policy, the worst pair; then the mean over policies."""
+    worst = []
+    for i in range(len(true)):
+        pairs = [j for j in range(len(true)) if (made[i] > made[j]) != (true[i] > true[j])]
+        worst.append(max((abs(true[i] - true[j]) for j in pairs), default=0.0))
+    return sum(worst) / len(worst)
+
+
+def area_by_hand(true: list[bool], scores: list[float]) -> float:
+    good = [score for one, score in zip(true, scores, strict=True) if one]
+    bad = [score for one, score in zip(true, scores, strict=True) if not one]
+    return sum((a > b) + (a == b) / 2 for a in good for b in bad) / (len(good) * len(bad))
+
+
+BOTH = st.tuples(st.integers(3, 6), st.integers(8, 12)).flatmap(
+    lambda shape: st.tuples(
+        arrays(np.float64, shape, elements=st.integers(0, 2)),
+        arrays(np.float64, shape, elements=st.integers(0, 2)),
+    )
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(BOTH)
+def test_every_measure_is_what_plain_loops_compute(both: tuple[np.ndarray, np.ndarray]) -> None:
+    one, other = both
+    means = [row.mean() for row in one], [row.mean() for row in other]
+    found = correlations(one, other)
+    if found["pearson"].value is not None:
+        assert found["pearson"].value == pytest.approx(correlation_by_hand(*means), abs=1e-9)
+        ranks = [ranks_by_hand(values) for values in means]
+        assert found["spearman"].value == pytest.approx(correlation_by_hand(*ranks), abs=1e-9)
+    violation = mmrv(one, other)
+    if violation.value is not None:
+        assert violation.value == pytest.approx(violation_by_hand(*means))
+        assert violation.low <= violation.value <= violation.high
+    true = one > 0
+    area = auroc(true, other)
+    if area.value is None:
+        assert true.all() or not true.any()
+    else:
+        assert area.value == pytest.approx(area_by_hand(true.ravel().tolist(), other.ravel().tolist()))
+        assert 0 <= area.low <= area.high <= 1
+    precision, recall = precision_recall(true.ravel(), other.ravel() > 0)
+    hits = sum(a and b > 0 for a, b in zip(true.ravel().tolist(), other.ravel().tolist(), strict=True))
+    if precision.value is not None:
+        assert precision.value == hits / sum(b > 0 for b in other.ravel().tolist())
+    if recall.value is not None:
+        assert recall.value == hits / sum(true.ravel().tolist())
+
+
+def test_intervals_of_mmrv_and_auroc_resample_the_episodes_of_all_policies_together() -> None:
+    rng = np.random.default_rng(1)
+    one = (rng.random((5, 40)) < np.linspace(0.3, 0.7, 5)[:, None]).astype(float)
+    other = np.abs(one - (rng.random((5, 40)) < 0.3))
+    found, area = mmrv(one, other, seed=7), auroc(one > 0, other, seed=7)
+    violations, areas = [], []
+    for _ in range(2000):
+        drawn = rng.integers(40, size=40)
+        violations.append(violation_by_hand(*(v[:, drawn].mean(axis=1).tolist() for v in (one, other))))
+        true, scores = one[:, drawn].ravel() > 0, other[:, drawn].ravel()
+        areas.append((scores[true].mean() - scores[~true].mean() + 1) / 2)  # of scores of 0 and 1
+    for one_found, drawn_values in ((found, violations), (area, areas)):
+        wanted = np.percentile(drawn_values, [2.5, 97.5])
+        np.testing.assert_allclose((one_found.low, one_found.high), wanted, atol=0.03)
+    assert mmrv(one, one).value == 0 and auroc(one > 0, one).low < 1  # 40 starts are never certain
+
+
+def test_a_model_that_turns_the_order_round_violates_it_by_the_largest_differences() -> None:
+    assert rank_violation([0.0, 0.5, 1.0], [1.0, 0.5, 0.0]) == pytest.approx((1 + 0.5 + 1) / 3)
+    assert rank_violation([0.0, 0.5, 1.0], [0.2, 0.3, 0.9]) == 0
+    assert "2 of at least 3" in mmrv(np.ones((2, 9)), np.ones((2, 9))).reason
+    assert "5 of at least 8" in auroc(np.ones((3, 5), bool), np.ones((3, 5))).reason
+    assert "alike in the simulator" in mmrv(np.ones((3, 9)), np.ones((3, 9))).reason
+    assert "end alike" in auroc(np.ones((3, 9), bool), np.ones((3, 9))).reason
