@@ -40,11 +40,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_060, 14_600, 12),
     "hma_model/released": (830, 7_200, 4),
     "hma_model/synthetic": (1_210, 9_000, 5),
-    "hma_model/training": (3_520, 28_900, 18),
+    "hma_model/training": (3_560, 29_200, 18),
     "hma_model/worlds": (1_530, 11_500, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 62_100, 489_200
-TEST_LINES = 45_900
+PRODUCT_LINES, PRODUCT_NODES = 63_000, 497_000
+TEST_LINES = 46_500
 DOC_WORDS = 38_000
 
 

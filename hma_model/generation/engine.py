@@ -1,5 +1,6 @@
 """Set up a model's trunk and readout to generate with: packed, compiled, in a chosen precision."""
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -38,6 +39,9 @@ class Engine:
     def __init__(self, model: Network, precision: str, compile: bool) -> None:
         self.config, self.device, self.precision = model.config, model.device, precision
         dtype, device = products_in(precision, model.device, compile), model.device
+        if compile and (fault := compiler_fault(device)):
+            warnings.warn(fault, RuntimeWarning, stacklevel=3)
+            compile = False
         whole = model.dtype == torch.float32 and not torch.is_autocast_enabled(device.type)
         pack = whole and not compile and packs(device)
         trunk = model.get_submodule("trunk")
@@ -82,6 +86,20 @@ def products_in(precision: str, device: torch.device, compile: bool) -> torch.dt
         fault = "int8 is for processors with AVX-512 VNNI, without compile"
         raise HMAError("precision", fault, "use float32 or bf16")
     return PRECISIONS[precision]
+
+
+def compiler_fault(device: torch.device) -> str:
+    """Return what torch.compile lacks for a device, and what becomes of it; empty if it can work."""
+    from torch._inductor.cpp_builder import get_cpp_compiler  # these take a second to import
+    from torch._inductor.exc import InvalidCxxCompiler
+    from torch.utils._triton import has_triton
+
+    missing = "" if device.type != "cuda" or has_triton() else "triton"
+    try:
+        get_cpp_compiler()
+    except InvalidCxxCompiler:
+        missing = "a C++ compiler (g++, or the one that CXX names)"
+    return missing and f"compile: {missing} is missing, so nothing is compiled, which is slower"
 
 
 def _compiled(function: Callable[..., Tensor], device: torch.device) -> Callable[..., Tensor]:

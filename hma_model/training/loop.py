@@ -22,6 +22,7 @@ from hma_data.errors import UsageError
 from hma_data.storage.paths import StrPath, as_text
 from hma_model.checkpoint.folder import resolve
 from hma_model.training.logging import RunLog, Tracker, open_trackers, read_metrics
+from hma_model.training.memory import memory_errors
 from hma_model.training.parallel import join
 from hma_model.training.recipe import Recipe, load_recipe, recipe_for
 from hma_model.training.report import write_report
@@ -85,6 +86,7 @@ def train(
     with join(device) as ranks, run_errors(Path(folder)), ExitStack() as stack, torch.random.fork_rng(cuda):
         ranks.once(lambda: stack.enter_context(own_folder(Path(folder))))
         run = Run(recipe, Path(folder), device, ranks)
+        stack.enter_context(memory_errors(run.model, run.recipe, device, ranks.size))
         kept = run.resume(force)
         if kept is None:
             run.begin()

@@ -3,25 +3,30 @@
 A process that needs more than there is ends without a word: the system kills it. The estimate adds up the
 weights with their gradients and moments, what a forward pass keeps for the backward pass, and the process
 itself. Its factors were fitted to measured peaks on a CPU (`tests/model/training/test_memory.py`).
-On a GPU only the weights count: what does not fit there ends in an error that names what to lower.
+On a GPU only the weights are refused beforehand: what does not fit there ends in an error, which names the
+batch that would fit by the same estimate.
 
 B windows a pass, T frames of a pass, S tokens of a frame, D width.
 """
 
 import os
-from contextlib import suppress
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from itertools import product
 from pathlib import Path
 
 import torch
 
-from hma_data.errors import RecipeError
+from hma_data.errors import RecipeError, TrainingError
 from hma_model.config import OBJECTIVES, HMAConfig
 from hma_model.network.network import Network
 from hma_model.training.data import share
 from hma_model.training.recipe import Recipe
 
 GIB = 2**30
+SMALLER = "model.layers=4 model.width=128 model.heads=4"
+_NO_MEMORY = re.compile("out of memory|can't allocate memory|not enough memory|bad_alloc", re.IGNORECASE)
 PROCESS = 0.4 * GIB  # what a process gains before its first pass: kernels, threads, decoded rows
 # A block keeps so many values for each value of its input, besides those of the MLP's hidden layer.
 BLOCK_VALUES = 21.0
@@ -80,8 +85,13 @@ def _unet_bytes(config: HMAConfig, recipe: Recipe, predicted: int) -> float:
     return 4.0 * share * computed * (blocks + embedded)
 
 
-def needed_bytes(model: Network, recipe: Recipe, device: torch.device, ranks: int = 1) -> float:
-    """Return the estimated bytes of one rank's training; the model may be on the device `meta`."""
+def needed_bytes(
+    model: Network, recipe: Recipe, device: torch.device, ranks: int = 1, passes: bool | None = None
+) -> float:
+    """Return the estimated bytes of one rank's training; the model may be on the device `meta`.
+
+    Those of its passes are counted if `passes`; by default on a CPU only.
+    """
     weights = sum(parameter.numel() for parameter in model.parameters())
     trained = weights
     if recipe.freeze == "trunk":
@@ -90,13 +100,13 @@ def needed_bytes(model: Network, recipe: Recipe, device: torch.device, ranks: in
     if recipe.ema:
         values += trained + weights  # the averages, and the model that evaluates them
     of_weights = 4.0 * values / (ranks if recipe.parallel == "fsdp" else 1)
-    if device.type == "cuda":
+    if not (device.type != "cuda" if passes is None else passes):
         return of_weights
     return PROCESS + of_weights + activation_bytes(model.config, recipe, share(recipe, ranks)[1])
 
 
 def free_bytes(device: torch.device) -> float:
-    """Return the memory that a process can still get: of a GPU all of it, else what the system has free."""
+    """Return the memory that a rank can still get: of a GPU all of it, else its share of what is free."""
     if device.type == "cuda":
         return float(torch.cuda.get_device_properties(device).total_memory)
     free = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -105,7 +115,7 @@ def free_bytes(device: torch.device) -> float:
         free = 1024.0 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1])
     with suppress(OSError, ValueError):  # a container's limit; "max" is none
         free = min(free, float(Path("/sys/fs/cgroup/memory.max").read_text()))
-    return free
+    return free / int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 
 
 def require_memory(model: Network, recipe: Recipe, device: torch.device, ranks: int = 1) -> None:
@@ -120,23 +130,46 @@ def require_memory(model: Network, recipe: Recipe, device: torch.device, ranks: 
     Raises:
         RecipeError: the estimate is above the memory that is free.
     """
-    there = free_bytes(device)
-    if device.type != "cuda":
-        there /= int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    needed = needed_bytes(model, recipe, device, ranks)
+    needed, there = needed_bytes(model, recipe, device, ranks), free_bytes(device)
     if needed <= there:
         return
-    remedy = "use a smaller network, as in model.layers=4 model.width=128 model.heads=4"
-    sizes = [recipe.batch_size >> halvings for halvings in range(recipe.batch_size.bit_length())]
+    keys = _fitting_keys(model, recipe, device, ranks, recipe.batch_size)
+    remedy = f"set {keys}" if keys else f"use a smaller network, as in {SMALLER}"
+    weights = sum(parameter.numel() for parameter in model.parameters())
+    what = f"{weights / 1e6:,.0f} million weights and passes of {share(recipe, ranks)[1]} windows"
+    fault = f"needs about {needed / GIB:,.1f} GiB ({what}), and {there / GIB:,.1f} GiB are free"
+    raise RecipeError("recipe: memory", fault, remedy)
+
+
+@contextmanager
+def memory_errors(model: Network, recipe: Recipe, device: torch.device, ranks: int = 1) -> Iterator[None]:
+    """Convert an error of the block for want of memory into one that names the batch that would fit.
+
+    Raises:
+        TrainingError: the block needed more memory than there is.
+    """
+    try:
+        yield
+    except (RuntimeError, MemoryError) as fault:
+        text = str(fault).partition("\n")[0][:200]
+        if isinstance(fault, RuntimeError) and not _NO_MEMORY.search(text):
+            raise
+        keys = _fitting_keys(model, recipe, device, ranks, recipe.batch_size // 2)
+        remedy = f"set {keys}, which should fit" if keys else f"use a smaller network, as in {SMALLER}"
+        told = f"there is not enough for this model and batch: {text}"
+        raise TrainingError("memory", told, remedy) from fault
+
+
+def _fitting_keys(model: Network, recipe: Recipe, device: torch.device, ranks: int, most: int) -> str:
+    """Return the keys of the largest passes, of `most` windows or fewer, that should fit; empty for none."""
+    there = free_bytes(device)
+    sizes = [most >> halvings for halvings in range(most.bit_length())]
     for checkpointing, size in product(dict.fromkeys((recipe.checkpointing, True)), sizes):
         keys = {"batch_size": size, "accumulate": -(-recipe.windows_per_step // size)}
         if checkpointing:
             keys["checkpointing"] = True
         even = size * keys["accumulate"] % ranks == 0
-        if even and needed_bytes(model, recipe.model_copy(update=keys), device, ranks) <= there:
-            remedy = "set " + " ".join(f"{key}={str(value).lower()}" for key, value in keys.items())
-            break
-    weights = sum(parameter.numel() for parameter in model.parameters())
-    what = f"{weights / 1e6:,.0f} million weights and passes of {share(recipe, ranks)[1]} windows"
-    fault = f"needs about {needed / GIB:,.1f} GiB ({what}), and {there / GIB:,.1f} GiB are free"
-    raise RecipeError("recipe: memory", fault, remedy)
+        smaller = recipe.model_copy(update=keys)
+        if even and needed_bytes(model, smaller, device, ranks, passes=True) <= there:
+            return " ".join(f"{key}={str(value).lower()}" for key, value in keys.items())
+    return ""

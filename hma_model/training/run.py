@@ -25,6 +25,7 @@ from hma_model.checkpoint.folder import Checkpoint, action_stats, training_check
 from hma_model.config import OBJECTIVES, ActionSpace, HMAConfig
 from hma_model.evaluation.losses import digit_frequencies
 from hma_model.evaluation.rollout_video import newest_sheets
+from hma_model.generation.engine import compiler_fault
 from hma_model.network.model import HMA
 from hma_model.training import guards, new_stem, optim
 from hma_model.training.data import TrainData
@@ -189,7 +190,9 @@ class Run:
 
     def prepare(self, kept: TrainingState | None) -> None:
         """Distribute the model over the ranks, and make its optimizer and average, from `kept` if given."""
-        if self.recipe.compile:
+        if self.recipe.compile and (fault := compiler_fault(self.device)):
+            self.notes.append(fault)
+        elif self.recipe.compile:
             for block in self.model.trunk.blocks:
                 block.compile()
         self.parallel_model = ParallelModel(self.model, self.ranks, self.recipe.parallel)

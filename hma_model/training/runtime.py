@@ -3,7 +3,6 @@
 import fcntl
 import os
 import platform
-import re
 import shutil
 import signal
 import subprocess
@@ -19,7 +18,7 @@ from typing import Any
 import torch
 
 import hma_data
-from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
+from hma_data.errors import HMAError, OutputError, RecipeError
 from hma_model.config import HMAConfig
 from hma_model.generation.packed import has_bfloat16
 from hma_model.network.trunks.transformer import PRODUCT_KEYS
@@ -30,7 +29,6 @@ LOCK, START = ".lock", ".start"  # START: the checkpoint that the run starts fro
 # A transformer's width and a U-Net's finest channels from which steps in bf16 are faster on a processor with
 # AVX512-BF16 (docs/results.md, Training). At width 64 a transformer's take as long.
 LEAST_WIDTH, LEAST_CHANNELS = 128, 32
-_NO_MEMORY = re.compile("out of memory|can't allocate memory|not enough memory|bad_alloc", re.IGNORECASE)
 
 
 def choose_device(name: str) -> torch.device:
@@ -165,11 +163,10 @@ def own_folder(out: Path) -> Iterator[None]:
 
 @contextmanager
 def run_errors(out: Path) -> Iterator[None]:
-    """Convert errors of the block, which trains into a folder: no memory, or a file that cannot be written.
+    """Convert errors of the block, which trains into a folder, where a file cannot be written.
 
     Raises:
         OutputError: something cannot be written.
-        TrainingError: the block needed more memory than there is.
     """
     try:
         yield
@@ -177,13 +174,6 @@ def run_errors(out: Path) -> Iterator[None]:
         where, why = fault.filename or out, fault.strerror or str(fault)
         remedy = "free space or choose another folder; existing checkpoints are intact"
         raise OutputError(where, f"cannot be written: {why}", remedy) from fault
-    except (RuntimeError, MemoryError) as fault:
-        text = str(fault).partition("\n")[0][:200]
-        if isinstance(fault, RuntimeError) and not _NO_MEMORY.search(text):
-            raise
-        told = f"there is not enough for this model and batch: {text}"
-        remedy = "lower batch_size (accumulate makes up for it), frames or width, or set checkpointing=true"
-        raise TrainingError("memory", told, remedy) from fault
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import nn
+from torch._inductor import config as inductor
 
 from hma_data.errors import HMAError
 from hma_model.generation import engine
@@ -46,6 +47,7 @@ def graphs(monkeypatch: pytest.MonkeyPatch) -> Graphs:
         return compile(function, backend=backend, fullgraph=True, dynamic=False)  # type: ignore[call-overload]
 
     monkeypatch.setattr(torch, "compile", traced)
+    monkeypatch.setattr(engine, "compiler_fault", lambda device: "")  # the backend above needs none
     torch._dynamo.reset()
     return found
 
@@ -155,6 +157,16 @@ def test_what_a_rollout_returns_can_be_changed_and_trained_on() -> None:
     frame[0] = 0
     weight = torch.ones((), requires_grad=True)
     (weight * frame).sum().backward()
+
+
+def test_without_a_compiler_the_same_frames_are_made_and_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = small_model()
+    monkeypatch.setattr(inductor.cpp, "cxx", (None, "/nowhere/g++"))
+    with pytest.warns(
+        RuntimeWarning, match=r"compile: a C\+\+ compiler .* is missing, so nothing is compiled"
+    ):
+        frames = _frames(model, compile=True)
+    assert torch.equal(frames, _frames(model))
 
 
 @pytest.mark.slow

@@ -7,14 +7,14 @@ import sys
 import pytest
 import torch
 
-from hma_data.errors import RecipeError
+from hma_data.errors import RecipeError, TrainingError
 from hma_data.loading.rows import Batch
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.config import OBJECTIVES, ActionSpace
 from hma_model.network.model import HMA
 from hma_model.training import memory
 from hma_model.training.loop import train
-from hma_model.training.memory import activation_bytes, needed_bytes, require_memory
+from hma_model.training.memory import activation_bytes, memory_errors, needed_bytes, require_memory
 from hma_model.training.recipe import Recipe, load_recipe, make_recipe, parse_overrides
 from tests.model.shards import make_shards
 
@@ -136,6 +136,26 @@ def test_what_does_not_fit_is_refused_with_keys_that_make_it_fit(name, free, mon
     smaller = make_recipe({**recipe.values(), **parse_overrides(keys)})
     assert smaller.windows_per_step == recipe.windows_per_step
     require_memory(network(smaller, spec), smaller, CPU)
+
+
+@pytest.mark.parametrize("name", ["discrete_base", "continuous_base"])
+def test_a_pass_that_finds_no_memory_names_the_batch_that_would_fit(name, monkeypatch):
+    spec = TOKENS if name.startswith("discrete") else LATENTS
+    recipe = load_recipe(name)
+    model = network(recipe, spec)
+    there = needed_bytes(model, recipe.model_copy(update={"batch_size": 2}), CPU)
+    monkeypatch.setattr(memory, "free_bytes", lambda device: there)
+    text = "CUDA out of memory. Tried to allocate 20.00 MiB"
+    with (
+        pytest.raises(TrainingError, match="memory: there is not enough .* 20.00 MiB — set ") as refused,
+        memory_errors(model, recipe, CPU),
+    ):
+        raise torch.OutOfMemoryError(text)
+    keys = refused.value.remedy.removeprefix("set ").removesuffix(", which should fit").split()
+    smaller = make_recipe({**recipe.values(), **parse_overrides(keys)})
+    assert (smaller.batch_size, smaller.windows_per_step) == (2, recipe.windows_per_step)
+    with pytest.raises(RuntimeError, match="another"), memory_errors(model, recipe, CPU):
+        raise RuntimeError("another fault")
 
 
 def test_a_network_that_no_batch_makes_fit_is_refused_before_anything_is_made(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hma_data.errors import RecipeError
-from hma_model.training import runtime
+from hma_model.training import run, runtime
 from hma_model.training.data import TrainData, share
 from hma_model.training.guards import listed
 from hma_model.training.logging import read_metrics
@@ -74,8 +74,18 @@ def test_compiled_blocks_give_the_same_losses(recipe, tmp_path, monkeypatch):
         plain(self, backend="eager")
 
     monkeypatch.setattr(torch.nn.Module, "compile", traced)
+    monkeypatch.setattr(run, "compiler_fault", lambda device: "")
     given = losses(recipe, tmp_path / "a", steps=3, compile=True)
     assert len(compiled) == 1 and given == pytest.approx(losses(recipe, tmp_path / "b", steps=3), rel=1e-5)
+
+
+def test_without_a_compiler_training_runs_as_it_is_and_says_so(
+    recipe, finished, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(run, "compiler_fault", lambda device: "compile: a compiler is missing")
+    result = train(recipe(compile=True), out=tmp_path / "run")
+    assert result.losses == finished.losses
+    assert "compile: a compiler is missing" in capsys.readouterr().err
 
 
 def test_bf16_stays_near_full_precision_with_weights_in_float32(recipe, finished, tmp_path, monkeypatch):
