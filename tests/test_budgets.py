@@ -37,7 +37,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/lerobot_env": (570, 4_600, 3),
     "hma_model/network": (3_250, 27_700, 16),
     "hma_model/play": (1_650, 11_900, 8),
-    "hma_model/policies": (2_060, 14_600, 12),
+    "hma_model/policies": (2_140, 15_100, 12),
     "hma_model/released": (830, 7_200, 4),
     "hma_model/synthetic": (1_210, 9_000, 5),
     "hma_model/training": (3_560, 29_200, 18),

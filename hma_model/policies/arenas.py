@@ -1,11 +1,13 @@
 """Let policies act in N scenes of a laboratory robot at once: in its simulator, or in the world model.
 
 Both begin with the same frames and are driven alike: an action each control step, and a new image after
-every `stride` of them, as the environments of the world model show it.
+every `stride` of them, as the environments of the world model show it. They are paired: until the model makes
+its first image, a policy sees in it exactly what it saw in the simulator.
 
 N scenes, S pixels a side, A action dims, K = stride · A, P parts, T chunks of an episode.
 """
 
+import copy
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError
 from hma_data.lab import FAMILY, truth
-from hma_data.lab.scripted import PUSHER, SceneState, SeenState, seen_state, state_of
+from hma_data.lab.scripted import PUSHER, SceneState, SeenState, seen_state, state_of, steerable
 from hma_data.lab.simulator import LabSimulator, simulated
 from hma_model.generation.commands import OutsideRangeWarning, described
 from hma_model.worlds.env import WorldModelVectorEnv
@@ -146,6 +148,8 @@ class TrueArena:
         prompts: of the scenes.
         parts: the true places (N, P, 2) of the parts at each image.
         told: what `recorded` returned so far.
+        first_images: (N, S, S, 3) of the start.
+        first_states: of each step of the first chunk, what `states` and `observed` returned.
     """
 
     def __init__(self, scenes: Scenes, size: int, drawn: bool = True) -> None:
@@ -159,6 +163,9 @@ class TrueArena:
         self.parts: list[Places] = []
         self.told: list[Float32s] = []
         self._look()
+        self.first_images = self.images
+        self.first_states: list[tuple[list[SceneState], Float32s | None]] = []
+        self._keep_first()
 
     @property
     def fresh(self) -> bool:
@@ -182,6 +189,12 @@ class TrueArena:
         self._steps += 1
         if self.fresh:
             self._look()
+        self._keep_first()
+
+    def _keep_first(self) -> None:
+        if self._steps < self.scenes.stride:
+            states = copy.deepcopy(self.states()) if steerable(self.scenes.name) else []
+            self.first_states.append((states, self.observed()))
 
     def _look(self) -> None:
         if self._drawn or not self.parts:
@@ -213,6 +226,10 @@ class ModelArena:
         world: with the robot.
         true: the simulators that acted in the same scenes, or other beginnings.
         probe: reads places for policies that ask for a state.
+
+    Attributes:
+        images: what policies see; with simulators, their images until the model makes its first one.
+        made: the newest images of the model; at the start, the last one of the prompt as it decodes it.
     """
 
     def __init__(self, world: "World", true: Beginning, probe: "Probe | None") -> None:
@@ -227,7 +244,12 @@ class ModelArena:
         )
         for env, number, prompt in zip(self._envs.envs, self.scenes.numbers, true.prompts, strict=True):
             env.reset(seed=self.scenes.seed + number, options={"prompt": prompt._asdict()})
-        self.images: Image = np.stack([env.image for env in self._envs.envs])
+        self.made: Image = np.stack([env.image for env in self._envs.envs])
+        self.images = self.made
+        self._first_states: list[tuple[list[SceneState], Float32s | None]] = []
+        if isinstance(true, TrueArena):
+            self.images = true.first_images
+            self._first_states = true.first_states
         self._steps = 0
         self._seen: list[SeenState] | None = None
 
@@ -242,20 +264,27 @@ class ModelArena:
     def states(self) -> list[SceneState]:
         """Return what the probe reads off the images, moved by the actions since the last one.
 
+        With simulators, the states of the first chunk are theirs.
+
         Raises:
             HMAError: there is no probe.
         """
         if self._probe is None:
             raise HMAError(self.scenes.name, "nothing reads its state off images", "give another policy")
         if self._seen is None:
-            places = self._probe.read(self.images)
+            places = self._probe.read(self.made)
             self._seen = [seen_state(self.scenes.name, self._probe.own, one) for one in places]
+        if self._steps < len(self._first_states):
+            return self._first_states[self._steps][0]
         return [seen.state for seen in self._seen]
 
     def observed(self) -> Float32s | None:
         if self._probe is None or not shows_state(self.scenes.name):
             return None
-        return np.stack([state.pose for state in self.states()]).astype(np.float32)
+        states = self.states()
+        if self._steps < len(self._first_states):
+            return self._first_states[self._steps][1]
+        return np.stack([state.pose for state in states]).astype(np.float32)
 
     def recorded(self) -> Float32s:
         """Return the actions of the simulator's driver in the true episode."""
@@ -265,10 +294,12 @@ class ModelArena:
         self._steps += 1
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", OutsideRangeWarning)  # `run` says which policy leaves the range
-            self.images, *_ = self._envs.step(actions)
+            self.made, *_ = self._envs.step(actions)
+        if self._steps >= self.scenes.stride:
+            self.images = self.made
         if self._seen is None or self._probe is None:
             return
-        places = self._probe.read(self.images) if self.fresh else None
+        places = self._probe.read(self.made) if self.fresh else None
         for row, seen in enumerate(self._seen):
             seen.move(actions[row])
             if places is not None:

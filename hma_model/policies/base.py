@@ -5,11 +5,13 @@ A policy acts in N scenes at once. `Arena` gives it the newest images, and to th
 N scenes, A action dims.
 """
 
+import random
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 
 from hma_data.errors import HMAError, UsageError
 from hma_model.policies.arenas import Arena, Float32s
@@ -85,6 +87,27 @@ def checked(name: str, policy: Policy, arena: Arena) -> Float32s:
             where, "returns NaN or infinite values", "return a number for each value of the action"
         )
     return actions
+
+
+@contextmanager
+def kept_randomness() -> Iterator[None]:
+    """Put the global random numbers of Python, numpy and torch back to where they were."""
+    python, legacy = random.getstate(), np.random.get_state()  # noqa: NPY002
+    devices = range(torch.cuda.device_count() if torch.cuda.is_initialized() else 0)
+    with torch.random.fork_rng(devices):
+        try:
+            yield
+        finally:
+            random.setstate(python)
+            np.random.set_state(legacy)  # noqa: NPY002
+
+
+def seed_samplers(*key: int) -> None:
+    """Seed the global random numbers of Python, numpy and torch, from which policies may draw."""
+    (seed,) = np.random.SeedSequence(key).generate_state(1).tolist()
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002
+    torch.manual_seed(seed)
 
 
 @contextmanager

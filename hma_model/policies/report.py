@@ -15,7 +15,7 @@ from hma_data.storage.files import atomic_path
 from hma_model.evaluation.agreement import Estimate
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
-from hma_model.policies.scores import MODEL, TRUE, WORK, PolicyEvaluation, Scored
+from hma_model.policies.scores import MODEL, SHARED, TRUE, WORK, PolicyEvaluation, Scored
 
 COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same actions, sim.")
 LISTED_PAIRS = 6  # pairs of policies that a sentence names
@@ -66,6 +66,7 @@ def sentences(found: PolicyEvaluation) -> list[str]:
         f"success: {found.judge.task.text}; shares with 95 % intervals over episodes; scores in px: {scores}",
         "alike: episodes with the same outcome in both; same actions, sim.: the simulator, under the "
         "actions that the policy gave in the model",
+        f"paired: simulator and model share {SHARED}; the first chunks of actions are equal, as was checked",
         f"judge on held-out true episodes: {found.judge.held_out}",
         f"judge on generated frames, against the simulator under the same actions: {found.generated}",
         f"precision: the simulator confirms {_share(found.precision)} of the successes seen in the model "

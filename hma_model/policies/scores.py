@@ -4,7 +4,9 @@
     found.success["spearman"]         # of the policies' success rates
 
 Every policy acts in the same scenes of a laboratory robot: once in its simulator, which knows the outcome,
-and once in the world model from the same frames, where a judge reads the outcome off the images. The
+and once in the world model from the same frames, where a judge reads the outcome off the images. Both
+branches are paired: they share the start, the state in it and all random numbers of every control step, and
+an error says which policy acts otherwise in the first chunk all the same. The
 actions that it gave in the model are also played to the simulator. So the judge's word on generated frames
 is compared with what truly comes of the same actions.
 
@@ -26,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import UsageError
+from hma_data.errors import HMAError, UsageError
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
@@ -45,7 +47,7 @@ from hma_model.evaluation.agreement import (
 )
 from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.policies.arenas import Arena, Float32s, Image, ModelArena, Scenes, TrueArena
-from hma_model.policies.base import Judged, Policy, begin, checked
+from hma_model.policies.base import Judged, Policy, begin, checked, kept_randomness, seed_samplers
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import (
     device_facts,
@@ -64,6 +66,7 @@ WORK = ".policies"  # folder of finished policies in an output
 OUTCOMES = ("true", "model", "replayed")
 TRUE, MODEL, REPLAYED = range(3)
 SHOWN_FRAMES = 8  # images that are kept of an episode
+SHARED = "start frames and state, and the random numbers of every control step"  # by both branches
 GOOD_ACCURACY = 0.75  # balanced; an interval that holds chance and this says nothing
 
 
@@ -180,7 +183,8 @@ class PolicyEvaluation:
                 "generated_better_than_chance": self.generated.better_than_chance,
             },
             "refused": self.refusal,
-            "paired": {name: asdict(one) for name, one in self.paired.items()},
+            "paired": {"shared": SHARED, "first_chunks_equal": True}  # else `score_policy` raises
+            | {name: asdict(one) for name, one in self.paired.items()},
             "policies": self.rows(),
             "alike": {"simulator": self.alike(TRUE), "model": self.alike(MODEL)},
             "correlation": {
@@ -300,7 +304,7 @@ def _keys(
 
     The rest is in the settings of the folder of work, with which a judge of words always comes out the same.
     """
-    shared = [world_facts(world), None if isinstance(judge, str) else object_sha256(judge)]
+    shared = ["paired", world_facts(world), None if isinstance(judge, str) else object_sha256(judge)]
     own = [
         (one, policy_facts(one, embodiment)) if isinstance(one, str) else (one[0], object_sha256(one[1]))
         for one in policies
@@ -317,17 +321,22 @@ def score_policy(
     frames: int,
     tell: Progress = lambda done, where: None,
 ) -> dict[str, NDArray[Any]]:
-    """Return what comes of one policy in the simulator and in the model: the arrays of `Scored`."""
+    """Return what comes of one policy in the simulator and in the model: the arrays of `Scored`.
+
+    Raises:
+        HMAError: the policy fails, or its first chunks differ though both branches begin alike.
+    """
     size = world.image_shape[0]
     limit = judge.task.limit
     shown = np.unique(np.linspace(0, frames, SHOWN_FRAMES).round().astype(int))
     true = TrueArena(scenes, size)
-    true_images, _ = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
+    true_images, acted = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
     model = ModelArena(world, true, judge.probe)
     try:
         model_images, actions = run(name, policy, model, frames, lambda done: tell(done, "in the model"))
     finally:
         model.close()
+    _require_paired(name, acted[: scenes.stride], actions[: scenes.stride])
     again = TrueArena(scenes, size, drawn=False)
     for action in actions:
         again.step(action)
@@ -342,10 +351,19 @@ def score_policy(
     }
 
 
+def _require_paired(name: str, true: list[Float32s], model: list[Float32s]) -> None:
+    """Check that the first chunks of a policy in both branches are equal, but for rounding."""
+    scale = np.abs(true).max(axis=(0, 1)) + 1e-6
+    if not (np.abs(np.subtract(true, model)) <= 1e-5 * scale).all():
+        fault = "does not act alike twice: its first actions in the model differ from those in the simulator"
+        remedy = "draw from random, numpy.random or torch, which are seeded, or seed its own in reset()"
+        raise HMAError(f"policy {name}", fault, remedy)
+
+
 def run(
     name: str, policy: Policy, arena: Arena, frames: int, tell: Callable[[float], None] = lambda done: None
 ) -> tuple[list[Image], list[Float32s]]:
-    """Let a policy act for so many frames.
+    """Let a policy act for so many frames, with global random numbers that are seeded at each step.
 
     Returns:
         The T + 1 images (N, S, S, 3), the last one of the prompt first; and all actions (N, A).
@@ -353,17 +371,21 @@ def run(
     Raises:
         HMAError: the policy fails.
     """
-    images = [arena.images]
+    images = [arena.made if isinstance(arena, ModelArena) else arena.images]
     actions = list[Float32s]()
     said = ""
-    begin(name, policy, arena)
-    for _ in range(frames * arena.scenes.stride):
-        actions.append(checked(name, policy, arena))
-        if not said and isinstance(arena, ModelArena) and (said := arena.outside(actions[-1])):
-            guess = "what the model shows of such actions is a guess"
-            warnings.warn(f"policy {name}: {said}; {guess}", OutsideRangeWarning, stacklevel=2)
-        arena.step(actions[-1])
-        if arena.fresh:
-            images.append(arena.images)
-            tell((len(images) - 1) * len(arena.images))
+    with kept_randomness():
+        key = (arena.scenes.seed, 5, arena.scenes.numbers[0])
+        seed_samplers(*key)
+        begin(name, policy, arena)
+        for step in range(frames * arena.scenes.stride):
+            seed_samplers(*key, step)
+            actions.append(checked(name, policy, arena))
+            if not said and isinstance(arena, ModelArena) and (said := arena.outside(actions[-1])):
+                guess = "what the model shows of such actions is a guess"
+                warnings.warn(f"policy {name}: {said}; {guess}", OutsideRangeWarning, stacklevel=2)
+            arena.step(actions[-1])
+            if arena.fresh:
+                images.append(arena.images)
+                tell((len(images) - 1) * len(arena.images))
     return images, actions

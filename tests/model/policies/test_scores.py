@@ -1,6 +1,7 @@
 """Policies scored twice: in a world without error both agree; faults of policies are one clear line."""
 
 import json
+import random
 import re
 import shutil
 import sys
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from hma_data.errors import HMAError, OutputError, UsageError
@@ -32,6 +34,7 @@ from hma_model.policies.scores import (
     PolicyEvaluation,
     Scored,
     evaluate_policies,
+    run,
     score_policy,
 )
 from hma_model.policies.scripted import Called, Still
@@ -271,6 +274,65 @@ def test_both_arenas_begin_with_the_same_frames_and_numbers_follow_the_seed(worl
     assert np.array_equal(one.images, other.images)
     assert not np.array_equal(one.images[0], one.images[1])
     assert not np.array_equal(one.images, TrueArena(Scenes.of(world, ROBOT, 2, 2), 128).images)
+
+
+def noisy(image: np.ndarray) -> np.ndarray:
+    """Act on the image and on the global random numbers of three libraries."""
+    drawn = random.random() + np.random.random() + float(torch.rand(1))  # noqa: NPY002
+    DRAWN.append(drawn)
+    return np.array([image.mean() / 100, drawn], np.float32)
+
+
+def unseeded(image: np.ndarray) -> np.ndarray:
+    return np.random.default_rng().random(2)
+
+
+DRAWN: list[float] = []
+
+
+@pytest.mark.parametrize("name", [f"{__name__}:noisy", "scripted:noise=0.5", "reach"])
+def test_branches_share_start_state_and_the_random_numbers_of_every_step(
+    world: World, judge: StateJudge, name: str
+) -> None:
+    scenes = Scenes.of(world, ROBOT, 2, 0)
+    true = TrueArena(scenes, 128)
+    policy = read_policy(name, scenes)
+    DRAWN.clear()
+    before = random.getstate(), torch.get_rng_state()
+    _, acted = run("it", policy, true, 3)
+    model = ModelArena(world, true, judge.probe)
+    images, made = run("it", policy, model, 3)
+    stride = scenes.stride
+    assert np.array_equal(acted[:stride], made[:stride])  # of the same image, though the model's is decoded
+    assert not np.array_equal(images[0], true.first_images) and not np.array_equal(acted, made)
+    assert DRAWN[: len(DRAWN) // 2] == DRAWN[len(DRAWN) // 2 :]
+    assert len(set(DRAWN)) * 2 == len(DRAWN)  # other numbers at each step and in each scene
+    assert before[0] == random.getstate() and torch.equal(before[1], torch.get_rng_state())
+    model.close()
+
+
+@pytest.mark.parametrize("broken", ["image", "seed", "state", "policy"])
+def test_branches_that_do_not_begin_alike_are_refused(
+    world: World, judge: StateJudge, broken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = {"seed": "random", "state": "reach", "policy": f"{__name__}:unseeded"}.get(
+        broken, f"{__name__}:noisy"
+    )
+    made = ModelArena.__init__
+
+    def begun(self: ModelArena, *given: Any) -> None:
+        made(self, *given)
+        if broken == "image":
+            self.images = self.made
+        if broken == "seed":
+            self.scenes = replace(self.scenes, seed=self.scenes.seed + 1)
+        if broken == "state":
+            self._first_states = []
+
+    monkeypatch.setattr(ModelArena, "__init__", begun)
+    scenes = Scenes.of(world, ROBOT, 2, 0)
+    with pytest.raises(HMAError, match="does not act alike twice: its first actions in the model differ"):
+        score_policy("it", read_policy(name, scenes), world, scenes, judge, 4)
 
 
 def test_a_random_action_is_held_for_a_chunk_and_stays_in_range(world: World) -> None:
