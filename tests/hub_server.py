@@ -189,7 +189,10 @@ class _Handler(BaseHTTPRequestHandler):
             )
         if self.right != "write":
             return self._answer(403, {"error": "You don't have the rights to create this"})
-        self.server.create(name, kind, wanted.get("visibility") == "private")
+        made = self.server.create(name, kind, wanted.get("visibility") == "private")
+        if kind == "spaces":
+            header = f"---\nsdk: {wanted['sdk']}\n---\n".encode()
+            made.commit({"README.md": header, "index.html": b"new", "style.css": b"new"}, "new Space")
         prefix = "" if kind == "models" else f"{kind}/"
         return self._answer(200, {"url": f"{self.server.url}/{prefix}{name}", "name": name})
 
@@ -209,7 +212,9 @@ class _Handler(BaseHTTPRequestHandler):
         return self._answer(200, {"errors": [], "warnings": []})
 
     def _repository(self) -> None:
-        found = re.fullmatch(r"(?:/api)?(?:/(models|datasets))?/([^/]+/[^/]+?)(?:\.git)?(/.*)?", self.route)
+        found = re.fullmatch(
+            r"(?:/api)?(?:/(models|datasets|spaces))?/([^/]+/[^/]+?)(?:\.git)?(/.*)?", self.route
+        )
         if not found:
             return self._answer(404, {"error": "no such page"})
         kind, name, rest = found[1] or "models", found[2], (found[3] or "").lstrip("/")

@@ -71,7 +71,7 @@ class Repository:
         repo: organisation/name.
         revision: branch, tag or commit; None for main.
         write: whether to make the repository if it does not exist.
-        kind: model or dataset.
+        kind: model, dataset or space; a new Space is a static one.
         private: whether to make it private.
         name: name for errors, instead of its URI.
 
@@ -91,7 +91,7 @@ class Repository:
     ) -> None:
         from huggingface_hub import HfApi, get_session, get_token
 
-        prefix = "datasets/" if kind == "dataset" else ""
+        prefix = "" if kind == "model" else f"{kind}s/"
         self.name, self.repo, self.kind, self._revision = name or f"hf://{prefix}{repo}", repo, kind, revision
         self._place: dict[str, Any] = {"repo_id": repo, "repo_type": kind}
         self._api = HfApi(library_name="hma-toolkit")
@@ -303,8 +303,10 @@ class Repository:
             )
 
     def _make(self) -> None:
-        private = self._private or None
-        self._ask(lambda: self._api.create_repo(**self._place, private=private, exist_ok=True))
+        asked: dict[str, Any] = {"private": self._private or None, "exist_ok": True}
+        if self.kind == "space":
+            asked["space_sdk"] = "static"
+        self._ask(lambda: self._api.create_repo(**self._place, **asked))
 
     # -- asking
 

@@ -36,17 +36,26 @@ def push(
     page: Annotated[
         bool, Option("--page", help="Publish a page too that drives these robots, as hma export writes it.")
     ] = False,
+    space: Annotated[
+        str | None,
+        Option(metavar="ORG/NAME", help="Make a static Space of that page as well; needs --page."),
+    ] = None,
     private: Private = False,
 ) -> None:
     """Publish a checkpoint, whole or robot by robot.
 
     Example: hma hub push runs/first ./my-hub/team/model -e my_arm
     """
+    from hma_data.errors import UsageError
     from hma_model.checkpoint.folder import Checkpoint
     from hma_model.cli.export import export_checkpoint
+    from hma_model.export.space import Space
     from hma_model.hub import publish as hub
 
+    if space and not page:
+        raise UsageError("--space", "needs the page that it shows", "add --page")
     opened = Checkpoint.open(checkpoint)
+    static = Space(space, private) if space else None
     if film or sample:
         _add_films(opened, sample, embodiment)
     with tempfile.TemporaryDirectory() as folder:
@@ -55,7 +64,10 @@ def push(
             exported = Path(folder) / "page"
             export_checkpoint(opened.name, [], exported, embodiment, target.rstrip("/").rsplit("/", 1)[-1])
         address = hub.push(opened, target, embodiment, private, exported)
-    print(f"published to {address}")
+        print(f"published to {address}")
+        if static and exported:
+            cards = opened.cards(embodiment)
+            print(f"the page runs at {static.publish(exported, target, cards.values())}")
     for name, card in opened.cards(embodiment).items():
         judged = card.get("evaluation")
         if judged and not judged["follows"]:
