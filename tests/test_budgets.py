@@ -28,7 +28,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/tokenizers": (3_290, 23_900, 17),
     "hma_model": (520, 3_100, 3),
     "hma_model/checkpoint": (870, 6_500, 5),
-    "hma_model/cli": (1_600, 10_200, 11),
+    "hma_model/cli": (1_640, 10_300, 11),
     "hma_model/demo": (470, 3_800, 4),
     "hma_model/evaluation": (4_060, 32_200, 21),
     "hma_model/export": (950, 7_300, 7),
@@ -37,13 +37,13 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/lerobot_env": (570, 4_600, 3),
     "hma_model/network": (3_250, 27_700, 16),
     "hma_model/play": (1_650, 11_900, 8),
-    "hma_model/policies": (2_140, 15_100, 12),
+    "hma_model/policies": (2_760, 19_500, 14),
     "hma_model/released": (830, 7_200, 4),
     "hma_model/synthetic": (1_210, 9_000, 5),
     "hma_model/training": (3_560, 29_200, 18),
     "hma_model/worlds": (1_530, 11_500, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 63_000, 497_000
+PRODUCT_LINES, PRODUCT_NODES = 63_200, 497_000
 TEST_LINES = 46_500
 DOC_WORDS = 38_000
 

@@ -1,12 +1,14 @@
 """Define the verbs `hma policy-eval`, `hma augment` and `hma label-actions`."""
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
 from hma_data.cli.options import Json
 from hma_data.console import human_count, interruptible, print_json, progress
+from hma_data.errors import UsageError
 from hma_model.cli.options import (
     Compile,
     Device,
@@ -24,7 +26,10 @@ from hma_model.cli.options import (
 def policy_eval(
     embodiment: Annotated[
         str,
-        Argument(help="A simulated robot of the checkpoint.", autocompletion=embedded_robots),
+        Argument(
+            help="A robot of the checkpoint; without a reward model as --judge, a simulated one.",
+            autocompletion=embedded_robots,
+        ),
     ],
     policies: Annotated[
         list[str],
@@ -38,8 +43,19 @@ def policy_eval(
     episodes: Annotated[int, Option(min=1, help="Episodes of each policy.")] = 32,
     frames: Annotated[int, Option(min=4, help="Frames of an episode.")] = 40,
     judge: Annotated[
-        str, Option(help="Success criterion: moved, reached or placed; moved=8 sets the limit in px.")
+        str,
+        Option(
+            help="Success criterion: moved, reached or placed; moved=8 sets the limit in px. For robots "
+            "without a simulator a reward model of lerobot: a folder or hub repo."
+        ),
     ] = "moved",
+    source: Annotated[
+        Path | None,
+        Option(
+            "--from",
+            help="Shards with success labels, for a reward model; default: those of the training run.",
+        ),
+    ] = None,
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
     precision: Precision = "float32",
@@ -51,17 +67,26 @@ def policy_eval(
 ) -> None:
     """Score policies in a robot's simulator and inside the world model, and compare the two.
 
+    With a reward model as --judge, policies are scored in the world model alone.
     With --out, finished policies are kept, and the same command continues.
 
     Example: hma policy-eval rails_03 scripted scripted:noise=0.5 random still --out policies
     """
-    from hma_model.policies.report import show, write_report
+    from hma_model.policies import recorded, report
+    from hma_model.policies.rewards import names_reward_model
     from hma_model.policies.scores import evaluate_policies
 
+    evaluate: Any = evaluate_policies
+    pages: Any = report
+    if names_reward_model(judge):
+        evaluate = partial(recorded.evaluate_recorded, shards=source)
+        pages = recorded
+    elif source is not None:
+        raise UsageError("--from", "is for a reward model", "add --judge FOLDER_OR_REPO, or leave it out")
     there = device_name(device)
     whole = len(policies) * episodes * frames
     with interruptible(lambda: kept("policies", out)), progress("policies", whole) as update:
-        found = evaluate_policies(
+        found = evaluate(
             embodiment,
             policies,
             checkpoint=checkpoint,
@@ -77,11 +102,11 @@ def policy_eval(
             compile=compile,
             on_progress=update,
         )
-    page = write_report(found, out) if out else None
+    page = pages.write_report(found, out) if out else None
     if json:
         print_json(found.to_json())
         return
-    show(found)
+    pages.show(found)
     if page:
         print(f"open {page}")
 

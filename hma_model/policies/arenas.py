@@ -66,7 +66,7 @@ class Scenes:
         found = described(world.model, embodiment)
         spec = world.action_spec(embodiment)
         if simulator and not simulated(embodiment):
-            remedy = "choose a robot of the laboratory; hma play shows those of a checkpoint"
+            remedy = "choose a robot of the laboratory, or judge by a reward model: --judge FOLDER_OR_REPO"
             raise HMAError(embodiment, "has no true simulator to compare with", remedy)
         space = world.model.embodiments[embodiment]
         action = {"mean": space.mean, "std": space.std}

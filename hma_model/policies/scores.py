@@ -228,20 +228,14 @@ def evaluate_policies(
         HMAError: a policy fails, the robot has no simulator, or the judge is no better than chance.
         OutputError: the folder cannot be written, or was begun with other settings.
     """
-    if not policies:
-        raise UsageError("policies", "none is given", "give at least one; a correlation takes three")
-    names = [one if isinstance(one, str) else one[0] for one in policies]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise UsageError(f"policy {twice}", "is given twice", "give each once")
+    names = names_of(policies)
     folder = None if out is None else as_path(out)
     with locked(folder) if folder else nullcontext():
         world = world or load_world(checkpoint, **settings)
-        sampling = f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}"
-        if world.precision != "float32":
-            sampling += f",precision={world.precision}"
+        sampling = sampling_of(world)
         scenes = Scenes.of(world, embodiment, episodes, seed)
         made = [read_policy(one, scenes, world) if isinstance(one, str) else one[1] for one in policies]
-        keys = [""] * len(made) if folder is None else _keys(policies, world, embodiment, judge)
+        keys = [""] * len(made) if folder is None else part_keys(policies, world, embodiment, judge)
         for name, policy in zip(names, made, strict=True):
             if not isinstance(policy, Judged):
                 # What it returns is refused here, before minutes of work.
@@ -297,7 +291,23 @@ def evaluate_policies(
     )
 
 
-def _keys(
+def names_of(policies: Sequence[str | tuple[str, Policy]]) -> list[str]:
+    """Return the names of policies; raise UsageError if there is none, or one is given twice."""
+    if not policies:
+        raise UsageError("policies", "none is given", "give at least one; a correlation takes three")
+    names = [one if isinstance(one, str) else one[0] for one in policies]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise UsageError(f"policy {twice}", "is given twice", "give each once")
+    return names
+
+
+def sampling_of(world: World) -> str:
+    """Return in words how a world draws its frames."""
+    sampling = f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}"
+    return sampling if world.precision == "float32" else f"{sampling},precision={world.precision}"
+
+
+def part_keys(
     policies: Sequence[str | tuple[str, Policy]], world: World, embodiment: str, judge: str | StateJudge
 ) -> list[str]:
     """Return the name under which each policy's results are kept: another one for all that changes them.

@@ -1,0 +1,312 @@
+"""Score policies inside the world model alone, for robots without a simulator.
+
+    found = evaluate_recorded("my_arm", ["lerobot:act"], checkpoint="runs/my_arm", judge="reward_classifier")
+
+Episodes begin with the first frames of held-out recorded episodes, and a reward model judges what the world
+model shows. There is no truth to compare with, so the result states how often the judge is right on recorded
+episodes. How it does on generated frames stays unknown.
+
+N episodes, T frames after the prompt, A action dims.
+"""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.console import print_table
+from hma_data.episodes.sheets import grid, png_bytes
+from hma_data.errors import UsageError
+from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.windows import episode_pieces
+from hma_data.storage.files import write_atomic
+from hma_data.storage.kept import KeptParts
+from hma_data.storage.locks import locked
+from hma_data.storage.paths import StrPath, as_path
+from hma_model.evaluation.agreement import Bools, alike_pairs, share_interval
+from hma_model.evaluation.pages import Page
+from hma_model.generation.decode import cameras_for
+from hma_model.policies.arenas import Float32s, Image, ModelArena, Scenes
+from hma_model.policies.base import Judged, Policy, begin, checked
+from hma_model.policies.catalog import read_policy
+from hma_model.policies.fingerprints import device_facts, policy_facts, world_digests
+from hma_model.policies.rewards import RewardJudge, labelled_shards, measured_judge
+from hma_model.policies.scores import (
+    EPISODES,
+    FRAMES,
+    SHOWN_FRAMES,
+    WORK,
+    Progress,
+    names_of,
+    part_keys,
+    run,
+    sampling_of,
+)
+from hma_model.worlds.images import Prompt, seen_cameras
+from hma_model.worlds.prompts import default_frames, shard_window
+from hma_model.worlds.scenes import at_rest
+from hma_model.worlds.world import World, load_world
+
+COLUMNS = ("policy", "success in the model", "mean reward")
+SHOWN_EPISODES = 2  # of each policy and outcome on the page
+UNKNOWN = "no simulator tells how often the judge is right on generated frames: compare policies, not rates"
+
+
+@dataclass
+class RecordedBeginnings:
+    """The first frames of recorded episodes; a `Beginning`."""
+
+    scenes: Scenes
+    prompts: Sequence[Prompt]
+    held: Float32s
+    told: list[Float32s]
+
+
+@dataclass(frozen=True)
+class Played:
+    """The results of one policy.
+
+    Attributes:
+        scores, success: (N,) of its episodes, as judged.
+        images: (N, SHOWN_FRAMES, S, V·S, 3).
+    """
+
+    policy: str
+    scores: NDArray[np.float64]
+    success: Bools
+    images: Image
+
+
+@dataclass(frozen=True)
+class ModelEvaluation:
+    """Policies scored in the model alone.
+
+    Attributes:
+        beginnings: recorded episodes whose first frames the N episodes begin with.
+    """
+
+    embodiment: str
+    checkpoint: str
+    sampling: str
+    seed: int
+    frames: int
+    beginnings: int
+    judge: RewardJudge
+    policies: tuple[Played, ...]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the figures of each policy."""
+        return [
+            {
+                "policy": one.policy,
+                "model_success": float(one.success.mean()),
+                "model_success_interval": share_interval(int(one.success.sum()), one.success.size),
+                "model_score": float(one.scores.mean()),
+            }
+            for one in self.policies
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures, and the outcome of each episode, as plain values."""
+        own = ("embodiment", "checkpoint", "sampling", "seed", "frames", "beginnings")
+        return {key: getattr(self, key) for key in own} | {
+            "episodes": self.policies[0].success.size,
+            "judge": self.judge.to_json(),
+            "policies": self.rows(),
+            "outcomes": {
+                one.policy: {"scores": one.scores.round(3).tolist(), "success": one.success.tolist()}
+                for one in self.policies
+            },
+        }
+
+    def sentences(self) -> list[str]:
+        """Return in words what the table means."""
+        pairs = alike_pairs(np.stack([one.success for one in self.policies]))
+        names = [f"{self.policies[one].policy} and {self.policies[other].policy}" for one, other in pairs]
+        alike = [f"by success, these cannot be told apart: {'; '.join(names)}"] if names else []
+        success = "success: the judge scores some frame above 0.5; 95 % intervals over episodes"
+        return [success, self.judge.sentence, UNKNOWN, *alike]
+
+    def table(self) -> list[list[Any]]:
+        """Return a row of COLUMNS for each policy."""
+        rows = []
+        for row in self.rows():
+            low, high = row["model_success_interval"]
+            success = f"{row['model_success']:.0%} ({low:.0%}–{high:.0%})"
+            rows.append([row["policy"], success, round(row["model_score"], 2)])
+        return rows
+
+
+def evaluate_recorded(
+    embodiment: str,
+    policies: Sequence[str | tuple[str, Policy]],
+    *,
+    judge: str,
+    shards: StrPath | None = None,
+    checkpoint: StrPath = "embedded",
+    episodes: int = EPISODES,
+    frames: int = FRAMES,
+    seed: int = 0,
+    out: StrPath | None = None,
+    world: World | None = None,
+    on_progress: Progress = lambda done, words: None,
+    **settings: Any,
+) -> ModelEvaluation:
+    """Score policies inside a world model, judged by a reward model of lerobot.
+
+    Args:
+        embodiment: a robot of the checkpoint.
+        policies: words as `read_policy` takes them, or a name and a policy; none that needs a simulator.
+        judge: folder or hub repository of the reward model.
+        shards: set whose held-out episodes have success labels; by default that of the training run.
+        others: as of `evaluate_policies`.
+
+    Raises:
+        HMAError: a policy fails, or the judge cannot be loaded, measured, or trusted.
+        OutputError: the folder cannot be written, or was begun with other settings.
+    """
+    names = names_of(policies)
+    for name in names:
+        if name.partition(":")[0] in ("scripted", "reach"):
+            raise UsageError(f"policy {name}", "reads the state of a simulator", "give another policy")
+    folder = None if out is None else as_path(out)
+    with locked(folder) if folder else nullcontext():
+        world = world or load_world(checkpoint, **settings)
+        scenes = Scenes.of(world, embodiment, episodes, seed, simulator=False)
+        made = [read_policy(one, scenes, world) if isinstance(one, str) else one[1] for one in policies]
+        if planner := next((name for name, one in zip(names, made) if isinstance(one, Judged)), None):
+            raise UsageError(f"policy {planner}", "plans for a task of the laboratory", "give another policy")
+        labelled = labelled_shards(world, embodiment, shards, judge)
+        measured = measured_judge(judge, world, embodiment, labelled, partial(on_progress, 0))
+        begun, beginnings = recorded_beginnings(world, scenes, labelled)
+        for name, policy in zip(names, made, strict=True):
+            _try(name, policy, world, begun)
+        kept = None
+        keys = [""] * len(made)
+        if folder:
+            digest = hashlib.sha256(labelled.manifest.to_text().encode()).hexdigest()
+            facts: dict[str, Any] = {"embodiment": embodiment, "episodes": episodes, "frames": frames}
+            facts |= {"seed": seed, "sampling": sampling_of(world), "shards_sha256": digest, "judge": judge}
+            facts |= {"judge_sha256": policy_facts(f"lerobot:{judge}", embodiment)}
+            facts |= world_digests(world, embodiment) | device_facts(world.model)
+            kept = KeptParts(folder / WORK, facts)
+            keys = part_keys(policies, world, embodiment, judge)
+        on_progress(0, "episodes")  # the clock of the time left starts here
+        played = []
+        for number, (name, policy, key) in enumerate(zip(names, made, keys, strict=True)):
+
+            def tell(done: float, number: int = number, name: str = name) -> None:
+                on_progress(number * frames * episodes + done, name)
+
+            play = partial(_play, name, policy, world, begun, measured, frames, tell)
+            played.append(Played(name, **(play() if kept is None else kept.part(key, play))))
+    return ModelEvaluation(
+        embodiment, str(checkpoint), sampling_of(world), seed, frames, beginnings, measured, tuple(played)
+    )
+
+
+def recorded_beginnings(world: World, scenes: Scenes, shards: ShardSet) -> tuple[RecordedBeginnings, int]:
+    """Return the first frames of held-out episodes in turn, one for each scene, and how many there are.
+
+    Raises:
+        UsageError: no held-out episode is long enough.
+    """
+    count = default_frames(world.model)
+    span = (count - 1) * shards.row_stride
+    rows = []
+    for row in shards.episodes.to_pylist():
+        if row["split"] == "val" and len(episode_pieces(shards, row)[0]) > span:
+            rows.append(row)
+    if not rows:
+        fault = f"has no held-out episode of {count} frames without a pause"
+        raise UsageError(shards.folder, fault, "give other shards")
+    cameras = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
+    reader = EpisodeReader(shards, shards.columns(cameras))
+    at = np.arange(0, span + 1, shards.row_stride)
+    kept = [shard_window(shards, reader, row, cameras, at) for row in rows[: len(scenes.numbers)]]
+    prompts = [kept[number % len(kept)] for number in range(len(scenes.numbers))]
+    dims = len(scenes.dimensions)
+    # the action in force at the last frame of the prompt; without one, a target is zero
+    last = [prompt.chunks[-1, -dims:] if len(prompt.chunks) else np.zeros(dims) for prompt in prompts]
+    held = at_rest(scenes.dimensions, np.nan_to_num(np.stack(last)))
+    return RecordedBeginnings(scenes, prompts, held, []), len(kept)
+
+
+def _try(name: str, policy: Policy, world: World, begun: RecordedBeginnings) -> None:
+    """Refuse what a policy returns before minutes of work."""
+    one = RecordedBeginnings(begun.scenes.take(range(1)), begun.prompts[:1], begun.held[:1], [])
+    arena = ModelArena(world, one, None)
+    try:
+        begin(name, policy, arena)
+        checked(name, policy, arena)
+    finally:
+        arena.close()
+
+
+def _play(
+    name: str,
+    policy: Policy,
+    world: World,
+    begun: RecordedBeginnings,
+    judge: RewardJudge,
+    frames: int,
+    tell: Any,
+) -> dict[str, NDArray[Any]]:
+    """Return what comes of one policy in the model: the arrays of `Played`."""
+    arena = ModelArena(world, begun, None)
+    try:
+        images, _ = run(name, policy, arena, frames, tell)
+    finally:
+        arena.close()
+    shown = np.unique(np.linspace(0, frames, SHOWN_FRAMES).round().astype(int))
+    # the frames of an episode are scored together, so that memory does not grow with N
+    scores = np.concatenate([judge.model.score(np.stack(one)[None]) for one in zip(*images, strict=True)])
+    return {
+        "scores": scores,
+        "success": judge.model.success(scores),
+        "images": np.stack([images[frame] for frame in shown], axis=1),
+    }
+
+
+def show(found: ModelEvaluation) -> None:
+    """Print the table and what it means."""
+    print_table(list(COLUMNS), found.table())
+    for sentence in found.sentences():
+        print(sentence)
+
+
+def write_report(found: ModelEvaluation, folder: Path) -> Path:
+    """Write results.json and report.html; return the path of the page. Finished policies are then removed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomic(folder / "results.json", json.dumps(found.to_json(), indent=1))
+    write_atomic(folder / "report.html", html(found))
+    shutil.rmtree(folder / WORK, ignore_errors=True)
+    return folder / "report.html"
+
+
+def html(found: ModelEvaluation) -> str:
+    """Return the page."""
+    lead = (
+        f"{found.embodiment} in {found.checkpoint} ({found.sampling}): {found.policies[0].success.size} "
+        f"episodes of {found.frames} frames a policy, from the first frames of {found.beginnings} held-out "
+        "recorded episodes"
+    )
+    page = Page("Policies inside the world model", lead)
+    page.table(COLUMNS, found.table())
+    for sentence in found.sentences():
+        page.text(sentence[:1].upper() + sentence[1:] + ".")
+    for one in found.policies:
+        page.section(one.policy)
+        for outcome, word in ((True, "success"), (False, "failure")):
+            for number in np.flatnonzero(one.success == outcome)[:SHOWN_EPISODES]:
+                caption = f"episode {number}, judged a {word}: highest reward {one.scores[number]:.2f}"
+                page.picture(png_bytes(grid([list(one.images[number])])), "png", caption)
+    return page.html()

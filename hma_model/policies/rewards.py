@@ -1,0 +1,307 @@
+"""Judge episodes of any robot by a reward model of lerobot that scores single frames.
+
+A reward model is a success classifier trained with lerobot. It scores images, so it needs no simulator. An
+episode counts as a success as soon as one frame is scored above 0.5, as in lerobot's own training loop. How
+often that is right is measured on held-out episodes whose outcome was recorded, as the tokenizer shows them.
+
+Nothing is unpickled, and no code of a repository runs: weights and statistics are safetensors files.
+
+N episodes, T frames, S pixels a side, V views side by side.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import HMAError, MissingDependencyError, UsageError
+from hma_data.hub.repository import Repository
+from hma_data.lab import imported
+from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.storage.paths import REPOSITORY
+from hma_model.evaluation.agreement import Accuracy, Bools, accuracy, share_interval
+from hma_model.generation.decode import cameras_for
+from hma_model.policies.lerobot import TASK
+from hma_model.worlds.images import seen_cameras
+from hma_model.worlds.prompts import require_fit, seen_frames
+
+if TYPE_CHECKING:
+    from hma_model.worlds.world import World
+
+Floats = NDArray[np.float64]
+Images = NDArray[np.uint8]
+
+LIMIT = 0.5  # least reward of a success, as lerobot's
+FRAMES_AT_ONCE = 64
+NEEDED = 4  # held-out successes, and failures, with which a judge that is always right passes
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+PREPROCESSOR = "*preprocessor.json"
+VIDEO_MODELS = ("sarm", "robometer", "topreward")  # they score a video and its text, not a frame
+
+
+def names_reward_model(judge: str) -> bool:
+    """Check whether the words of a judge are a folder or ORGANISATION/NAME, not a task of the laboratory."""
+    return "/" in judge or Path(judge).is_dir()
+
+
+class RewardModel:
+    """A reward model of lerobot that scores frames, with the preprocessor that it was saved with.
+
+    Args:
+        source: its folder or hub repository.
+        cameras: names of the V views that a world model's image shows.
+        task: what the robot is told.
+        device: of the network.
+
+    Raises:
+        HMAError: it cannot be loaded safely, scores no single frames, or takes other inputs.
+    """
+
+    def __init__(self, source: str, cameras: Sequence[str], task: str, device: str = "cpu") -> None:
+        self.name = f"judge {source}"
+        self._task = task
+        self._device = device
+        folder = _folder(source, self.name)
+        with imported("lerobot"):
+            from lerobot.configs.rewards import RewardModelConfig
+            from lerobot.processor import PolicyProcessorPipeline
+            from lerobot.rewards import get_reward_model_class
+        from safetensors.torch import load_model
+
+        try:
+            with redirect_stdout(sys.stderr):  # it prints what it loads
+                kind = json.loads((folder / CONFIG).read_text()).get("type")
+                if kind in VIDEO_MODELS:
+                    remedy = "give a reward_classifier, or another model that scores single frames"
+                    raise HMAError(self.name, f"is a {kind}, which scores videos", remedy)
+                config = RewardModelConfig.from_pretrained(folder)
+                config.device = device
+                with _encoder_without_code() if kind == "reward_classifier" else nullcontext():
+                    self._model: Any = get_reward_model_class(config.type)(config)
+                # not by lerobot's loader, which leaves missing weights random
+                missing, _ = load_model(self._model, folder / WEIGHTS, strict=False)
+                if missing:
+                    raise ValueError(f"{WEIGHTS} lacks {min(missing)}")
+                self._model.to(device).eval()
+                self._before: Any = lambda batch: batch
+                for path in sorted(folder.glob(PREPROCESSOR)):
+                    _require_registered(path, self.name)
+                    there = {"device_processor": {"device": device}}
+                    self._before = PolicyProcessorPipeline.from_pretrained(
+                        folder, config_filename=path.name, overrides=there
+                    )
+        except HMAError:
+            raise
+        except Exception as fault:
+            said = f"cannot be loaded: {type(fault).__name__}: {str(fault).strip().partition(chr(10))[0]}"
+            remedy = "give a reward model that lerobot has saved, whose encoder needs no code of its own"
+            raise HMAError(self.name, said, remedy) from fault
+        self._keys = self._places(config, cameras)
+
+    def _places(self, config: Any, cameras: Sequence[str]) -> dict[str, tuple[int, tuple[int, int]]]:
+        """Return the view and the height and width of each image that the model takes."""
+        keys = list(config.input_features)
+        names = [key.rpartition(".")[2] for key in keys]
+        if len(keys) == len(cameras) == 1:
+            names = list(cameras)
+        others = [key for key in keys if not key.startswith("observation.image")]
+        if not keys or others or not set(names) <= set(cameras):
+            fault = f"takes {', '.join(keys) or 'no camera'}"
+            raise HMAError(self.name, fault, f"the world model shows {', '.join(cameras)}")
+        self._views = len(cameras)
+        shapes = [tuple(config.input_features[key].shape[1:]) for key in keys]
+        places = [list(cameras).index(name) for name in names]
+        return dict(zip(keys, zip(places, shapes, strict=True), strict=True))
+
+    def rewards(self, images: Images) -> Floats:
+        """Return the rewards (N,) of images (N, S, V·S, 3)."""
+        import torch
+        from torch.nn.functional import interpolate
+
+        views = np.split(images, self._views, axis=2)
+        batch: dict[str, Any] = {TASK: [self._task] * len(images)}
+        for key, (place, shape) in self._keys.items():
+            view = torch.from_numpy(np.ascontiguousarray(views[place])).permute(0, 3, 1, 2).float() / 255
+            if view.shape[2:] != shape:
+                view = interpolate(view, shape, mode="bilinear", antialias=True)
+            batch[key] = view.to(self._device)
+        with torch.inference_mode():
+            found = self._model.compute_reward(self._before(batch))
+        return np.asarray(found.float().cpu(), np.float64).reshape(len(images))
+
+    def score(self, images: Images) -> Floats:
+        """Return the highest reward (N,) of the frames of episodes (N, T, S, V·S, 3)."""
+        flat = images.reshape(-1, *images.shape[2:])
+        parts = [self.rewards(flat[i : i + FRAMES_AT_ONCE]) for i in range(0, len(flat), FRAMES_AT_ONCE)]
+        highest: Floats = np.concatenate(parts).reshape(images.shape[:2]).max(axis=1)
+        return highest
+
+    def success(self, scores: Floats) -> Bools:
+        """Return which scores (N,) are a success."""
+        judged: Bools = scores > LIMIT
+        return judged
+
+
+@dataclass(frozen=True)
+class RewardJudge:
+    """A reward model with its accuracy.
+
+    Attributes:
+        held_out: its accuracy on recorded episodes that are held out of training.
+        hits, alarms: successes, and failures, that it calls a success.
+    """
+
+    source: str
+    model: RewardModel
+    held_out: Accuracy
+    hits: int
+    alarms: int
+
+    @property
+    def sentence(self) -> str:
+        """Return in words how often it is right."""
+        found = self.held_out
+        seen = _of(self.hits, found.successes)
+        false = _of(self.alarms, found.count - found.successes)
+        return f"judge on held-out recorded episodes: calls {seen} successes and {false} failures a success"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return its figures as plain values."""
+        failures = self.held_out.count - self.held_out.successes
+        return {
+            "model": self.source,
+            "held_out": vars(self.held_out),
+            "true_positives": self.hits,
+            "true_positive_interval": share_interval(self.hits, self.held_out.successes),
+            "false_positives": self.alarms,
+            "false_positive_interval": share_interval(self.alarms, failures),
+        }
+
+
+def _of(part: int, whole: int) -> str:
+    low, high = share_interval(part, whole)
+    return f"{part} of {whole} ({low:.0%} to {high:.0%})"
+
+
+def measured_judge(
+    source: str,
+    world: "World",
+    embodiment: str,
+    shards: ShardSet,
+    tell: Callable[[str], None] = lambda words: None,
+) -> RewardJudge:
+    """Load a reward model and measure it on the held-out episodes of a shard set.
+
+    Args:
+        source: its folder or hub repository.
+        world: whose images it is to judge.
+        embodiment: a robot of the world.
+        shards: of the robot and the world's tokenizer, with success labels.
+        tell: called with how far it is.
+
+    Raises:
+        HMAError: it cannot be loaded, too few episodes are labelled, or it is no better than chance.
+    """
+    require_fit(world.model, embodiment, shards)
+    rows = [row for row in shards.episodes.to_pylist() if row["split"] == "val"]
+    rows = [row for row in rows if row["success"] is not None]
+    true = np.array([row["success"] for row in rows], np.bool_)
+    where = f"judge {source}"
+    if not len(rows) or accuracy(true, true).too_few:
+        successes = int(true.sum())
+        fault = (
+            f"{shards.folder} has {successes} successes and {len(true) - successes} failures among its "
+            "held-out episodes with a success label, too few to measure its accuracy"
+        )
+        remedy = f"give --from SHARDS with {NEEDED} or more of each"
+        raise HMAError(where, fault, remedy)
+    names = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
+    model = RewardModel(source, names, embodiment, str(world.model.device))
+    reader = EpisodeReader(shards, shards.columns(names))
+    judged = np.empty(len(rows), np.bool_)
+    for place, row in enumerate(rows):
+        frames, _ = seen_frames(shards, reader, row, names)
+        images = world.shown(frames[:: shards.row_stride])
+        judged[place] = model.success(model.score(images[None]))[0]
+        tell(f"measuring the judge: episode {place + 1} of {len(rows)}")
+    found = accuracy(true, judged)
+    judge = RewardJudge(source, model, found, int(judged[true].sum()), int(judged[~true].sum()))
+    if not found.better_than_chance:
+        fault = f"is no better than chance: {judge.sentence.partition(': ')[2]}"
+        raise HMAError(where, fault, "train it on more episodes, or give another one")
+    return judge
+
+
+def labelled_shards(world: "World", embodiment: str, given: Any, judge: str) -> ShardSet:
+    """Return the shard set that is given, or that of the run that the world was loaded from.
+
+    Raises:
+        UsageError: there is none.
+    """
+    if given is not None:
+        return ShardSet(given)
+    there = world.model.source.shards() if world.model.source else []
+    for shards in there:
+        if shards.embodiment.id == embodiment:
+            return shards
+    fault = f"no recorded episodes of {embodiment} tell how often it is right"
+    remedy = (
+        f"give --from SHARDS whose held-out episodes have {NEEDED} or more labelled successes and failures"
+    )
+    raise UsageError(f"judge {judge}", fault, remedy)
+
+
+def _folder(source: str, where: str) -> Path:
+    """Return the folder of a reward model, of a repository without any file that could hold code."""
+    folder = Path(source)
+    if not folder.is_dir():
+        if not REPOSITORY.fullmatch(source):
+            remedy = "give the folder of a reward model, or ORGANISATION/NAME on the Hub"
+            raise HMAError(where, "no such folder", remedy)
+        repository = Repository(source, name=where)
+        names = [name for name in repository.files() if "/" not in name]
+        wanted = [name for name in names if name.endswith((".json", ".safetensors"))]
+        if CONFIG not in wanted:
+            raise HMAError(where, f"has no {CONFIG}", "give a reward model that lerobot has saved")
+        folder = repository.pull(wanted)
+    for name in (CONFIG, WEIGHTS):
+        if not (folder / name).is_file():
+            raise HMAError(where, f"has no {name}", "give a reward model that lerobot has saved")
+    return folder
+
+
+def _require_registered(path: Path, where: str) -> None:
+    """Refuse a preprocessor whose steps are named by a Python path: loading it would import that."""
+    steps = json.loads(path.read_text())["steps"]
+    if any("registry_name" not in step for step in steps):
+        remedy = "save it anew with steps that lerobot registers"
+        raise HMAError(where, f"{path.name} names a step by a Python path", remedy)
+
+
+@contextmanager
+def _encoder_without_code() -> Iterator[None]:
+    """Let lerobot's classifier make its encoder from a configuration alone.
+
+    It would load weights, pickled ones too, and run the code of their repository. The classifier's own
+    safetensors file holds the weights of its encoder.
+    """
+    try:
+        from transformers import AutoConfig, AutoModel
+    except ImportError as fault:
+        said = f"cannot be imported: {fault}; lerobot's reward_classifier needs it"
+        raise MissingDependencyError(
+            "transformers", said, "pip install 'lerobot[transformers-dep]'"
+        ) from fault
+
+    def make(name: str, **ignored: Any) -> Any:
+        return AutoModel.from_config(AutoConfig.from_pretrained(name, trust_remote_code=False))
+
+    with patch.object(AutoModel, "from_pretrained", make):
+        yield
