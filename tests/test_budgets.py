@@ -16,7 +16,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data": (700, 4_100, 7),
     "hma_data/cli": (1_550, 10_950, 8),
     "hma_data/conversion": (4_020, 29_900, 14),
-    "hma_data/episodes": (1_660, 14_550, 9),
+    "hma_data/episodes": (1_670, 14_600, 9),
     "hma_data/hub": (520, 3_800, 3),
     "hma_data/inspection": (2_170, 20_400, 9),
     "hma_data/lab": (3_380, 31_100, 16),

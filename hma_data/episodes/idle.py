@@ -1,7 +1,8 @@
 """Find the frames of an episode in which nothing moves, by its numbers.
 
 A frame is idle where no value of its action or state has moved since the last frame that was kept. A command
-that is a motion by itself (a delta, a velocity) has moved where it is not near zero.
+that is a motion by itself (a delta, a velocity) has moved where it is not near zero. Where a mixed action space
+leaves open whether a command is a place or a motion, it has moved in both cases: a frame too many is kept.
 
 A value has moved by more than `STILL` of the widest range that a value of its component has in the episode,
 and by more than `NOISE` in its own unit; a motion is not near zero above `STILL` of the component's largest.
@@ -20,7 +21,7 @@ from hma_data.registry.embodiment import Embodiment
 
 STILL = 0.005
 NOISE = 0.001
-# Action spaces whose commands are motions; in a mixed one, those in a unit a second are.
+# Action spaces whose commands are motions; in a mixed one, those in a unit a second are, and others may be.
 MOTIONS = ("eef_delta", "joint_delta", "joint_velocity", "base_velocity")
 
 
@@ -53,6 +54,12 @@ def _is_motion(part: Component, action: Action) -> bool:
     return action.space in MOTIONS or (part.unit or "").endswith("/s")
 
 
+def _may_be_motion(part: Component, action: Action) -> bool:
+    """Return whether a command is a motion, or nothing says that it is none; a switch (raw values) is none."""
+    unknown = action.space == "mixed" and part.gripper is None and part.normalize
+    return unknown or _is_motion(part, action)
+
+
 def _numbers(clip: Clip, embodiment: Embodiment) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the values (T, n) of action and state that are no motions, and by how much each may change."""
     found: list[NDArray[np.float64]] = [np.zeros((len(clip), 0))]
@@ -74,10 +81,10 @@ def _limits(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _motions(clip: Clip, action: Action) -> NDArray[np.bool_]:
-    """Return at which frames (T,) a command that is a motion by itself is not near zero."""
+    """Return at which frames (T,) a command that may be a motion by itself is not near zero."""
     asked = np.zeros(len(clip), np.bool_)
     for part, values in _parts(clip.actions, action):
-        if _is_motion(part, action):
+        if _may_be_motion(part, action):
             asked |= (np.abs(values) > STILL * np.abs(values).max()).any(axis=1)
     return asked
 

@@ -5,7 +5,7 @@ steps on one thread, so that the same code on the same machine gives the same fi
 
     loss        nats a token (continuous: the diffusion loss) on held-out windows
     psnr_db     of rollouts, mean over the horizon
-    gain_db     PSNR of the last frame, true less shuffled commands: above 0 the model follows
+    gain_db     PSNR of the last frame with recorded minus shuffled actions: above 0 the model follows
     error_px    distance of the robot's parts at the last frame from where the simulator has them
 
 The case `holds` trains nothing: it drives the bundled model and measures what is left of the robot and of

@@ -380,12 +380,15 @@ def test_frames_in_which_nothing_moves_are_left_out_and_counted(tmp_path: Path) 
     assert len(dataset) == 27 - 6
 
 
-def test_a_velocity_in_a_mixed_space_is_a_motion_while_it_stays_the_same(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unit", ["m/s", "m"])  # a step of so many metres, repeated, is a motion too
+def test_what_may_be_a_motion_in_a_mixed_space_moves_while_it_stays_the_same(
+    tmp_path: Path, unit: str
+) -> None:
     data, robot = hdf5(tmp_path)
     values = robot.to_dict()
     values["action"]["space"] = "mixed"
     for part in values["action"]["components"]:
-        part["unit"] = "m/s"
+        part["unit"] = unit
     with h5py.File(data, "a") as file:
         for demo in file["data"].values():
             demo["actions"][...] = 0.5
