@@ -1,6 +1,7 @@
 """The pages: the site builds without a warning, links and named tests exist, commands are those of `hma`."""
 
 import ast
+import json
 import os
 import re
 import shlex
@@ -34,6 +35,7 @@ def name_of(page: Path) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)  # it exports the page "Try it"
 def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
     env = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
@@ -46,6 +48,12 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_
     assert "def generate" not in (tmp_path / "reference/python.html").read_text()  # signatures, not source
     assert 'id="hma_model.network.model.HMA.generate"' in (tmp_path / "reference/python.html").read_text()
     require_search_from_a_folder(tmp_path)
+    manifest = json.loads((tmp_path / "try/manifest.json").read_text())
+    assert len(manifest["robots"]) == 3
+    beside_runtime = [path for path in (tmp_path / "try").rglob("*.*") if path.parent.name != "ort"]
+    assert sum(path.stat().st_size for path in beside_runtime) < 15e6
+    for page, link in (("index.html", "try/index.html"), ("reference/cli.html", "../try/index.html")):
+        assert re.search(rf'href="{link}"[^>]*>\s*(<[^>]*>\s*)?Try it', (tmp_path / page).read_text())
 
 
 def require_search_from_a_folder(site: Path) -> None:
