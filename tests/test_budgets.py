@@ -37,11 +37,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/lerobot_env": (570, 4_600, 3),
     "hma_model/network": (3_250, 27_700, 16),
     "hma_model/play": (1_650, 11_900, 8),
-    "hma_model/policies": (2_760, 19_500, 14),
+    "hma_model/policies": (2_790, 19_700, 14),
     "hma_model/released": (830, 7_200, 4),
     "hma_model/synthetic": (1_210, 9_000, 5),
     "hma_model/training": (3_560, 29_200, 18),
-    "hma_model/worlds": (1_530, 11_500, 6),
+    "hma_model/worlds": (1_550, 11_600, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 63_200, 497_000
 TEST_LINES = 46_500

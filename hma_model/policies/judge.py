@@ -136,8 +136,10 @@ class StateJudge:
 
     def score(self, images: Images) -> Floats:
         """Return the scores (N,) of episodes (N, T, S, S, 3)."""
-        places = self.probe.read(images)
-        areas = self.probe.areas(images)
+        return self.read_score(self.probe.read(images), self.probe.areas(images))
+
+    def read_score(self, places: Floats, areas: Floats) -> Floats:
+        """Return the scores (N,) of the places (N, T, P, 2) and areas (N, T, P) that the probe reads."""
         loose = last_seen(places[..., self.probe.loose, :], areas[..., self.probe.loose])
         own = places[..., self.probe.own, :]
         return self.task.score(np.concatenate([own, loose], axis=-2), len(self.probe.own))
@@ -153,7 +155,28 @@ class StateJudge:
         return judged
 
     def __call__(self, images: Images, actions: Any) -> tuple[float, bool]:
-        return float(self.score(images[None])[0]), False
+        return self.begun()(images, actions)
+
+    def begun(self) -> "EpisodeScore":
+        """Return the judge of one episode, which reads each of its images once."""
+        return EpisodeScore(self)
+
+
+class EpisodeScore:
+    """A `StateJudge` in one episode: it keeps what it read of the earlier images."""
+
+    def __init__(self, judge: StateJudge) -> None:
+        self._judge = judge
+        self._places: list[Floats] = []
+        self._areas: list[Floats] = []
+
+    def __call__(self, images: Images, actions: Any) -> tuple[float, bool]:
+        new = images[len(self._places) :]
+        if len(new):
+            self._places += list(self._judge.probe.read(new))
+            self._areas += list(self._judge.probe.areas(new))
+        score = self._judge.read_score(np.stack(self._places)[None], np.stack(self._areas)[None])
+        return float(score[0]), False
 
 
 def train_judge(

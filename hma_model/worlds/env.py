@@ -12,7 +12,7 @@ import copy
 import os
 import warnings
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
@@ -48,6 +48,15 @@ class Judge(Protocol):
         ...
 
 
+@runtime_checkable
+class EpisodeJudge(Protocol):
+    """A judge that remembers what it read of an episode's earlier images."""
+
+    def begun(self) -> Judge:
+        """Return the judge of one episode, which is about to begin."""
+        ...
+
+
 def _known(options: dict[str, Any] | None, *keys: str) -> dict[str, Any]:
     """Return the options of a reset; raise HMAError for one that would have no effect."""
     options = options or {}
@@ -71,7 +80,7 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
             after every `stride` of them. "chunk": steps at the rate of the model's frames; an action is
             (stride, A).
         horizon: steps after which an episode is truncated; None for never.
-        judge: gives the reward and ends episodes, see `Judge`; without one the reward is 0.
+        judge: gives the reward and ends episodes, see `Judge` and `EpisodeJudge`; by default the reward is 0.
         render_mode: "rgb_array" or None.
         clip: clip actions to the range seen in training.
         size: side in pixels of the observations; None for that of the model's images.
@@ -155,6 +164,7 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
         self._frames = 0
         self._waiting: list[Float32s] = []  # actions since the newest image
         self._past = [self.image]  # kept for a judge only
+        self._judge = self.judge.begun() if isinstance(self.judge, EpisodeJudge) else self.judge
         self._chunks: list[Float32s] = []
         return self._seen(self.image), {"frames": 0}
 
@@ -164,14 +174,17 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
 
     def take(self, action: Any) -> dict[int, Float32s]:
         """Take an action; return the session's chunk for the world once it is whole."""
-        if self.session is None:
-            raise HMAError("step", "there is no episode", "call reset() first")
-        self._waiting += list(self._checked(action))
+        return self.queue(self.checked(action))
+
+    def queue(self, actions: Float32s) -> dict[int, Float32s]:
+        """Take actions as `checked` returns them; return the session's chunk once it is whole."""
+        assert self.session is not None
+        self._waiting += list(actions)
         if len(self._waiting) < self.action_spec.stride:
             return {}
         chunk = np.stack(self._waiting)
         self._waiting = []
-        if self.judge is not None:
+        if self._judge is not None:
             self._chunks.append(chunk)
         return {self.session: chunk}
 
@@ -184,9 +197,9 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
         if self.session in made:
             self.image = made[self.session]
             self._frames += 1
-            if self.judge is not None:
+            if self._judge is not None:
                 self._past.append(self.image)
-                reward, terminated = self.judge(np.stack(self._past), np.stack(self._chunks))
+                reward, terminated = self._judge(np.stack(self._past), np.stack(self._chunks))
         truncated = self.horizon is not None and self._steps >= self.horizon
         facts = {"frames": self._frames}
         return self._seen(self.image), float(reward), bool(terminated), truncated, facts
@@ -210,8 +223,10 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
             self._read[seed] = read_prompt(self.world.model, self.embodiment, self.prompt, seed=seed or 0)
         return self._read[seed]
 
-    def _checked(self, action: Any) -> Float32s:
+    def checked(self, action: Any) -> Float32s:
         """Return an action as actions (n, A): checked, clipped if wanted; warn once of a strange range."""
+        if self.session is None:
+            raise HMAError("step", "there is no episode", "call reset() first")
         if self.control == "frame":
             values = self.action_spec.one(action)[None]
         else:
@@ -309,7 +324,8 @@ class WorldModelVectorEnv(VectorEnv[Image, Float32s, NDArray[Any]]):
 
     def advance(self, chosen: NDArray[np.int64], actions: Float32s) -> list[tuple[int, Any]]:
         """Send actions (N, …) to the chosen environments in one pass; return their numbers and steps."""
-        chunks = [self.envs[i].take(actions[i]) for i in chosen]
+        checked = [self.envs[i].checked(actions[i]) for i in chosen]  # all, before any is queued
+        chunks = [self.envs[i].queue(values) for i, values in zip(chosen, checked, strict=True)]
         made = self.world.step({session: chunk for part in chunks for session, chunk in part.items()})
         return [(i, self.envs[i].finish(made)) for i in chosen]
 

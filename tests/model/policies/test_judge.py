@@ -7,8 +7,9 @@ import pytest
 
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import truth
+from hma_model.evaluation.agreement import Accuracy
 from hma_model.policies import judge
-from hma_model.policies.judge import best_limit, last_seen, moved, reached, task_of, train_judge
+from hma_model.policies.judge import StateJudge, best_limit, last_seen, moved, reached, task_of, train_judge
 
 SIDE = 8
 
@@ -20,8 +21,10 @@ class WrittenPlaces:
 
     def __init__(self, blind: bool = False) -> None:
         self.rng = np.random.default_rng(0) if blind else None
+        self.count = 0  # images that were read
 
     def read(self, images: np.ndarray) -> np.ndarray:
+        self.count += int(np.prod(images.shape[:-3]))
         places = images[..., :3, 0, :2].astype(float)
         return places if self.rng is None else self.rng.normal(64, 5, places.shape)
 
@@ -120,6 +123,18 @@ def test_a_judge_tells_its_accuracy_on_episodes_that_it_was_not_fitted_to(episod
     assert reward == 0 and not ended
     parts[5:, 2] += 9
     assert made.success(made.score(written(parts)[None])).tolist() == [True]
+
+
+def test_a_judge_reads_each_image_of_an_episode_once() -> None:
+    sure = Accuracy(1.0, 1.0, 1.0, 1.0, 20, 10)
+    made = StateJudge("rails_03", task_of("rails_03"), WrittenPlaces(), 5.0, sure)  # type: ignore[arg-type]
+    parts = np.cumsum(np.random.default_rng(0).uniform(0, 3, (12, 3, 2)), axis=0) + 20
+    images = written(parts)
+    in_turn, other = made.begun(), made.begun()
+    rewards = [in_turn(images[:count], None)[0] for count in range(2, 13)]
+    assert made.probe.count == 12  # type: ignore[attr-defined]
+    assert rewards == [made.score(images[None, :count])[0] for count in range(2, 13)]
+    assert other(images[6:8], None)[0] == made.score(images[None, 6:8])[0]  # another episode
 
 
 def test_a_judge_that_is_no_better_than_chance_is_refused(episodes: None) -> None:

@@ -239,6 +239,19 @@ def test_bad_actions_are_refused_and_the_episode_goes_on(world, window, action, 
     env.step(np.array([100.0, 100.0]))
 
 
+def test_an_action_that_is_refused_leaves_no_environment_of_a_vector_ahead(world, window) -> None:
+    envs = WorldModelVectorEnv(2, embodiment=PUSH, world=world, prompt=prompt(window))
+    envs.reset(seed=1)
+    given = actions(4, 2)
+    envs.step(given[0])
+    bad = given[1].copy()
+    bad[1] = np.inf
+    with pytest.raises(HMAError, match="not finite"):
+        envs.step(bad)
+    frames = [envs.step(action)[4]["frames"].tolist() for action in given[1:]]
+    assert frames == [[0, 0], [0, 0], [1, 1]]  # both get their image after four actions
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
