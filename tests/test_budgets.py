@@ -35,12 +35,12 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_300, 6),
     "hma_model/lerobot_env": (570, 4_600, 3),
-    "hma_model/network": (3_250, 27_700, 16),
+    "hma_model/network": (3_260, 27_700, 16),
     "hma_model/play": (1_650, 11_900, 8),
     "hma_model/policies": (2_790, 19_700, 14),
     "hma_model/released": (830, 7_200, 4),
     "hma_model/synthetic": (1_210, 9_000, 5),
-    "hma_model/training": (3_560, 29_200, 18),
+    "hma_model/training": (3_610, 29_700, 18),
     "hma_model/worlds": (1_550, 11_600, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 63_200, 497_000

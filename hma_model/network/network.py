@@ -105,6 +105,10 @@ class Network(nn.Module):
         self.heads[key] = ActionHead(self.config, space).to(self.device, self.dtype)
         self.embodiments[space.id] = space
 
+    def share_stem(self, embodiment: str, other: str) -> None:
+        """Let another embodiment with the same actions and statistics use the stem of an embodiment."""
+        self.stems[module_key(other)] = self.stem(embodiment)
+
     def stem(self, embodiment: str) -> Stem:
         """Return the stem of an embodiment."""
         return self._of(self.stems, embodiment)  # type: ignore[return-value]

@@ -6,7 +6,9 @@ writes files.
 
 import math
 import time
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -55,6 +57,48 @@ from hma_model.training.scheduled_sampling import forwarded
 from hma_model.training.start import Start
 
 
+def sharing(sets: Mapping[str, ShardSet]) -> list[list[str]]:
+    """Return the names of the robots of each `stats_key` that several have: they share statistics and stem.
+
+    Raises:
+        RecipeError: their actions differ in form.
+    """
+    found: dict[str, list[str]] = {}
+    for name, shards in sets.items():
+        if key := shards.embodiment.stats_key:
+            found.setdefault(key, []).append(name)
+    for key, names in found.items():
+        forms = []
+        for name in names:
+            robot = sets[name].embodiment
+            forms.append((robot.action.space, robot.action_dim, robot.stride, list(robot.normalize_mask)))
+        if any(form != forms[0] for form in forms):
+            fault = (
+                f"{', '.join(names)} have stats_key {key}, and differ in action space, width, stride or mask"
+            )
+            raise RecipeError("recipe: data", fault, "give them different stats_key in their YAMLs")
+    return [names for names in found.values() if len(names) > 1]
+
+
+def pooled_statistics(sets: Mapping[str, ShardSet]) -> dict[str, dict[str, Any]]:
+    """Return the statistics of each robot; of the actions, those over all robots that share them."""
+    stats = {name: shards.manifest.stats for name, shards in sets.items()}
+    for names in sharing(sets):
+        parts = [stats[name]["action"] for name in names]
+        counts = np.array([part["count"] for part in parts], np.float64)[:, None]
+        mean, std, low, high = (
+            np.array([part[key] for part in parts], np.float64) for key in ("mean", "std", "min", "max")
+        )
+        share = counts / counts.sum()
+        middle = (share * mean).sum(axis=0)
+        spread = np.sqrt((share * (std**2 + (mean - middle) ** 2)).sum(axis=0))
+        pooled = {"count": int(counts.sum()), "mean": middle.tolist(), "std": spread.tolist()}
+        pooled |= {"min": low.min(axis=0).tolist(), "max": high.max(axis=0).tolist()}
+        for name in names:
+            stats[name] = stats[name] | {"action": pooled}
+    return stats
+
+
 class Run:
     """A training run in an existing folder `out`: its model, optimizer, data and progress."""
 
@@ -82,7 +126,7 @@ class Run:
         self.objective = OBJECTIVES[often]  # whose loss the evaluations compute
         self.train_data = TrainData(recipe, self.sets, self.ranks)
         self.digests = data_digests(self.sets)
-        self.stats = {name: shards.manifest.stats for name, shards in self.sets.items()}
+        self.stats = pooled_statistics(self.sets)
         if self.start:
             self.digests["the checkpoint it starts from"] = self.start.checkpoint.trunk_sha256[:16]
             self.stats = {name: self.start.stats(shards) for name, shards in self.sets.items()}
@@ -122,6 +166,10 @@ class Run:
             space = ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name))
             waves = self.start.waves(shards.embodiment, self.recipe) if self.start else None
             model.add_embodiment(space, waves=waves)
+        for names in [] if self.start else sharing(self.sets):
+            for name in names[1:]:
+                if model.embodiments[name].agrees_with(replace(model.embodiments[names[0]], id=name)):
+                    model.share_stem(names[0], name)
         return model
 
     def _fresh_model(self) -> HMA:

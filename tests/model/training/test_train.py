@@ -7,11 +7,13 @@ import os
 import shutil
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from hma_data.errors import (
     CheckpointError,
@@ -21,6 +23,7 @@ from hma_data.errors import (
     TrainingError,
     UsageError,
 )
+from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint import io as checkpoint
 from hma_model.network.model import HMA
@@ -29,6 +32,7 @@ from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
 from hma_model.training.resume import seed_for
 from hma_model.training.runtime import own_folder
+from tests.model import shards as shard_files
 from tests.model.runs import TINY, same, train_until
 from tests.model.shards import make_shards
 
@@ -267,3 +271,49 @@ def test_a_continuous_model_trains(tmp_path):
         make_recipe({**TINY, "data": [str(shards)], "model": model}), out=tmp_path / "run", show=False
     )
     assert result.step == 6 and result.masked_val_loss > 0 and result.baseline is None
+
+
+@pytest.fixture
+def keyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
+    """Shards of robots that state one stats_key, of so many action dims each."""
+
+    def make(*dims: int) -> list[str]:
+        own = shard_files.yaml
+        with monkeypatch.context() as patch:
+            patch.setattr(shard_files, "yaml", lambda *given: own(*given) + "stats_key: arms\n")
+            return [
+                str(make_shards(tmp_path / f"arm{i}", f"arm{i}", width, episodes=4 + 4 * i, seed=i))
+                for i, width in enumerate(dims)
+            ]
+
+    return make
+
+
+def test_robots_of_one_stats_key_share_statistics_and_stem(recipe, keyed, tmp_path) -> None:
+    data = keyed(2, 2)
+    given = recipe(data=data, steps=6, checkpoint_every=2)
+    whole = Path(train(given, out=tmp_path / "whole", show=False).checkpoint)
+    folders = [whole / "embodiments" / name for name in ("arm0", "arm1")]
+    stems = [load_file(folder / "stem.safetensors") for folder in folders]
+    assert all(torch.equal(stems[0][name], value) for name, value in stems[1].items())
+    one, other = (json.loads((folder / "stats.json").read_text())["action"] for folder in folders)
+    rows = np.concatenate(
+        [
+            shards.episode_rows(row["episode_index"])["action"]
+            for shards in map(ShardSet, data)
+            for row in shards.episodes.to_pylist()
+            if row["split"] == "train"
+        ]
+    ).astype(np.float64)
+    assert one == other and one["count"] == len(rows)
+    for key in ("mean", "std", "min", "max"):
+        np.testing.assert_allclose(one[key], getattr(rows, key)(axis=0), rtol=1e-5, atol=1e-6)
+    train_until(given, tmp_path / "killed", 3)
+    assert same(whole, Path(train(given, out=tmp_path / "killed", show=False).checkpoint))
+
+
+def test_robots_of_one_stats_key_whose_actions_differ_are_refused(recipe, keyed, tmp_path) -> None:
+    with pytest.raises(
+        RecipeError, match="arm0, arm1 have stats_key arms, and differ in action space, width"
+    ):
+        train(recipe(data=keyed(2, 3), steps=1), out=tmp_path / "run", show=False)
