@@ -31,7 +31,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/cli": (1_640, 10_300, 11),
     "hma_model/demo": (470, 3_800, 4),
     "hma_model/evaluation": (4_060, 32_200, 21),
-    "hma_model/export": (950, 7_300, 7),
+    "hma_model/export": (1_000, 7_800, 7),
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_300, 6),
     "hma_model/lerobot_env": (570, 4_600, 3),

@@ -6,6 +6,8 @@
     robots/ID/frames.npy     (starts, P, …) known frames, as the step takes them
     robots/ID/chunks.npy     (starts, P - 1, K) commands between them; NaN where they are unknown
     robots/ID/start-0.png    the last known frame of each start
+    robots/ID/replays.npy    (starts, R - 1, K) recorded commands from there on, if there is a simulator
+    robots/ID/replay-0.webp  R true images under them, in rows, of each start
     index.html, *.js, *.css  the page; ort/ if its runtime was copied
 
 P frames of a start, K = stride * action dim.
@@ -22,7 +24,7 @@ from hma_data import __version__
 from hma_data.episodes.images import opencv
 from hma_data.errors import OutputError
 from hma_data.storage.files import new_folder, read_json, to_json, write_atomic
-from hma_model.export.files import require_onnx, write_graph
+from hma_model.export.files import facts, require_onnx, write_graph
 from hma_model.export.graphs import Port, StemGraph, StepGraph, require_exportable
 from hma_model.export.page import require_runtime, write_page
 from hma_model.export.starts import Start, round_weights, take_starts
@@ -37,6 +39,8 @@ if TYPE_CHECKING:
 
 FORMAT, FORMAT_VERSION = "hma-export", 1
 MANIFEST = "manifest.json"
+COLUMNS = 10  # true images in a row of a picture
+QUALITY = 90  # of WebP
 
 
 def export_folder(
@@ -144,7 +148,35 @@ def _write_robot(folder: Path, model: "HMA", robot: Drivable, starts: Sequence[S
         "chunks": f"robots/{name}/chunks.npy",
         "pictures": pictures,
         "held": [start.action.tolist() for start in starts],
+        "replays": _write_replays(home, starts),
     }
+
+
+def _write_replays(home: Path, starts: Sequence[Start]) -> dict[str, Any] | None:
+    """Write recorded commands and true images; return what the manifest says of them."""
+    replays = [start.replay for start in starts if start.replay is not None]
+    if not replays:
+        return None
+    _save(home / "replays.npy", np.stack(replays))
+    place, strips = f"robots/{home.name}", []
+    for number, start in enumerate(starts):
+        assert start.true is not None
+        path = home / f"replay-{number}.webp"
+        write_atomic(path, _webp(start.true))
+        strips.append(facts(path) | {"file": f"{place}/{path.name}"})
+    return {"chunks": f"{place}/replays.npy", "strips": strips, "columns": COLUMNS}
+
+
+def _webp(images: NDArray[np.uint8]) -> bytes:
+    """Return images (R, H, W, 3) in rows of COLUMNS as one picture, which is a sixth of theirs as PNG."""
+    cv2 = opencv()
+    count, height, width, _ = images.shape
+    cells = np.zeros((-(-count // COLUMNS) * COLUMNS, height, width, 3), np.uint8)
+    cells[:count] = images
+    strip = cells.reshape(-1, COLUMNS, height, width, 3).swapaxes(1, 2).reshape(-1, COLUMNS * width, 3)
+    settings = [cv2.IMWRITE_WEBP_QUALITY, QUALITY]
+    data: bytes = cv2.imencode(".webp", cv2.cvtColor(strip, cv2.COLOR_RGB2BGR), settings)[1].tobytes()
+    return data
 
 
 def _save(path: Path, values: NDArray[Any]) -> None:

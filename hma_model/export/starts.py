@@ -4,7 +4,7 @@ P frames of a start, H×W pixels, A action dims, K = stride * A.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from hma_data.tokenizers.network import NetworkTokenizer
 from hma_model.export.files import rounded
 from hma_model.play.session import psnr
-from hma_model.worlds.scenes import Drivable
+from hma_model.worlds.scenes import Drivable, LabScene
 from hma_model.worlds.world import World
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
+REPLAY_FRAMES = 60  # true images of a replay, that of the start included
 MOST_LOSS_DB = 0.1  # that weights in float16 may cost
 
 
@@ -33,12 +34,16 @@ class Start:
         chunks: (P - 1, K), NaN where they are unknown.
         action: (A,) that leaves the robot as it is.
         image: (H, W, 3) of the last frame.
+        replay: (R - 1, K) that the recorder's driver takes from here on; None without a simulator.
+        true: (R, H, W, 3) images of the simulator under them, the start's first; likewise.
     """
 
     frames: NDArray[Any]
     chunks: NDArray[np.float32]
     action: NDArray[np.float32]
     image: NDArray[np.uint8]
+    replay: NDArray[np.float32] | None = None
+    true: NDArray[np.uint8] | None = None
 
 
 def take_starts(world: World, robot: Drivable, count: int) -> list[Start]:
@@ -50,7 +55,12 @@ def take_starts(world: World, robot: Drivable, count: int) -> list[Start]:
         frames = world.encoded(name, scene.prompt.frames)[-world.model.config.frames :]
         chunks = scene.prompt.chunks[len(scene.prompt.chunks) + 1 - len(frames) :]
         session = world.open(name, frames, chunks)
-        found.append(Start(frames, chunks, scene.action, world.image(session)))
+        start = Start(frames, chunks, scene.action, world.image(session))
+        if isinstance(scene, LabScene):
+            rest = [scene.advance(None) for _ in range(REPLAY_FRAMES - 1)]
+            true = np.stack([scene.prompt.frames[-1], *(image for _, image in rest)])
+            start = replace(start, replay=np.stack([chunk for chunk, _ in rest]), true=true)
+        found.append(start)
         world.close(session)
     return found
 

@@ -1,7 +1,8 @@
 // Drive a robot by keys, mouse, touch, sliders and a gamepad. The page of `hma play` and the exported page share it.
 //
-//   const controls = new Controls({ stage, knob, dims, hint }, host);
+//   const controls = new Controls({ stage, knob, card }, host);   // fills the card
 //   controls.open(robot, held);      // robot as hma_model.play.pads describes it; the action it begins with
+//   controls.look();                 // before a frame: the action of this moment
 //   controls.used(number);           // a frame was made by the action of that number
 //
 // The host says how things stand, and is told what a person does:
@@ -11,6 +12,10 @@
 //   drive(action, number)            the action from now on
 //   buttons                          key -> id of the button that it presses
 
+const CARD = `
+  <header><h2>Drive</h2><span class="hint" id="rate"></span></header>
+  <p class="hint" id="hint"></p>
+  <div class="dims" id="dims"></div>`;
 const NAMES = { ArrowLeft: "←", ArrowRight: "→", ArrowUp: "↑", ArrowDown: "↓", " ": "Space" };
 
 export function clamp(value, low, high) { return Math.min(Math.max(value, low), high); }
@@ -40,15 +45,17 @@ const bare = (event) => event.key.length === 1 ? event.key.toLowerCase() : event
 const typing = (element) => element && element.matches("select, input, textarea");
 
 export class Controls {
-  constructor(parts, host) {
-    Object.assign(this, parts, { host, robot: null, targets: [], action: [], pushed: [], sticks: [], input: 0, sentText: "" });
+  constructor({ stage, knob, card }, host) {
+    card.innerHTML = CARD;
+    const [rate, hint, dims] = ["rate", "hint", "dims"].map((id) => card.querySelector("#" + id));
+    Object.assign(this, { stage, knob, rate, hint, dims }, { host, robot: null, targets: [], action: [], pushed: [], sticks: [], input: 0, sentText: "" });
     this.pressed = new Set(); this.fresh = new Set();
     this.latched = new Map();  // key that was let go -> input that a frame must have had
     this.sentAt = new Map();  // input that no frame has had yet -> when it was sent
     this.grips = new Map();  // pointer -> where it drags
     this.before = performance.now(); this.padButton = false;
     this.listen();
-    requestAnimationFrame((now) => this.tick(now));
+    requestAnimationFrame(() => this.tick());
   }
 
   open(robot, held) {
@@ -57,6 +64,7 @@ export class Controls {
     this.pressed.clear(); this.latched.clear(); this.sentAt.clear(); this.grips.clear();
     this.sentText = "";
     this.targets = held.slice(); this.action = [];
+    this.rate.textContent = `${+robot.hz.toPrecision(3)} actions/s, ${robot.stride} a frame`;
     if (!same) this.build();
     this.pushed = robot.dimensions.map(() => 0);
     this.drawKnob();
@@ -149,12 +157,16 @@ export class Controls {
 
   // -- the action of the moment
 
-  tick(now) {
-    const passed = Math.min(now - this.before, 100) / 1000;
+  tick() {
+    this.look();
+    requestAnimationFrame(() => this.tick());
+  }
+
+  look() {  // a model that computes without a pause leaves the browser few animation frames
+    const now = performance.now(), passed = Math.min(now - this.before, 100) / 1000;
     this.before = now;
     const tilted = () => gamepads().some((one) => one.axes.some((axis) => Math.abs(axis) > 0.2));
     if (this.robot && (!this.host.replays() || tilted())) this.drive(passed);
-    requestAnimationFrame((next) => this.tick(next));
   }
 
   drive(passed) {

@@ -1,23 +1,24 @@
 // The page of an exported model: choose a robot and a start, and drive.
 
 import { Controls, cap, fill } from "./controls.js";
-import { Loader, World, openRuntime, readManifest } from "./world.js";
+import { Loader, World, openReplays, openRuntime, readManifest } from "./world.js";
 
 const $ = (id) => document.getElementById(id);
 const asked = new URLSearchParams(location.search);
 let manifest, ort, step, backend, robot, world = null, start = 0;
 let paused = true, begun = false, wanted = 0, frame = 0, times = [], due = 0, opening = 0;
+let replays = null, replaying = false;  // recorded actions and true images from each start, and whether they are followed
 let making = Promise.resolve();  // one frame at a time
 const loader = new Loader((done, total) => {
   $("bar").max = Math.max(total, done); $("bar").value = done;
   $("veil-text").textContent = `Loading: ${(done / 1e6).toFixed(1)} MB`;
 });
 
-const controls = new Controls({ stage: $("stage"), knob: $("knob"), dims: $("dims"), hint: $("hint") }, {
-  paused: () => paused, replays: () => false, begun: () => begun, blocked: () => $("about").open || !world,
-  takeOver: () => { if (world && !begun && paused) run(true); },
+const controls = new Controls({ stage: $("stage"), knob: $("knob"), card: $("drive") }, {
+  paused: () => paused, replays: () => replaying, begun: () => begun, blocked: () => $("about").open || !world,
+  takeOver: () => { follow(false); if (world && !begun && paused) run(true); },
   drive: () => {},
-  buttons: { p: "run", n: "step", r: "reset", c: "scene" },
+  buttons: { p: "run", n: "step", r: "reset", c: "scene", v: "replay" },
 });
 
 // -- loading
@@ -57,7 +58,7 @@ async function isolate() {  // a service worker keeps files for offline use; loa
 
 async function prune() {  // forget the files of an older export
   if (!self.caches) return;
-  const versions = new Set([manifest.runtime.version, ...[manifest.step, ...manifest.robots.map((one) => one.stem)].map((part) => part.sha256.slice(0, 12))]);
+  const versions = new Set([manifest.runtime.version, ...[manifest.step, ...manifest.robots.flatMap((one) => [one.stem, ...(one.replays ? one.replays.strips : [])])].map((part) => part.sha256.slice(0, 12))]);
   const cache = await caches.open("hma-export");
   for (const request of await cache.keys()) {
     const version = new URL(request.url).searchParams.get("v");
@@ -79,6 +80,7 @@ async function poster() {  // show the start at once
 async function openRobot() {
   const turn = ++opening;
   world = null; run(false);
+  $("replay").hidden = true;
   veil("Loading …");
   $("robot").value = robot.id;
   start = 0;
@@ -87,16 +89,21 @@ async function openRobot() {
   if (turn !== opening) return;  // another robot was chosen meanwhile
   opened.temperature = manifest.temperature === null ? null : Number($("temperature").value);
   world = opened;
-  $("rate").textContent = `${+robot.hz.toPrecision(3)} actions/s, ${robot.stride} a frame`;
+  replays = null;
   $("scene").hidden = robot.pictures.length < 2;
   if (!robot.follows) note(robot.id + " does not follow its actions in this model: drive another robot to see it answer.");
   await begin(0);
+  const found = await openReplays(robot, loader).catch(() => null);  // the page drives without them too
+  if (turn !== opening) return;
+  replays = found;
+  $("replay").hidden = !replays;
 }
 
 async function begin(number) {
   start = number;
   run(false);
   begun = false; frame = 0; wanted = 0;
+  follow(false); showTruth(false);
   await making;
   await poster();
   await world.begin(start);
@@ -130,8 +137,9 @@ function pause(ms) {
 }
 
 async function make() {
-  const current = world, action = controls.action.length ? controls.action : controls.targets, number = controls.input;
-  const chunk = Array.from({ length: robot.stride }, () => action).flat();
+  controls.look();
+  const current = world, followed = replaying, action = controls.action.length ? controls.action : controls.targets, number = controls.input;
+  const chunk = followed ? [...replays[start].chunks[frame]] : Array.from({ length: robot.stride }, () => action).flat();
   const begunAt = performance.now(), period = 1000 * robot.stride / robot.hz;
   const image = await current.advance(chunk);
   if (current !== world) return;
@@ -142,6 +150,9 @@ async function make() {
   frame += 1;
   draw(image);
   controls.used(number);
+  if (followed && replaying) controls.follow(chunk.slice(-robot.dimensions.length));
+  followed ? drawTruth() : $("unknown").hidden = false;
+  if (followed && frame === replays[start].chunks.length) { follow(false); run(false); }
   times = [...times.filter((time) => now - time < 4000), now];
   $("fps").textContent = times.length > 1 ? (1000 * (times.length - 1) / (now - times[0])).toFixed(1) : "–";
   $("fps").title = `The model took ${(now - begunAt).toFixed(0)} ms`;
@@ -156,6 +167,31 @@ function draw(rgb) {
   for (let i = 0, j = 0; i < rgb.length; i += 3, j += 4) { pixels[j] = rgb[i]; pixels[j + 1] = rgb[i + 1]; pixels[j + 2] = rgb[i + 2]; }
   size(width, height);
   $("view").getContext("2d").putImageData(new ImageData(pixels, width, height), 0, 0);
+}
+
+// -- what truly happened
+
+function follow(on) {
+  if (replaying && !on) controls.sentText = "";  // the action is a person's again
+  replaying = on;
+  $("replay").setAttribute("aria-pressed", on);
+}
+
+function showTruth(on) { $("true-figure").hidden = !on; $("left").classList.toggle("two", on); $("unknown").hidden = true; }
+
+function drawTruth() {
+  const { strip, columns } = replays[start], view = $("true-view"), side = strip.width / columns;
+  view.width = view.height = side;
+  view.getContext("2d").drawImage(strip, frame % columns * side, Math.floor(frame / columns) * side, side, side, 0, 0, side, side);
+}
+
+async function replay() {
+  if (replaying) return follow(false);
+  const turn = opening;
+  await begin(start);
+  if (turn !== opening || !replays) return;  // another robot was chosen meanwhile
+  showTruth(true); drawTruth(); follow(true);
+  run(true);
 }
 
 function counted() {
@@ -211,6 +247,7 @@ $("run").onclick = () => { if (world) run(paused); };
 $("step").onclick = () => { if (world) { run(false); wanted += 1; } };
 $("reset").onclick = () => { if (world) begin(start).catch(fail); };
 $("scene").onclick = () => { if (world) begin((start + 1) % robot.pictures.length).catch(fail); };
+$("replay").onclick = () => { if (world && replays) replay().catch(fail); };
 $("again").onclick = () => location.reload();
 $("temperature").oninput = () => {
   $("temperature-out").value = $("temperature").value;

@@ -144,6 +144,32 @@ def test_200_frames_driven_by_keys_are_those_of_onnxruntime_and_it_works_offline
     page.wait_for_function("Number(document.body.dataset.frame) >= 1")
 
 
+def test_a_replay_shows_the_true_images_until_a_person_drives(page: "Page", server: Any, site: Path) -> None:
+    chunks = np.load(site / "sub" / "page" / "robots" / ROBOT / "replays.npy")[0]
+    page.goto(address(server))
+    page.wait_for_selector("#replay:visible")
+    assert page.is_hidden("#true-figure")
+    page.focus("#fast")
+    page.keyboard.press("Space")
+    page.keyboard.press("v")
+    page.wait_for_function(f"document.body.dataset.frame === '{len(chunks)}'")
+    assert np.allclose(np.float32([chunk for chunk, _ in page.evaluate("kept")]), chunks)
+    assert page.is_visible("#true-figure") and page.is_hidden("#unknown")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.keyboard.press("p")
+    page.wait_for_selector("#unknown:visible")
+    page.keyboard.press("r")
+    page.wait_for_selector("#true-figure", state="hidden")
+
+
+def test_keys_are_looked_at_before_each_frame(page: "Page", server: Any) -> None:
+    page.add_init_script("window.requestAnimationFrame = () => 0;")  # as a loop without a pause starves it
+    page.goto(address(server))
+    page.wait_for_selector("#veil", state="hidden")
+    page.keyboard.down("w")
+    page.wait_for_function("kept.length && kept[kept.length - 1][0].some((value) => value)")
+
+
 def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(
     page: "Page", server: Any, site: Path
 ) -> None:
