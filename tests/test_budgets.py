@@ -27,8 +27,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/storage": (1_640, 10_700, 11),
     "hma_data/tokenizers": (3_290, 23_900, 17),
     "hma_model": (520, 3_100, 3),
+    "hma_model/benchmark": (560, 4_700, 4),
     "hma_model/checkpoint": (870, 6_500, 5),
-    "hma_model/cli": (1_640, 10_300, 11),
+    "hma_model/cli": (1_710, 10_700, 12),
     "hma_model/demo": (470, 3_800, 4),
     "hma_model/evaluation": (4_060, 32_200, 21),
     "hma_model/export": (1_000, 7_800, 7),
@@ -43,9 +44,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_610, 29_700, 18),
     "hma_model/worlds": (1_550, 11_600, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 63_200, 497_000
+PRODUCT_LINES, PRODUCT_NODES = 63_900, 502_500
 TEST_LINES = 46_500
-DOC_WORDS = 38_000
+DOC_WORDS = 38_300
 
 
 @cache

@@ -23,7 +23,8 @@ ROOMS = (
     "hma_model.config", "hma_model.checkpoint.folder", "hma_model.network", "hma_model.checkpoint",
     "hma_model.generation",
     "hma_model.evaluation", "hma_model.released", "hma_model.hub", "hma_model.worlds",
-    "hma_model.simulate", "hma_model.play", "hma_model.export", "hma_model.policies", "hma_model.lerobot_env",
+    "hma_model.simulate", "hma_model.play", "hma_model.export", "hma_model.policies", "hma_model.benchmark",
+    "hma_model.lerobot_env",
     "hma_model.synthetic", "hma_model.training", "hma_model.demo", "hma_model.cli", "hma_model",
 )  # fmt: skip
 DOORS = {  # HMA.generate; HMA.from_pretrained and push_to_hub: imported when they are called

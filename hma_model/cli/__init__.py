@@ -21,6 +21,7 @@ from hma_data.console import fail, interruptible
 from hma_data.cpu import bound_spinning, take_ordinary_priority
 from hma_data.errors import HMAError, UsageError
 from hma_model.cli import train as cli_train
+from hma_model.cli.benchmark import benchmark
 from hma_model.cli.evaluate import evaluate
 from hma_model.cli.export import export
 from hma_model.cli.hub import hub_app
@@ -175,6 +176,7 @@ cli_train.mount(app)
 
 
 app.command("evaluate", rich_help_panel=MODELS)(evaluate)
+app.command(rich_help_panel=MODELS)(benchmark)
 
 
 @app.command(rich_help_panel=MODELS)

@@ -1,0 +1,1 @@
+"""Measure a checkpoint by a named protocol with fixed seeds: `hma benchmark`."""

@@ -1,0 +1,174 @@
+"""Measure rollouts of a laboratory robot: pictures, state, decision fidelity and inverse-action stability.
+
+Decision fidelity is a multiple choice. In each scene the simulator runs several action sequences, and the
+goal is where one of them ends. The model rolls all of them out from the same frames with the same random
+numbers, and chooses the one whose last image is nearest to the goal. It is right if that one truly ends
+there.
+
+Inverse-action stability plays actions and then their inverses in reverse order, after which the robot must be
+where it began. It needs no true outcome; the simulator's own return is the reference.
+
+N scenes, C sequences of each, T frames after the prompt, S pixels a side, P parts that a probe reads. Places
+are px of an image of 128 by 128.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_model.evaluation.agreement import share_interval
+from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded, summary
+from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, psnr
+from hma_model.evaluation.probe import Probe
+from hma_model.policies.arenas import Float32s, Image, ModelArena, Scenes, TrueArena
+from hma_model.policies.base import Policy
+from hma_model.policies.scores import run
+from hma_model.worlds.scenes import Dimension
+from hma_model.worlds.world import World
+
+Arrays = dict[str, NDArray[Any]]
+CHOICES = 5
+REACHED_PX = 1.0  # mean distance of the parts from the goal up to which a sequence truly ends there
+INVERSE_SHARE = 0.5  # of the range of training, up to which actions are drawn
+WARM_FRAMES, TIMED_FRAMES = 3, 20
+
+
+def played(world: World, true: TrueArena, actions: Sequence[Float32s]) -> Image:
+    """Return the model's images (N, T + 1, S, S, 3) under given actions, from the beginning of `true`."""
+    model = ModelArena(world, true, None)
+    images = [model.made]
+    try:
+        for action in actions:
+            model.step(action)
+            if model.fresh:
+                images.append(model.made)
+    finally:
+        model.close()
+    return np.stack(images, axis=1)
+
+
+def parts_read(probe: Probe) -> NDArray[np.int64]:
+    """Return the numbers of the parts whose places the probe reads."""
+    return np.concatenate([probe.own, probe.loose])
+
+
+def choose(world: World, scenes: Scenes, probe: Probe, policy: Policy, frames: int) -> Arrays:
+    """Return what comes of C action sequences of each scene in the simulator and in the model.
+
+    Returns:
+        `psnr`, `copy_psnr` (of the first frame repeated) (N, C, T); `true`, `made` (N, C, T, P, 2) places.
+    """
+    kept = parts_read(probe)
+    found: dict[str, list[NDArray[Any]]] = {name: [] for name in ("psnr", "copy_psnr", "true", "made")}
+    for choice in range(CHOICES):
+        true = TrueArena(replace(scenes, seed=scenes.seed + 1000 * choice), world.image_shape[0])
+        pictures, actions = run("benchmark", policy, true, frames)
+        true.scenes = scenes  # the model's random numbers are the same for all sequences of a scene
+        shown = np.stack(pictures, axis=1)
+        made = played(world, true, actions)
+        found["psnr"].append(psnr(shown[:, 1:], made[:, 1:], limit=PSNR_LIMIT))
+        still = np.broadcast_to(made[:, :1], made[:, 1:].shape)
+        found["copy_psnr"].append(psnr(shown[:, 1:], still, limit=PSNR_LIMIT))
+        found["true"].append(np.stack(true.parts, axis=1)[:, 1:, kept])
+        found["made"].append(probe.read(made[:, 1:])[..., kept, :])
+    return {name: np.stack(parts, axis=1) for name, parts in found.items()}
+
+
+def decisions(true: NDArray[Any], made: NDArray[Any], seed: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return whether the model's choice truly reaches the goal (N,), and the share of sequences that do.
+
+    Args:
+        true, made: (N, C, P, 2) last places of the sequences, in the simulator and as read off the model.
+        seed: of the goals.
+    """
+    rows = np.arange(len(true))
+    goals = true[rows, np.random.default_rng([seed, 53]).integers(true.shape[1], size=len(true))][:, None]
+    chosen = np.linalg.norm(made - goals, axis=-1).mean(axis=-1).argmin(axis=1)
+    reach = np.linalg.norm(true - goals, axis=-1).mean(axis=-1) <= REACHED_PX
+    return reach[rows, chosen].astype(float), reach.mean(axis=1)
+
+
+def choice_figures(arrays: Arrays, seed: int) -> tuple[dict[str, Any], dict[str, list[float]]]:
+    """Return the figures of `choose`, and those of each scene."""
+    signal, copied = arrays["psnr"].mean(axis=1), arrays["copy_psnr"].mean(axis=1)  # (N, T)
+    errors = np.linalg.norm(arrays["made"] - arrays["true"], axis=-1).mean(axis=(1, 3))
+    right, chance = decisions(arrays["true"][:, :, -1], arrays["made"][:, :, -1], seed)
+    found = horizon_summary("psnr", signal, seed, within=PSNR_RANGE)
+    found |= summary("copy_psnr", copied.mean(axis=1), seed, within=PSNR_RANGE)
+    found |= summary("copy_psnr_last", copied[:, -1], seed, within=PSNR_RANGE)
+    found |= horizon_summary("error_px", errors, seed, within=NATURAL)
+    ends = np.array(share_interval(int(right.sum()), len(right)))
+    found |= {
+        "decision": rounded(right.mean()),
+        "decision_95": rounded(ends),
+        "chance": rounded(chance.mean()),
+    }
+    by_scene = {
+        "psnr": signal.mean(axis=1),
+        "psnr_last": signal[:, -1],
+        "error_px": errors.mean(axis=1),
+        "error_px_last": errors[:, -1],
+        "decision": right,
+    }
+    return found, {name: rounded(values) for name, values in by_scene.items()}
+
+
+def no_inverse(dims: Sequence[Dimension]) -> str:
+    """Say why actions have no inverse: a value is no velocity or delta, or goes one way; "" if they have."""
+    if others := [dim.name for dim in dims if dim.kind != "rate"]:
+        return f"the actions have no inverse: {', '.join(others)} are positions or switches, not velocities"
+    if others := [dim.name for dim in dims if not dim.low < 0 < dim.high]:
+        return f"the actions have no inverse: {', '.join(others)} only ever went one way in training"
+    return ""
+
+
+def turn_back(world: World, scenes: Scenes, probe: Probe, frames: int) -> Arrays:
+    """Play random actions for half of the frames and then their inverses, last one first.
+
+    Returns:
+        Of each scene (N,): `return_psnr` and `turn_psnr` of the last and the middle image against the first;
+        `return_px` and `turn_px`, the same of the robot's own parts (NaN if none is read); `true_return_px`.
+    """
+    limit = INVERSE_SHARE * np.array([min(-dim.low, dim.high) for dim in scenes.dimensions])
+    there = frames // 2
+    drawn = [rng.uniform(-limit, limit, (there, len(limit))) for rng in scenes.rng(6)]
+    out = np.stack(drawn, axis=1).astype(np.float32).repeat(scenes.stride, axis=0)  # (steps, N, A)
+    actions = [*out, *-out[::-1]]
+    true = TrueArena(scenes, world.image_shape[0], drawn=False)
+    made = played(world, true, actions)
+    for action in actions:
+        true.step(action)
+
+    def far(places: NDArray[Any]) -> NDArray[Any]:
+        if not len(probe.own):
+            return np.full(len(places), np.nan)
+        moved = np.linalg.norm(places[:, 1] - places[:, 0], axis=-1)
+        found: NDArray[Any] = moved[:, probe.own].mean(axis=-1)
+        return found
+
+    ends, turn = made[:, [0, -1]], made[:, [0, there]]
+    return {
+        "return_psnr": psnr(ends[:, 0], ends[:, 1], limit=PSNR_LIMIT),
+        "turn_psnr": psnr(turn[:, 0], turn[:, 1], limit=PSNR_LIMIT),
+        "return_px": far(probe.read(ends)),
+        "turn_px": far(probe.read(turn)),
+        "true_return_px": far(np.stack([true.parts[0], true.parts[-1]], axis=1)),
+    }
+
+
+def speed(world: World, scenes: Scenes) -> Arrays:
+    """Return the frames a second of one rollout on this machine."""
+    (prompt,) = TrueArena(scenes.take(range(1)), world.image_shape[0]).prompts
+    session = world.open(scenes.name, *prompt)
+    chunk = prompt.chunks[-1]
+    begun = 0.0
+    for frame in range(WARM_FRAMES + TIMED_FRAMES):
+        if frame == WARM_FRAMES:
+            begun = time.perf_counter()
+        world.step({session: chunk})
+    world.close(session)
+    return {"frames_per_second": np.array(TIMED_FRAMES / (time.perf_counter() - begun))}

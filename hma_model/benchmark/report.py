@@ -1,0 +1,174 @@
+"""Show results of the benchmark: as a table for a model card, as a page, and two of them compared."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hma_data.errors import HMAError, UsageError
+from hma_data.storage.files import write_atomic
+from hma_data.tables import Table
+from hma_model.benchmark.run import NAME, RESULTS
+from hma_model.evaluation.intervals import interval, rounded
+from hma_model.evaluation.pages import Page
+
+CARD, PAGE = "benchmark.md", "benchmark.html"
+COLUMNS = ("robot", "measure", "value (95 % interval)", "reference")
+PLAIN = (  # key of a robot's figures, measure, key or text of the reference, its name
+    ("psnr", "PSNR over the horizon, dB", "copy_psnr", "first frame repeated"),
+    ("psnr_last", "PSNR of the last frame, dB", "copy_psnr_last", "first frame repeated"),
+    ("error_px", "state error, px of 128", "", ""),
+    ("error_px_last", "state error of the last frame, px", "", ""),
+    ("decision", "decision fidelity, right choices of 5", "chance", "if guessed"),
+    (
+        "inverse.return_px",
+        "distance after actions and their inverses, px",
+        "inverse.true_return_px",
+        "simulator",
+    ),
+    ("inverse.return_psnr", "PSNR of the frame so reached, dB", "inverse.turn_psnr", "before turning back"),
+    ("frames_per_second", "frames a second, one rollout", "", ""),
+)
+AGREEMENT = (  # path in the results of hma policy-eval, measure
+    (("correlation", "success", "pearson"), "policies: Pearson of success rates"),
+    (("correlation", "success", "spearman"), "policies: rank correlation"),
+    (("correlation", "success", "mmrv"), "policies: MMRV, 0 is best"),
+    (("judge", "precision"), "policies: precision per episode"),
+    (("judge", "recall"), "policies: recall per episode"),
+    (("judge", "auroc"), "policies: AUROC of scores"),
+)
+
+
+def rows(found: dict[str, Any]) -> list[list[str]]:
+    """Return a row of COLUMNS for each measure of each robot."""
+    made = []
+    for robot, one in found["measures"].items():
+        for key, measure, reference, about in PLAIN:
+            value, ends = figure(one, key)
+            if value is None and key.startswith("inverse."):
+                made.append([robot, measure, _absent(one["inverse"].get("missing", "no part is read")), ""])
+                continue
+            beside = figure(one, reference)[0] if reference else None
+            made.append(
+                [robot, measure, _shown(value, ends), f"{beside:.2f} {about}" if beside is not None else ""]
+            )
+        policies = one["policies"]
+        for path, measure in AGREEMENT:
+            value, ends, reason = agreement(policies, path)
+            made.append([robot, measure, _shown(value, ends) if value is not None else _absent(reason), ""])
+        if said := policies.get("refused"):
+            made.append([robot, "policies: verdict", f"none: {said}", ""])
+    return made
+
+
+def figure(one: dict[str, Any], key: str) -> tuple[float | None, list[float] | None]:
+    """Return a figure of a robot by its key, such as `inverse.return_px`, and its interval."""
+    *path, name = key.split(".")
+    for part in path:
+        one = one[part]
+    return one.get(name), one.get(f"{name}_95")
+
+
+def agreement(
+    policies: dict[str, Any], path: tuple[str, ...]
+) -> tuple[float | None, list[float] | None, str]:
+    """Return a measure of hma policy-eval, its interval, and why it is absent."""
+    if "missing" in policies:
+        return None, None, policies["missing"]
+    found: Any = policies
+    for part in path:
+        found = found[part]
+    ends = None if found["low"] is None else [found["low"], found["high"]]
+    return found["value"], ends, found["reason"]
+
+
+def _absent(reason: str) -> str:
+    return f"not measured: {reason}"
+
+
+def _shown(value: float | None, ends: list[float] | None) -> str:
+    if value is None:
+        return "not measured"
+    return f"{value:.2f}" if ends is None else f"{value:.2f} ({ends[0]:.2f} to {ends[1]:.2f})"
+
+
+def title(found: dict[str, Any]) -> str:
+    """Return the protocol in words."""
+    seed = "" if found["seed"] == 0 else f", seed {found['seed']}"
+    return f"{NAME} {found['version']}, {found['mode']}{seed}"
+
+
+def write_report(found: dict[str, Any], folder: Path) -> Path:
+    """Write the table for the model card and the page beside the results; return the path of the page."""
+    table = Table(COLUMNS, rows(found))
+    lead = (
+        f"{found['checkpoint']} by {title(found)}: {found['scenes']} scenes of {found['frames']} frames, and "
+        f"{found['episodes']} episodes of {found['policy_frames']} frames a policy, of each robot"
+    )
+    page = Page("Benchmark", lead)
+    page.table(COLUMNS, table.rows)
+    page.text(
+        "Intervals hold 95 %, over scenes and episodes. All branches are paired: same starts, same seeds."
+    )
+    for robot, one in found["measures"].items():
+        page.section(robot, "By predicted frame.")
+        by_frame = zip(one["psnr_by_frame"], one["error_px_by_frame"], strict=True)
+        cells = [[frame, signal, error] for frame, (signal, error) in enumerate(by_frame, 1)]
+        page.table(("frame", "PSNR, dB", "state error, px"), cells)
+    write_atomic(folder / CARD, f"{lead}.\n\n{table.markdown()}\n")
+    write_atomic(folder / PAGE, page.html())
+    return folder / PAGE
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """Return the results in a file, or in the folder that the benchmark wrote.
+
+    Raises:
+        HMAError: there is none.
+    """
+    path = path / RESULTS if path.is_dir() else path
+    try:
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        if found["benchmark"] != NAME:
+            raise ValueError
+    except (OSError, ValueError, TypeError, KeyError):
+        remedy = f"give the {RESULTS} of a finished hma benchmark, or its folder"
+        raise HMAError(str(path), "holds no results of the benchmark", remedy) from None
+    return found
+
+
+def compared(one: dict[str, Any], other: dict[str, Any]) -> Table:
+    """Return both results side by side, and the paired difference where both measured the same scenes.
+
+    Raises:
+        UsageError: they are not of the same protocol and seed, or share no robot.
+    """
+    keys = ("version", "mode", "seed", "scenes", "frames", "noises", "episodes", "policy_frames")
+    if differing := [key for key in keys if one[key] != other[key]]:
+        fault = f"the results differ in {', '.join(differing)}: {title(one)}, and {title(other)}"
+        raise UsageError("--compare", fault, "run both by the same protocol and seed")
+    robots = [robot for robot in one["measures"] if robot in other["measures"]]
+    if not robots:
+        raise UsageError("--compare", "the results share no robot", "give checkpoints with common robots")
+    made = []
+    for robot in robots:
+        pair = [result["measures"][robot] for result in (one, other)]
+        scenes = [result["by_scene"][robot] for result in (one, other)]
+        for key, measure, *_ in PLAIN:
+            figures = [figure(each, key) for each in pair]
+            values = [each.get(key) for each in scenes]
+            made.append([robot, measure, *(_shown(*each) for each in figures), _difference(*values)])
+        for path, measure in AGREEMENT:
+            both = [_shown(*agreement(each["policies"], path)[:2]) for each in pair]
+            made.append([robot, measure, *both, ""])
+    return Table(("robot", "measure", one["checkpoint"], other["checkpoint"], "second − first"), made)
+
+
+def _difference(one: list[Any] | None, other: list[Any] | None) -> str:
+    """Return the mean difference of the same scenes with its interval."""
+    if not one or not other or None in one or None in other:
+        return ""
+    change = np.subtract(other, one)
+    ends = rounded(interval(change))
+    return _shown(float(change.mean()), None if None in ends else ends)

@@ -1,0 +1,199 @@
+"""Run the benchmark on a checkpoint; a stopped one continues with the part that was not finished.
+
+    found = benchmark("runs/first", "card", FULL)
+    found["robots"]["mover_04"]["decision"]
+
+The protocol has a name and a version. A change of what is measured makes another version, so results of one
+version may be compared.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.lab import FAMILY
+from hma_data.storage.files import write_atomic
+from hma_data.storage.kept import KeptParts
+from hma_data.storage.locks import locked
+from hma_data.storage.paths import StrPath, as_path
+from hma_model.benchmark.measures import choice_figures, choose, no_inverse, speed, turn_back
+from hma_model.evaluation.intervals import NATURAL, rounded, summary
+from hma_model.evaluation.metrics import PSNR_RANGE
+from hma_model.evaluation.probe import Probe, train_probe
+from hma_model.policies.arenas import Scenes
+from hma_model.policies.fingerprints import device_facts, world_digests, world_facts
+from hma_model.policies.judge import task_of, train_judge
+from hma_model.policies.scores import evaluate_policies
+from hma_model.policies.scripted import Scripted
+from hma_model.worlds.world import World, load_world
+
+NAME, VERSION = "hma-benchmark", 1
+WORK, RESULTS = ".benchmark", "benchmark.json"
+NOISE = 0.5  # share of random chunks in the action sequences of a choice
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What is measured.
+
+    Attributes:
+        mode: its name.
+        robots: laboratory robots; those that the checkpoint lacks are left out.
+        scenes, frames: of decision fidelity and of inverse-action stability, a robot.
+        noises: shares of random actions of the scripted policies, to which random and still are added.
+        episodes, policy_frames: of each policy.
+    """
+
+    mode: str
+    robots: tuple[str, ...]
+    scenes: int
+    frames: int
+    noises: tuple[float, ...]
+    episodes: int
+    policy_frames: int
+
+
+FULL = Protocol(
+    "full", ("mover_04", "pusht_fast", "rails_03", "planar_arm"), 64, 20, (0.0, 0.2, 0.4, 0.6, 0.8), 100, 20
+)
+QUICK = Protocol("quick", ("mover_04",), 16, 12, (0.0, 0.4, 0.8), 16, 12)
+
+
+def benchmark(
+    checkpoint: StrPath,
+    out: StrPath,
+    protocol: Protocol = FULL,
+    *,
+    seed: int = 0,
+    world: World | None = None,
+    on_progress: Progress = lambda done, words: None,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Measure a checkpoint, write benchmark.json to a folder, and return what it holds.
+
+    Args:
+        checkpoint: as `load_world` takes it.
+        out: folder; it keeps finished parts, and the same call continues. Finished results are read.
+        protocol: FULL or QUICK.
+        seed: of scenes, goals, policies and probes; 0 is the protocol's own.
+        world: a world instead of a checkpoint.
+        on_progress: called with the parts done, and what is done.
+        settings: of the world made from the checkpoint, as of `load_world`.
+
+    Raises:
+        UsageError: the checkpoint has none of the robots.
+        OutputError: the folder was begun with other settings.
+    """
+    folder = as_path(out)
+    with locked(folder):
+        world = world or load_world(checkpoint, **settings)
+        robots = [robot for robot in protocol.robots if robot in world.model.embodiments]
+        if not robots:
+            fault = f"has none of the benchmark's robots: {', '.join(protocol.robots)}"
+            raise UsageError(
+                str(checkpoint), fault, "use hma evaluate and hma policy-eval for its own robots"
+            )
+        facts = {"benchmark": NAME, "version": VERSION, "seed": seed} | asdict(protocol) | {"robots": robots}
+        facts |= {"unmask_steps": world.unmask_steps, "temperature": world.temperature}
+        facts |= world_facts(world) | device_facts(world.model)
+        facts |= {"digests": {robot: world_digests(world, robot) for robot in robots}}
+        facts = json.loads(json.dumps(facts))
+        if (folder / RESULTS).exists():
+            found: dict[str, Any] = json.loads((folder / RESULTS).read_text(encoding="utf-8"))
+            if any(found.get(key) != value for key, value in facts.items()):
+                raise OutputError(folder, "holds the results of other settings", "give another folder")
+            return found
+        kept = KeptParts(folder / WORK, facts)
+        made, by_scene = {}, {}
+        for number, robot in enumerate(robots):
+
+            def tell(words: str, number: int = number, robot: str = robot) -> None:
+                on_progress(number, f"{robot}, {words}")
+
+            one = _Robot(world, robot, protocol, seed, kept, tell)
+            made[robot], by_scene[robot] = one.measured()
+        found = facts | {"checkpoint": str(checkpoint), "measures": made, "by_scene": by_scene}
+        write_atomic(folder / RESULTS, json.dumps(found, indent=1))
+        kept.remove()
+    return found
+
+
+class _Robot:
+    """The benchmark of one robot; its probe is trained when a part needs it, and comes out the same again."""
+
+    def __init__(
+        self,
+        world: World,
+        robot: str,
+        protocol: Protocol,
+        seed: int,
+        kept: KeptParts,
+        tell: Callable[[str], None],
+    ) -> None:
+        self.world, self.robot, self.protocol, self.seed = world, robot, protocol, seed
+        self.kept, self.tell = kept, tell
+        self.scenes = Scenes.of(world, robot, protocol.scenes, seed)
+        self._probe: Probe | None = None
+
+    @property
+    def probe(self) -> Probe:
+        if self._probe is None:
+            stride = self.scenes.stride
+            self._probe = train_probe(self.robot, self.world.tokenizer, stride, self.seed, self.tell)
+        return self._probe
+
+    def measured(self) -> tuple[dict[str, Any], dict[str, list[float]]]:
+        """Return the figures, and those of each scene."""
+        frames = self.protocol.frames
+        self.tell("action sequences")
+        arrays = self.kept.part(
+            f"choices-{self.robot}",
+            lambda: choose(self.world, self.scenes, self.probe, Scripted(NOISE), frames),
+        )
+        found, by_scene = choice_figures(arrays, self.seed)
+        self.tell("actions and their inverses")
+        if missing := no_inverse(self.scenes.dimensions):
+            found["inverse"] = {"missing": missing}
+        else:
+            turned = self.kept.part(
+                f"inverse-{self.robot}", lambda: turn_back(self.world, self.scenes, self.probe, frames)
+            )
+            found["inverse"] = {}
+            for name, values in turned.items():
+                within = PSNR_RANGE if name.endswith("psnr") else NATURAL
+                found["inverse"] |= summary(name, values, self.seed, within=within)
+                by_scene[f"inverse.{name}"] = rounded(values)
+        text = self.kept.part(f"policies-{self.robot}", lambda: {"json": np.array(self._policies())})["json"]
+        found["policies"] = json.loads(str(text))
+        self.tell("speed")
+        timed = self.kept.part(f"speed-{self.robot}", lambda: speed(self.world, self.scenes))
+        found["frames_per_second"] = rounded(timed["frames_per_second"], 2)
+        return found, by_scene
+
+    def _policies(self) -> str:
+        """Return what `hma policy-eval` finds, as JSON; or why there is no judge."""
+        family = FAMILY.fullmatch(self.robot) is not None
+        kind = "reach" if family else "scripted"
+        task = task_of(
+            self.robot, "reached" if family else "placed" if self.robot == "pusht_fast" else "moved"
+        )
+        names = [f"{kind}:noise={noise:g}" if noise else kind for noise in self.protocol.noises]
+        frames = self.protocol.policy_frames
+        try:
+            judge = train_judge(
+                self.robot, self.world.tokenizer, self.scenes.stride, frames + 1, task,
+                seed=self.seed, probe=self.probe, tell=self.tell,
+            )  # fmt: skip
+        except HMAError as fault:
+            return json.dumps({"missing": str(fault)})
+        found = evaluate_policies(
+            self.robot, [*names, "random", "still"], episodes=self.protocol.episodes, frames=frames,
+            judge=judge, seed=self.seed, world=self.world, out=self.kept.folder / f"policies-{self.robot}",
+            on_progress=lambda done, words: self.tell(f"policies, {words}"),
+        )  # fmt: skip
+        return json.dumps(found.to_json())

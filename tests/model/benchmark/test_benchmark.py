@@ -1,0 +1,154 @@
+"""The benchmark: a flawless and a frozen model, plain loops as the oracle, and stops at every part."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.benchmark import run as running
+from hma_model.benchmark.measures import REACHED_PX, decisions, no_inverse
+from hma_model.benchmark.report import compared, read_results, rows, write_report
+from hma_model.benchmark.run import QUICK, RESULTS, WORK, benchmark
+from hma_model.cli import main
+from hma_model.evaluation.agreement import Accuracy
+from hma_model.evaluation.metrics import PSNR_LIMIT
+from hma_model.policies.judge import StateJudge, task_of
+from hma_model.simulate import World
+from hma_model.worlds.scenes import Dimension
+from tests.model.policies.test_scores import ROBOT, FlawlessWorld, KnownPlaces
+from tests.model.true_world import tiny_model
+
+TINY = replace(
+    QUICK, robots=("absent", ROBOT), scenes=3, frames=4, noises=(0.0,), episodes=3, policy_frames=4
+)
+
+
+class FrozenWorld(FlawlessWorld):
+    """A model in which nothing ever moves."""
+
+    def step(self, actions: Any) -> Any:
+        return {row: self.rows[row].picture() for row in actions}
+
+
+def world_of(kind: type[FlawlessWorld]) -> Any:
+    made: Any = kind(World(tiny_model(ROBOT), get_tokenizer("fsq-8")))
+    made.sample_steps = None
+    return made
+
+
+@pytest.fixture(autouse=True)
+def probe(monkeypatch: pytest.MonkeyPatch) -> None:
+    known: Any = KnownPlaces(monkeypatch)
+    sure = Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24)
+    judge = StateJudge(ROBOT, task_of(ROBOT, "reached"), known, -12.0, sure)
+    monkeypatch.setattr(running, "train_probe", lambda *given: known)
+    monkeypatch.setattr(running, "train_judge", lambda *given, **named: judge)
+
+
+def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(tmp_path: Path) -> None:
+    best, frozen = (
+        benchmark("it", tmp_path / kind.__name__, TINY, world=world_of(kind))["measures"]
+        for kind in (FlawlessWorld, FrozenWorld)
+    )
+    assert list(best) == [ROBOT]
+    one, other = best[ROBOT], frozen[ROBOT]
+    assert one["psnr"] == PSNR_LIMIT and one["error_px_last"] == 0 and one["decision"] == 1
+    assert one["decision_95"][0] < 0.5  # three scenes make nothing certain
+    assert one["inverse"]["return_px"] == one["inverse"]["true_return_px"] < 2 < one["inverse"]["turn_px"]
+    assert one["policies"]["paired"]["first_chunks_equal"] and one["frames_per_second"] > 0
+    assert other["psnr"] == other["copy_psnr"] < one["psnr"] and other["error_px"] > 1
+    assert other["inverse"]["return_px"] == other["inverse"]["turn_px"] == 0
+
+
+CHOICES = st.tuples(st.integers(1, 4), st.integers(2, 5)).flatmap(
+    lambda shape: st.tuples(
+        *(arrays(np.float64, (*shape, 2, 2), elements=st.integers(0, 4)) for _ in range(2)),
+        st.integers(0, 9),
+    )
+)
+
+
+@settings(max_examples=30, deadline=None)
+@given(CHOICES)
+def test_a_decision_is_what_plain_loops_compute(drawn: tuple[np.ndarray, np.ndarray, int]) -> None:
+    true, made, seed = drawn
+    goals = np.random.default_rng([seed, 53]).integers(true.shape[1], size=len(true))
+    right, chance = decisions(true, made, seed)
+
+    def far(places: np.ndarray, goal: np.ndarray) -> float:
+        return sum(float(np.hypot(*(a - b))) for a, b in zip(places, goal, strict=True)) / len(places)
+
+    for scene, goal in enumerate(goals):
+        there = true[scene, goal]
+        distances = [far(one, there) for one in made[scene]]
+        reaching = [far(one, there) <= REACHED_PX for one in true[scene]]
+        assert chance[scene] == pytest.approx(sum(reaching) / len(reaching))
+        nearest = [k for k, value in enumerate(distances) if value <= min(distances) + 1e-9]
+        assert right[scene] in {float(reaching[k]) for k in nearest}
+
+
+def test_actions_without_an_inverse_are_refused_by_name() -> None:
+    rate, target = Dimension("vx", "m/s", -1, 1, "rate"), Dimension("grip", "", 0, 1, "switch")
+    assert no_inverse([rate]) == ""
+    assert "grip are positions or switches" in no_inverse([rate, target])
+    assert "vx only ever went one way" in no_inverse([replace(rate, low=0.0)])
+
+
+def test_a_benchmark_stopped_at_every_part_ends_with_the_same_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*given: Any, **named: Any) -> None:
+        raise KeyboardInterrupt
+
+    whole = benchmark("it", tmp_path / "whole", TINY, world=world_of(FlawlessWorld))
+    out = tmp_path / "out"
+    parts = ("choose", "turn_back", "evaluate_policies", "speed")
+    for number, part in enumerate(parts):
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            for name in (part, *parts[: max(number - 1, 0)]):  # what is finished is not done again
+                patch.setattr(running, name, stop)
+            benchmark("it", out, TINY, world=world_of(FlawlessWorld))
+        assert len(list((out / WORK).glob("*.npz"))) == number
+    with pytest.raises(OutputError, match="begun with other settings"):
+        benchmark("it", out, TINY, seed=1, world=world_of(FlawlessWorld))
+    found = benchmark("it", out, TINY, world=world_of(FlawlessWorld))
+    monkeypatch.setattr(running, "choose", stop)
+    assert benchmark("it", out, TINY, world=world_of(FlawlessWorld)) == found  # is read
+    for one in (found, whole):
+        one["measures"][ROBOT].pop("frames_per_second")
+    assert found == whole and not (out / WORK).exists()
+    with pytest.raises(OutputError, match="holds the results of other settings"):
+        benchmark("it", out, TINY, seed=1, world=world_of(FlawlessWorld))
+
+
+def test_the_card_the_page_and_a_comparison(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folders = tmp_path / "best", tmp_path / "frozen"
+    for folder, kind in zip(folders, (FlawlessWorld, FrozenWorld), strict=True):
+        found = benchmark(folder.name, folder, TINY, world=world_of(kind))
+        page = write_report(found, folder)
+        assert "hma-benchmark 1, quick" in page.read_text()
+        card = (folder / "benchmark.md").read_text()
+        assert card.count("\n| ") == len(rows(found)) + 2 and "decision fidelity, right choices of 5" in card
+        assert "not measured: 3 of at least 8 episodes" in card
+    one, other = map(read_results, folders)
+    table = {row[1]: row[2:] for row in compared(one, other).rows}
+    errors = np.array(other["by_scene"][ROBOT]["error_px"])
+    assert table["state error, px of 128"][2].startswith(f"{errors.mean():.2f} (")
+    assert {row[4] for row in compared(one, one).rows} <= {"", "0.00 (0.00 to 0.00)"}
+    assert main(["benchmark", "--compare", *map(str, folders), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["robot"] == ROBOT
+    with pytest.raises(UsageError, match="differ in seed"):
+        compared(one, {**other, "seed": 1})
+    with pytest.raises(HMAError, match="holds no results of the benchmark"):
+        read_results(tmp_path / "nothing" / RESULTS)
+    with pytest.raises(UsageError, match="none of the benchmark's robots: absent"):
+        benchmark("it", tmp_path / "none", replace(TINY, robots=("absent",)), world=world_of(FlawlessWorld))
+    assert main(["benchmark"]) == 2
