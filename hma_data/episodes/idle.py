@@ -1,8 +1,9 @@
 """Find the frames of an episode in which nothing moves, by its numbers.
 
 A frame is idle where no value of its action or state has moved since the last frame that was kept. A command
-that is a motion by itself (a delta, a velocity) has moved where it is not near zero. Where a mixed action space
-leaves open whether a command is a place or a motion, it has moved in both cases: a frame too many is kept.
+that is a motion by itself (a delta, a velocity) has moved where it is not near zero. Where a mixed action
+space leaves open whether a command is a place or a motion, it has moved in both cases: a frame too many is
+kept.
 
 A value has moved by more than `STILL` of the widest range that a value of its component has in the episode,
 and by more than `NOISE` in its own unit; a motion is not near zero above `STILL` of the component's largest.
@@ -55,7 +56,7 @@ def _is_motion(part: Component, action: Action) -> bool:
 
 
 def _may_be_motion(part: Component, action: Action) -> bool:
-    """Return whether a command is a motion, or nothing says that it is none; a switch (raw values) is none."""
+    """Return whether a command is a motion, or may be one; a switch (raw values) is none."""
     unknown = action.space == "mixed" and part.gripper is None and part.normalize
     return unknown or _is_motion(part, action)
 

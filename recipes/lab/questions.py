@@ -11,7 +11,8 @@ Student's t. The robots are recorded into OUT/data where --data names no folder 
 
 What a row measures, besides the steps and the held-out loss (nats a token; not comparable between kinds):
 
-    psnr_last, gain     dB of a rollout's last frame, six frames from two; that minus the PSNR with shuffled actions
+    psnr_last, gain     dB of a rollout's last frame, six frames from two; that minus the PSNR with
+                        shuffled actions
     seconds_a_frame     CPU seconds of a generated frame on one thread, batch 1, without decoding
     error_px, psnr_star, perplexity_star    table34: as `hma evaluate --state` has them
 """
@@ -317,7 +318,10 @@ def plot(question: str, lines: list[dict[str, Any]]) -> bytes:
     rows = summary(lines)
     figure = Figure(figsize=(7.2, 1.2 + 0.35 * len(rows)), layout="constrained")
     places = np.arange(len(rows))[::-1]
-    titles = {"gain": "gain of the last frame, recorded vs shuffled actions, dB", "psnr_last": "PSNR of the last frame, dB"}
+    titles = {
+        "gain": "gain of the last frame, recorded vs shuffled actions, dB",
+        "psnr_last": "PSNR of the last frame, dB",
+    }
     for axes, (key, title) in zip(figure.subplots(1, 2, sharey=True), titles.items(), strict=True):
         means, halves = zip(*(rows[name][key] for name in rows), strict=True)
         axes.errorbar(means, places, xerr=[half or 0 for half in halves], fmt="o", color="#0072b2", capsize=3)
