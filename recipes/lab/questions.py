@@ -319,7 +319,7 @@ def plot(question: str, lines: list[dict[str, Any]]) -> bytes:
     figure = Figure(figsize=(7.2, 1.2 + 0.35 * len(rows)), layout="constrained")
     places = np.arange(len(rows))[::-1]
     titles = {
-        "gain": "gain of the last frame, recorded vs shuffled actions, dB",
+        "gain": "gain, recorded vs shuffled actions, dB",
         "psnr_last": "PSNR of the last frame, dB",
     }
     for axes, (key, title) in zip(figure.subplots(1, 2, sharey=True), titles.items(), strict=True):
