@@ -61,7 +61,6 @@ SKIPS = {
     "no paper's code": "the paper's released code",
     "another platform": "this platform",
     "no Chromium": "no Chromium",
-    "no transformers": "needs transformers",
 }
 _skipped: list[str] = []
 

@@ -5,7 +5,6 @@ import sys
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -204,8 +203,9 @@ def test_what_is_no_safe_reward_model_of_frames_is_refused_in_one_line(
         RewardModel(str(cut), ["top"], ROBOT)
 
 
+@pytest.mark.slow  # transformers, of which the encoder is, comes with the slow tests' group
 def test_lerobots_classifier_runs_no_code_and_gives_its_own_rewards(tmp_path: Path) -> None:
-    transformers: ModuleType = pytest.importorskip("transformers", reason="the encoder needs transformers")
+    import transformers
     from lerobot.rewards.classifier.configuration_classifier import RewardClassifierConfig
     from lerobot.rewards.classifier.modeling_classifier import Classifier
     from lerobot.rewards.classifier.processor_classifier import make_classifier_processor
