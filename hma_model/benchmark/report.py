@@ -28,7 +28,7 @@ PLAIN = (  # key of a robot's figures, measure, key or text of the reference, it
         "simulator",
     ),
     ("inverse.return_psnr", "PSNR of the frame so reached, dB", "inverse.turn_psnr", "before turning back"),
-    ("frames_per_second", "frames a second, one rollout", "", ""),
+    ("frames_per_second", "frames a second, one rollout", "frames_per_cpu_second", "a CPU second"),
 )
 AGREEMENT = (  # path in the results of hma policy-eval, measure
     (("correlation", "success", "pearson"), "policies: Pearson of success rates"),

@@ -172,7 +172,7 @@ class _Robot:
         found["policies"] = json.loads(str(text))
         self.tell("speed")
         timed = self.kept.part(f"speed-{self.robot}", lambda: speed(self.world, self.scenes))
-        found["frames_per_second"] = rounded(timed["frames_per_second"], 2)
+        found |= {name: rounded(value, 2) for name, value in timed.items()}
         return found, by_scene
 
     def _policies(self) -> str:

@@ -123,7 +123,8 @@ def test_a_benchmark_stopped_at_every_part_ends_with_the_same_figures(
     monkeypatch.setattr(running, "choose", stop)
     assert benchmark("it", out, TINY, world=world_of(FlawlessWorld)) == found  # is read
     for one in (found, whole):
-        one["measures"][ROBOT].pop("frames_per_second")
+        for name in ("frames_per_second", "frames_per_cpu_second"):
+            one["measures"][ROBOT].pop(name)
     assert found == whole and not (out / WORK).exists()
     with pytest.raises(OutputError, match="holds the results of other settings"):
         benchmark("it", out, TINY, seed=1, world=world_of(FlawlessWorld))
