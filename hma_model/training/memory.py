@@ -156,7 +156,7 @@ def memory_errors(model: Network, recipe: Recipe, device: torch.device, ranks: i
             raise
         keys = _fitting_keys(model, recipe, device, ranks, recipe.batch_size // 2)
         remedy = f"set {keys}, which should fit" if keys else f"use a smaller network, as in {SMALLER}"
-        told = f"there is not enough for this model and batch: {text}"
+        told = ": ".join(filter(None, ("there is not enough for this model and batch", text)))
         raise TrainingError("memory", told, remedy) from fault
 
 

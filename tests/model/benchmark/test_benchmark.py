@@ -102,6 +102,7 @@ def test_actions_without_an_inverse_are_refused_by_name() -> None:
     assert "vx only ever went one way" in no_inverse([replace(rate, low=0.0)])
 
 
+@pytest.mark.slow
 def test_a_benchmark_stopped_at_every_part_ends_with_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -111,6 +111,7 @@ def test_its_true_and_false_positives_are_those_of_the_held_out_episodes(
     assert found.to_json()["false_positive_interval"] == pytest.approx((0.003, 0.527), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_policies_are_scored_in_the_model_alone_and_a_stop_continues(
     world: World, shards: Path, judge: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
