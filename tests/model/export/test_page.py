@@ -167,7 +167,8 @@ def test_keys_are_looked_at_before_each_frame(page: "Page", server: Any) -> None
     page.goto(address(server))
     page.wait_for_selector("#veil", state="hidden")
     page.keyboard.down("w")
-    page.wait_for_function("kept.length && kept[kept.length - 1][0].some((value) => value)")
+    # Playwright, too, would look by animation frames.
+    page.wait_for_function("kept.length && kept[kept.length - 1][0].some((value) => value)", polling=50)
 
 
 def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(
