@@ -15,12 +15,13 @@ from hma_data.registry.embodiment import find
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.recorded import Recorded
 from hma_data.storage.files import write_atomic
-from hma_model.demo.results import DemoRun
+from hma_model.demo.results import HELD, DemoRun
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import over_horizon
 from hma_model.evaluation.report import strip
 from hma_model.evaluation.tables import ROLLOUTS
 from hma_model.evaluation.verdict import horizon, verdict
+from hma_model.evaluation.wholeness import left_words
 
 KEPT_FRAMES = 7  # of an episode, that show what the tokens keep
 OWN_DATA = """
@@ -70,7 +71,13 @@ def _headline(page: Page, made: DemoRun) -> None:
             about = (
                 f"{robot}: nearer to the truth with its own actions than with others, after {seconds:.1f} s"
             )
-            tiles.append((f"{gain:+.1f} dB", about))
+            torn = [name for name, one in made.left[robot].items() if not one.whole]
+            tiles.append(
+                (
+                    f"{gain:+.1f} dB",
+                    about + f"; not whole after {HELD} frames: {' and '.join(torn)}" * bool(torn),
+                )
+            )
     tiles.append((human_seconds(made.run.seconds), f"of finetuning, {made.run.step:,} steps"))
     tiles.append((human_seconds(sum(made.seconds.values())), "from recording to rollout"))
     page.figures(tiles)
@@ -90,6 +97,9 @@ def _films(page: Page, made: DemoRun) -> None:
         light, dark = (webp_bytes(frames, film.fps) for frames in (film.frames, film.dark()))
         page.picture(light, "webp", caption, dark)
         page.text(f"The model {verdict(made.figures[robot])}.")
+        seconds = HELD / film.fps
+        left = left_words(made.left[robot])
+        page.text(f"In closed loop in new episodes, after {HELD} frames ({seconds:.1f} s): {left}.")
 
 
 def _robots(page: Page, made: DemoRun) -> None:

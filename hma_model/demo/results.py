@@ -16,9 +16,11 @@ from hma_model.checkpoint.folder import Checkpoint
 
 if TYPE_CHECKING:
     from hma_model.evaluation.rollout_video import RolloutVideo
+    from hma_model.evaluation.wholeness import Left
     from hma_model.training.loop import TrainResult
 
 TIMINGS = "timings.json"
+HELD = 20  # frames in closed loop after which it is measured what is left
 
 
 @dataclass
@@ -34,6 +36,7 @@ class DemoRun:
     pulled: dict[str, Path] = field(default_factory=dict)  # checkpoints with one robot
     figures: dict[str, dict[str, Any]] = field(default_factory=dict)  # of `evaluate` on held-out windows
     films: dict[str, "RolloutVideo"] = field(default_factory=dict)  # held-out rollouts
+    left: dict[str, dict[str, "Left"]] = field(default_factory=dict)  # after HELD frames
     seconds: dict[str, float] = field(default_factory=dict)  # stage -> wall time
     sizes: dict[str, int] = field(default_factory=dict)  # name of a file or folder -> bytes
 

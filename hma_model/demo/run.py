@@ -7,6 +7,7 @@ a report of one page. It downloads nothing. A second run in the same folder cont
 """
 
 import json
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.cpu import usable_cores
 from hma_data.errors import OutputError, ShardError
+from hma_data.lab import truth
 from hma_data.lab.family import HELD_OUT
 from hma_data.loading.dataset import open_sets
 from hma_data.loading.mixture import Mixture
@@ -32,11 +34,12 @@ from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
 from hma_model.demo.report import write_report
-from hma_model.demo.results import TIMINGS, DemoRun
+from hma_model.demo.results import HELD, TIMINGS, DemoRun
 
 if TYPE_CHECKING:
     from hma_model.evaluation.rollout_video import RolloutVideo
     from hma_model.evaluation.rollouts import Sampling
+    from hma_model.evaluation.wholeness import Left
 
 START, ROBOTS = EMBEDDED_NAME, HELD_OUT  # the trunk, and robots that it has not seen
 RECIPE = "demo"
@@ -45,6 +48,7 @@ FILMED = 3  # windows of a robot's film
 RESULTS, SETTINGS = "results.json", "settings.json"
 OURS = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS, RESULTS, SETTINGS}
 WINDOWS = 24  # held-out windows of each robot; the figures are means over them
+HELD_ROLLOUTS, HELD_SEED = 4, 55  # of other episodes than the recorded ones, driven for HELD frames
 LONGEST = 10  # frames of a window of the film
 FILM: "Sampling" = {"unmask_steps": 8, "order": "confidence"}  # slower than the figures, and limbs stay whole
 
@@ -83,10 +87,12 @@ def demo(out: StrPath, *, episodes: int = 32, steps: int | None = None, seed: in
     with made.stage(5, "roll out"):
         roll_out(made)
     names = {"true": "psnr_last", "shuffled": "psnr_last_shuffled", "copy": "psnr_last_copy"}
-    figures = {
+    figures: dict[str, dict[str, Any]] = {
         robot: {name: found[key]["psnr_last"] for key, name in names.items()}
         for robot, found in made.figures.items()
     }
+    for robot, left in made.left.items():
+        figures[robot]["left"] = {name: asdict(one) for name, one in left.items()}
     results = {"seconds": sum(made.seconds.values()), "embodiments": figures}
     write_atomic(out / RESULTS, json.dumps(results, indent=1))
     return write_report(made)
@@ -203,10 +209,11 @@ def roll_out(made: DemoRun) -> None:
     from hma_model.evaluation.evaluate import EvaluationSettings, measure
     from hma_model.evaluation.rollout_video import lively_windows, rollout_video
     from hma_model.evaluation.verdict import verdict
+    from hma_model.evaluation.wholeness import continued, left_at, left_words
     from hma_model.generation.decode import default_prompt
     from hma_model.network.model import HMA
 
-    def roll(robot: str) -> tuple[dict[str, Any], "RolloutVideo"]:
+    def roll(robot: str) -> tuple[dict[str, Any], "RolloutVideo", dict[str, "Left"]]:
         shards = made.sets[robot]
         model = HMA.from_pretrained(str(made.pulled[robot]), embodiments=[robot]).eval()
         tokenizer = tokenizer_of(shards)
@@ -225,13 +232,19 @@ def roll_out(made: DemoRun) -> None:
             prompt=prompt,
             **FILM,
         )
-        return found, film
+        simulated = partial(truth.episode, robot, prompt + HELD, model.embodiments[robot].stride, HELD_SEED)
+        episodes = [simulated(number) for number in range(HELD_ROLLOUTS)]
+        left = left_at(
+            continued(model, tokenizer, robot, episodes, prompt, HELD_SEED, decoded=True, **FILM), HELD
+        )
+        return found, film, left
 
     with single_threads(len(made.sets)) as pool:
         results = list(pool.map(roll, made.sets))
-    for robot, (found, film) in zip(made.sets, results, strict=True):
-        made.figures[robot], made.films[robot] = found, film
+    for robot, (found, film, left) in zip(made.sets, results, strict=True):
+        made.figures[robot], made.films[robot], made.left[robot] = found, film, left
         print(f"  {robot}: the model {verdict(found)}", flush=True)
+        print(f"  {robot}: after {HELD} frames in closed loop {left_words(left)}", flush=True)
 
 
 def _size(path: Path) -> int:

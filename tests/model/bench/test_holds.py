@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from hma_data.errors import UsageError
+from hma_model.evaluation.wholeness import Left, left_at, left_words
 from recipes.bench import holds
 from recipes.lab import pushes
 
@@ -55,6 +56,17 @@ def test_an_object_that_is_turned_keeps_its_shape_and_one_that_lost_a_limb_does_
     assert row(turned)["shape"] > 0.9
     limb = row(scene(PLACES, bar=False))
     assert limb["shape"] < 0.75 and limb["left"] == pytest.approx(64 / 96, abs=0.01)
+
+
+def test_what_is_left_is_said_with_whether_it_stays_whole() -> None:
+    whole = left_at(found(scene(PLACES), PLACES), FRAMES - 1)
+    assert whole == {"the robot": Left(1.0, 1.0), "loose objects": Left(1.0, 1.0)}
+    assert left_words(whole).endswith("100% of the pixels of loose objects (shape 100%), whole")
+    torn = left_at(found(scene(PLACES, bar=False), PLACES), FRAMES - 1)
+    assert torn["the robot"].whole and not torn["loose objects"].whole
+    assert left_words(torn).endswith("not whole: loose objects")
+    many = left_at(found(np.roll(scene(PLACES), 1, axis=-1), PLACES), FRAMES - 1)  # other colours
+    assert many["the robot"] == Left(0.0, 0.0)
 
 
 def test_two_places_of_one_object_are_one_object_though_one_lies_on_its_edge() -> None:

@@ -1,0 +1,217 @@
+"""Measure what is left of a simulated robot and of loose objects in a model that is driven in closed loop.
+
+Robots and objects are told by their colours, in the truth and in the model alike.
+
+B rollouts, T frames, S pixels a side, P parts, C colours.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.images import opencv, prepare
+from hma_data.lab import truth
+from hma_data.lab.simulator import embodiment
+from hma_data.lab.truth import TrueEpisode
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.network.model import HMA
+
+Images = NDArray[np.uint8]
+Masks = NDArray[np.bool_]
+
+NEAR = 60.0  # distance of RGB within which a pixel has an object's colour
+FEWEST = 12  # pixels of an object below which it is hidden, and not judged
+WHOLE = (0.8, 1.2)  # shares of the true pixels between which a robot or an object is whole
+SHAPED = 0.7  # overlap with the true shape from which it is whole
+TURNS = 36  # angles of the search for the best overlap
+
+
+@dataclass(frozen=True)
+class Found:
+    """The rollouts of a robot.
+
+    Attributes:
+        true, made: (B, T, S, S, 3) from the prompt's last frame on.
+        parts: (B, T, P, 2) true places in px of 128.
+        driven: how many of the parts, the first ones, are the robot's own.
+    """
+
+    robot: str
+    true: Images
+    made: Images
+    parts: NDArray[np.float64]
+    driven: int
+
+
+def continued(
+    model: "HMA",
+    tokenizer: "Tokenizer",
+    robot: str,
+    episodes: Sequence[TrueEpisode],
+    prompt: int,
+    seed: int,
+    *,
+    decoded: bool = False,
+    **options: Any,
+) -> Found:
+    """Continue true episodes of one length in the model, from their first frames under the same actions.
+
+    Args:
+        decoded: take the truth as the tokens show it, so that what they lose does not count.
+        options: of the `Rollout`.
+    """
+    size, (camera, *_) = tokenizer.spec.image_size, embodiment(robot).cameras
+    seen = np.stack([prepare(one.pictures, camera, size, tokenizer.spec.resize_filter) for one in episodes])
+    tokens = np.stack([tokenizer.encode(images if decoded else images[:prompt]) for images in seen])
+    given = tokens[:, :prompt]
+    chunks, frames = np.stack([one.chunks for one in episodes]), range(1, seen.shape[1] - prompt + 1)
+    made = rolled(model, tokenizer, robot, given, chunks, options=options, frames=frames, seed=seed)
+    images = np.concatenate([tokenizer.decode(given[:, -1])[:, None], made], axis=1)
+    parts = np.stack([one.parts for one in episodes])[:, prompt - 1 :]
+    true = np.stack([tokenizer.decode(one) for one in tokens]) if decoded else seen
+    return Found(robot, true[:, prompt - 1 :], images, parts, episodes[0].driven)
+
+
+def rolled(
+    model: "HMA",
+    tokenizer: "Tokenizer",
+    robot: str,
+    stored: NDArray[Any],
+    chunks: NDArray[np.float32],
+    *,
+    options: dict[str, Any],
+    frames: Sequence[int],
+    seed: int,
+) -> Images:
+    """Continue prompts (B, P, …) under chunks (B, T, K); return the images (B, W, S, S, 3) of W frames."""
+    import torch
+
+    from hma_model.generation.decode import decode
+    from hma_model.generation.rollout import Rollout
+
+    discrete, begin = model.config.kind == "discrete", stored.shape[1] - 1
+    known = torch.from_numpy(stored.astype(np.int64 if discrete else np.float32)).to(model.device)
+    commands = torch.from_numpy(chunks).to(model.device)
+    generator = torch.Generator().manual_seed(seed)
+    rollout = Rollout(model, robot, len(known), generator=generator, **options)
+    rollout.prompt(known, commands)
+    kept = []
+    for frame in range(1, frames[-1] + 1):
+        made = rollout.step(commands[:, begin + frame - 1])
+        if frame in frames:
+            kept.append(made.cpu())
+    return decode(tokenizer, torch.stack(kept, dim=1))
+
+
+def colors_of(found: Found) -> NDArray[np.float64]:
+    """Return the colour (P, 3) of each part: the commonest at its place in the true frames."""
+    side, count = found.true.shape[2], found.parts.shape[2]
+    places = np.clip((found.parts * side / truth.SIZE).astype(int), 0, side - 1)
+    b, t = np.ogrid[: found.true.shape[0], : found.true.shape[1]]
+    taken = [found.true[b, t, places[:, :, p, 1], places[:, :, p, 0]].reshape(-1, 3) for p in range(count)]
+    return np.stack([np.median(pixels, axis=0) for pixels in taken])
+
+
+def distinct(colors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the colours (C, 3) without those near an earlier one: places of one object differ a little."""
+    kept: list[NDArray[np.float64]] = []
+    for color in colors:
+        if all(np.linalg.norm(color - other) >= NEAR for other in kept):
+            kept.append(color)
+    return np.reshape(kept, (-1, 3))
+
+
+def masks_of(images: Images, colors: NDArray[np.float64]) -> Masks:
+    """Return the pixels (C, …, S, S) that have each of the colours (C, 3) and no other one rather."""
+    far = np.stack([np.linalg.norm(images.astype(np.float32) - color, axis=-1) for color in colors])
+    return (far < NEAR) & (far == far.min(axis=0))
+
+
+def palettes(found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the colours of the robot's own parts and of loose objects, (C, 3) each."""
+    colors = colors_of(found)
+    return distinct(colors[: found.driven]), distinct(colors[found.driven :])
+
+
+def shares(true: Masks, made: Masks) -> NDArray[np.float64]:
+    """Return the pixels in the model as a share of the true ones (C, B); NaN where an object is hidden."""
+    areas, kept = true.sum((-1, -2)), made.sum((-1, -2))
+    return np.where(areas >= FEWEST, kept / np.maximum(areas, 1), np.nan)
+
+
+def best_overlap(true: Masks, made: Masks) -> float:
+    """Return the overlap of an object with the true one (S, S) after the best shift and turn."""
+    if not made.any():
+        return 0.0
+    cv2 = opencv()
+    middle, shift = centre(made), centre(true) - centre(made)
+    best = 0.0
+    for turn in range(TURNS):
+        matrix = cv2.getRotationMatrix2D((float(middle[0]), float(middle[1])), turn * 360 / TURNS, 1.0)
+        matrix[:, 2] += shift
+        turned = cv2.warpAffine(made.astype(np.float32), matrix, made.shape[::-1]) > 0.5
+        best = max(best, overlap(true, turned))
+    return best
+
+
+def overlap(one: Masks, other: Masks) -> float:
+    """Return the pixels that two objects share, of those that either has."""
+    return float((one & other).sum() / max((one | other).sum(), 1))
+
+
+def centre(mask: Masks) -> NDArray[np.float64]:
+    """Return the mean place (x, y) of an object's pixels."""
+    return np.array([axis.mean() for axis in np.nonzero(mask)[::-1]])
+
+
+@dataclass(frozen=True)
+class Left:
+    """What is left of a robot or of loose objects, by their parts of one colour.
+
+    Attributes:
+        share: of the true pixels; 1 keeps them, 0 has melted them.
+        shape: overlap of each with the true one after the best shift and turn.
+    """
+
+    share: float
+    shape: float
+
+    @property
+    def whole(self) -> bool:
+        return WHOLE[0] <= self.share <= WHOLE[1] and self.shape >= SHAPED
+
+
+def left_at(found: Found, frame: int) -> dict[str, Left]:
+    """Return what is left of the robot and of loose objects, where large enough to see."""
+    own, loose = palettes(found)
+    palette = np.concatenate([own, loose])
+    true, made = masks_of(found.true[:, frame], palette), masks_of(found.made[:, frame], palette)
+    kept, left = shares(true, made), {}
+    for name, colors in (("the robot", range(len(own))), ("loose objects", range(len(own), len(palette)))):
+        seen = [(color, b) for color in colors for b in np.flatnonzero(np.isfinite(kept[color]))]
+        if seen:
+            shape = np.mean([best_overlap(true[one], made[one]) for one in seen])
+            left[name] = Left(float(np.mean([kept[one] for one in seen])), float(shape))
+    return left
+
+
+def left_words(left: dict[str, Left]) -> str:
+    """Return what is left in words, and what does not stay whole."""
+    if not left:
+        return "nothing was large enough to judge"
+    told = [f"{one.share:.0%} of the pixels of {name} (shape {one.shape:.0%})" for name, one in left.items()]
+    torn = [name for name, one in left.items() if not one.whole]
+    verdict = f"not whole: {' and '.join(torn)}" if torn else "whole"
+    return f"{' and '.join(told)}, {verdict}"
+
+
+def mean_of(values: Any) -> float | None:
+    """Return the mean of the finite values, None if there are none."""
+    kept = np.asarray(values, dtype=np.float64)
+    kept = kept[np.isfinite(kept)]
+    return round(float(kept.mean()), 3) if kept.size else None
