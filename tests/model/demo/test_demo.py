@@ -16,6 +16,7 @@ from hma_model.demo.results import DemoRun
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.rollout_video import RolloutVideo
 from hma_model.evaluation.verdict import verdict
+from hma_model.evaluation.wholeness import Left
 
 
 @pytest.mark.slow
@@ -44,7 +45,9 @@ def test_a_demo_that_was_cut_goes_on_by_the_same_command(tmp_path, monkeypatch) 
     for robot in demos.ROBOTS:
         assert verify(out / "shards" / robot) == []
         assert (out / "pulled" / robot / "embodiments" / robot / "head.safetensors").is_file()
-        assert set(results["embodiments"][robot]) == {"psnr_last", "psnr_last_shuffled", "psnr_last_copy"}
+        figures = results["embodiments"][robot]
+        assert set(figures) == {"psnr_last", "psnr_last_shuffled", "psnr_last_copy", "left"}
+        assert 0 <= figures["left"]["the robot"]["shape"] <= 1
         assert f'alt="{robot}: recorded"' in page and f"<h2>{robot}: " in page
     for title in ("The robots", "What the tokens keep", "Sizes and timings", "on your own data"):
         assert title in page
@@ -81,6 +84,10 @@ def test_the_report_opens_with_decibels_and_time_under_the_rule_of_evaluate(tmp_
     made: Any = SimpleNamespace(
         figures={"arm3_55": FOUND, "mover_52": wide},
         films={name: film() for name in ("arm3_55", "mover_52")},
+        left={
+            "arm3_55": {"the robot": Left(0.65, 0.48), "loose objects": Left(0.9, 0.76)},
+            "mover_52": {"the robot": Left(1.0, 0.9)},
+        },
         run=SimpleNamespace(seconds=158.0, step=620),
         seconds={"all": 200.0},
     )
@@ -89,6 +96,8 @@ def test_the_report_opens_with_decibels_and_time_under_the_rule_of_evaluate(tmp_
     shown = page.html()
     assert "<b>+2.1 dB</b>" in shown and "after 0.6 s" in shown and "2 min 38 s" in shown
     assert "nats" not in shown
+    assert shown.count("; not whole after 20 frames: the robot<") == 1  # a gain does not stand bare
+    assert "65% of the pixels of the robot (shape 48%)" in shown and "(shape 90%), whole." in shown
     for found in (FOUND, wide):
         assert f"The model {verdict(found)}." in shown
     assert "recorded vs shuffled actions, 0.6 s after the prompt" in shown and "may follow" in shown
