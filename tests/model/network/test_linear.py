@@ -23,7 +23,7 @@ def values_and_gradients(function, parameters: list[nn.Parameter], x: Tensor, gr
 @pytest.mark.parametrize("kernels", [True, False])
 def test_values_and_gradients_equal_float64(before, bias, kernels, monkeypatch):
     if kernels and not linears.has_kernels():
-        pytest.skip("this processor has no AVX-512")
+        pytest.skip("this platform has no AVX-512")
     monkeypatch.setattr(linears, "has_kernels", lambda: kernels)
     torch.manual_seed(0)
     linear, norm = Linear(INPUTS, OUTPUTS, bias=bias), nn.LayerNorm(INPUTS)
