@@ -97,10 +97,10 @@ def panels(frames: Sequence[Frame], side: int, truth: str) -> Iterator[Image]:
     """Return the model's images, and the true ones beside them, with titles; an unknown one is white."""
     wide = any(frame.true is not None for frame in frames)
     for frame in frames:
-        shown = [_panel("world model", frame.model, side)]
+        score = "" if frame.psnr is None else f", PSNR {frame.psnr:.1f} dB"
+        shown = [_panel(f"world model{score}", frame.model, side)]
         if wide:
-            text = truth if frame.psnr is None else f"{truth}: {frame.psnr:.1f} dB"
-            true = np.full_like(shown[0], 255) if frame.true is None else _panel(text, frame.true, side)
+            true = np.full_like(shown[0], 255) if frame.true is None else _panel(truth, frame.true, side)
             shown += [np.full((side + HEAD, GAP, 3), 255, np.uint8), true]
         yield np.concatenate(shown, axis=1)
 
