@@ -27,11 +27,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/storage": (1_640, 10_700, 11),
     "hma_data/tokenizers": (3_290, 23_900, 17),
     "hma_model": (520, 3_100, 3),
-    "hma_model/benchmark": (560, 4_700, 4),
+    "hma_model/benchmark": (840, 7_300, 5),
     "hma_model/checkpoint": (870, 6_500, 5),
     "hma_model/cli": (1_710, 10_700, 12),
     "hma_model/demo": (490, 4_100, 4),
-    "hma_model/evaluation": (4_260, 34_100, 22),
+    "hma_model/evaluation": (4_560, 36_900, 23),
     "hma_model/export": (1_000, 7_800, 7),
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_300, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_610, 29_700, 18),
     "hma_model/worlds": (1_550, 11_600, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_000, 504_500
-TEST_LINES = 46_500
+PRODUCT_LINES, PRODUCT_NODES = 64_700, 510_500
+TEST_LINES = 46_700
 DOC_WORDS = 38_300
 
 

@@ -37,18 +37,24 @@ INVERSE_SHARE = 0.5  # of the range of training, up to which actions are drawn
 WARM_FRAMES, TIMED_FRAMES = 3, 20
 
 
-def played(world: World, true: TrueArena, actions: Sequence[Float32s]) -> Image:
-    """Return the model's images (N, T + 1, S, S, 3) under given actions, from the beginning of `true`."""
+def played(world: World, true: TrueArena, actions: Sequence[Float32s]) -> tuple[Image, NDArray[np.float64]]:
+    """Return the model's images (N, T + 1, S, S, 3) under given actions, from the beginning of `true`.
+
+    With them comes how unsure the model was of the generated ones, (N, T) as of `Rollout`.
+    """
     model = ModelArena(world, true, None)
-    images = [model.made]
+    images, unsure = [model.made], []
+    world.measure = True
     try:
         for action in actions:
             model.step(action)
             if model.fresh:
                 images.append(model.made)
+                unsure.append(model.uncertainty())
     finally:
+        world.measure = False
         model.close()
-    return np.stack(images, axis=1)
+    return np.stack(images, axis=1), np.stack(unsure, axis=1)
 
 
 def parts_read(probe: Probe) -> NDArray[np.int64]:
@@ -60,16 +66,19 @@ def choose(world: World, scenes: Scenes, probe: Probe, policy: Policy, frames: i
     """Return what comes of C action sequences of each scene in the simulator and in the model.
 
     Returns:
-        `psnr`, `copy_psnr` (of the first frame repeated) (N, C, T); `true`, `made` (N, C, T, P, 2) places.
+        `psnr`, `copy_psnr` (of the first frame repeated), `uncertainty` (N, C, T); `true`, `made`
+        (N, C, T, P, 2) places.
     """
     kept = parts_read(probe)
-    found: dict[str, list[NDArray[Any]]] = {name: [] for name in ("psnr", "copy_psnr", "true", "made")}
+    names = ("psnr", "copy_psnr", "true", "made", "uncertainty")
+    found: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
     for choice in range(CHOICES):
         true = TrueArena(replace(scenes, seed=scenes.seed + 1000 * choice), world.image_shape[0])
         pictures, actions = run("benchmark", policy, true, frames)
         true.scenes = scenes  # the model's random numbers are the same for all sequences of a scene
         shown = np.stack(pictures, axis=1)
-        made = played(world, true, actions)
+        made, unsure = played(world, true, actions)
+        found["uncertainty"].append(unsure)
         found["psnr"].append(psnr(shown[:, 1:], made[:, 1:], limit=PSNR_LIMIT))
         still = np.broadcast_to(made[:, :1], made[:, 1:].shape)
         found["copy_psnr"].append(psnr(shown[:, 1:], still, limit=PSNR_LIMIT))
@@ -117,6 +126,15 @@ def choice_figures(arrays: Arrays, seed: int) -> tuple[dict[str, Any], dict[str,
     return found, {name: rounded(values) for name, values in by_scene.items()}
 
 
+def frame_errors(arrays: Arrays) -> Arrays:
+    """Return what came of each frame (N, C, T) of `choose`, rounded as it is written to the results."""
+    return {
+        "uncertainty": arrays["uncertainty"].round(4),
+        "error_px": np.linalg.norm(arrays["made"] - arrays["true"], axis=-1).mean(axis=-1).round(3),
+        "pixel_rmse": (255 * 10 ** (-arrays["psnr"] / 20)).round(3),
+    }
+
+
 def no_inverse(dims: Sequence[Dimension]) -> str:
     """Say why actions have no inverse: a value is no velocity or delta, or goes one way; "" if they have."""
     if others := [dim.name for dim in dims if dim.kind != "rate"]:
@@ -139,7 +157,7 @@ def turn_back(world: World, scenes: Scenes, probe: Probe, frames: int) -> Arrays
     out = np.stack(drawn, axis=1).astype(np.float32).repeat(scenes.stride, axis=0)  # (steps, N, A)
     actions = [*out, *-out[::-1]]
     true = TrueArena(scenes, world.image_shape[0], drawn=False)
-    made = played(world, true, actions)
+    made, _ = played(world, true, actions)
     for action in actions:
         true.step(action)
 

@@ -12,6 +12,7 @@ from hma_data.tables import Table
 from hma_model.benchmark.run import NAME, RESULTS
 from hma_model.evaluation.intervals import interval, rounded
 from hma_model.evaluation.pages import Page
+from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
 
 CARD, PAGE = "benchmark.md", "benchmark.html"
 COLUMNS = ("robot", "measure", "value (95 % interval)", "reference")
@@ -28,8 +29,28 @@ PLAIN = (  # key of a robot's figures, measure, key or text of the reference, it
         "simulator",
     ),
     ("inverse.return_psnr", "PSNR of the frame so reached, dB", "inverse.turn_psnr", "before turning back"),
+    ("planning.truth", "goals reached by planning in the simulator", "planning.random", "at random"),
+    ("planning.model", "goals reached by planning in the model", "planning.random", "at random"),
+    ("planning.gap", "planning gap: simulator less model", "planning.verdict", "limit: {}"),
+    ("calibration.gap_px", "state error against what the uncertainty tells to expect, px", "", ""),
+    ("calibration.half_px", "state error of the surest half of rollouts, px", "calibration.all_px", "of all"),
+    ("calibration.right", "rollouts warned in time", "calibration.clock", "by a clock"),
+    ("calibration.misses", "misses: no warning by the time the error doubles", "", ""),
+    ("calibration.false_alarms", "false alarms: no doubling soon after a warning", "", ""),
     ("frames_per_second", "frames a second, one rollout", "frames_per_cpu_second", "a CPU second"),
 )
+RELIABILITY = (
+    "uncertainty since the start",
+    "expected state error, px",
+    "state error, px (95 % interval)",
+    "expected RMSE of pixels",
+    "RMSE of pixels",
+)
+ABSENT = {  # why a figure is absent though its part was measured
+    "inverse.return_px": "no part is read",
+    "calibration.misses": "no error doubles",
+    "calibration.false_alarms": "nothing is warned of",
+}
 AGREEMENT = (  # path in the results of hma policy-eval, measure
     (("correlation", "success", "pearson"), "policies: Pearson of success rates"),
     (("correlation", "success", "spearman"), "policies: rank correlation"),
@@ -46,13 +67,12 @@ def rows(found: dict[str, Any]) -> list[list[str]]:
     for robot, one in found["measures"].items():
         for key, measure, reference, about in PLAIN:
             value, ends = figure(one, key)
-            if value is None and key.startswith("inverse."):
-                made.append([robot, measure, _absent(one["inverse"].get("missing", "no part is read")), ""])
+            if value is None and "." in key:
+                part = one.get(key.split(".")[0], {})
+                made.append([robot, measure, _absent(part.get("missing") or ABSENT[key]), ""])
                 continue
             beside = figure(one, reference)[0] if reference else None
-            made.append(
-                [robot, measure, _shown(value, ends), f"{beside:.2f} {about}" if beside is not None else ""]
-            )
+            made.append([robot, measure, _shown(value, ends), _beside(beside, about)])
         policies = one["policies"]
         for path, measure in AGREEMENT:
             value, ends, reason = agreement(policies, path)
@@ -62,11 +82,11 @@ def rows(found: dict[str, Any]) -> list[list[str]]:
     return made
 
 
-def figure(one: dict[str, Any], key: str) -> tuple[float | None, list[float] | None]:
+def figure(one: dict[str, Any], key: str) -> tuple[Any, list[float] | None]:
     """Return a figure of a robot by its key, such as `inverse.return_px`, and its interval."""
     *path, name = key.split(".")
     for part in path:
-        one = one[part]
+        one = one.get(part, {})
     return one.get(name), one.get(f"{name}_95")
 
 
@@ -81,6 +101,12 @@ def agreement(
         found = found[part]
     ends = None if found["low"] is None else [found["low"], found["high"]]
     return found["value"], ends, found["reason"]
+
+
+def _beside(value: float | str | None, about: str) -> str:
+    if value is None:
+        return ""
+    return about.format(value) if isinstance(value, str) else f"{value:.2f} {about}"
 
 
 def _absent(reason: str) -> str:
@@ -116,9 +142,53 @@ def write_report(found: dict[str, Any], folder: Path) -> Path:
         by_frame = zip(one["psnr_by_frame"], one["error_px_by_frame"], strict=True)
         cells = [[frame, signal, error] for frame, (signal, error) in enumerate(by_frame, 1)]
         page.table(("frame", "PSNR, dB", "state error, px"), cells)
+        _calibration(page, one["calibration"])
     write_atomic(folder / CARD, f"{lead}.\n\n{table.markdown()}\n")
     write_atomic(folder / PAGE, page.html())
     return folder / PAGE
+
+
+def _calibration(page: Page, found: dict[str, Any]) -> None:
+    """Add the reliability curve, risk against coverage, and what the warnings are worth."""
+    if "missing" in found:
+        page.text(f"Uncertainty is not calibrated: {found['missing']}.")
+        return
+    verdict = found["meter"]["verdict"]
+    page.text(
+        f"{verdict[:1].upper()}{verdict[1:]}. In time: by the frame at which the state error reaches "
+        f"{found['doubled_px']:.2f} px, twice that of first frames, at most {found['lead_frames']} frames "
+        "before. A clock warns all rollouts at the same frame, the best one. The scenes of a rate are not "
+        "those that its limit was fitted on."
+    )
+    curve, risk = found["reliability"], found["risk"]
+    page.picture(_curves(curve, risk), "svg+xml", "Reliability of the uncertainty, and risk against coverage")
+    names = ("stated", "expected_px", "measured_px", "expected_pixels", "measured_pixels")
+    cells = [list(row) for row in zip(*(curve[name] for name in names), strict=True)]
+    for row, ends in zip(cells, curve["measured_px_95"], strict=True):
+        row[2] = _shown(row[2], ends)
+    page.table(RELIABILITY, cells)
+
+
+def _curves(curve: dict[str, Any], risk: dict[str, Any]) -> bytes:
+    """Return the plot of a reliability curve, and of risk against coverage."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    top = max(*curve["expected_px"], *curve["measured_px"])
+    left.plot([0, top], [0, top], color="#999999", ls=":", lw=1)
+    ends = np.array(curve["measured_px_95"], float).T
+    bars = np.abs(ends - np.array(curve["measured_px"]))
+    look: dict[str, Any] = {"fmt": MARKERS[0], "color": COLOURS[0], "ms": 5, "lw": 1}
+    left.errorbar(curve["expected_px"], curve["measured_px"], yerr=bars, **look)
+    label_axes(left, "expected state error, px", "measured, px")
+    for number, kind in enumerate(("episodes", "frames")):
+        values, ends = np.array(risk[f"{kind}_px"]), np.array(risk[f"{kind}_px_95"], float).T
+        look = {"color": COLOURS[number], "fmt": f"{MARKERS[number]}-", "ms": 5, "lw": 1}
+        right.errorbar(risk["coverage"], values, yerr=np.abs(ends - values), label=f"surest {kind}", **look)
+    right.legend(frameon=False, fontsize=9)
+    label_axes(right, "share that is kept", "state error, px")
+    return svg_bytes(figure)
 
 
 def read_results(path: Path) -> dict[str, Any]:

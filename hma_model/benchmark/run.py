@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hma_data.errors import HMAError, OutputError, UsageError
 from hma_data.lab import FAMILY
@@ -20,7 +21,16 @@ from hma_data.storage.files import write_atomic
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.benchmark.measures import choice_figures, choose, no_inverse, speed, turn_back
+from hma_model.benchmark.measures import (
+    choice_figures,
+    choose,
+    frame_errors,
+    no_inverse,
+    speed,
+    turn_back,
+)
+from hma_model.benchmark.planning import WAYS, planning_figures, reached
+from hma_model.evaluation.calibration import calibration
 from hma_model.evaluation.intervals import NATURAL, rounded, summary
 from hma_model.evaluation.metrics import PSNR_RANGE
 from hma_model.evaluation.probe import Probe, train_probe
@@ -31,7 +41,7 @@ from hma_model.policies.scores import evaluate_policies
 from hma_model.policies.scripted import Scripted
 from hma_model.worlds.world import World, load_world
 
-NAME, VERSION = "hma-benchmark", 1
+NAME, VERSION = "hma-benchmark", 2
 WORK, RESULTS = ".benchmark", "benchmark.json"
 NOISE = 0.5  # share of random chunks in the action sequences of a choice
 Progress = Callable[[float, str], None]
@@ -109,15 +119,16 @@ def benchmark(
                 raise OutputError(folder, "holds the results of other settings", "give another folder")
             return found
         kept = KeptParts(folder / WORK, facts)
-        made, by_scene = {}, {}
+        made, by_scene, by_frame = {}, {}, {}
         for number, robot in enumerate(robots):
 
             def tell(words: str, number: int = number, robot: str = robot) -> None:
                 on_progress(number, f"{robot}, {words}")
 
             one = _Robot(world, robot, protocol, seed, kept, tell)
-            made[robot], by_scene[robot] = one.measured()
+            made[robot], by_scene[robot], by_frame[robot] = one.measured()
         found = facts | {"checkpoint": str(checkpoint), "measures": made, "by_scene": by_scene}
+        found["by_frame"] = by_frame
         write_atomic(folder / RESULTS, json.dumps(found, indent=1))
         kept.remove()
     return found
@@ -147,8 +158,8 @@ class _Robot:
             self._probe = train_probe(self.robot, self.world.tokenizer, stride, self.seed, self.tell)
         return self._probe
 
-    def measured(self) -> tuple[dict[str, Any], dict[str, list[float]]]:
-        """Return the figures, and those of each scene."""
+    def measured(self) -> tuple[dict[str, Any], dict[str, list[float]], dict[str, Any]]:
+        """Return the figures, those of each scene, and those of each frame of the action sequences."""
         frames = self.protocol.frames
         self.tell("action sequences")
         arrays = self.kept.part(
@@ -156,6 +167,11 @@ class _Robot:
             lambda: choose(self.world, self.scenes, self.probe, Scripted(NOISE), frames),
         )
         found, by_scene = choice_figures(arrays, self.seed)
+        by_frame = frame_errors(arrays)
+        found["calibration"] = calibration(
+            by_frame["uncertainty"], by_frame["error_px"], by_frame["pixel_rmse"],
+            unmask_steps=self.world.unmask_steps, temperature=self.world.temperature, seed=self.seed,
+        )  # fmt: skip
         self.tell("actions and their inverses")
         if missing := no_inverse(self.scenes.dimensions):
             found["inverse"] = {"missing": missing}
@@ -168,12 +184,26 @@ class _Robot:
                 within = PSNR_RANGE if name.endswith("psnr") else NATURAL
                 found["inverse"] |= summary(name, values, self.seed, within=within)
                 by_scene[f"inverse.{name}"] = rounded(values)
+        if len(self.probe.own):
+            goals = self.kept.part(f"planning-{self.robot}", self._planned)
+            found["planning"] = planning_figures(goals)
+            by_scene |= {f"planning.{way}": rounded(goals[way].astype(float)) for way in WAYS}
+        else:
+            found["planning"] = {"missing": "no part of the robot is read, so no goal can be reached"}
         text = self.kept.part(f"policies-{self.robot}", lambda: {"json": np.array(self._policies())})["json"]
         found["policies"] = json.loads(str(text))
         self.tell("speed")
         timed = self.kept.part(f"speed-{self.robot}", lambda: speed(self.world, self.scenes))
         found |= {name: rounded(value, 2) for name, value in timed.items()}
-        return found, by_scene
+        return found, by_scene, {name: rounded(values) for name, values in by_frame.items()}
+
+    def _planned(self) -> dict[str, NDArray[np.bool_]]:
+        """Return which goals are reached in each of WAYS."""
+        found = {}
+        for way in WAYS:
+            self.tell(f"planning, {way}")
+            found[way] = reached(self.world, self.scenes, self.probe, way)
+        return found
 
     def _policies(self) -> str:
         """Return what `hma policy-eval` finds, as JSON; or why there is no judge."""

@@ -81,12 +81,20 @@ class Cost:
         actions = self._own.clip(self._mean + self._std * rows).astype(np.float32)
         return actions.repeat(stride, axis=-2) if held and stride > 1 else actions
 
-    def imagine(self, sessions: Sequence[int], candidates: NDArray[Any]) -> Image:
-        """Return the images (N, C, H, S, S, 3) that candidates (N, C, H, A or K) lead to from sessions."""
+    def imagine(self, sessions: Sequence[int], candidates: NDArray[Any], *, ends: bool = False) -> Image:
+        """Return the images (N, C, H, S, S, 3) that candidates (N, C, H, A or K) lead to from sessions.
+
+        With `ends` it is the last one alone, (N, C, 1, S, S, 3), which saves decoding the others.
+        """
         count, tried, horizon = candidates.shape[:3]
         actions = self.actions(candidates).reshape(count * tried, horizon, self._own.stride, -1)
         world = self.world.fork(sessions, tried)
-        made = [world.step(dict(enumerate(actions[:, ahead]))) for ahead in range(horizon)]
+        last = horizon - 1
+        made = [
+            world.step(dict(enumerate(actions[:, ahead])), decoded=ahead == last or not ends)
+            for ahead in range(horizon)
+        ]
+        made = made[last:] if ends else made
         images = np.stack([[one[row] for row in range(count * tried)] for one in made], axis=1)
         return images.reshape(count, tried, *images.shape[1:])
 
@@ -106,7 +114,7 @@ class Cost:
             self.open([(one, None) for one in shown])
             scenes = list(range(len(shown)))
         sessions = [self.sessions[scene] for scene in scenes]
-        images = self.imagine(sessions, action_candidates.cpu().numpy())
+        images = self.imagine(sessions, action_candidates.cpu().numpy(), ends=self.judge is None)
         if self.judge is None:
             costs = goal_distance(images[:, :, -1], np.asarray(info_dict["goal"][:, 0]))
         else:

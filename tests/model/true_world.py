@@ -1,6 +1,7 @@
 """A world that knows the truth, and a viewer that keeps what it is shown."""
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -37,6 +38,7 @@ class TrueWorld:
     def __init__(self) -> None:
         self.rows: dict[int, LabSimulator] = {}
         self.steps: list[dict[int, NDArray[np.float32]]] = []
+        self.measure, self.uncertainty = False, dict[int, float]()
         self.begun: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
         self.blind: set[int] = set()
         self.sampling: list[tuple[int, float, str]] = []
@@ -60,7 +62,15 @@ class TrueWorld:
                     self._advance(first, chunk)
                 self.rows[session] = first
 
-    def step(self, actions: Mapping[int, NDArray[np.float32]]) -> dict[int, NDArray[np.uint8]]:
+    def fork(self, sessions: Sequence[int], n: int) -> "TrueWorld":
+        other = copy.copy(self)
+        rows = [self.rows[session].copy() for session in sessions for _ in range(n)]
+        other.rows, other.steps = dict(enumerate(rows)), []
+        return other
+
+    def step(
+        self, actions: Mapping[int, NDArray[np.float32]], *, decoded: bool = True
+    ) -> dict[int, NDArray[np.uint8]]:
         self.steps.append(dict(actions))
         self.sampling.append((self.unmask_steps, self.temperature, self.order))
         for row, chunk in actions.items():

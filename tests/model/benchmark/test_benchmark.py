@@ -1,6 +1,7 @@
 """The benchmark: a flawless and a frozen model, plain loops as the oracle, and stops at every part."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,15 @@ from hypothesis.extra.numpy import arrays
 
 from hma_data.errors import HMAError, OutputError, UsageError
 from hma_data.tokenizers.base import get_tokenizer
+from hma_model.benchmark import planning
 from hma_model.benchmark import run as running
 from hma_model.benchmark.measures import REACHED_PX, decisions, no_inverse
+from hma_model.benchmark.planning import difference, plan, verdict
 from hma_model.benchmark.report import compared, read_results, rows, write_report
 from hma_model.benchmark.run import QUICK, RESULTS, WORK, benchmark
 from hma_model.cli import main
 from hma_model.evaluation.agreement import Accuracy
+from hma_model.evaluation.calibration import NO_UNCERTAINTY
 from hma_model.evaluation.metrics import PSNR_LIMIT
 from hma_model.policies.judge import StateJudge, task_of
 from hma_model.simulate import World
@@ -34,7 +38,7 @@ TINY = replace(
 class FrozenWorld(FlawlessWorld):
     """A model in which nothing ever moves."""
 
-    def step(self, actions: Any) -> Any:
+    def step(self, actions: Any, *, decoded: bool = True) -> Any:
         return {row: self.rows[row].picture() for row in actions}
 
 
@@ -49,6 +53,7 @@ def probe(monkeypatch: pytest.MonkeyPatch) -> None:
     known: Any = KnownPlaces(monkeypatch)
     sure = Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24)
     judge = StateJudge(ROBOT, task_of(ROBOT, "reached"), known, -12.0, sure)
+    monkeypatch.setattr(planning, "ROUNDS", 1)
     monkeypatch.setattr(running, "train_probe", lambda *given: known)
     monkeypatch.setattr(running, "train_judge", lambda *given, **named: judge)
 
@@ -65,6 +70,10 @@ def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(
     assert one["inverse"]["return_px"] == one["inverse"]["true_return_px"] < 2 < one["inverse"]["turn_px"]
     assert one["policies"]["paired"]["first_chunks_equal"] and one["frames_per_second"] > 0
     assert other["psnr"] == other["copy_psnr"] < one["psnr"] and other["error_px"] > 1
+    assert one["planning"]["gap"] == 0 and one["planning"]["truth"] == one["planning"]["model"]
+    assert one["planning"]["verdict"] == "undecided"  # three scenes tell nothing
+    assert other["planning"]["truth"] == one["planning"]["truth"]  # the same planner and simulator
+    assert one["calibration"] == {"missing": NO_UNCERTAINTY} and "policies" in one
     assert other["inverse"]["return_px"] == other["inverse"]["turn_px"] == 0
 
 
@@ -102,6 +111,37 @@ def test_actions_without_an_inverse_are_refused_by_name() -> None:
     assert "vx only ever went one way" in no_inverse([replace(rate, low=0.0)])
 
 
+def test_the_planner_finds_actions_near_a_target(monkeypatch: pytest.MonkeyPatch) -> None:
+    target = np.array([0.6, -0.3])
+    low, high = np.full(2, -1.0), np.ones(2)
+
+    def costs(candidates: np.ndarray) -> np.ndarray:
+        return np.square(candidates.sum(axis=2) / 5 - target).sum(axis=-1)
+
+    monkeypatch.setattr(planning, "ROUNDS", 4)
+    found = plan(costs, low, high, 3, np.random.default_rng(0))
+    assert found.shape == (3, 5, 2) and np.abs(found).max() <= 1
+    assert np.linalg.norm(found.mean(axis=1) - target, axis=-1).max() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("truth", "model", "words"),
+    [(30, 5, "model"), (5, 3, "planner"), (30, 29, "undecided"), (16, 12, "undecided")],
+)
+def test_a_planning_gap_with_its_interval_and_verdict(truth: int, model: int, words: str) -> None:
+    one, other = np.arange(32) < truth, np.arange(32) < model
+    value, (low, high) = difference(one, other)
+    assert value == pytest.approx((truth - model) / 32) and -1 <= low <= value <= high <= 1
+    back, ends = difference(other, one)
+    assert back == -value and ends == pytest.approx([-high, -low])
+    # Bonett and Price: a pair is added to each kind of discordant scenes.
+    more, less = (truth - model + 1) / 34, 1 / 34
+    half = 1.959964 * math.sqrt((more + less - (more - less) ** 2) / 34)
+    assert [low, high] == pytest.approx([min(more - less - half, value), max(more - less + half, value)])
+    figures = {"gap_95": [low, high], "truth_95": [0.0, 0.4 if truth < 16 else 1.0]}
+    assert verdict(figures) == words
+
+
 @pytest.mark.slow
 def test_a_benchmark_stopped_at_every_part_ends_with_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -111,7 +151,7 @@ def test_a_benchmark_stopped_at_every_part_ends_with_the_same_figures(
 
     whole = benchmark("it", tmp_path / "whole", TINY, world=world_of(FlawlessWorld))
     out = tmp_path / "out"
-    parts = ("choose", "turn_back", "evaluate_policies", "speed")
+    parts = ("choose", "turn_back", "reached", "evaluate_policies", "speed")
     for number, part in enumerate(parts):
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             for name in (part, *parts[: max(number - 1, 0)]):  # what is finished is not done again
@@ -136,7 +176,7 @@ def test_the_card_the_page_and_a_comparison(tmp_path: Path, capsys: pytest.Captu
     for folder, kind in zip(folders, (FlawlessWorld, FrozenWorld), strict=True):
         found = benchmark(folder.name, folder, TINY, world=world_of(kind))
         page = write_report(found, folder)
-        assert "hma-benchmark 1, quick" in page.read_text()
+        assert "hma-benchmark 2, quick" in page.read_text()
         card = (folder / "benchmark.md").read_text()
         assert card.count("\n| ") == len(rows(found)) + 2 and "decision fidelity, right choices of 5" in card
         assert "not measured: 3 of at least 8 episodes" in card

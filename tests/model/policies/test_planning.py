@@ -71,7 +71,7 @@ class DotWorld:
         other.at = dict(enumerate(self.at[session] for session in sessions for _ in range(n)))
         return other
 
-    def step(self, actions: Any) -> dict[int, np.ndarray]:
+    def step(self, actions: Any, *, decoded: bool = True) -> dict[int, np.ndarray]:
         for session, chunk in actions.items():
             self.at[session] = (self.at[session] + chunk[0]).clip(6, SIDE - 6)
         return {session: self.image(session) for session in actions}
