@@ -10,6 +10,7 @@ B batch, T frames, S = h*w tokens of a frame, D width, A ages (the frame itself 
 R slots of a row, E width of the conditioning.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -62,37 +63,61 @@ class Embeddings:
         return [self.frames, self.actions]
 
 
-class ChannelNorm(nn.LayerNorm):
-    """A LayerNorm over the channels of each place: no place depends on what lies far from it.
+def convolve(conv: nn.Module, x: Tensor) -> Tensor:
+    """Apply a convolution to places with their channels last, (M, h, w, C)."""
+    made: Tensor = conv(x.permute(0, 3, 1, 2))
+    return made.permute(0, 2, 3, 1)
 
+
+class Block(nn.Module):
+    """Two modulated 3×3 convolutions with a residual connection; it begins as the identity.
+
+    The norms are over the channels of each place, so that no place depends on what lies far from it.
     Statistics over the whole frame (GroupNorm) let an error anywhere change everything; a rollout of such a
     network drifts several times as fast.
     """
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Normalise (M, C, h, w)."""
-        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
-
-
-class Block(nn.Module):
-    """Two modulated 3×3 convolutions with a residual connection; it begins as the identity."""
-
     def __init__(self, before: int, after: int) -> None:
         super().__init__()
-        self.norm1, self.conv1 = ChannelNorm(before), nn.Conv2d(before, after, 3, padding=1)
-        self.norm2, self.conv2 = ChannelNorm(after), nn.Conv2d(after, after, 3, padding=1)
+        self.norm1, self.conv1 = nn.LayerNorm(before), nn.Conv2d(before, after, 3, padding=1)
+        self.norm2, self.conv2 = nn.LayerNorm(after), nn.Conv2d(after, after, 3, padding=1)
         self.modulation = nn.Linear(CONDITIONING, 2 * after)
-        self.skip = nn.Conv2d(before, after, 1) if before != after else nn.Identity()
+        self.skip = nn.Conv2d(before, after, 1) if before != after else None
         nn.init.zeros_(self.conv2.weight)
         if self.conv2.bias is not None:
             nn.init.zeros_(self.conv2.bias)
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        """Apply the block to (M, C, h, w) under conditions (M, E)."""
-        gain, shift = self.modulation(condition)[..., None, None].chunk(2, dim=1)
-        hidden = self.conv1(F.silu(self.norm1(x)))
-        hidden = self.conv2(F.silu(torch.addcmul(shift, self.norm2(hidden), 1 + gain)))
-        return self.skip(x) + hidden
+        """Apply the block to (M, h, w, C) under conditions (M, E)."""
+        gain, shift = self.modulation(condition).to(x.dtype)[:, None, None].chunk(2, dim=-1)
+        hidden = convolve(self.conv1, F.silu(self.norm1(x)))
+        hidden = convolve(self.conv2, F.silu(torch.addcmul(shift, self.norm2(hidden), 1 + gain)))
+        return hidden + (x if self.skip is None else convolve(self.skip, x))
+
+
+class Ages(nn.Module):
+    """A linear map of what each place has seen, the newest first; frames are picked out one age at a time."""
+
+    def __init__(self, config: HMAConfig, channels: int) -> None:
+        super().__init__()
+        self.shape = config.frames, config.views, config.width
+        start = nn.Linear(math.prod(self.shape), channels)
+        self.weight, self.bias = start.weight, start.bias
+
+    def forward(self, frames: Tensor, index: Tensor, unseen: Tensor) -> Tensor:
+        """Map frames (N, views * S, D), of which each sees those numbered `index` (M, A), to (M, S, C).
+
+        `unseen` (M, A, D) is added to the frame of each age.
+        """
+        ages, views, _ = self.shape
+        maps = self.weight.unflatten(1, self.shape)  # (C, A, views, D)
+        offset = self.bias + torch.einsum("mad,cavd->mc", unseen, maps)
+        x = offset.to(frames.dtype).unsqueeze(1)
+        joined = frames.unflatten(1, (views, -1)).transpose(1, 2).flatten(2)  # (N, S, views * D)
+        for age in range(ages):
+            weight = maps[:, age].flatten(1).to(frames.dtype)
+            x = x + F.linear(joined.index_select(0, index[:, age]), weight)
+        return x
 
 
 class UNet(nn.Module):
@@ -109,7 +134,7 @@ class UNet(nn.Module):
         self.absent = nn.Parameter(torch.randn(1, width) * 0.02)
         self.unseen = nn.Parameter(torch.zeros(ages, width))  # added where an age repeats the oldest frame
         levels = config.levels
-        self.ages = nn.Linear(ages * width * views, levels[0])
+        self.ages = Ages(config, levels[0])
         height, across = config.token_grid
         self.grid = height // views, across
         self.position = nn.Parameter(torch.randn(levels[0], *self.grid) * 0.02)
@@ -125,7 +150,7 @@ class UNet(nn.Module):
         pairs = list(pairwise(levels))
         self.shrink = nn.ModuleList(nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairs)
         self.grow = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairs)
-        self.norm = ChannelNorm(levels[0])
+        self.norm = nn.LayerNorm(levels[0])
         self.output = nn.Conv2d(levels[0], views * width, 3, padding=1)
 
     def embed_frames(
@@ -151,7 +176,8 @@ class UNet(nn.Module):
         if actions is None:
             actions = self.absent.expand(*x.shape[:2], -1)
         if carried is None:
-            frames, of_actions, index, seen = *self._flat(x, actions), *self._of_window(times, len(x))
+            frames, of_actions = x.flatten(0, 1), actions.flatten(0, 1)
+            index, seen = self._of_window(times, len(x))
         else:
             frames, of_actions = carried.frames.flatten(0, 1), carried.actions.flatten(0, 1)
             assert times.slots is not None
@@ -163,18 +189,15 @@ class UNet(nn.Module):
         if not index.shape[1]:
             return torch.zeros_like(x)
         b, t = index.shape[:2]
+        condition = self.condition(of_actions[index].flatten(2).flatten(0, 1))
         if torch.is_autocast_enabled(x.device.type):  # else the products alone would be in less precision
             frames = frames.to(torch.get_autocast_dtype(x.device.type))
-        unseen = (self.unseen * ~seen.unsqueeze(-1)).to(frames.dtype)  # (B or 1, t, A, D)
-        stacked = frames[index].add(unseen.unsqueeze(3)).flatten(0, 1)  # (M, A, S, D)
-        condition = self.condition(of_actions[index].flatten(2).flatten(0, 1))
-        features = self._spread(stacked, condition).unflatten(0, (b, t))
+        unseen = (self.unseen * ~seen.unsqueeze(-1)).expand(b, -1, -1, -1).flatten(0, 1)
+        x = self.ages(frames, index.flatten(0, 1), unseen) + self.position.flatten(1).t().to(frames.dtype)
+        features = self._spread(x.unflatten(1, self.grid), condition).unflatten(0, (b, t))
         if not times.wanted:
             return features
         return torch.cat([features.new_zeros(b, times.wanted, *features.shape[2:]), features], dim=1)
-
-    def _flat(self, x: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        return x.flatten(0, 1), actions.flatten(0, 1)
 
     def _of_window(self, times: TimePositions, batch: int) -> tuple[Tensor, Tensor]:
         """Return for each frame of a window and age the index (B, T, A) of its frame, and whether it is seen.
@@ -202,27 +225,23 @@ class UNet(nn.Module):
         held = positions - torch.minimum(ages, positions)
         return held % slots * rows + times.slots.unsqueeze(-1) % rows, seen
 
-    def _spread(self, stacked: Tensor, condition: Tensor) -> Tensor:
-        """Return features (M, S, D) of the frames (M, A, S, D) that each frame sees."""
-        views = self.config.views
-        seen = stacked.unflatten(2, (views, -1)).permute(0, 3, 1, 2, 4).flatten(2)  # (M, h*w, A * views * D)
-        x = self.ages(seen).transpose(1, 2).unflatten(2, self.grid)
-        x = x + self.position.to(x.dtype)
+    def _spread(self, x: Tensor, condition: Tensor) -> Tensor:
+        """Return features (M, S, D) of frames (M, h, w, C) under conditions (M, E)."""
         layers, kept = self.config.layers, []
         for level in range(self.depth + 1):
             for block in self.blocks[level * layers : (level + 1) * layers]:
                 x = self._run(block, x, condition)
             if level < self.depth:
                 kept.append(x)
-                x = self.shrink[level](x)
+                x = convolve(self.shrink[level], x)
         first = (self.depth + 1) * layers
         for level in reversed(range(self.depth)):
-            x = F.interpolate(self.grow[level](x), scale_factor=2.0, mode="nearest")
-            x = torch.cat([x, kept[level]], dim=1)
+            x = convolve(self.grow[level], x).repeat_interleave(2, 1).repeat_interleave(2, 2)
+            x = torch.cat([x, kept[level]], dim=-1)
             for block in self.blocks[first + level * layers : first + (level + 1) * layers]:
                 x = self._run(block, x, condition)
-        x = self.output(F.silu(self.norm(x)))
-        return x.unflatten(1, (views, -1)).flatten(3).transpose(2, 3).flatten(1, 2)
+        x = convolve(self.output, F.silu(self.norm(x)))
+        return x.unflatten(-1, (self.config.views, -1)).permute(0, 3, 1, 2, 4).flatten(1, 3)
 
     def _run(self, block: nn.Module, x: Tensor, condition: Tensor) -> Tensor:
         if self.checkpointing and self.training and torch.is_grad_enabled():
