@@ -169,12 +169,15 @@ def lab_robots(*names: str) -> dict[str, Drivable]:
     return robots
 
 
+SMALL_HEAD: dict[str, Any] = {"channels": 3, "diffusion_width": 32, "diffusion_depth": 1}
+
+
 def trained_on(
     views: Any, shards: ShardSet, folder: Path, objective: str = "forward", frames: int = 12
 ) -> Any:
     """Return a world of a saved model whose robot was trained on these cameras."""
     spec, count = shards.spec, 1 if isinstance(views, str) else len(views)
-    sizes = {"factored": spec.factored} if spec.kind == "discrete" else {"channels": 3}
+    sizes = {"factored": spec.factored} if spec.kind == "discrete" else SMALL_HEAD
     config = HMAConfig(
         kind=spec.kind, layers=1, width=16, heads=2, grid=(8, 8), views=count, frames=frames,
         tokenizer=spec.to_json(), objectives={objective: 1.0}, **sizes,

@@ -326,7 +326,9 @@ class CameraLook:
         The answer is sure, no (they are certainly in order), or empty where it is unknown.
         """
         if self.colours:
-            colours = np.unique(np.concatenate(self.colours), axis=0)
+            # One number a colour: sorting rows takes twenty times as long.
+            codes = np.unique(np.concatenate(self.colours).astype(np.uint32) @ np.uint32([65536, 256, 1]))
+            colours = np.stack([codes >> 16, codes >> 8, codes], axis=1).astype(np.uint8)
             straight, turned = ycbcr_share(colours), ycbcr_share(colours[:, ::-1])
             if straight is not None and turned is not None:
                 if turned >= SURE and straight <= CHANCE:

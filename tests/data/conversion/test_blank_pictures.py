@@ -159,9 +159,8 @@ def check(frames: np.ndarray) -> PictureCheck:
     return seen
 
 
-@pytest.mark.parametrize("size", [64, 128, 480])
-@pytest.mark.parametrize("level", [0, 16, 128])
-@pytest.mark.parametrize("sigma", [0, 2, 5])
+@pytest.mark.parametrize("size", [64, 480])
+@pytest.mark.parametrize(("level", "sigma"), [(0, 0), (0, 5), (16, 2), (128, 5)])
 def test_the_noise_of_a_sensor_does_not_hide_a_blank_camera(size: int, level: int, sigma: float) -> None:
     noise = np.random.default_rng(0).normal(level, sigma, (8, size, size, 3))
     assert check(np.clip(noise, 0, 255).astype(np.uint8)).blank

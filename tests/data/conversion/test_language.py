@@ -8,12 +8,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from lerobot.annotations.steerable_pipeline.reader import iter_episodes
-from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
-from lerobot.annotations.steerable_pipeline.writer import LanguageColumnsWriter, speech_atom
-from lerobot.datasets.io_utils import load_info, write_info
-from lerobot.datasets.language import language_feature_info
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
@@ -30,7 +24,7 @@ def subtask(text: str, at: float) -> dict[str, Any]:
 
 
 SAID = {
-    0: [subtask("reach", 0.0), subtask("grasp é", 0.4), speech_atom(0.5, "got it")],
+    0: [subtask("reach", 0.0), subtask("grasp é", 0.4)],
     2: [
         subtask("look", 0.0),
         {"role": "user", "content": "not there", "style": "interjection", "timestamp": 0.3},
@@ -43,9 +37,16 @@ SAID = {
 @pytest.fixture
 def dataset(tmp_path: Path) -> Path:
     """A dataset of three episodes, two of them annotated by lerobot's own writer."""
+    # Only the tests that need it wait for the import, which takes seconds.
+    from lerobot.annotations.steerable_pipeline.reader import iter_episodes
+    from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
+    from lerobot.annotations.steerable_pipeline.writer import LanguageColumnsWriter, speech_atom
+    from lerobot.datasets.io_utils import load_info, write_info
+    from lerobot.datasets.language import language_feature_info
+
     folder = write_dataset(tmp_path / "recorded")
     records = list(iter_episodes(folder))
-    for episode, items in SAID.items():
+    for episode, items in (SAID | {0: [*SAID[0], speech_atom(0.5, "got it")]}).items():
         stamps = np.array(records[episode].frame_timestamps)
         rows = [item | {"timestamp": float(stamps[round(item["timestamp"] * 10)])} for item in items]
         EpisodeStaging(tmp_path / "staging", episode).write("plan", rows)
@@ -58,9 +59,11 @@ def dataset(tmp_path: Path) -> Path:
 
 def said(folder: Path) -> list[tuple[Any, Any]]:
     """The language columns of every row, as lerobot gives them."""
-    found = LeRobotDataset("lab/robot", root=folder, video_backend="pyav")
-    items = [found[row] for row in range(len(found))]
-    return [(item["language_persistent"], item["language_events"]) for item in items]
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    columns = "language_persistent", "language_events"
+    rows = LeRobotDataset("lab/robot", root=folder).hf_dataset.select_columns(list(columns))
+    return [tuple(row[column] for column in columns) for row in rows]
 
 
 def test_shards_state_what_is_said_and_the_export_says_it_again(dataset: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from tests.data.inferring import (
 )
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", list(KINDS)[::3])  # test_rosbag reads all of them
 def test_every_kind_of_bag(bags: dict[str, Path], recording: Recording, kind: str) -> None:
     values = inferred(bags[kind])
     assert keys(values, "action") == ["/command.data"] and keys(values, "state") == ["/joint_states.position"]

@@ -8,7 +8,6 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
@@ -20,10 +19,16 @@ from tests.command import fails, hma
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 
 
+def reader(path: Path) -> Any:
+    from rerun.chunk import RrdReader
+
+    return RrdReader(path)
+
+
 def read(path: Path) -> dict[str, dict[str, list[Any]]]:
     """entity -> column -> values in the order of the frames; static columns too."""
     found: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
-    for chunk in RrdReader(path).stream().to_chunks():
+    for chunk in reader(path).stream().to_chunks():
         for name, values in chunk.to_record_batch().to_pydict().items():
             if not name.startswith("rerun.controls"):
                 found[chunk.entity_path][name] += values
@@ -63,7 +68,7 @@ def test_a_recording_is_shown_frame_by_frame(arm: Path, tmp_path: Path) -> None:
     assert found["/actions"]["SeriesLines:names"] == [["a", "b", "c"]]
     assert np.abs(pictures(found["/cameras/top"]).astype(int) - image).max() < 8
     assert "demo_1" in found["/about"]["TextDocument:text"][0][0]
-    assert list(RrdReader(tmp_path / "seen.rrd").blueprints())
+    assert list(reader(tmp_path / "seen.rrd").blueprints())
 
 
 def test_a_shard_set_is_shown_by_its_decoded_tokens(arm: Path, tmp_path: Path) -> None:

@@ -141,19 +141,18 @@ def threads():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("name", ["fsq-8", "fsq-16", "vae-8"])
-@pytest.mark.parametrize("size", [1, 5])
-def test_a_frame_has_the_same_tokens_in_any_batch(name, size):
+@pytest.mark.parametrize("name", ["fsq-8", "vae-8"])
+def test_a_frame_has_the_same_tokens_in_any_batch(name):
     tokenizer = get_tokenizer(name)
     frames = scenes(7, tokenizer.spec.image_size)
-    whole = tokenizer.encode(np.concatenate([frames, frames]))
-    assert np.array_equal(whole[:7], whole[7:])
-    parts = [tokenizer.encode(frames[start : start + size]) for start in range(0, 7, size)]
+    order = np.random.default_rng(0).permutation(7)
+    whole = tokenizer.encode(np.concatenate([frames, frames[order]]))
+    assert np.array_equal(whole[order], whole[7:])
+    parts = [tokenizer.encode(frames[start:stop]) for start, stop in ((0, 1), (1, 6), (6, 7))]
     assert np.array_equal(np.concatenate(parts), whole[:7])
 
 
-@pytest.mark.parametrize("name", ["fsq-8", "fsq-16", "vae-8"])
-@pytest.mark.parametrize("count", [3, 8])
+@pytest.mark.parametrize(("name", "count"), [("fsq-8", 8), ("fsq-16", 3), ("vae-8", 3)])
 def test_a_frame_has_the_same_latents_to_the_last_bit_on_any_number_of_threads(name, count, threads):
     # Ids alone would hide it: one latent in a million lies so near a border that its last bits count.
     tokenizer = get_tokenizer(name)
@@ -168,7 +167,7 @@ def test_a_frame_has_the_same_latents_to_the_last_bit_on_any_number_of_threads(n
     assert len(one) == 4 and one == many
 
 
-@pytest.mark.parametrize("name", ["fsq-8", "fsq-16", "vae-8"])
+@pytest.mark.parametrize("name", ["fsq-8", "vae-8"])
 def test_a_frame_has_the_same_tokens_however_it_lies_in_memory(name):
     tokenizer = get_tokenizer(name)
     frames = scenes(3, tokenizer.spec.image_size)
@@ -182,17 +181,10 @@ def test_a_frame_has_the_same_tokens_however_it_lies_in_memory(name):
         assert np.array_equal(tokenizer.encode(same), whole)
 
 
-@pytest.mark.parametrize("size", [1, 3])
-def test_tokens_decode_to_the_same_pixels_in_any_batch(fsq8, size):
-    tokens = np.random.default_rng(2).integers(0, 2**18, (32, 8, 8))
-    parts = [fsq8.decode(tokens[start : start + size]) for start in range(0, 32, size)]
+def test_tokens_decode_to_the_same_pixels_in_any_batch(fsq8):
+    tokens = np.random.default_rng(2).integers(0, 2**18, (12, 8, 8))
+    parts = [fsq8.decode(tokens[start:stop]) for start, stop in ((0, 1), (1, 4), (4, 12))]
     assert np.array_equal(np.concatenate(parts), fsq8.decode(tokens))
-
-
-def test_a_frame_has_the_same_ids_in_any_order(fsq8):
-    frames = scenes(21, 128)
-    order = np.random.default_rng(0).permutation(21)
-    assert np.array_equal(fsq8.encode(frames[order]), fsq8.encode(frames)[order])
 
 
 def test_threads_may_encode_at_the_same_time(fsq8, threads):

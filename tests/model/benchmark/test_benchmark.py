@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,21 +49,31 @@ def world_of(kind: type[FlawlessWorld]) -> Any:
     return made
 
 
-@pytest.fixture(autouse=True)
-def probe(monkeypatch: pytest.MonkeyPatch) -> None:
-    known: Any = KnownPlaces(monkeypatch)
-    sure = Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24)
-    judge = StateJudge(ROBOT, task_of(ROBOT, "reached"), known, -12.0, sure)
-    monkeypatch.setattr(planning, "ROUNDS", 1)
-    monkeypatch.setattr(running, "train_probe", lambda *given: known)
-    monkeypatch.setattr(running, "train_judge", lambda *given, **named: judge)
+@pytest.fixture(autouse=True, scope="module")
+def probe() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        known: Any = KnownPlaces(monkeypatch)
+        sure = Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24)
+        judge = StateJudge(ROBOT, task_of(ROBOT, "reached"), known, -12.0, sure)
+        monkeypatch.setattr(planning, "ROUNDS", 1)
+        monkeypatch.setattr(running, "train_probe", lambda *given: known)
+        monkeypatch.setattr(running, "train_judge", lambda *given, **named: judge)
+        yield
 
 
-def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(tmp_path: Path) -> None:
-    best, frozen = (
-        benchmark("it", tmp_path / kind.__name__, TINY, world=world_of(kind))["measures"]
-        for kind in (FlawlessWorld, FrozenWorld)
-    )
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The finished benchmarks of a flawless and of a frozen model."""
+    made = tmp_path_factory.mktemp("best"), tmp_path_factory.mktemp("frozen")
+    for folder, kind in zip(made, (FlawlessWorld, FrozenWorld), strict=True):
+        write_report(benchmark(folder.name, folder, TINY, world=world_of(kind)), folder)
+    return made
+
+
+def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(
+    folders: tuple[Path, Path],
+) -> None:
+    best, frozen = (read_results(folder)["measures"] for folder in folders)
     assert list(best) == [ROBOT]
     one, other = best[ROBOT], frozen[ROBOT]
     assert one["psnr"] == PSNR_LIMIT and one["error_px_last"] == 0 and one["decision"] == 1
@@ -171,11 +182,12 @@ def test_a_benchmark_stopped_at_every_part_ends_with_the_same_figures(
         benchmark("it", out, TINY, seed=1, world=world_of(FlawlessWorld))
 
 
-def test_the_card_the_page_and_a_comparison(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folders = tmp_path / "best", tmp_path / "frozen"
-    for folder, kind in zip(folders, (FlawlessWorld, FrozenWorld), strict=True):
-        found = benchmark(folder.name, folder, TINY, world=world_of(kind))
-        page = write_report(found, folder)
+def test_the_card_the_page_and_a_comparison(
+    folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder in folders:
+        found = read_results(folder)
+        (page,) = folder.glob("*.html")
         assert "hma-benchmark 2, quick" in page.read_text()
         card = (folder / "benchmark.md").read_text()
         assert card.count("\n| ") == len(rows(found)) + 2 and "decision fidelity, right choices of 5" in card

@@ -84,7 +84,7 @@ def test_accuracy_counts_successes_and_failures_alike() -> None:
 def test_a_judge_that_guesses_hardly_ever_passes(count: int, says_success: float) -> None:
     """However few the successes; it need not be a fair coin."""
     rng, draws = np.random.default_rng(0), 400
-    for successes in (*range(1, 13), 18, 24):
+    for successes in (1, 2, 3, 5, 8, 12, 24):
         true = np.arange(count) < successes
         passed = [accuracy(true, rng.random(count) < says_success).better_than_chance for _ in range(draws)]
         assert np.mean(passed) <= 0.05, successes

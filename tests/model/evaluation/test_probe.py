@@ -29,7 +29,7 @@ def scenes(count, seed):
 
 @pytest.fixture(scope="module")
 def probe() -> Probe:
-    return fit(*scenes(300, 0), driven=2, steps=120)
+    return fit(*scenes(150, 0), driven=2, steps=50)
 
 
 def test_places_are_read_to_a_pixel_or_two_off_other_pictures(probe):

@@ -29,7 +29,8 @@ from tests.command import hma
 from tests.model.export.checkpoints import ROBOT, Driver, drawn_as_torch
 from tests.model.true_world import BlockLatents, latent_model
 
-FRAMES = 100
+pytestmark = pytest.mark.slow  # exporting a graph takes a quarter of a minute
+FRAMES = 40
 
 
 def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[Any, Any, float]]:
@@ -65,7 +66,6 @@ def test_a_u_net_makes_the_pixels_of_torch(pixels: Path) -> None:
     assert len({own.tobytes() for own, *_ in made}) > FRAMES / 2
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(3000)
 def test_every_bundled_robot_makes_the_tokens_of_torch(tmp_path: Path) -> None:
     manifest = export_checkpoint("embedded", [], tmp_path / "page", None)

@@ -1,5 +1,6 @@
 """A page as a static Space: its header, what it replaces, and which Spaces are refused."""
 
+import json
 import shutil
 from importlib import import_module
 from pathlib import Path
@@ -9,12 +10,25 @@ import pytest
 import yaml
 
 from hma_data.errors import HubError
+from hma_model.export.folder import FORMAT, MANIFEST
 from hma_model.export.space import Space
 from tests.command import hma
 from tests.hub_server import Hub
+from tests.model.export.checkpoints import save_tokens
 
 pytest_plugins = ["tests.hub_fixtures"]
 NAME = "team/drive"
+
+
+@pytest.fixture(scope="module")
+def tokens(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint, and a folder that stands for its page."""
+    folder = tmp_path_factory.mktemp("tokens")
+    save_tokens(folder / "model")
+    (folder / "page").mkdir()
+    (folder / "page" / "index.html").write_text("a page")
+    (folder / "page" / MANIFEST).write_text(json.dumps({"format": FORMAT, "model": "model"}))
+    return folder / "page"
 
 
 def space(server: Hub) -> dict[str, bytes]:

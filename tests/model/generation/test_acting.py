@@ -24,9 +24,10 @@ def wanted(
     return model.predict_actions(given[0], NAMES[row], given[1], given[2])[0, -1]
 
 
-@pytest.mark.parametrize("cache", [True, False])
 @pytest.mark.parametrize(
-    ("layout", "kind"), [(name, "discrete") for name in LAYOUTS] + [("rotary", "continuous")]
+    ("layout", "kind", "cache"),
+    [(name, "discrete", True) for name in LAYOUTS]
+    + [("rotary", "continuous", True), ("rotary", "discrete", False), ("learned", "discrete", False)],
 )
 def test_the_cached_chunk_is_that_of_the_whole_history(layout: str, kind: str, cache: bool) -> None:
     model = small_model(kind=kind, **LAYOUTS[layout] | ACTS)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import nn
-from torch._inductor import config as inductor
 
 from hma_data.errors import HMAError
 from hma_model.generation import engine
@@ -161,7 +160,7 @@ def test_what_a_rollout_returns_can_be_changed_and_trained_on() -> None:
 
 def test_without_a_compiler_the_same_frames_are_made_and_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     model = small_model()
-    monkeypatch.setattr(inductor.cpp, "cxx", (None, "/nowhere/g++"))
+    monkeypatch.setattr("torch._inductor.config.cpp.cxx", (None, "/nowhere/g++"))
     with pytest.warns(
         RuntimeWarning, match=r"compile: a C\+\+ compiler .* is missing, so nothing is compiled"
     ):

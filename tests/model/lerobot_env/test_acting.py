@@ -22,6 +22,7 @@ from hma_model.policies.base import begin, checked
 from hma_model.simulate import World
 from tests.model.true_world import tiny_model
 
+pytestmark = pytest.mark.slow  # of the import of lerobot
 ROBOT = "rails_03"
 
 
@@ -83,7 +84,6 @@ def test_what_does_not_fit_is_one_line(run: Path, tmp_path: Path) -> None:
         WorldModelPolicy(WorldModelConfig(checkpoint=str(tmp_path / "dreams"), device="cpu"))
 
 
-@pytest.mark.slow
 def test_lerobot_eval_runs_it(run: Path, tmp_path: Path) -> None:
     found = subprocess.run(
         [

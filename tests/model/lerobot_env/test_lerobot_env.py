@@ -17,6 +17,7 @@ from hma_model.lerobot_env import HMAEnvConfig, vector
 from hma_model.worlds.world import World
 from tests.model.policies.test_lerobot_policy import CAMERA, saved
 
+pytestmark = pytest.mark.slow  # of the import of lerobot
 ROBOT = "rails_03"
 RENAME = "--rename_map=" + json.dumps({"observation.image": CAMERA})
 IMAGE = np.full((64, 64, 3), 90, np.uint8)
@@ -151,7 +152,6 @@ def test_a_repository_is_loaded_in_the_revision_of_its_file(monkeypatch: pytest.
     assert asked == ["org/m@abc"]
 
 
-@pytest.mark.slow
 def test_lerobot_eval_and_its_recording(tmp_path: Path) -> None:
     saved(tmp_path / "policy", state=2)
     found = subprocess.run(

@@ -28,6 +28,7 @@ from hma_model.simulate import World, load_world
 from tests.model.shards import make_shards
 from tests.model.true_world import trained_on
 
+pytestmark = pytest.mark.slow  # of the import of lerobot, and of transformers, which the encoder needs
 ROBOT, CAMERA = "twist_arm", "observation.images.top"
 HELD_OUT = 16
 
@@ -111,7 +112,6 @@ def test_its_true_and_false_positives_are_those_of_the_held_out_episodes(
     assert found.to_json()["false_positive_interval"] == pytest.approx((0.003, 0.527), abs=1e-3)
 
 
-@pytest.mark.slow
 def test_policies_are_scored_in_the_model_alone_and_a_stop_continues(
     world: World, shards: Path, judge: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,7 +204,6 @@ def test_what_is_no_safe_reward_model_of_frames_is_refused_in_one_line(
         RewardModel(str(cut), ["top"], ROBOT)
 
 
-@pytest.mark.slow  # transformers, of which the encoder is, comes with the slow tests' group
 def test_lerobots_classifier_runs_no_code_and_gives_its_own_rewards(tmp_path: Path) -> None:
     import transformers
     from lerobot.rewards.classifier.configuration_classifier import RewardClassifierConfig

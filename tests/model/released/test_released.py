@@ -193,8 +193,10 @@ def test_the_tokenizer_is_the_papers_where_the_sizes_are(tmp_path: Path) -> None
         hub.import_released(source, tmp_path / "no", tokenizer="fsq-8")
 
 
-@pytest.mark.parametrize("actions", [True, False])
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS if "continuous" not in name])
+@pytest.mark.parametrize(
+    ("layout", "actions"),
+    [(name, True) for name in LAYOUTS if "continuous" not in name] + [("joint", False), ("concat", False)],
+)
 def test_the_cache_changes_nothing_in_a_released_rollout(layout: str, actions: bool) -> None:
     model = _model(**LAYOUTS[layout])
     batch = small_batch(model.config, ["arm", "pusher"], frames=9)
