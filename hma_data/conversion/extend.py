@@ -107,8 +107,10 @@ def _refuse_damaged(out: Path, base: Manifest) -> None:
     sizes = shard_sizes(out)
     for shard in base.shards:
         if sizes.get(shard.path) != shard.bytes:
-            fault = f"is missing, or has other than the {shard.bytes:,} bytes of the manifest"
-            raise OutputError(out / shard.path, fault, "put back a copy of it, or --overwrite to start anew")
+            fault = f"is missing, or does not have the {shard.bytes:,} bytes of the manifest"
+            raise OutputError(
+                out / shard.path, fault, "restore it from a copy, or start over with --overwrite"
+            )
     if damaged := damaged_files(out, base):
         remedy = f"hma shards restat {out} writes it anew from the shards"
         raise OutputError(damaged[0], "is missing, or changed since the manifest was written", remedy)
@@ -127,12 +129,10 @@ def _refuse_changed(
             return True
 
     if refs:
-        log.info("%s: a file has changed; %s known episodes are read again", out, f"{len(refs):,}")
+        log.info("%s: a file has changed; rereading %s known episodes", out, f"{len(refs):,}")
     if changed := [ref.id for ref in refs if is_changed(ref)]:
-        fault = (
-            f"cannot be extended: {len(changed):,} of its episodes were recorded anew, first {changed[0]!r}"
-        )
-        raise OutputError(out, fault, "--overwrite to start anew, or give the new episodes other names")
+        fault = f"cannot be extended: {len(changed):,} of its episodes were re-recorded, first {changed[0]!r}"
+        raise OutputError(out, fault, "--overwrite to start over, or give the new episodes other names")
 
 
 def _with(base: Manifest, new: Records[EpisodeRef], first: int, shard_frames: int | None) -> Plan:

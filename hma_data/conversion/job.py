@@ -154,7 +154,9 @@ class Conversion:
     def __post_init__(self) -> None:
         if self.to == "lerobot" and self.extend:
             raise UsageError(
-                "--extend", "adds to shard sets; a LeRobotDataset is made anew", "give another --out"
+                "--extend",
+                "works for shards only; a LeRobotDataset is always written from scratch",
+                "give another --out",
             )
         if self.to == "shards" and self.settings.drop_idle:
             fault = "is for --to lerobot: frames left out of shards would be pauses, which no window crosses"
@@ -278,7 +280,7 @@ class _Run:
             fault = (
                 f"has rows of stride {stride} (--frames strided), the YAML gives stride {embodiment.stride}"
             )
-            remedy = f"set stride: {stride} in the YAML, choose another --out, or --overwrite to start anew"
+            remedy = f"set stride: {stride} in the YAML, choose another --out, or --overwrite to start over"
             raise OutputError(self.folder, fault, remedy)
 
     def make(self, plan: Plan, base: Manifest | None, share: Share | None, on_progress: OnProgress) -> None:

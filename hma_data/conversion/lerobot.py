@@ -487,7 +487,7 @@ class LeRobotHolder:
         path = self._conversion()
         if path is None:
             return None
-        return Manifest.from_text(path.read_bytes(), path, "--overwrite makes the dataset anew")
+        return Manifest.from_text(path.read_bytes(), path, "--overwrite writes the dataset again")
 
     def _conversion(self) -> Path | None:
         """Return the file of a dataset of ours in `out`; None where nothing is there."""

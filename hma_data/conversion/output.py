@@ -279,9 +279,9 @@ def _metadata(out: Path, names: list[str]) -> Iterator[tuple[str, dict[bytes, by
 
 def other_plan(out: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> OutputError:
     """Return the error for a folder that holds the set of another plan."""
-    remedy = "choose another --out, or --overwrite to start anew"
+    remedy = "choose another --out, or --overwrite to start over"
     if ways(ours) == ways(theirs) and "to" not in ours:
-        remedy = "--extend adds the episodes that are new, --overwrite starts anew"
+        remedy = "--extend adds the episodes that are new, --overwrite starts over"
     fault = f"belongs to another conversion; different: {differences(ours, theirs)}"
     return OutputError(out, fault, remedy)
 

@@ -131,13 +131,13 @@ def held_out_line(manifest: Manifest, plan: Plan) -> str:
     fraction = plan.facts["settings"]["val_fraction"]
     said = f"{count:,} of {human_count(total, 'episode')} held out for validation, "
     if plan.own_split:
-        said += "by the recording's own split, which goes before --val-fraction"
+        said += "by the recording's own split, which takes precedence over --val-fraction"
     elif fraction is None:
-        said += f"{VAL_FRACTION:.0%} or at least {HELD_OUT}, of few a quarter; --val-fraction changes it"
+        said += f"{VAL_FRACTION:.0%}, at least {HELD_OUT} but at most a quarter; --val-fraction changes it"
     else:
         said += f"by --val-fraction {fraction:g}"
     if 0 < count < HELD_OUT:
-        said += f"; fewer than {HELD_OUT} say little about a model: record more episodes"
+        said += f"; fewer than {HELD_OUT} are too few to judge a model: record more episodes"
     return said
 
 
@@ -149,9 +149,9 @@ def _empty_val(manifest: Manifest, plan: Plan) -> str:
     if any(unit.split == "val" for unit in plan.units):
         return "its episodes were refused, see quarantine.jsonl"
     if settings["limit"]:
-        fault = f"the first {plan.episodes:,} episodes are train, by a split of the recording's own"
-        return f"{fault} — a larger --limit reaches its others"
-    return "the episodes are of one group, or all train by a split of the recording's own"
+        fault = f"the recording's own split puts the first {plan.episodes:,} episodes in train"
+        return f"{fault}; use a larger --limit"
+    return "all episodes belong to one group, or to train in the recording's own split"
 
 
 def rate_warning(folder: Path, out: Path) -> str:

@@ -283,7 +283,7 @@ def _grid(episode_id: str, frames: Floats, embodiment: Embodiment, timed: list[T
         grid, total = frames[(frames >= start - close) & (frames <= stop + close)], len(frames)
     if not len(grid):
         spans = ", ".join(f"{name} {times[0]:.3f} to {times[-1]:.3f} s" for name, times, *_ in timed)
-        fault = f"its streams never run together: {spans}"
+        fault = f"its streams do not overlap in time: {spans}"
         raise AlignmentError(episode_id, fault, _clock_remedy(embodiment))
     return grid, total - len(grid)
 

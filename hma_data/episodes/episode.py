@@ -172,7 +172,7 @@ class Pictures:
             picture = self._decode(int(index))
             if picture.shape != first.shape:
                 sizes = f"{first.shape} and {picture.shape}"
-                raise EpisodeError("", f"pictures change size within the episode: {sizes}")
+                raise EpisodeError("", f"images change size within the episode: {sizes}")
             pictures[i] = picture
         return pictures
 

@@ -47,7 +47,7 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str, least: int = 0) ->
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
     head = buffer[:26].tobytes()
     if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:] in (b"\x10\0", b"\x10\4"):
-        raise EpisodeError(where, "a picture has 16 bits of grey: depth, not colour", "name another camera")
+        raise EpisodeError(where, "an image has 16 bits of grey: depth, not colour", "name another camera")
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
     if least and head[:2] == b"\xff\xd8":
         side = _short_side(memoryview(buffer))
@@ -58,7 +58,7 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str, least: int = 0) ->
     except cv2.error as error:  # OpenCV checks the claimed size before it decodes
         picture, fault = None, f": {error.err}"
     if picture is None:
-        raise EpisodeError(where, f"a picture of {len(buffer)} bytes cannot be decoded{fault}")
+        raise EpisodeError(where, f"an image of {len(buffer)} bytes cannot be decoded{fault}")
     return picture
 
 
@@ -131,7 +131,7 @@ def prepare(
     if camera.crop:
         x, y, width, height = camera.crop
         if y + height > frames.shape[1] or x + width > frames.shape[2]:
-            fault = f"crop {list(camera.crop)} leaves the picture of {frames.shape[2]}×{frames.shape[1]}"
+            fault = f"crop {list(camera.crop)} leaves the image of {frames.shape[2]}×{frames.shape[1]}"
             raise EpisodeError(f"camera {camera.name}", fault)
         frames = frames[:, y : y + height, x : x + width]
     return resize(frames, size, camera.resize, resize_filter, out)
@@ -310,7 +310,7 @@ def picture_flags(seen: PictureCheck, rule: Quality, episode_id: str, camera: st
     share = seen.repeated / max(seen.pictures - 1, 1)
     for name, met, count, said in (
         ("blank", seen.blank, seen.pictures, "shows one colour throughout"),
-        ("still", seen.still, seen.pictures, "shows one picture throughout"),
+        ("still", seen.still, seen.pictures, "shows one image throughout"),
         ("repeated", share > rule.repeated_share, seen.repeated, "repeats pictures"),
     ):
         if met and getattr(rule, name) == "refuse":

@@ -132,7 +132,7 @@ def framing(camera: Camera, box: Box | None, height: int, width: int) -> Framing
     outside = 1 - inside_wide * inside_tall / (wide * tall)
     side = max(round(max(wide, tall) * (1 + 2 * MARGIN)), NARROWEST)
     cut_off = outside > CUT_OFF
-    fault = f"what moves lies in {wide}×{tall} of {width}×{height} pixels"
+    fault = f"the moving region is {wide}×{tall} of {width}×{height} pixels"
     if cut_off:
         how = "crop" if camera.crop else f"resize: {camera.resize}"
         fault += f", and {how} cuts off {outside:.0%} of that"
@@ -207,8 +207,8 @@ class Kept:
 
     def __str__(self) -> str:
         if not self.moved:
-            return "nothing is seen to move"
+            return "nothing moves in the sampled frames"
         return (
-            f"what moves, {100 * self.share:.2g} % of the pixels, is kept at {self.psnr_db:.1f} dB: "
-            f"decoded frames show {self.change_shown:.0%} of its change"
+            f"moving pixels ({100 * self.share:.2g} % of the image) are decoded at {self.psnr_db:.1f} dB: "
+            f"decoded frames show {self.change_shown:.0%} of the recorded change"
         )

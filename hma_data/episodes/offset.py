@@ -59,21 +59,19 @@ class Offset:
     def measured(self) -> str:
         """Return the ages and delays as text."""
         return (
-            f"the last one {_ms(self.age_ms)} before each picture, the next one {_ms(self.delay_ms)} after it"
+            f"the last one {_ms(self.age_ms)} before each image, the next one {_ms(self.delay_ms)} after it"
         )
 
     @property
     def said(self) -> str:
         """Return as text how commands come."""
         if self.after_ms is None:
-            return (
-                f"commands are not tied to pictures, the last one is {_ms(self.age_ms)} old at each picture"
-            )
+            return f"actions are not tied to images; the last one is {_ms(self.age_ms)} old at each image"
         median, spread = self.after_ms
         side = "before" if median < 0 else "after"
-        come = f"commands come {_ms((abs(median), spread))} {side} each picture"
+        come = f"actions come {_ms((abs(median), spread))} {side} each image"
         if self.tolerance_ms and median > UNCLEAR_PART * self.period_ms:
-            come += ", about midway to the next (remove tolerance_ms if they belong to the next)"
+            come += ", about midway to the next (remove tolerance_ms if they belong to the next image)"
         return come
 
     @property

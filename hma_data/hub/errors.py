@@ -62,11 +62,11 @@ def explain(where: str, fault: BaseException) -> HubError:
     if isinstance(fault, OSError) and fault.errno is not None:
         return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
     if isinstance(fault, OSError):
-        return HubError(where, f"did not come whole: {shown(str(fault))}", RUN_AGAIN)
+        return HubError(where, f"was not transferred completely: {shown(str(fault))}", RUN_AGAIN)
     if isinstance(fault, RuntimeError) and not isinstance(fault, RecursionError):
         remedy = "run it again; HF_HUB_DISABLE_XET=1 may help"  # of the hub's library for transfers
         return HubError(where, f"the transfer failed: {shown(str(fault))}", remedy)
-    return HubError(where, f"did not answer as a hub does: {name}", "check HF_ENDPOINT and your proxy")
+    return HubError(where, f"does not answer like a hub: {name}", "check HF_ENDPOINT and your proxy")
 
 
 def _answered(where: str, fault: Any) -> HubError:

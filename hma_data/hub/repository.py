@@ -226,8 +226,8 @@ class Repository:
             )
             if entry.states(Path(found)):
                 return Path(found)
-        remedy = f"pull again; if it stays so, delete {found}, or do not use this repository"
-        raise HubError(f"{self.name}/{name}", "came with other content than the hub stated", remedy)
+        remedy = f"pull again; if the error stays, delete {found}, or do not use this repository"
+        raise HubError(f"{self.name}/{name}", "differs from the content that the hub stated", remedy)
 
     def _each[T](self, act: Callable[[str], T], names: Iterable[str]) -> list[T]:
         """Return the results of an action for each file, a few files at a time; the first error ends it."""

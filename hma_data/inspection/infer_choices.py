@@ -249,7 +249,9 @@ def action_group(found: list[KeyInfo]) -> Choice:
     if others := [key for key in moved if key not in parts]:
         asked.append(question(parts, others))
     if still := shown(key.key for key in group if key not in moved):
-        asked.append(f"{still} never changes in the episode looked at and is left out; does it in others?")
+        asked.append(
+            f"{still} never changes in the sampled episode and is left out; does it change in others?"
+        )
     return Choice(parts, " ".join(asked))
 
 

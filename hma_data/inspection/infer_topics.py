@@ -67,7 +67,7 @@ def commanding_topics(found: list[KeyInfo]) -> Choice:
     still = shown(key.key for key in fields if key not in keys)
     asked = []
     if still:
-        asked.append(f"{still} never changes in the bag looked at and is left out; does it in others?")
+        asked.append(f"{still} never changes in the sampled bag and is left out; does it change in others?")
     others = [topic[0] for _, topic in commanding if topic not in chosen]
     (clear, ticks, *_), _ = commanding[0]
     if clear <= WEAK or not ticks:

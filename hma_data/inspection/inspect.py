@@ -176,7 +176,7 @@ def unanswered(inspection: Inspection) -> Iterator[Finding]:
         )
     for topic, seconds in held_actions(inspection).items():
         said = f"{topic}: its last message is {seconds:.3g} s before the first frame, held throughout"
-        yield Finding("offset", "warn", said, "an action of one value teaches nothing; name another", topic)
+        yield Finding("offset", "warn", said, "a constant action teaches nothing; name another", topic)
     if inspection.format in ONE_INDEX and not inspection.hz:
         yield Finding(
             "rate", "info", "the recording states no rate", "state frequency_hz in the robot's YAML"
@@ -357,7 +357,7 @@ def _episodes(
             refused.append((name, fault))
     severity: Severity = "warn" if clips else "error"
     for which, first in alike(refused):
-        said = f"{len(which)} of {len(chosen)} episodes looked at, such as {which[0]}: {first.fault}"
+        said = f"{len(which)} of {len(chosen)} sampled episodes, such as {which[0]}: {first.fault}"
         numbers = {"refused": len(which), "looked_at": len(chosen)}
         yield Finding("usable", severity, said, first.remedy, numbers=numbers)
     if clips:
@@ -379,7 +379,7 @@ def _states_as_actions(clips: list[Clip], robot: Embodiment) -> Iterator[Finding
     if same:
         names = robot.action.names()
         said = f"equal the state of the same frame throughout: {', '.join(names[i] for i in same)}"
-        remedy = "name the key of the commands"
+        remedy = "name the key of the commanded actions"
         if robot.source.format in ONE_INDEX:
             remedy += "; where none is recorded, sync: {action_shift: 1} takes the state of the next step"
         yield Finding("action", "warn", f"actions {said}", remedy)
@@ -415,7 +415,7 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
     names = robot.action.names()
     spread = actions.std(axis=0)
     if constant := _constant(spread, robot):
-        said = f"never change in the episodes looked at: {', '.join(constant)}"
+        said = f"never change in the sampled episodes: {', '.join(constant)}"
         yield Finding("constant", "warn", said, "remove them from the YAML if they never change")
     with np.errstate(divide="ignore", invalid="ignore"):
         far = (np.abs(actions - np.median(actions, axis=0)) / spread > 30).any(axis=0)

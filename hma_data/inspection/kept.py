@@ -51,7 +51,7 @@ def kept_findings(
                 part.add(upright(raw, camera))
             yield _finding(camera, kept, part)
     except (HMAError, OSError, ImportError) as fault:
-        said = f"what the tokens keep was not measured: {' '.join(str(fault).split())}"
+        said = f"token quality was not measured: {' '.join(str(fault).split())}"
         yield Finding("tokens", "info", said)
 
 
@@ -64,6 +64,6 @@ def _finding(camera: Camera, kept: Kept, part: MovingPart) -> Finding:
         return Finding("tokens", "info", said, key=camera.key, numbers=numbers)
     said += "; the tokens lose the robot" if kept.lost else ""
     said += f"; {framed.fault}" if framed else ""
-    remedy = f"set {framed.words} in the YAML" if framed else "take another tokenizer, see hma tokenizer list"
+    remedy = f"set {framed.words} in the YAML" if framed else "use another tokenizer, see hma tokenizer list"
     remedy += ", and convert again with --overwrite; hma shards preview shows both"
     return Finding("tokens", "warn", said, remedy, camera.key, numbers)

@@ -53,7 +53,9 @@ def record(
         MissingDependencyError: the simulator, or the writer of the format, is not installed.
     """
     if robot not in RECORDERS and not FAMILY.fullmatch(robot):
-        raise UsageError(robot, "is not a laboratory robot", f"known: {', '.join(RECORDERS)}")
+        raise UsageError(
+            robot, "is not one of the toolkit's simulated robots", f"known: {', '.join(RECORDERS)}"
+        )
     if episodes < 1:
         raise UsageError("episodes", f"{episodes} asked for", "ask for at least one")
     module, name = RECORDERS.get(robot, ("hma_data.lab.family", f"{robot}.hdf5"))

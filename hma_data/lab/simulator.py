@@ -130,4 +130,4 @@ def embodiment(robot: str) -> Embodiment:
     if robot in RECORDERS:
         return find(robot)
     known = f"{', '.join(RECORDERS)}, and the family, such as {family.TRUNK[0]}"
-    raise UsageError(robot, "has no simulator in the laboratory", f"known: {known}")
+    raise UsageError(robot, "has no simulator in the toolkit", f"known: {known}")

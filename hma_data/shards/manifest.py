@@ -408,7 +408,7 @@ def derive(
                 if footer.plan["hash"] not in plan_hashes(plan):
                     theirs = footer.plan["hash"]
                     fault = f"is of the plan {theirs}, the set of {plan['hash']}: two jobs wrote here"
-                    remedy = "start one of them anew with --overwrite, the other with another --out"
+                    remedy = "restart one of them with --overwrite, the other with another --out"
                     raise ShardError(folder / name, fault, remedy)
                 rows = tuple(group_rows(metadata))
                 shard = ShardFile(name, footer.split, sum(rows), len(footer.episodes), size, sha256, rows)

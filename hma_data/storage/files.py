@@ -23,7 +23,7 @@ from hma_data.storage.remote import RemotePath, put_bytes, put_file
 PART = ".part"  # ends the name of every unfinished file
 PARTIAL = ".partial-"  # is in the name of every unfinished folder
 MAX_JSON_BYTES = 16_000_000
-_AGAIN = "have it saved or pushed again"
+_AGAIN = "save or push it again"
 
 
 # -- files

@@ -182,7 +182,7 @@ def check_frames(frames: NDArray[Any], spec: TokenizerSpec) -> None:
     if frames.ndim != 4 or frames.shape[1:] != (size, size, 3) or frames.dtype != np.uint8:
         raise TokenizerError(
             spec.name,
-            f"takes uint8 pictures (N, {size}, {size}, 3), was given {frames.dtype} {tuple(frames.shape)}",
+            f"takes uint8 images (N, {size}, {size}, 3), was given {frames.dtype} {tuple(frames.shape)}",
             "resize with hma_data.episodes.images.resize",
         )
 

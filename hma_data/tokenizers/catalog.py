@@ -119,12 +119,12 @@ _ROWS = (
     ),
     Entry(
         "fsq-8", "discrete", 128, (8, 8),
-        "the same network on small pictures, four times cheaper to train on",
+        "the same network on small images, four times cheaper to train on",
         "embedded", "hma_data.tokenizers.embedded", {"image_size": 128}, file="fsq.safetensors",
     ),
     Entry(
         "fsq-lab", "discrete", 128, (16, 16),
-        "sharp on clean small pictures, 15 bits a token; the embedded world model's",
+        "sharp on clean small images, 15 bits per token; the tokenizer of the bundled world model",
         "embedded", "hma_data.tokenizers.embedded", {"image_size": 128}, file="fsq-lab.safetensors",
     ),
     Entry(
@@ -155,7 +155,7 @@ _ROWS = (
     ),
     Entry(
         "taef2", "continuous", 256, (32, 32),
-        "the latents of FLUX.2 by a tiny network, 32 channels: finer pictures, eight times the data",
+        "the latents of FLUX.2 by a tiny network, 32 channels: finer images, eight times the data",
         "download", "hma_data.tokenizers.latents", {"channels": 32}, licence="MIT",
         repo="madebyollin/taef2", file="taef2.safetensors", bytes=10_000_000,
         revision="bd244ebfe4398c84fbf312a2f1c868c676b500e3",

@@ -21,23 +21,28 @@ PLAIN = (  # key of a robot's figures, measure, key or text of the reference, it
     ("psnr_last", "PSNR of the last frame, dB", "copy_psnr_last", "first frame repeated"),
     ("error_px", "state error, px of 128", "", ""),
     ("error_px_last", "state error of the last frame, px", "", ""),
-    ("decision", "decision fidelity, right choices of 5", "chance", "if guessed"),
+    ("decision", "decision fidelity, right choices of 5", "chance", "by chance"),
     (
         "inverse.return_px",
-        "distance after actions and their inverses, px",
+        "distance from the start after actions and their inverses, px",
         "inverse.true_return_px",
         "simulator",
     ),
-    ("inverse.return_psnr", "PSNR of the frame so reached, dB", "inverse.turn_psnr", "before turning back"),
-    ("planning.truth", "goals reached by planning in the simulator", "planning.random", "at random"),
-    ("planning.model", "goals reached by planning in the model", "planning.random", "at random"),
-    ("planning.gap", "planning gap: simulator less model", "planning.verdict", "limit: {}"),
-    ("calibration.gap_px", "state error against what the uncertainty tells to expect, px", "", ""),
-    ("calibration.half_px", "state error of the surest half of rollouts, px", "calibration.all_px", "of all"),
-    ("calibration.right", "rollouts warned in time", "calibration.clock", "by a clock"),
+    ("inverse.return_psnr", "PSNR of that frame, dB", "inverse.turn_psnr", "before turning back"),
+    ("planning.truth", "goals reached by planning in the simulator", "planning.random", "random actions"),
+    ("planning.model", "goals reached by planning in the model", "planning.random", "random actions"),
+    ("planning.gap", "planning gap: simulator minus model", "planning.verdict", "limit: {}"),
+    ("calibration.gap_px", "calibration gap of the state error, px", "", ""),
+    (
+        "calibration.half_px",
+        "state error of the least uncertain half, px",
+        "calibration.all_px",
+        "of all",
+    ),
+    ("calibration.right", "rollouts warned in time", "calibration.clock", "by elapsed time"),
     ("calibration.misses", "misses: no warning by the time the error doubles", "", ""),
     ("calibration.false_alarms", "false alarms: no doubling soon after a warning", "", ""),
-    ("frames_per_second", "frames a second, one rollout", "frames_per_cpu_second", "a CPU second"),
+    ("frames_per_second", "frames per second, one rollout", "frames_per_cpu_second", "per CPU second"),
 )
 RELIABILITY = (
     "uncertainty since the start",
@@ -47,9 +52,9 @@ RELIABILITY = (
     "RMSE of pixels",
 )
 ABSENT = {  # why a figure is absent though its part was measured
-    "inverse.return_px": "no part is read",
+    "inverse.return_px": "the probe locates no part",
     "calibration.misses": "no error doubles",
-    "calibration.false_alarms": "nothing is warned of",
+    "calibration.false_alarms": "no warnings",
 }
 AGREEMENT = (  # path in the results of hma policy-eval, measure
     (("correlation", "success", "pearson"), "policies: Pearson of success rates"),
@@ -130,7 +135,7 @@ def write_report(found: dict[str, Any], folder: Path) -> Path:
     table = Table(COLUMNS, rows(found))
     lead = (
         f"{found['checkpoint']} by {title(found)}: {found['scenes']} scenes of {found['frames']} frames, and "
-        f"{found['episodes']} episodes of {found['policy_frames']} frames a policy, of each robot"
+        f"{found['episodes']} episodes of {found['policy_frames']} frames per policy, for each robot"
     )
     page = Page("Benchmark", lead)
     page.table(COLUMNS, table.rows)
@@ -217,7 +222,7 @@ def compared(one: dict[str, Any], other: dict[str, Any]) -> Table:
     keys = ("version", "mode", "seed", "scenes", "frames", "noises", "episodes", "policy_frames")
     if differing := [key for key in keys if one[key] != other[key]]:
         fault = f"the results differ in {', '.join(differing)}: {title(one)}, and {title(other)}"
-        raise UsageError("--compare", fault, "run both by the same protocol and seed")
+        raise UsageError("--compare", fault, "run both with the same protocol and seed")
     robots = [robot for robot in one["measures"] if robot in other["measures"]]
     if not robots:
         raise UsageError("--compare", "the results share no robot", "give checkpoints with common robots")

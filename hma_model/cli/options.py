@@ -37,7 +37,7 @@ Precision = Annotated[
     Literal["float32", "bf16", "int8"],
     Option(
         "--precision",
-        help="Precision of products in rollouts; bf16 needs a CPU or GPU with bf16, int8 a CPU with VNNI.",
+        help="Precision in rollouts; bf16 and int8 (CPUs with VNNI) need hardware support.",
     ),
 ]
 Compile = Annotated[

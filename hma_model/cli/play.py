@@ -77,7 +77,7 @@ def play(
     from hma_model.play.server import LOOPBACK, serve
 
     listener = _listen(host, port)
-    name = "the embedded model" if opened.folder == EMBEDDED else checkpoint
+    name = "the bundled model" if opened.folder == EMBEDDED else checkpoint
     if token is None and host not in LOOPBACK:
         token = secrets.token_urlsafe(18)
     shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host

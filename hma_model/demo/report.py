@@ -68,9 +68,7 @@ def _headline(page: Page, made: DemoRun) -> None:
     for robot, found in made.figures.items():
         gain, seconds = found["psnr_action_gain_last"], horizon(found)
         if gain is not None:
-            about = (
-                f"{robot}: nearer to the truth with its own actions than with others, after {seconds:.1f} s"
-            )
+            about = f"{robot}: last-frame PSNR gain, recorded vs shuffled actions, after {seconds:.1f} s"
             torn = [name for name, one in made.left[robot].items() if not one.whole]
             tiles.append(
                 (
@@ -104,7 +102,7 @@ def _films(page: Page, made: DemoRun) -> None:
 
 def _robots(page: Page, made: DemoRun) -> None:
     about = (
-        "Two robots that the embedded trunk has not seen, in two formats, each described by one YAML. A "
+        "Two robots that the bundled model has not seen, in two formats, each described by one YAML. A "
         "training sample is drawn with the probability p ∝ windows^(1/τ), τ = 3."
     )
     page.section("The robots", about)
@@ -125,8 +123,8 @@ def _robots(page: Page, made: DemoRun) -> None:
 
 
 def _kept_by_tokens(page: Page, made: DemoRun) -> None:
-    about = "Recorded frames, and the same decoded from their tokens. The model predicts tokens only."
-    page.section("What the tokens keep", about)
+    about = "Recorded frames, and the same frames decoded from their tokens. The model sees only tokens."
+    page.section("Recorded vs decoded frames", about)
     for robot, shards in made.sets.items():
         row = next(row for row in shards.episodes.to_pylist() if row["split"] == "val")
         picks = np.linspace(0, row["length"] - 1, KEPT_FRAMES).astype(int)
@@ -144,9 +142,9 @@ def _kept_by_tokens(page: Page, made: DemoRun) -> None:
 def _rollouts(page: Page, made: DemoRun) -> None:
     page.section(
         "Rollouts on held-out episodes",
-        "The model, pulled from the hub for one robot alone, sees the first frames and the actions. It "
-        "continues from its own predictions. With other actions it should do worse. Bands are 95 % intervals "
-        "of the mean.",
+        "The model, pulled from the hub for one robot alone, gets the first frames and the actions, and "
+        "continues from its own predictions. With shuffled actions it should do worse. Bands are 95 % "
+        "intervals of the mean.",
     )
     rows = []
     for robot, shards in made.sets.items():
@@ -158,9 +156,9 @@ def _rollouts(page: Page, made: DemoRun) -> None:
             if None not in figures["psnr_by_frame"]
         }
         plot = over_horizon(curves, 1 / shards.embodiment.effective_hz, "PSNR, dB")
-        about = f"mean of {found['windows']} held-out windows, against {found['against']}"
+        about = f"mean of {found['windows']} held-out windows, vs {found['against']}"
         page.picture(plot, "svg+xml", f"{robot}: PSNR over the horizon, {about}")
         last = [figures["psnr_last"] for figures in kinds.values()]
         rows.append([robot, horizon(found), *last, found["true"]["ssim"]])
-    heads = ["PSNR last frame, own actions", "shuffled actions", "copy", "SSIM"]
+    heads = ["PSNR last frame, recorded actions", "shuffled actions", "copy", "SSIM"]
     page.table(["robot", "seconds", *heads], rows)

@@ -81,7 +81,7 @@ class Accuracy:
     def __str__(self) -> str:
         counts = f"{self.count} episodes, {self.successes} success{'es' * (self.successes != 1)}"
         if self.balanced is None:
-            return f"{self.share:.0%} right; all episodes end alike ({counts})"
+            return f"{self.share:.0%} right; all episodes have the same outcome ({counts})"
         few = f"; too few {self.too_few} to tell" if self.too_few else ""
         return f"balanced {self.balanced:.0%} ({self.low:.0%} to {self.high:.0%}; {counts}{few})"
 
@@ -158,7 +158,7 @@ def mmrv(true: Floats, made: Floats, seed: int = 0) -> Estimate:
     """
     reason = _too_few(true.shape)
     if not reason and np.ptp(true.mean(axis=1)) < 1e-12:
-        reason = "all policies are alike in the simulator"
+        reason = "all policies are equal in the simulator"
     if reason:
         return Estimate(None, reason=reason)
     value = float(rank_violation(true.mean(axis=1), made.mean(axis=1)))
@@ -188,7 +188,7 @@ def _too_little(one: Floats, other: Floats) -> str:
         return reason
     for values, where in ((one, "the simulator"), (other, "the model")):
         if np.ptp(values.mean(axis=1)) < 1e-12:
-            return f"all policies are alike in {where}"
+            return f"all policies are equal in {where}"
     return ""
 
 
@@ -252,7 +252,7 @@ def auroc(true: Bools, scores: Floats, seed: int = 0) -> Estimate:
     if count < MIN_EPISODES:
         return Estimate(None, reason=f"{count} of at least {MIN_EPISODES} episodes")
     if not successes or not failures:
-        return Estimate(None, reason="all episodes end alike")
+        return Estimate(None, reason="all episodes have the same outcome")
     above, pairs = np.zeros((count, count)), np.zeros((count, count))  # by the episodes of both
     for success, high in zip(true, scores, strict=True):
         for other, low in zip(true, scores, strict=True):
@@ -279,7 +279,7 @@ def episode_correlation(one: Floats, other: Floats) -> Estimate:
     if one.size < MIN_EPISODES:
         return Estimate(None, reason=f"{one.size} of at least {MIN_EPISODES} episodes")
     if np.ptp(one) < 1e-12 or np.ptp(other) < 1e-12:
-        return Estimate(None, reason="all episodes score alike")
+        return Estimate(None, reason="all episodes have the same score")
     found = stats.pearsonr(one, other)
     ends = found.confidence_interval(1 - 2 * TAIL)
     return Estimate(float(found.statistic), float(ends.low), float(ends.high))

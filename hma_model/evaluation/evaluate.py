@@ -314,13 +314,13 @@ def _notes(
     """Return what must be known to read the figures; `count` windows are of so many episodes."""
     notes, config = [], model.config
     if config.kind == "discrete" and config.merge > 1:
-        square = f"squares of {config.merge}×{config.merge} tokens"
+        square = f"square of {config.merge}×{config.merge} tokens"
         notes.append(
-            f"loss, perplexity and accuracy are of {square}, which the model takes as one: compare them with "
-            "those of such models alone, and nats/token with all of the tokenizer"
+            f"loss, perplexity and accuracy are per {square}: compare only models of the same square; "
+            "nats/token is comparable for all models of this tokenizer"
         )
     if not config.sees_actions:
-        notes.append("no objective of its training sees actions, so all rollouts are without")
+        notes.append("it was trained without action inputs, so all rollouts ignore actions")
     if wrong := sum(int((~part.finite).sum()) for part in joined.values()):
         total = sum(part.finite.size for part in joined.values())
         notes.append(f"{wrong} of {total} predicted frames are NaN or infinite: the checkpoint has diverged")
@@ -328,15 +328,15 @@ def _notes(
         notes.append("the loss is not finite: the checkpoint has diverged")
     if 2 * still > count:
         notes.append(
-            f"the true pictures of {still} of {count} windows never change: a copy of the prompt is perfect "
-            "there, and the figures say nothing about the actions"
+            f"the recorded images of {still} of {count} windows never change: a copy of the prompt is "
+            "perfect there, so the figures say nothing about actions"
         )
     blind = any(not OBJECTIVES[name].sees_actions for name, often in config.objectives.items() if often)
     if not blind:
-        notes.append("the model was not trained without actions, so its rollouts with none may be poor")
+        notes.append("the model was not trained without actions, so its rollouts without actions may be poor")
     if episodes == 1:
         notes.append(
-            "all windows are of one episode, so no figure has an interval, and others may differ much: "
-            "convert more episodes, or with a larger --val-fraction"
+            "all windows come from one episode, so no figure has an interval: convert more episodes, or use "
+            "a larger --val-fraction"
         )
     return notes

@@ -228,7 +228,7 @@ class FeatureCollector:
         missing: dict[str, str] = {}
         for metric, remedy in REMEDIES.items():
             if metric not in self.networks.facts:
-                missing[metric] = f"not measured, for want of weights: {remedy}"
+                missing[metric] = f"not measured, weights are missing: {remedy}"
         for (metric, kind), own in self.moments.items():
             true = self.moments[metric, "truth"]
             if true.count < true.needed:

@@ -169,7 +169,9 @@ def measure_recorded_state(
     here = joined["reconstruction"][kept].mean(axis=(0, 1))  # the windows may be unlike what it learned from
     own = np.array([n for n in reader.readable if here[n] <= UNREADABLE_SHARE * reader.spread[n]], np.int64)
     if not len(own):
-        cannot = "no recorded state can be read off the true pictures; more training episodes may help"
+        cannot = (
+            "no recorded state can be estimated from the recorded images; more training episodes may help"
+        )
         return nothing | {"missing": cannot}, unknown
     joined = {kind: part[..., own] for kind, part in joined.items()}
     found: dict[str, Any] = {

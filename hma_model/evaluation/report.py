@@ -91,7 +91,7 @@ def page(parts: Sequence[Part], command: str) -> str:
     counted = f"{human_count(len(labels), 'checkpoint')}, {human_count(len(robots), 'robot')}"
     lead = (
         f"{counted}; windows of {first['frames']} frames of {first['split']}, of which the model gets the "
-        f"first {first['prompt']}. Pictures are compared with those decoded from the true tokens."
+        f"first {first['prompt']}. The reference is the decoded recorded tokens."
     )
     made = Page(f"Evaluation of {', '.join(labels)}", lead)
     made.definitions(legend)
@@ -102,13 +102,13 @@ def page(parts: Sequence[Part], command: str) -> str:
     table = turned(parts)
     made.table(table.columns, table.rows)
     if said := absences(parts):
-        made.section("Not measured, and to be known")
+        made.section("Not measured, and notes")
         made.definitions(said)
     made.section(
         "How to read the strips",
         "Each strip is a window. Grey line: frames that the model gets; green line: frames that it predicts. "
-        "The difference is that of the prediction to what the tokens keep: black is none, yellow is "
-        f"{BRIGHTEST:.0f} of 255 and more. Other actions are those of another window.",
+        "Difference: prediction vs decoded tokens, from black (none) to yellow "
+        f"({BRIGHTEST:.0f} of 255 or more). Other actions are those of another window.",
     )
     for robot in robots:
         _robot(made, [part for part in parts if part.found["embodiment"] == robot])
@@ -133,13 +133,13 @@ def _headline(made: Page, parts: Sequence[Part]) -> None:
     for part in parts[:6]:
         gain = part.found["psnr_action_gain_last"]
         if gain is not None:
-            words = "nearer to the truth with its own actions than with others, last frame"
+            words = "last-frame PSNR gain, recorded vs shuffled actions"
             tiles.append((f"{gain:+.1f} dB", f"{_whose(part, parts)}: {words}"))
     if len(parts) == 1:
         found = parts[0].found
         for path, digits, unit, about in (
             ("true.psnr_last", 1, " dB", "PSNR of the last frame"),
-            ("copy.psnr_last", 1, " dB", "the same of a copy of the prompt's last frame"),
+            ("copy.psnr_last", 1, " dB", "PSNR of a copy of the prompt's last frame"),
             ("perplexity", 1, "", f"perplexity of a frame's {_units(found)}"),
             ("accuracy", 2, "", f"share of {_units(found)} predicted right"),
         ):
@@ -188,7 +188,7 @@ def _state(made: Page, part: Part, seconds: float) -> None:
         if None not in measured[kind][f"{key}_by_frame"]
     }
     tables = state(measured)
-    caption = f"{part.checkpoint}: how far the state read off the images is from {truth}; {tables[0][1]}"
+    caption = f"{part.checkpoint}: distance of the state estimated from the images to {truth}; {tables[0][1]}"
     made.picture(over_horizon(curves, seconds, unit), "svg+xml", caption)
     for table, _ in tables[1:]:
         made.table(table.columns, table.rows)
@@ -207,7 +207,7 @@ def _strips(made: Page, parts: Sequence[Part]) -> None:
         title = f"The {name} window{whose}"
         made.strips(title, f"{figures} on the last frame; {case.titles[i]}", _rows(case, i, parts))
     if case.unread:
-        made.text(f"The recorded pictures are not shown: {case.unread}. Strips begin with what tokens keep.")
+        made.text(f"The recorded images are not shown: {case.unread}. Strips begin with the decoded tokens.")
 
 
 def _rows(case: Showcase, i: int, parts: Sequence[Part]) -> list[tuple[str, bytes]]:

@@ -116,7 +116,7 @@ def _controllability(probe: Probe, ways: dict[str, Images], parts: Floats, seed:
     """Return the errors of the robot's own parts, of pictures (B, P, S, S, 3) by the kind of rollout."""
     own = probe.own
     if not len(own):
-        return {"missing": "no part of the robot can be read off the pictures of this tokenizer"}
+        return {"missing": "no part of the robot can be located in images of this tokenizer"}
     found: dict[str, Any] = {
         "probe_px": rounded(probe.error[own].mean()),
         "spread_px": rounded(probe.spread[own].mean()),

@@ -109,7 +109,7 @@ def trained(
         loss.backward()
         optimizer.step()
         schedule.step()
-        tell(f"learning to read the state off images: step {step + 1} of {steps}")
+        tell(f"learning to estimate the state from images: step {step + 1} of {steps}")
     return network.eval()
 
 

@@ -138,7 +138,7 @@ class _Work:
     def of(cls, label: str, model: "HMA", shards: ShardSet, settings: EvaluationSettings) -> "_Work":
         plan = WindowPlan.of(model, shards, settings)
         if settings.state and not simulated(shards.embodiment.id) and not shards.embodiment.state:
-            fault = "is no robot of the laboratory, and its shards have no states"
+            fault = "is not one of the toolkit's simulated robots, and its shards have no states"
             remedy = "leave --state out, or name the recorded states in its YAML and convert again"
             raise UsageError(shards.embodiment.id, fault, remedy)
         return cls(label, model, shards, plan.cameras, plan.predicted_frames(settings))
@@ -196,10 +196,10 @@ def _measured(
             episodes=settings.state, seed=settings.seed, **sampling,
         )  # fmt: skip
     elif simulated(robot) or shards.embodiment.state:
-        found["missing"]["state"] = "not measured: --state reads what the robot does off its images"
+        found["missing"]["state"] = "not measured: --state estimates the robot's state from images"
     else:
         found["missing"]["state"] = (
-            "not measured: the shards have no states, and the robot is none of the laboratory"
+            "not measured: the shards have no states, and the robot is none of the toolkit's simulated ones"
         )
     label = work.label
     found = {"checkpoint": label, "data": str(shards.folder), **found}

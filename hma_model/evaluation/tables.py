@@ -292,15 +292,15 @@ def state(found: Mapping[str, Any] | None) -> list[tuple[Table, str]]:
          _ends(found[kind][f"{key}_last_95"])]
         for kind in kinds
     ]  # fmt: skip
-    first = Table(["state read off the images", f"error, {unit}", "last frame", "95 %"], errors)
+    first = Table(["state estimated from the images", f"error, {unit}", "last frame", "95 %"], errors)
     if recorded:
         said = (
-            f"{found['read']} of {found['of']} values can be read off the images; what reads them errs by "
-            f"{found['reader_sd']:.2f} standard deviations on true images of other episodes"
+            f"{found['read']} of {found['of']} values can be estimated from the images; the estimator's own "
+            f"error is {found['reader_sd']:.2f} standard deviations on recorded images of other episodes"
         )
         values = [[row["name"], row["unit"], *(row[kind] for kind in kinds)] for row in found["values"]]
         return [(first, said), (Table(["last frame, error of", "unit", *kinds], values), "")]
-    said = f"{found['episodes']} simulated episodes; the probe errs by {found['probe_px']:.2f} px"
+    said = f"{found['episodes']} simulated episodes; the probe's own error is {found['probe_px']:.2f} px"
     noisy = found["perturbed"]
     about = f"perturbed by {noisy['scale']:g} standard deviations, against the simulator's answer to them"
     answers = [

@@ -153,7 +153,7 @@ def warn_outside(
             said = own.outside(rows.reshape(-1, len(own.names)))
             watched[name] = None if said else own
             if said:
-                warnings.warn(f"{said}. This is said once", OutsideRangeWarning, stacklevel=4)
+                warnings.warn(f"{said}. Shown only once", OutsideRangeWarning, stacklevel=4)
 
 
 def _known(model: "Network", embodiment: str) -> Commands | None:

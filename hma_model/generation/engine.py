@@ -81,9 +81,9 @@ def products_in(precision: str, device: torch.device, compile: bool) -> torch.dt
     if precision not in PRECISIONS:
         raise HMAError("precision", f"{precision!r} is unknown", f"give {' or '.join(PRECISIONS)}")
     if precision == "bf16" and device.type == "cpu" and not has_bfloat16():
-        raise HMAError("precision", "this processor has no products of bfloat16", "use float32")
+        raise HMAError("precision", "this processor does not support bf16", "use float32")
     if precision == "int8" and (compile or not packs(device) or not has_int8()):
-        fault = "int8 is for processors with AVX-512 VNNI, without compile"
+        fault = "int8 needs a processor with AVX-512 VNNI, and no --compile"
         raise HMAError("precision", fault, "use float32 or bf16")
     return PRECISIONS[precision]
 

@@ -28,7 +28,7 @@ from hma_model.checkpoint.model_card import licence, line, number
 from hma_model.hub.stores import Store, open_store
 
 _OWN_FILES = {*SMALL, MANIFEST, *FILES_BESIDE}
-_PULL_AGAIN = "pull again; if it stays so, have it pushed again"
+_PULL_AGAIN = "pull again; if the error stays, push it again"
 _DATASETS = "hf://datasets/"
 _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"),
           (10**7, "1M<n<10M"), (10**8, "10M<n<100M"), (10**9, "100M<n<1B"), (10**10, "1B<n<10B"))  # fmt: skip
@@ -90,7 +90,7 @@ def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> 
     shards = {shard.path: shard.sha256 for shard in manifest.shards}
     lacking = [path for path in shards if path not in files]
     if lacking:
-        raise HubError(store.name, f"lacks {len(lacking)} shards, {lacking[0]} first", "have it pushed again")
+        raise HubError(store.name, f"lacks {len(lacking)} shards, {lacking[0]} first", "push it again")
     wanted = [path for path in shards if not _has_sha256(out / path, shards[path])]
     store.download([*wanted, *(name for name in SMALL if name in files)], out)
     for name in (*wanted, *(name for name in SMALL if name in manifest.files)):
@@ -115,7 +115,7 @@ def _open(
     return open_store(address, revision, write, private, "dataset")
 
 
-def _published(store: Store, remedy: str = "have it pushed again") -> tuple[Manifest, bytes]:
+def _published(store: Store, remedy: str = "push it again") -> tuple[Manifest, bytes]:
     """Return the published manifest and its bytes."""
     if MANIFEST not in store.files():
         raise HubError(store.name, f"has no {MANIFEST}", "is it a shard set, and has its push finished?")

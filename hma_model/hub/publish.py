@@ -279,9 +279,9 @@ def _pull(
         lacking = [part for part in PARTS if f"embodiments/{name}/{part}" not in files]
         if lacking and not store.from_cache:
             fault = f"lacks {lacking[0]} of embodiment {name!r}"
-            raise HubError(store.name, fault, "name the embodiments you want, or have it pushed again")
+            raise HubError(store.name, fault, "name the embodiments you want, or push it again")
     if TRUNK not in files and not store.from_cache:
-        raise HubError(store.name, f"has no {TRUNK}", "have it pushed again")
+        raise HubError(store.name, f"has no {TRUNK}", "push it again")
     names = [CONFIG, TRUNK]
     for name in wanted:
         shown = [part for part in PICTURES if f"embodiments/{name}/{part}" in files]
@@ -305,7 +305,9 @@ def _pull(
 def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
     """Return the values of config.json, checked."""
     if CONFIG not in files:
-        raise HubError(store.name, f"has no {CONFIG}", "it is no checkpoint of hma-toolkit; check the name")
+        raise HubError(
+            store.name, f"has no {CONFIG}", "it is not a checkpoint of hma-toolkit; check the name"
+        )
     values = json_object(store.read(CONFIG), f"{store.name}: {CONFIG}", HubError)
     try:
         parse_config(values, f"{store.name}: {CONFIG}")

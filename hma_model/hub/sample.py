@@ -34,7 +34,7 @@ def add_samples(checkpoint: StrPath | Checkpoint, data: Iterable[StrPath]) -> li
     source, made = Checkpoint.open(checkpoint), []
     if source.folder == EMBEDDED:
         remedy = "copy the folder and name the copy, or finetune it"
-        raise CheckpointError(source.folder, "comes along with the package, which stays as it is", remedy)
+        raise CheckpointError(source.folder, "is part of the installed package, which is not changed", remedy)
     for folder in data:
         shards = ShardSet(folder)
         name = shards.embodiment.id

@@ -175,7 +175,7 @@ def require_fit(config: HMAEnvConfig) -> None:
             remedy = f"""rename it: --rename_map='{{"{camera}": "{key}"}}'"""
             raise UsageError(where, f"takes {key}, and {config.embodiment} gives {', '.join(own)}", remedy)
         if there is None:
-            fault = f"takes {key}, which nobody can read off the images of {config.embodiment} in this model"
+            fault = f"takes {key}, which cannot be estimated from the images of {config.embodiment} here"
             raise UsageError(where, fault, "give a policy that acts from images alone")
         if feature.type is not FeatureType.VISUAL and tuple(there.shape) != tuple(feature.shape):
             fault = f"has {feature.shape[0]} values of {key}, {config.embodiment} has {there.shape[0]}"

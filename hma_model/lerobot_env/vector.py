@@ -127,7 +127,7 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
             raise UsageError(self.embodiment, "has no episode whose states are all known", "give state=false")
         own = reader.readable
         error = f"{reader.error[own].mean():.2g} standard deviations" if len(own) else "unknown"
-        said = "%s: agent_pos is read off the images: %d of %d values, mean error on other episodes %s"
+        said = "%s: agent_pos is estimated from the images: %d of %d values, mean error on other episodes %s"
         log.warning(said, self.embodiment, len(own), len(reader.std), error)
         return reader
 

@@ -418,8 +418,8 @@ class Connection:
                 beyond.append(f"{name} {dim.low:g} to {dim.high:g}")
         if beyond:
             session.warned = True
-            known = f"the model knows only {', '.join(beyond)}; what it shows beyond is a guess"
-            self.tell({"kind": "error", "text": f"action: {known}. This is said once"})
+            known = f"the model knows only {', '.join(beyond)}; predictions beyond that are unreliable"
+            self.tell({"kind": "error", "text": f"action: {known}. Shown only once"})
 
 
 async def serve(

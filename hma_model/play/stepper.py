@@ -107,7 +107,7 @@ class Stepper:
             if not left:
                 fault = f"all {self.most} places are taken"
                 raise UsageError("sessions", fault, "close another page, or try again in a few minutes")
-            said = "Closed: nothing was done here for a while, and another page needed the place."
+            said = "Closed after a while without input: another page needed the session."
             self.close(min(left, key=lambda one: (one.viewer is not None, one.touched)).name, said)
         session = Session(
             secrets.token_urlsafe(18), robot, number, self._world, self._sampling, time.monotonic()
@@ -181,7 +181,7 @@ class Stepper:
             elif not session.paused:
                 session.paused = True
                 session.viewer.tell(session.status())
-                text = f"Paused, because nothing was done for {self.idle_s / 60:.0f} minutes."
+                text = f"Paused after {self.idle_s / 60:.0f} minutes without input."
                 session.viewer.tell({"kind": "error", "text": text})
         due = [session for session in self.sessions.values() if session.ready(now)]
         together: dict[FrameSampling, list[Session]] = {}

@@ -66,8 +66,8 @@ class Scenes:
         found = described(world.model, embodiment)
         spec = world.action_spec(embodiment)
         if simulator and not simulated(embodiment):
-            remedy = "choose a robot of the laboratory, or judge by a reward model: --judge FOLDER_OR_REPO"
-            raise HMAError(embodiment, "has no true simulator to compare with", remedy)
+            remedy = "choose one of the toolkit's robots, or judge by a reward model: --judge FOLDER_OR_REPO"
+            raise HMAError(embodiment, "has no simulator to compare with", remedy)
         space = world.model.embodiments[embodiment]
         action = {"mean": space.mean, "std": space.std}
         if spec.seen is not None:
@@ -270,7 +270,7 @@ class ModelArena:
             HMAError: there is no probe.
         """
         if self._probe is None:
-            raise HMAError(self.scenes.name, "nothing reads its state off images", "give another policy")
+            raise HMAError(self.scenes.name, "has no state to estimate from images", "give another policy")
         if self._seen is None:
             places = self._probe.read(self.made)
             self._seen = [seen_state(self.scenes.name, self._probe.own, one) for one in places]

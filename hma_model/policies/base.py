@@ -117,5 +117,5 @@ def _named_errors(name: str) -> Iterator[None]:
     except HMAError:
         raise
     except Exception as fault:
-        remedy = "mend it; --debug shows where it happened"
+        remedy = "fix it; --debug shows the traceback"
         raise HMAError(f"policy {name}", f"raised {type(fault).__name__}: {fault}", remedy) from fault

@@ -87,8 +87,8 @@ class Task:
 
 
 TASKS: dict[str, tuple[Score, str]] = {
-    "moved": (moved, "some loose part ends {:g} px or more from where it lay"),
-    "reached": (reached, "a moving part of the robot comes within {:g} px of where a loose part lay"),
+    "moved": (moved, "a loose part ends {:g} px or more from its start"),
+    "reached": (reached, "a moving part of the robot comes within {:g} px of a loose part's start"),
     "placed": (placed, "the T ends within {:g} px of its goal"),
 }
 
@@ -211,7 +211,7 @@ def train_judge(
     probe = probe or train_probe(robot, tokenizer, stride, seed, tell)
     unread = {"reached": not len(probe.own), "placed": len(probe.loose) < 2}
     if not len(probe.loose) or unread.get(task.name):
-        fault = f"cannot tell whether {task.text}: the probe does not read these parts"
+        fault = f"cannot judge whether {task.text}: the probe does not locate these parts"
         raise HMAError(f"judge of {robot}", fault, "judge another task or robot")
     looked = (
         set(range(frames)) if task.name == "reached" else {0, *range(max(frames - END_FRAMES, 1), frames)}

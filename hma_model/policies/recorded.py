@@ -57,7 +57,7 @@ from hma_model.worlds.world import World, load_world
 
 COLUMNS = ("policy", "success in the model", "mean reward")
 SHOWN_EPISODES = 2  # of each policy and outcome on the page
-UNKNOWN = "no simulator tells how often the judge is right on generated frames: compare policies, not rates"
+UNKNOWN = "the judge's accuracy on generated frames is unknown: compare policies, not rates"
 
 
 @dataclass
@@ -131,7 +131,7 @@ class ModelEvaluation:
         """Return in words what the table means."""
         pairs = alike_pairs(np.stack([one.success for one in self.policies]))
         names = [f"{self.policies[one].policy} and {self.policies[other].policy}" for one, other in pairs]
-        alike = [f"by success, these cannot be told apart: {'; '.join(names)}"] if names else []
+        alike = [f"not distinguishable by success: {'; '.join(names)}"] if names else []
         success = "success: the judge scores some frame above 0.5; 95 % intervals over episodes"
         return [success, self.judge.sentence, UNKNOWN, *alike]
 
@@ -183,7 +183,7 @@ def evaluate_recorded(
         scenes = Scenes.of(world, embodiment, episodes, seed, simulator=False)
         made = [read_policy(one, scenes, world) if isinstance(one, str) else one[1] for one in policies]
         if planner := next((name for name, one in zip(names, made) if isinstance(one, Judged)), None):
-            raise UsageError(f"policy {planner}", "plans for a task of the laboratory", "give another policy")
+            raise UsageError(f"policy {planner}", "needs a simulated robot's task", "give another policy")
         labelled = labelled_shards(world, embodiment, shards, judge)
         measured = measured_judge(judge, world, embodiment, labelled, partial(on_progress, 0))
         begun, beginnings = recorded_beginnings(world, scenes, labelled)
@@ -296,7 +296,7 @@ def html(found: ModelEvaluation) -> str:
     """Return the page."""
     lead = (
         f"{found.embodiment} in {found.checkpoint} ({found.sampling}): {found.policies[0].success.size} "
-        f"episodes of {found.frames} frames a policy, from the first frames of {found.beginnings} held-out "
+        f"episodes of {found.frames} frames per policy, from the first frames of {found.beginnings} held-out "
         "recorded episodes"
     )
     page = Page("Policies inside the world model", lead)

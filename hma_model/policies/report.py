@@ -17,7 +17,7 @@ from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
 from hma_model.policies.scores import MODEL, SHARED, TRUE, WORK, PolicyEvaluation, Scored
 
-COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "alike", "same actions, sim.")
+COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "agree", "same actions, sim.")
 LISTED_PAIRS = 6  # pairs of policies that a sentence names
 SHOWN_EPISODES = 2  # episodes of each kind on the page
 OUTCOME_TITLES = {  # (success in the simulator, in the model) -> title
@@ -64,16 +64,15 @@ def sentences(found: PolicyEvaluation) -> list[str]:
     guessed = f"{found.generated.successes / found.generated.count:.0%}"
     said = [
         f"success: {found.judge.task.text}; shares with 95 % intervals over episodes; scores in px: {scores}",
-        "alike: episodes with the same outcome in both; same actions, sim.: the simulator, under the "
-        "actions that the policy gave in the model",
-        f"paired: simulator and model share {SHARED}; the first chunks of actions are equal, as was checked",
-        f"judge on held-out true episodes: {found.judge.held_out}",
-        f"judge on generated frames, against the simulator under the same actions: {found.generated}",
-        f"precision: the simulator confirms {_share(found.precision)} of the successes seen in the model "
-        f"({guessed} if guessed); recall: {_share(found.recall)} of its own are seen",
-        f"scores of single episodes in the model and, under the same actions, in the simulator: "
-        f"correlation {found.followed}; they tell its successes from its failures with AUROC {found.auroc}",
-        f"model against simulator, each under its own actions: precision {_share(paired['precision'])}, "
+        "agree: episodes with the same outcome in both; same actions, sim.: success in the simulator "
+        "under the policy's actions in the model",
+        f"paired: simulator and model share {SHARED}; checked: the first action chunks are equal",
+        f"judge on held-out recorded episodes: {found.judge.held_out}",
+        f"judge on generated frames, vs the simulator under the same actions: {found.generated}",
+        f"precision: the simulator confirms {_share(found.precision)} of the model's successes ({guessed} by "
+        f"chance); recall: the model shows {_share(found.recall)} of the simulator's, same actions",
+        f"per-episode scores under the same actions: correlation {found.followed}, AUROC {found.auroc}",
+        f"model vs simulator, each under its own actions: precision {_share(paired['precision'])}, "
         f"recall {_share(paired['recall'])}, AUROC of scores {paired['auroc']}",
     ]
     if found.refusal:
@@ -82,18 +81,18 @@ def sentences(found: PolicyEvaluation) -> list[str]:
         correlated = {"success rates": found.success, "mean scores": found.score}
         for what, one in correlated.items():
             if one["pearson"].reason:  # of the ranks it is the same
-                said.append(f"{what} over policies: no correlation, {one['pearson'].reason}")
+                said.append(f"{what} over policies: no correlation: {one['pearson'].reason}")
             else:
                 said.append(
-                    f"{what} over policies: Pearson {one['pearson']}, ranks {one['spearman']}, "
-                    f"MMRV {one['mmrv']}, 0 is best"
+                    f"{what} over policies: Pearson {one['pearson']}, Spearman {one['spearman']}, "
+                    f"MMRV {one['mmrv']} (0 is best)"
                 )
     return said + [_alike(found, where) for where in (TRUE, MODEL) if found.alike(where)]
 
 
 def refused(found: PolicyEvaluation) -> str:
     """Return the sentence that says why there is no verdict."""
-    return f"no verdict: on generated frames {found.refusal}: the model's success rates mean nothing"
+    return f"no verdict: on generated frames {found.refusal}, so the model's success rates are meaningless"
 
 
 def _share(found: Estimate) -> str:
@@ -107,11 +106,11 @@ def _alike(found: PolicyEvaluation, where: int) -> str:
     pairs = found.alike(where)
     count = len(found.policies)
     if len(pairs) == count * (count - 1) // 2:
-        return f"by success in {place}, no two policies can be told apart"
+        return f"no two policies are distinguishable by success in {place}"
     names = [" and ".join(pair) for pair in pairs[:LISTED_PAIRS]]
     if len(pairs) > LISTED_PAIRS:
         names.append(f"{len(pairs) - LISTED_PAIRS} other pairs")
-    return f"by success in {place}, these cannot be told apart: {'; '.join(names)}"
+    return f"not distinguishable by success in {place}: {'; '.join(names)}"
 
 
 def show(found: PolicyEvaluation) -> None:
@@ -140,17 +139,17 @@ def html(found: PolicyEvaluation) -> str:
     count = len(found.policies[0].scores[TRUE])
     lead = (
         f"{found.embodiment} in {found.checkpoint} ({found.sampling}): {count} episodes of {found.frames} "
-        "frames a policy, from the same frames in the simulator and in the world model"
+        "frames per policy, from the same first frames in the simulator and in the world model"
     )
     page = Page("Policies inside the world model", lead)
     figures = [
         (
             _value(found.precision),
-            f"of the model's successes hold in the simulator{_ends(found.precision)}",
+            f"of the model's successes are confirmed by the simulator{_ends(found.precision)}",
         ),
-        (_value(found.recall), f"of the simulator's successes are seen{_ends(found.recall)}"),
-        (_value(found.followed), f"correlation of the scores of single episodes{_ends(found.followed)}"),
-        (_value(found.auroc), f"AUROC of the scores of single episodes{_ends(found.auroc)}"),
+        (_value(found.recall), f"of the simulator's successes are shown by the model{_ends(found.recall)}"),
+        (_value(found.followed), f"correlation of per-episode scores{_ends(found.followed)}"),
+        (_value(found.auroc), f"AUROC of per-episode scores{_ends(found.auroc)}"),
     ]
     if not found.refusal:
         pearson = found.success["pearson"]

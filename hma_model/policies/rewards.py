@@ -170,7 +170,7 @@ class RewardJudge:
         found = self.held_out
         seen = _of(self.hits, found.successes)
         false = _of(self.alarms, found.count - found.successes)
-        return f"judge on held-out recorded episodes: calls {seen} successes and {false} failures a success"
+        return f"judge on held-out recorded episodes: true positives {seen}, false positives {false}"
 
     def to_json(self) -> dict[str, Any]:
         """Return its figures as plain values."""
@@ -281,7 +281,7 @@ def _require_registered(path: Path, where: str) -> None:
     """Refuse a preprocessor whose steps are named by a Python path: loading it would import that."""
     steps = json.loads(path.read_text())["steps"]
     if any("registry_name" not in step for step in steps):
-        remedy = "save it anew with steps that lerobot registers"
+        remedy = "save it again with steps that lerobot registers"
         raise HMAError(where, f"{path.name} names a step by a Python path", remedy)
 
 

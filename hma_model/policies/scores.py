@@ -138,7 +138,7 @@ class PolicyEvaluation:
                 return "the judge may be no better than chance; more episodes would tell"
             return "the judge is no better than chance"
         if self.followed.low is not None and self.followed.low <= 0:
-            return "the scores of single episodes agree with the simulator's no better than by chance"
+            return "the per-episode scores agree with the simulator's no better than chance"
         return ""
 
     def alike(self, where: int) -> list[tuple[str, str]]:
@@ -365,8 +365,12 @@ def _require_paired(name: str, true: list[Float32s], model: list[Float32s]) -> N
     """Check that the first chunks of a policy in both branches are equal, but for rounding."""
     scale = np.abs(true).max(axis=(0, 1)) + 1e-6
     if not (np.abs(np.subtract(true, model)) <= 1e-5 * scale).all():
-        fault = "does not act alike twice: its first actions in the model differ from those in the simulator"
-        remedy = "draw from random, numpy.random or torch, which are seeded, or seed its own in reset()"
+        fault = (
+            "is not deterministic: from the same image, its first actions differ between model and simulator"
+        )
+        remedy = (
+            "draw from random, numpy.random or torch, which are seeded, or seed your generator in reset()"
+        )
         raise HMAError(f"policy {name}", fault, remedy)
 
 
@@ -392,7 +396,7 @@ def run(
             seed_samplers(*key, step)
             actions.append(checked(name, policy, arena))
             if not said and isinstance(arena, ModelArena) and (said := arena.outside(actions[-1])):
-                guess = "what the model shows of such actions is a guess"
+                guess = "predictions under such actions are unreliable"
                 warnings.warn(f"policy {name}: {said}; {guess}", OutsideRangeWarning, stacklevel=2)
             arena.step(actions[-1])
             if arena.fresh:

@@ -195,7 +195,7 @@ def augment(
         precision=settings.precision, **given,
     )  # fmt: skip
     if (views := world.model.config.views) > 1 and (shards is None or settings.looked_at):
-        fault = f"the laboratory's simulator shows one camera, and the model sees {views}"
+        fault = f"the simulator shows one camera, and the model sees {views}"
         remedy = "name shards with --from, and leave out --judge and policies that read the robot's state"
         raise UsageError("augment", fault, remedy)
     made_by: dict[str, Any] = {"by": "hma augment", "synthetic": True, **asdict(settings)}
@@ -271,7 +271,7 @@ class _Maker:
         kind, _, number = commands.partition("=")
         if not self.settings.recorded:
             if self.shards is not None and commands.startswith("scripted") and not steerable(self.robot.id):
-                fault = f"{commands!r} needs a driver that goes by images, and {self.robot.id} has none"
+                fault = f"{commands!r} needs a policy that acts from images, and {self.robot.id} has none"
                 raise UsageError("--commands", fault, "give replay, perturb=0.3, random or a policy of yours")
             policy = read_policy(commands, self.scenes, self.world)
             if isinstance(policy, Judged) and not self.settings.judge:

@@ -201,8 +201,8 @@ def how_read(robot: Embodiment, reader: Reader) -> str:
     errors = reader.error * reader.std
     read = [f"{name} {errors[i]:.3g}{units[i]}" for i, name in enumerate(robot.state.names()) if i in own]
     rest = [name for i, name in enumerate(robot.state.names()) if i not in own]
-    said = f"read off the images, mean error {', '.join(read)}" if read else ""
-    left = f"not seen in the images, always the mean: {', '.join(rest)}" if rest else ""
+    said = f"estimated from the images, mean error {', '.join(read)}" if read else ""
+    left = f"not visible in the images, always the mean: {', '.join(rest)}" if rest else ""
     return "; ".join(part for part in (said, left) if part)
 
 

@@ -122,7 +122,7 @@ class TrainData:
         """Continue from `state`, which any number of ranks may have saved.
 
         Returns:
-            The reason why the sampler starts again: a step has another number of passes, or the mixture is
+            The reason why the sampler restarts: a step has another number of passes, or the mixture is
             another one and `force` accepts it. An empty string if the sampler continues.
 
         Raises:

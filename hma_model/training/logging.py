@@ -181,7 +181,7 @@ class RunLog:
             from rich.console import Console
             from rich.live import Live
 
-            first = f"step {self._begin:,}/{self._steps:,}   the next step is the first of this session"
+            first = f"step {self._begin:,}/{self._steps:,}   waiting for the first step"
             self._live = Live(first, console=Console(stderr=True), refresh_per_second=4)
             self._live.__enter__()
         return self

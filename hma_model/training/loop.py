@@ -159,7 +159,7 @@ def _loop(
         last = run.done >= 1
         if run.held_out.sets and (last or _due(run.step, recipe.eval_every)):
             if last:
-                log.note("the steps are done; the held-out loss is measured")
+                log.note("training is finished; measuring the held-out loss")
             log.evaluation({**run.evaluate(), "mixture": run.train_data.realised()})
             log.pictures(run.out, run.step)
             _show_notes(run, log)

@@ -136,7 +136,7 @@ def require_memory(model: Network, recipe: Recipe, device: torch.device, ranks: 
     keys = _fitting_keys(model, recipe, device, ranks, recipe.batch_size)
     remedy = f"set {keys}" if keys else f"use a smaller network, as in {SMALLER}"
     weights = sum(parameter.numel() for parameter in model.parameters())
-    what = f"{weights / 1e6:,.0f} million weights and passes of {share(recipe, ranks)[1]} windows"
+    what = f"{weights / 1e6:,.0f} million weights and {share(recipe, ranks)[1]} windows per pass"
     fault = f"needs about {needed / GIB:,.1f} GiB ({what}), and {there / GIB:,.1f} GiB are free"
     raise RecipeError("recipe: memory", fault, remedy)
 
@@ -156,7 +156,7 @@ def memory_errors(model: Network, recipe: Recipe, device: torch.device, ranks: i
             raise
         keys = _fitting_keys(model, recipe, device, ranks, recipe.batch_size // 2)
         remedy = f"set {keys}, which should fit" if keys else f"use a smaller network, as in {SMALLER}"
-        told = ": ".join(filter(None, ("there is not enough for this model and batch", text)))
+        told = ": ".join(filter(None, ("too little for this model and batch", text)))
         raise TrainingError("memory", told, remedy) from fault
 
 

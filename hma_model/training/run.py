@@ -115,7 +115,7 @@ class Run:
             self.ranks.once(lambda: Start.bring(recipe, self.sets, self.out))
             self.start = Start.open(recipe, self.sets, self.out)
         elif recipe.freeze == "trunk":
-            fault = "freezes a trunk that nothing has trained"
+            fault = "freezes an untrained trunk"
             raise RecipeError("recipe: freeze", fault, "name a trained checkpoint with start=…")
         if self.start and "frames" not in recipe.model_fields_set:
             recipe = recipe.model_copy(update={"frames": self.start.checkpoint.config.frames})
@@ -233,8 +233,8 @@ class Run:
             if chosen := self.ranks.once(choose):
                 new_stem.copy_stem(self.model, name, start, chosen.like)
                 self.likes[name] = chosen.like
-                better = f"loss {chosen.loss:.3g}, with a fresh one {chosen.fresh_loss:.3g}"
-                self.notes.append(f"{name} begins with the stem of {chosen.like}: {better}")
+                better = f"loss {chosen.loss:.3g} vs {chosen.fresh_loss:.3g} with a fresh stem"
+                self.notes.append(f"{name} starts from the stem of {chosen.like}: {better}")
 
     def prepare(self, kept: TrainingState | None) -> None:
         """Distribute the model over the ranks, and make its optimizer and average, from `kept` if given."""
@@ -467,7 +467,7 @@ class Run:
         self.evaluation = state.evaluation
         self.notes += [*notes, f"resuming from step {state.step}"]
         if fault := self.train_data.load_state(state.sampler, force):
-            self.notes.append(f"the sampler starts again: {fault}")
+            self.notes.append(f"the sampler restarts: {fault}")
         return kept
 
     def _adopt(self, checkpoint: Checkpoint) -> list[str]:

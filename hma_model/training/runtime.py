@@ -59,7 +59,7 @@ def choose_precision(
         begun: the precision with which the run began, if it is resumed.
 
     Raises:
-        RecipeError: bf16 is asked for, and the device has no products of bfloat16.
+        RecipeError: bf16 is asked for, and the device does not support bf16.
     """
     cuda, auto = device.type == "cuda", recipe.precision == "auto"
     processor = "GPU" if cuda else "processor"
@@ -68,16 +68,16 @@ def choose_precision(
     else:
         there = device.type != "cpu" or has_bfloat16()
     asked = begun if auto else recipe.precision
-    lacks = f"this {processor} has no products of bfloat16"
+    lacks = f"this {processor} does not support bf16"
     if asked == "bf16" and not there:
-        remedy = "resume it where it began" if auto else "use precision=auto, or fp32"
+        remedy = "resume it on the machine where it started" if auto else "use precision=auto, or fp32"
         raise RecipeError("recipe: precision=bf16", lacks, remedy)
     if asked:
-        return asked, "as the run began" if auto else "as the recipe says"
+        return asked, "as at the start of the run" if auto else "as the recipe says"
     if not there:
         return "fp32", lacks
     if cuda:
-        return "bf16", f"this {processor} has products of bfloat16"
+        return "bf16", f"this {processor} supports bf16"
     if device.type != "cpu" or recipe.compile:
         return "fp32", f"bf16 was not measured {'compiled' if recipe.compile else f'on {device.type}'}"
     size, least = config.width, LEAST_WIDTH
@@ -85,7 +85,7 @@ def choose_precision(
         size, least = config.levels[0], LEAST_CHANNELS
     if size < least:
         return "fp32", f"a network of width {size} is no faster in bf16 on a CPU"
-    return "bf16", f"this {processor} has products of bfloat16, and width {size} is faster with them"
+    return "bf16", f"this {processor} supports bf16, and width {size} is faster in it"
 
 
 def attention_form(recipe: Recipe, config: HMAConfig, device: torch.device) -> str:
@@ -93,8 +93,8 @@ def attention_form(recipe: Recipe, config: HMAConfig, device: torch.device) -> s
     if config.trunk == "unet":
         return "no attention"
     if device.type == "cpu" and recipe.precision == "bf16" and not recipe.compile:
-        return f"attention by products up to {PRODUCT_KEYS} keys, above by torch's float32 kernel"
-    return "attention by torch's fused kernels"
+        return f"attention: matrix products up to {PRODUCT_KEYS} keys, torch's float32 kernel above"
+    return "attention: torch's fused kernels"
 
 
 def environment(device: torch.device) -> dict[str, Any]:

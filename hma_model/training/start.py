@@ -78,7 +78,7 @@ class Start:
         except CheckpointError as fault:
             if not likes - wanted:
                 raise
-            remedy = f"{fault.remedy}, or with new_stem=fresh go without the robots like yours"
+            remedy = f"{fault.remedy}, or set new_stem=fresh to do without similar robots"
             raise CheckpointError(fault.where, fault.fault, remedy) from fault
 
     @classmethod

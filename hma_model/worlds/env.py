@@ -238,8 +238,8 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
             return self.action_spec.clip(values)
         if outside and not self._warned:
             self._warned.add("outside")
-            said = f"{outside}, so what the model shows is a guess; clip=True clips actions to it"
-            warnings.warn(f"{said}. This is said once", OutsideRangeWarning, stacklevel=4)
+            said = f"{outside}, so predictions are unreliable; clip=True clips actions to it"
+            warnings.warn(f"{said}. Shown only once", OutsideRangeWarning, stacklevel=4)
         return values
 
     def _seen(self, image: Image) -> Image:

@@ -146,7 +146,9 @@ def starting_window(model: "HMA", embodiment: str, seed: int = 0) -> Prompt:
     robot = described(model, embodiment)
     if robot is None or not simulated(embodiment):
         raise HMAError(
-            f"prompt of {embodiment}", "none comes along: it is no robot of the laboratory", PROMPT_FORMS
+            f"prompt of {embodiment}",
+            "none is included: it is not one of the toolkit's simulated robots",
+            PROMPT_FORMS,
         )
     with tempfile.TemporaryDirectory() as folder:
         return _of_recording(model, robot, record(embodiment, folder, 1, seed), EpisodePart())

@@ -168,7 +168,7 @@ class MessageTimes:
         remedy = "cut the file there, and keep the parts in folders of their own"
         if by_header:
             fault = f"header stamps go back by {seconds:.3g} s at message {at}: their clock was set back"
-            fault += ", or a simulation began anew"
+            fault += ", or a simulation was restarted"
             if usable:
                 remedy = "sync: {stamp: receive} reads on by the times of receipt"
                 if seconds > 1:  # segments divide where a clock jumps back as far as they state

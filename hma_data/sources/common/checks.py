@@ -278,7 +278,7 @@ class CameraLook:
         sizes: (height, width) -> number of calls of `add` with it.
         changes: how often the size changes within an episode.
         neighbours, same: pairs of neighbouring images compared, and equal ones among them.
-        blank, episodes: episodes in which the camera shows one colour; all episodes looked at.
+        blank, episodes: episodes in which the camera shows one colour; all sampled episodes.
         colours: some of the colours met.
         moving: where images change.
     """
@@ -418,7 +418,7 @@ def picture_findings(looks: dict[str, CameraLook]) -> Iterator[Finding]:
             worst: Severity = "warn" if look.changes else "info"
             yield Finding("size", worst, f"{key}: images of several sizes, {said}{part}", key=key)
         if look.blank:
-            said = f"{key}: shows only one colour in {look.blank} of {look.episodes} episodes looked at"
+            said = f"{key}: shows only one colour in {look.blank} of {look.episodes} sampled episodes"
             # Where every episode is blank, the camera was never plugged in.
             severity: Severity = "info" if look.blank == look.episodes else "warn"
             numbers = {"blank": look.blank, "episodes": look.episodes}

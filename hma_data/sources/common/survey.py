@@ -371,17 +371,17 @@ class Survey:
             said = f"{first.where}: {first.fault}"
             if len(names) > 1:
                 named = said if said.startswith(names[0]) else f"{names[0]}: {said}"
-                said = f"{len(names):,} of {looked:,} episodes looked at, such as {named}"
+                said = f"{len(names):,} of {looked:,} sampled episodes, such as {named}"
             yield Finding("readable", severity, said, first.remedy, numbers={"episodes": len(names)})
         rest = sum(len(names) for names, _ in groups[MAX_NAMES:])
         if rest:
-            said = f"{rest:,} more of {looked:,} episodes looked at cannot be read"
+            said = f"{rest:,} more of {looked:,} sampled episodes cannot be read"
             yield Finding("readable", severity, said, numbers={"episodes": rest})
         missing = any(one.check == "files" and one.severity == "warn" for _, one in self._found)
         shown = any(look.images for look in self.looks.values())
         told = bool(groups) and severity == "error"  # no episode could be read at all
         if (faulty or missing) and not shown and not told and any(key.kind == "camera" for key in keys):
-            yield Finding("readable", "error", "not one image of the episodes looked at can be read")
+            yield Finding("readable", "error", "not one image of the sampled episodes can be read")
 
     def _finite(self) -> Iterator[Finding]:
         for key, held in self._numbers.items():

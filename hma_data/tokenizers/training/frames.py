@@ -111,7 +111,7 @@ def read_films(
             yield np.concatenate(film)
     if not found:
         remedy = "name a file or folder of png, jpg, mp4; a recording needs --embodiment"
-        raise TokenizerError(path, f"holds no picture and no video that can be decoded{skipped}", remedy)
+        raise TokenizerError(path, f"holds no image and no video that can be decoded{skipped}", remedy)
 
 
 def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
@@ -126,7 +126,7 @@ def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
     if path.suffix.lower() not in VIDEOS:
         picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if picture is None:
-            raise TokenizerError(path, "cannot be decoded as a picture")
+            raise TokenizerError(path, "cannot be decoded as an image")
         yield np.ascontiguousarray(picture[:, :, ::-1])
         return
     try:
@@ -223,7 +223,7 @@ def _source_files(source: FileSource | DrawnSource, corpus: Path) -> list[Path]:
     files = sorted({path for glob in source.glob for path in folder.glob(glob)})
     if isinstance(source, DrawnSource):
         if len(files) != source.pictures:
-            fault = f"holds {len(files)} pictures, the recipe says {source.pictures}"
+            fault = f"holds {len(files)} images, the recipe says {source.pictures}"
             raise RecipeError(folder, fault, f"recipes/tokenizer/draw.py {corpus} makes them")
     elif not files:
         fault = f"no file matches {', '.join(source.glob)}"
@@ -248,7 +248,7 @@ def load_pools(sources: Sequence[FileSource | DrawnSource], corpus: Path) -> tup
                         pictures.append(_levels(picture))
                         digest.update(pictures[-1][-1].tobytes())
         if not pictures:
-            fault = "holds no picture that can be decoded and is large enough"
+            fault = "holds no image that can be decoded and is large enough"
             raise RecipeError(corpus / source.path, fault)
         pools.append(Pool(source.path, source.weight, pictures))
     return pools, digest.hexdigest()

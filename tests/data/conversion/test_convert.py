@@ -107,9 +107,9 @@ def test_a_limit_that_leaves_val_empty_is_told(limit, empty, toy_arm, tmp_path) 
 def test_it_is_said_how_many_episodes_are_held_out_and_why(toy_arm, tmp_path) -> None:
     path = tmp_path / "eight.hdf5"
     write_toy(path, [20] * 8)
-    few = "fewer than 5 say little about a model: record more episodes"
+    few = "fewer than 5 are too few to judge a model: record more episodes"
     for fraction, wanted in (
-        (None, f"2 of 8 episodes held out for validation, 5% or at least 5, of few a quarter; .*; {few}"),
+        (None, f"2 of 8 episodes held out for validation, 5%, at least 5 but at most a quarter; .*; {few}"),
         (0.2, r"\d of 8 episodes held out for validation, by --val-fraction 0.2"),
         (0.0, "0 of 8 episodes held out for validation, by --val-fraction 0$"),
     ):
@@ -121,7 +121,7 @@ def test_it_is_said_how_many_episodes_are_held_out_and_why(toy_arm, tmp_path) ->
         file["mask/valid"] = np.array([f"demo_{i}" for i in range(5, 8)], "S")
     summary = run(toy_arm, path, tmp_path / "masks", Settings(val_fraction=0.5))
     assert summary.held_out.startswith(
-        "3 of 8 episodes held out for validation, by the recording's own split, which goes before"
+        "3 of 8 episodes held out for validation, by the recording's own split, which takes precedence over"
     )
 
 

@@ -106,7 +106,7 @@ def test_a_known_episode_that_changed_is_refused_by_its_name(what, toy_arm, reco
     grow(recording, [23], 3)
     with h5py.File(recording, "a") as file:
         CHANGES[what](file)
-    with pytest.raises(OutputError, match="1 of its episodes were recorded anew, first 'demo_1'"):
+    with pytest.raises(OutputError, match="1 of its episodes were re-recorded, first 'demo_1'"):
         run(toy_arm, recording, out, extend=True)
     assert shards(out) == before
 
@@ -118,7 +118,7 @@ def test_a_known_episode_that_cannot_be_read_any_more_is_refused_by_its_name(
     grow(recording, [23], 3)
     with h5py.File(recording, "a") as file:
         del file["data/demo_2/obs"]
-    with pytest.raises(OutputError, match="1 of its episodes were recorded anew, first 'demo_2'"):
+    with pytest.raises(OutputError, match="1 of its episodes were re-recorded, first 'demo_2'"):
         run(toy_arm, recording, tmp_path / "out", extend=True)
 
 
@@ -148,17 +148,17 @@ def test_a_shard_that_is_missing_is_told_before_the_set_is_extended(toy_arm, rec
     whole = shards(out)
     first = out / sorted(whole)[0]
     first.write_bytes(b"PAR1")
-    with pytest.raises(OutputError, match=r"is missing, or has other than the [\d,]+ bytes"):
+    with pytest.raises(OutputError, match=r"is missing, or does not have the [\d,]+ bytes"):
         run(toy_arm, recording, out, extend=True)
     first.unlink()
-    with pytest.raises(OutputError, match="shard-00000.parquet: is missing, or has other"):
+    with pytest.raises(OutputError, match="shard-00000.parquet: is missing, or does not have"):
         run(toy_arm, recording, out, extend=True)
     assert run(toy_arm, recording, out).made_shards == 1 and shards(out) == whole
     grow(recording, [23], 3)
     run(toy_arm, recording, out, extend=True)
     first.unlink()
     for extend in (False, True):
-        with pytest.raises(OutputError, match="is missing, or has other than .* put back a copy of it"):
+        with pytest.raises(OutputError, match="is missing, or does not have .* restore it from a copy"):
             run(toy_arm, recording, out, extend=extend)
 
 
@@ -186,7 +186,7 @@ def test_records_in_another_order_are_refused(tmp_path: Path) -> None:
     run(rlds_robot(), folder, out)
     shutil.rmtree(folder)
     toy(folder, (6, 4, 3, 5))
-    with pytest.raises(OutputError, match="recorded anew, first 'train/000000'"):
+    with pytest.raises(OutputError, match="re-recorded, first 'train/000000'"):
         run(rlds_robot(), folder, out, extend=True)
     assert json.loads((out / "manifest.json").read_text())["totals"]["episodes"] == 3
 

@@ -239,7 +239,7 @@ def test_an_episode_recorded_anew_cannot_extend(toy_arm: Embodiment, tmp_path: P
     run(toy_arm, recording, out)
     write_toy(recording, [20, 25, 22, 23])
     before = contents(out)
-    with pytest.raises(OutputError, match="of its episodes were recorded anew"):
+    with pytest.raises(OutputError, match="of its episodes were re-recorded"):
         run(toy_arm, recording, out, extend=True)
     with pytest.raises(OutputError, match="cannot be extended; different: embodiment"):
         run(toy_arm.model_copy(update={"id": "other"}), recording, out, extend=True)

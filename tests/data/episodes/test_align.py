@@ -149,7 +149,7 @@ def test_a_clip_is_the_lookup_of_every_frame_where_all_streams_run(
     try:
         clip = to_clip(episode(*clocks), embodiment(**sync))
     except AlignmentError as fault:
-        assert "never run together" in str(fault)
+        assert "do not overlap in time" in str(fault)
         return
     start, stop = reference_span(clocks, images, actions, states, rate)
     front = clocks[0]
@@ -235,7 +235,7 @@ def test_a_held_command_ends_with_its_stream_where_a_limit_is_set() -> None:
 
 
 def test_streams_that_never_overlap_are_told_with_their_times() -> None:
-    with pytest.raises(AlignmentError, match=r"never run together: .*a 100\.000 to 101\.900"):
+    with pytest.raises(AlignmentError, match=r"do not overlap in time: .*a 100\.000 to 101\.900"):
         to_clip(episode(STEADY, STEADY, STEADY + 100, STEADY, STEADY), embodiment())
 
 

@@ -77,7 +77,7 @@ def test_a_camera_that_is_always_black_is_left_out_and_a_frozen_one_noted(tmp_pa
     values = inferred(three_cameras(tmp_path, black=("front",)))
     assert keys(values, "cameras") == ["observation/top", "observation/side"]
     said = values["provenance"]["cameras"]
-    assert "observation/front: shows only one colour in 1 of 1 episodes looked at, and is left out" in said
+    assert "observation/front: shows only one colour in 1 of 1 sampled episodes, and is left out" in said
     assert "observation/side: 100% of neighbouring images are equal" in said and "top" not in said
 
 

@@ -119,7 +119,7 @@ def test_tokens_that_lose_the_robot_are_a_warning_and_with_the_crop_they_keep_it
 def test_a_set_whose_recording_is_gone_says_that_nothing_was_measured(tmp_path: Path) -> None:
     folder = toy_shards(tmp_path / "set", [12, 13])
     (kept,) = kept_findings(ShardSet(folder), tokenizer=BlockTokenizer())
-    assert kept.severity == "info" and "is kept at" in kept.message
+    assert kept.severity == "info" and "are decoded at" in kept.message
     folder.with_suffix(".hdf5").unlink()
     (found,) = kept_findings(ShardSet(folder), tokenizer=BlockTokenizer())
     assert found.severity == "info" and "was not measured" in found.message

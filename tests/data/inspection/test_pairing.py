@@ -1,4 +1,4 @@
-"""Commands beside pictures: a bag gives each picture the command that the same recording in HDF5 gives it."""
+"""Commands beside pictures: a bag gives each image the command that the same recording in HDF5 gives it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ DRAW = np.random.default_rng(0)
 
 @dataclass(frozen=True)
 class Case:
-    """When commands come (C,), which of them is each picture's own (T,), and what `infer` says of it."""
+    """When commands come (C,), which of them is each image's own (T,), and what `infer` says of it."""
 
     command_ns: np.ndarray
     own: np.ndarray
@@ -32,21 +32,21 @@ class Case:
 
 
 def each(delay_ns: np.ndarray | int, said: str, tolerance_ms: float | None) -> Case:
-    """One command for each picture."""
+    """One command for each image."""
     return Case(np.arange(FRAMES) * PERIOD + delay_ns, np.arange(FRAMES), said, tolerance_ms)
 
 
 CASES = {
-    "1 ms before": each(-MS, "1.0 ± 0.0 ms before each picture: actions: hold", None),
-    "with the picture": each(0, "0.0 ± 0.0 ms after each picture: actions: hold", None),
-    "1 ms after": each(MS, "1.0 ± 0.0 ms after each picture: actions: hold, tolerance_ms: 26", 26),
-    "half a period after": each(PERIOD // 2, "25.0 ± 0.0 ms after each picture, about midway", 50),
-    "after, with jitter": each(DRAW.integers(MS, 12 * MS, FRAMES), "after each picture", 32),
-    "around, with jitter": each(DRAW.integers(-3 * MS, 3 * MS, FRAMES), "each picture: actions: hold, ", 25),
+    "1 ms before": each(-MS, "1.0 ± 0.0 ms before each image: actions: hold", None),
+    "with the picture": each(0, "0.0 ± 0.0 ms after each image: actions: hold", None),
+    "1 ms after": each(MS, "1.0 ± 0.0 ms after each image: actions: hold, tolerance_ms: 26", 26),
+    "half a period after": each(PERIOD // 2, "25.0 ± 0.0 ms after each image, about midway", 50),
+    "after, with jitter": each(DRAW.integers(MS, 12 * MS, FRAMES), "after each image", 32),
+    "around, with jitter": each(DRAW.integers(-3 * MS, 3 * MS, FRAMES), "each image: actions: hold, ", 25),
     "100 Hz": Case(
         np.arange(FRAMES * 5) * PERIOD // 5 + 2 * MS,
         np.arange(FRAMES) * 5 - 1,
-        "not tied to pictures, the last one is 8.0 ± 0.0 ms old",
+        "not tied to images; the last one is 8.0 ± 0.0 ms old",
         None,
     ),
     "every third picture": Case(
@@ -70,7 +70,7 @@ def recording(case: Case) -> Recording:
 
 
 def in_hdf5(path: Path, made: Recording, case: Case) -> Path:
-    """The recording as a loop writes it: each picture with its own command, from the first command on."""
+    """The recording as a loop writes it: each image with its own command, from the first command on."""
     begin = int(np.argmax(case.own >= 0))
     with h5py.File(path, "w") as file:
         demo = file.create_group("data/demo_0")
@@ -125,11 +125,11 @@ def test_doctor_says_when_the_yaml_pairs_commands_with_other_pictures(tmp_path, 
 
 def test_infer_doctor_and_inspect_print_the_offset_in_one_line(tmp_path: Path) -> None:
     bag = FORMS["ros1"](tmp_path, recording(CASES["1 ms after"]))
-    line = "commands come 1.0 ± 0.0 ms after each picture"
+    line = "actions come 1.0 ± 0.0 ms after each image"
     told = hma("registry", "infer", bag, "--id", "mine", "--out", tmp_path / "mine.yaml").stdout
     assert f"\n{line}: actions: hold, tolerance_ms: 26\n" in told
     assert line in hma("doctor", bag).stdout
     report = inspect_recording(bag)
-    measured = "the last one 49.0 ± 0.0 ms before each picture, the next one 1.0 ± 0.0 ms after it"
+    measured = "the last one 49.0 ± 0.0 ms before each image, the next one 1.0 ± 0.0 ms after it"
     assert report["facts"]["actions /command"] == measured and report["checks"]["offset"] == "info"
     assert measured in hma("inspect", bag, "-e", yaml_of(tmp_path, bag)).stdout

@@ -167,7 +167,7 @@ def test_faults_that_differ_in_numbers_alone_are_one_group_that_counts_all(tmp_p
         if one.check == "usable"
     ]
     assert len(usable) == 1 and usable[0].severity == "error"
-    assert usable[0].message.startswith("20 of 20 episodes looked at, such as demo_0: ")
+    assert usable[0].message.startswith("20 of 20 sampled episodes, such as demo_0: ")
 
 
 def test_a_set_of_which_no_picture_can_be_read_is_an_error_for_both_commands(tmp_path: Path) -> None:

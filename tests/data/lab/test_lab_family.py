@@ -187,7 +187,7 @@ def test_recording_converts(robot: str, block_tokenizer: BlockTokenizer, tmp_pat
 def test_name_that_is_no_kind_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=re.escape("arm5_01")):
         Body.of("arm5_01")
-    with pytest.raises(UsageError, match="is not a laboratory robot"):
+    with pytest.raises(UsageError, match="is not one of the toolkit's simulated robots"):
         record("arm5_01", tmp_path, 1)
 
 

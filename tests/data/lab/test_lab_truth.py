@@ -57,5 +57,5 @@ def test_parts_are_where_their_colours_are() -> None:
 
 
 def test_a_robot_that_has_no_simulator_is_refused() -> None:
-    with pytest.raises(UsageError, match=f"bridge: has no simulator in the laboratory — known: .*{TRUNK[0]}"):
+    with pytest.raises(UsageError, match=f"bridge: has no simulator in the toolkit — known: .*{TRUNK[0]}"):
         simulator.embodiment("bridge")

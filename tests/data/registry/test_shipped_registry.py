@@ -163,7 +163,7 @@ def wrap(item: dict[str, Any]) -> dict[str, Any]:
 
 
 def values(path: str, kind: str, count: int) -> Any:
-    """Distinct numbers a step, small pictures, a text."""
+    """Distinct numbers a step, small images, a text."""
     stated = feature(kind)
     if kind == "text":
         return [b"push it"] * count

@@ -200,7 +200,7 @@ def test_a_corpus_that_is_not_there_is_named(tmp_path):
 
 def test_pictures_that_were_not_drawn_are_named_with_what_draws_them(tmp_path):
     drawn_corpus(tmp_path, 3)
-    with pytest.raises(RecipeError, match=r"holds 3 pictures, the recipe says 4 — recipes/tokenizer/draw.py"):
+    with pytest.raises(RecipeError, match=r"holds 3 images, the recipe says 4 — recipes/tokenizer/draw.py"):
         load_pools([DrawnSource(kind="drawn", pictures=4)], tmp_path)
 
 

@@ -80,7 +80,7 @@ def test_products_are_counted_where_operators_arrive_whole() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not has_bfloat16(), reason="this platform has no products of bfloat16")
+@pytest.mark.skipif(not has_bfloat16(), reason="this platform does not support bf16")
 @pytest.mark.parametrize("cache", [True, False])
 def test_latents_are_measured_in_either_precision(cache: bool) -> None:
     case = {"kind": "continuous", "cache": cache, "batch": 1, "decode": False, "ddim_steps": 2}

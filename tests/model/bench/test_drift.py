@@ -92,7 +92,7 @@ def test_motion_of_other_commands_does_not_correlate():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"robots": "bridge"}, "bridge: has no simulator in the laboratory"),
+        ({"robots": "bridge"}, "bridge: has no simulator in the toolkit"),
         ({"frames": 5}, "frames=5 is not allowed — give at least 10"),
         ({"rollouts": 1}, "rollouts=1 is not allowed — give at least 2"),
         (

@@ -93,7 +93,7 @@ def test_what_melted_or_what_nobody_touched_is_told() -> None:
 
 
 def test_a_robot_without_a_simulator_is_named() -> None:
-    with pytest.raises(UsageError, match="bridge: has no simulator in the laboratory"):
+    with pytest.raises(UsageError, match="bridge: has no simulator in the toolkit"):
         holds.run({**holds.BENCH.defaults, "robots": "bridge"})
 
 

@@ -49,7 +49,7 @@ def test_a_demo_that_was_cut_goes_on_by_the_same_command(tmp_path, monkeypatch) 
         assert set(figures) == {"psnr_last", "psnr_last_shuffled", "psnr_last_copy", "left"}
         assert 0 <= figures["left"]["the robot"]["shape"] <= 1
         assert f'alt="{robot}: recorded"' in page and f"<h2>{robot}: " in page
-    for title in ("The robots", "What the tokens keep", "Sizes and timings", "on your own data"):
+    for title in ("The robots", "Recorded vs decoded frames", "Sizes and timings", "on your own data"):
         assert title in page
     assert "hma finetune shards/my_arm --from embedded" in page
 

@@ -351,7 +351,7 @@ def test_a_single_episode_has_no_interval(data, model):
     found = evaluate(model, Blocks(), data, windows=5, prompt=1)
     assert found["episodes"] == 1 and found["windows"] == 5
     assert found["true"]["psnr_95"] is None and found["loss_95"] is None and found["perplexity_95"] is None
-    assert any("all windows are of one episode, so no figure has an interval" in t for t in found["notes"])
+    assert any("all windows come from one episode, so no figure has an interval" in t for t in found["notes"])
     assert found["true"]["psnr_by_frame_95"][0] == [None, None]
 
 
@@ -514,7 +514,7 @@ def test_pictures_that_never_change_are_said_in_words(model, data):
         warnings.simplefilter("error")
         found = evaluate(model, Dark(), data, windows=5)
     assert found["true"]["psnr_last"] == found["copy"]["psnr_last"] == 60
-    assert "the true pictures of 5 of 5 windows never change" in found["notes"][0]
+    assert "the recorded images of 5 of 5 windows never change" in found["notes"][0]
 
 
 def test_a_metric_without_weights_is_a_row_of_words(model, data):

@@ -143,7 +143,7 @@ def test_what_cannot_be_read_off_the_windows_own_pictures_is_left_out(disc, monk
     found, last = measure_recorded_state(
         BlockTokenizer(), disc, batches, made, prompt=PROMPT, cameras="first"
     )
-    assert "no recorded state can be read off the true pictures" in found["missing"] and np.isnan(last).all()
+    assert "no recorded state can be estimated" in found["missing"] and np.isnan(last).all()
 
 
 def test_too_few_episodes_are_said(disc: ShardSet, monkeypatch: pytest.MonkeyPatch) -> None:

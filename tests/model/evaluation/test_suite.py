@@ -112,13 +112,13 @@ def test_a_model_of_squares_is_compared_by_the_loss_of_a_stored_token(tmp_path, 
     assert square["loss"] == pytest.approx(4 * single["loss"], rel=1e-4)
     assert single["stored_loss"] == pytest.approx(square["stored_loss"], rel=1e-4)
     assert single["stored_loss"] == pytest.approx(np.log(64), rel=1e-4)
-    assert {one: whose for whose, one in absences(parts) if "squares of 2×2" in one}.popitem()[1] == (
+    assert {one: whose for whose, one in absences(parts) if "square of 2×2" in one}.popitem()[1] == (
         f"{tmp_path / 'square'} on arm"
     )
     assert "nats/token" in comparison(parts).columns
     assert main(["evaluate", str(tmp_path / "square"), str(tmp_path / "arm"), "--windows", "3"]) == 0
     said = capsys.readouterr().out
-    assert "loss, perplexity and accuracy are of squares of 2×2 tokens" in said and "nats/token" in said
+    assert "loss, perplexity and accuracy are per square of 2×2 tokens" in said and "nats/token" in said
 
 
 def test_parts_that_are_done_are_not_computed_again(made, tmp_path, monkeypatch) -> None:
@@ -157,7 +157,7 @@ def test_the_page_is_one_file_that_shows_each_robot_and_checkpoint(made: Path, t
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     strips = re.findall(r'alt="(The \w+ window[^"]*)"', page)
     assert len(strips) == 2 * 3 * (1 + 2 * 3)  # robots, windows, and from the tokens and three a checkpoint
-    assert "recorded pictures are not shown" in page and "--lpips FILE" in page
+    assert "recorded images are not shown" in page and "--lpips FILE" in page
     table = (tmp_path / "results.md").read_text()
     assert table.count("mean over sets") == 2 and "ΔPSNR" in table
     said = verdict(run(made)[0].found)
@@ -195,7 +195,7 @@ def test_the_difference_is_black_where_pictures_are_equal() -> None:
             ["{made}/one", "{made}/arm", "--cameras", "top,wrist"],
             "cameras: are 2 in a frame, but the model takes 1",
         ),
-        (["{made}/one", "{made}/arm", "--state"], "arm: is no robot of the laboratory"),
+        (["{made}/one", "{made}/arm", "--state"], "arm: is not one of the toolkit's simulated robots"),
         (["{made}/one", "{made}/arm", "--fid", "nowhere.pt"], "--fid: nowhere.pt: no such file"),
         (["{made}/one", "{made}/arm", "--out", "{made}"], "holds something else than an evaluation"),
         (

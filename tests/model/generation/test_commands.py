@@ -40,9 +40,7 @@ def test_actions_outside_the_range_are_told_once_of_each_embodiment(tmp_path, mo
     known[0, 1] = False
     assert told(model, wide, known) == []
     (said,) = told(model, wide)
-    assert (
-        said == "arm: an action is outside the range seen in training (actions.1 -1 to 1). This is said once"
-    )
+    assert said == "arm: an action is outside the range seen in training (actions.1 -1 to 1). Shown only once"
     assert told(model, wide * 20)[0].startswith("crane: ")
     assert told(model, wide * 20) == []
 

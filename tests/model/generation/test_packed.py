@@ -23,7 +23,7 @@ from tests.model.network.test_unet import stored, unet
 from tests.model.network_parts import small_batch, small_model
 
 needs_packing = pytest.mark.skipif(not packs(torch.device("cpu")), reason="this platform has no AVX-512")
-needs_bfloat16 = pytest.mark.skipif(not has_bfloat16(), reason="this platform has no products of bfloat16")
+needs_bfloat16 = pytest.mark.skipif(not has_bfloat16(), reason="this platform does not support bf16")
 
 needs_int8 = pytest.mark.skipif(
     not (packs(torch.device("cpu")) and has_int8()), reason="this platform has no products of int8"
@@ -114,7 +114,7 @@ def test_products_of_fewer_bits_keep_the_features_near(precision: str, near: flo
     ("precision", "message"),
     [
         ("fp8", "'fp8' is unknown — give float32 or bf16 or int8"),
-        ("bf16", "no products of bfloat16 — use float32"),
+        ("bf16", "does not support bf16 — use float32"),
     ],
 )
 def test_a_precision_that_is_not_there_is_refused(precision, message, monkeypatch) -> None:
@@ -143,7 +143,7 @@ def test_a_map_in_int8_is_near_the_plain_one() -> None:
 
 
 def test_int8_is_refused_with_a_compiler() -> None:
-    with pytest.raises(HMAError, match="int8 is for processors with AVX-512 VNNI, without compile"):
+    with pytest.raises(HMAError, match="int8 needs a processor with AVX-512 VNNI, and no --compile"):
         Rollout(small_model(), "arm", precision="int8", compile=True)
 
 

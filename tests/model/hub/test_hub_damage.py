@@ -85,7 +85,7 @@ def test_a_trunk_that_nobody_could_load_is_not_published(tmp_path):
 def test_a_damaged_manifest_is_named_where_it_is(tmp_path):
     shards = make_shards(tmp_path / "shards", "arm")
     cut(shards / "manifest.json", 300)
-    with pytest.raises(HMAError, match=rf"{shards}/manifest\.json: is damaged.*have it pushed again"):
+    with pytest.raises(HMAError, match=rf"{shards}/manifest\.json: is damaged.*push it again"):
         pull_data(shards, tmp_path / "out")
 
 

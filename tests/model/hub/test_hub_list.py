@@ -163,7 +163,7 @@ def test_new_weights_take_the_film_of_older_ones_from_the_hub(folder, tmp_path, 
 
 
 def test_samples_are_not_written_into_the_package(tmp_path):
-    with pytest.raises(CheckpointError, match="comes along with the package"):
+    with pytest.raises(CheckpointError, match="is part of the installed package"):
         add_samples("embedded", [make_shards(tmp_path / "shards", "arm")])
 
 

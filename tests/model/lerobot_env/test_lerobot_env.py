@@ -115,7 +115,7 @@ def test_settings_that_are_wrong(given: dict[str, Any], said: str) -> None:
     ("inputs", "rename", "state", "said"),
     [
         ({}, "", True, f"""takes {CAMERA}, and {ROBOT} gives action, observation.image,"""),
-        ({"state": 2}, RENAME, False, "takes observation.state, which nobody can read off the images"),
+        ({"state": 2}, RENAME, False, "takes observation.state, which cannot be estimated from the images"),
         ({"state": 3}, RENAME, True, f"has 3 values of observation.state, {ROBOT} has 2"),
         ({"actions": 3}, RENAME, True, f"has 3 values of action, {ROBOT} has 2"),
     ],
@@ -165,7 +165,7 @@ def test_lerobot_eval_and_its_recording(tmp_path: Path) -> None:
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert found.returncode == 0, found.stderr[-3000:]
-    assert "agent_pos is read off the images: 2 of 2 values, mean error" in found.stderr
+    assert "agent_pos is estimated from the images: 2 of 2 values, mean error" in found.stderr
     info = json.loads((tmp_path / "out" / "eval_info.json").read_text())
     assert info["overall"]["n_episodes"] == 2 and info["overall"]["pc_success"] == 0
     recorded = tmp_path / "out" / "recordings" / "hma_0" / "env_0"

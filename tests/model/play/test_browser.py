@@ -360,9 +360,9 @@ def test_a_recording_has_readable_names_and_its_end_offers_no_pause(browser, rec
 
 def test_a_closed_session_offers_to_start_again(page: "Page", stepper: Stepper) -> None:
     name = session_of(stepper, page).name
-    stepper.call(lambda: stepper.close(name, "Closed, because nothing was done for 5 minutes.")).result(10)
+    stepper.call(lambda: stepper.close(name, "Closed after 5 minutes without input.")).result(10)
     page.wait_for_selector("#again:visible")
-    assert "nothing was done" in (page.text_content("#veil-text") or "")
+    assert "without input" in (page.text_content("#veil-text") or "")
     page.click("#again")
     page.wait_for_selector("#veil", state="hidden")
     page.keyboard.press("p")
@@ -411,7 +411,7 @@ def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", st
     stepper.call(lambda: stepper._world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
     page.locator("input[value=fast]").check(force=True)
     page.click("#run")
-    page.wait_for_selector("#parted:has-text('parted at 0.1 s')")
+    page.wait_for_selector("#parted:has-text('diverged at 0.1 s')")
     assert "Sync restarts the model" in (page.text_content("#note") or "")
     assert page.get_attribute("#sync", "class") == "call"
     stepper.call(lambda: stepper._world.blind.clear()).result(10)  # type: ignore[attr-defined]
@@ -425,7 +425,7 @@ def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(pa
     stepper.call(lambda: stepper._world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
     page.locator("input[value=fast]").check(force=True)
     page.click("#run")
-    page.wait_for_selector("#parted:has-text('parted at 0.1 s')")
+    page.wait_for_selector("#parted:has-text('diverged at 0.1 s')")
     page.keyboard.press("p")
     page.wait_for_selector("#run:has-text('Run')")
     page.evaluate("""() => {
@@ -451,7 +451,7 @@ def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(pa
         page.wait_for_timeout(100)
     page.wait_for_timeout(1000)
     shown = page.evaluate("() => seen")
-    assert shown[-1] == "" and "parted at 0.1 s" not in shown[shown.index("") :]
+    assert shown[-1] == "" and "diverged at 0.1 s" not in shown[shown.index("") :]
     assert page.evaluate(bright)
 
 

@@ -169,7 +169,7 @@ def test_an_idle_session_is_paused_and_keeps_its_frames_but_is_closed_if_nobody_
     assert list(bench.world.rows) == [idle.row, busy.row]
     assert idle.paused and len(idle.frames) == 1 and len(busy.frames) == 4
     assert [told["kind"] for told in viewer.told] == ["status", "error"]
-    assert "nothing was done" in viewer.told[-1]["text"]
+    assert "without input" in viewer.told[-1]["text"]
 
 
 def test_an_idle_session_gives_its_place_to_a_new_page() -> None:

@@ -106,7 +106,7 @@ def test_its_true_and_false_positives_are_those_of_the_held_out_episodes(
     told: list[str] = []
     found = measured_judge(str(judge), world, ROBOT, ShardSet(shards), told.append)
     assert (found.hits, found.alarms, found.held_out.count, found.held_out.successes) == (7, 1, 16, 8)
-    said = "calls 7 of 8 (47% to 100%) successes and 1 of 8 (0% to 53%) failures a success"
+    said = "true positives 7 of 8 (47% to 100%), false positives 1 of 8 (0% to 53%)"
     assert found.sentence == f"judge on held-out recorded episodes: {said}"
     assert told[-1] == "measuring the judge: episode 16 of 16"
     assert found.to_json()["false_positive_interval"] == pytest.approx((0.003, 0.527), abs=1e-3)
@@ -124,7 +124,7 @@ def test_policies_are_scored_in_the_model_alone_and_a_stop_continues(
         again = evaluate_recorded(ROBOT, ["random", "still"], world=world, out=tmp_path / "out", **given)
     assert json.dumps(again.to_json()) == json.dumps(found.to_json())
     page = write_report(found, tmp_path / "out").read_text()
-    assert page.count("<img") >= 2 and "calls 7 of 8" in page
+    assert page.count("<img") >= 2 and "true positives 7 of 8" in page
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["report.html", "results.json"]
 
 
@@ -150,7 +150,7 @@ def test_a_judge_no_better_than_chance_and_too_few_labels_are_refused(
 ) -> None:
     label(shards, [bool(number % 2) for number in range(HELD_OUT)])
     always = saved(judge.parent / "always", -1.0)
-    said = r"is no better than chance: calls 8 of 8 \(63% to 100%\) successes and 8 of 8 \(63% to 100%\) fail"
+    said = r"is no better than chance: true positives 8 of 8 \(63% to 100%\), false positives 8 of 8 \(63"
     with pytest.raises(HMAError, match=said):
         measured_judge(str(always), world, ROBOT, ShardSet(shards))
     label(shards, [True, True, False] + [None] * (HELD_OUT - 3))

@@ -103,7 +103,7 @@ def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJu
     assert found.precision.value == found.recall.value == 1 and found.refusal == ""
     (reason,) = [one for one in sentences(found) if "success rates over policies" in one]
     assert found.success["pearson"].value is None
-    assert reason.endswith("no correlation, 4 of at least 8 episodes")
+    assert reason.endswith("no correlation: 4 of at least 8 episodes")
 
 
 def test_policies_of_gym_pusht_are_told_where_the_disc_is(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,7 +226,7 @@ def test_outcomes_alone_are_no_verdict_where_scores_say_nothing(judge: StateJudg
     read[0] = read[20] = -900.0  # one success and one failure are lost: outcomes hold, scores do not
     found = evaluation(judge, [scored_as(f"p{number}", read, true) for number in range(3)])
     assert found.generated.better_than_chance and found.precision.value == 1
-    assert "no better than by chance" in found.refusal and "Pearson" not in " ".join(sentences(found))
+    assert "no better than chance" in found.refusal and "Pearson" not in " ".join(sentences(found))
 
 
 def test_policies_that_cannot_be_told_apart_are_named(judge: StateJudge) -> None:
@@ -238,10 +238,10 @@ def test_policies_that_cannot_be_told_apart_are_named(judge: StateJudge) -> None
     apart = [("none", "one"), ("none", "two"), ("one", "two")]
     assert found.alike(TRUE) == found.alike(MODEL) == apart
     assert found.to_json()["alike"] == {"simulator": apart, "model": apart}
-    (said,) = [one for one in sentences(found) if "in the model, these cannot be told apart" in one]
+    (said,) = [one for one in sentences(found) if "not distinguishable by success in the model" in one]
     assert said.endswith("none and one; none and two; one and two")
     alike = evaluation(judge, [scored_as(name, outcomes[0], outcomes[0]) for name in names])
-    assert "by success in the model, no two policies can be told apart" in sentences(alike)
+    assert "no two policies are distinguishable by success in the model" in sentences(alike)
 
 
 @pytest.mark.slow
@@ -331,7 +331,7 @@ def test_branches_that_do_not_begin_alike_are_refused(
 
     monkeypatch.setattr(ModelArena, "__init__", begun)
     scenes = Scenes.of(world, ROBOT, 2, 0)
-    with pytest.raises(HMAError, match="does not act alike twice: its first actions in the model differ"):
+    with pytest.raises(HMAError, match="is not deterministic: from the same image, its first actions differ"):
         score_policy("it", read_policy(name, scenes), world, scenes, judge, 4)
 
 
@@ -441,7 +441,7 @@ def test_a_robot_without_a_simulator_is_refused() -> None:
     from hma_model.cli import app
     from tests.model.robots import make_model
 
-    with pytest.raises(HMAError, match="arm: has no true simulator"):
+    with pytest.raises(HMAError, match="arm: has no simulator to compare"):
         Scenes.of(_world_of(make_model({"arm": 2})), "arm", 1, 0)
     assert "POLICY" in CliRunner().invoke(app, ["policy-eval", "--help"]).output
 

@@ -383,7 +383,7 @@ def test_a_policy_of_lerobot_trains_on_the_dataset_with_the_state_in_its_images(
     augment(tmp_path / "out", asked(), world=world, lerobot=tmp_path / "rails")
     robot = Embodiment.load(tmp_path / "rails" / "embodiment.yaml")
     said = robot.provenance["state"]
-    assert "read off the images, mean error slider_1 " in said and robot.state is not None
+    assert "estimated from the images, mean error slider_1 " in said and robot.state is not None
     step = {"action": [row / robot.rate_hz for row in range(4)]}
     loaded = LeRobotDataset("lab/rails", root=tmp_path / "rails", delta_timestamps=step)
     assert loaded.meta.features["observation.state"]["names"] == robot.state.names()
@@ -471,7 +471,7 @@ def test_no_recording_is_called_scripted(one_sided: tuple[World, ShardSet], tmp_
     world, shards = one_sided
     for commands in ("scripted", "scripted:noise=0.5"):
         settings = Augmentation("a_strangers_arm", "real", commands=commands, frames=2)
-        with pytest.raises(UsageError, match=f"'{commands}' needs a driver .* a_strangers_arm has none"):
+        with pytest.raises(UsageError, match=f"'{commands}' needs a policy .* a_strangers_arm has none"):
             augment(tmp_path / "out", settings, world=world, shards=shards.folder)
 
 

@@ -184,7 +184,7 @@ def test_what_is_missing_is_said(base, leg, tmp_path):
         tune(tmp_path / "nowhere", leg, tmp_path / "run")
     with pytest.raises(UsageError, match="--data"):
         finetune(base.out, [], out=tmp_path / "run")
-    with pytest.raises(RecipeError, match="nothing has trained"):
+    with pytest.raises(RecipeError, match="untrained trunk"):
         train(make_recipe({**TINY, "data": [str(leg)], "freeze": "trunk"}), out=tmp_path / "r", show=False)
 
 

@@ -113,7 +113,7 @@ def test_a_step_shared_otherwise_goes_on_with_windows_anew_and_says_so(recipe, t
     given = recipe(accumulate=1, batch_size=4)
     train_until(given, tmp_path / "run", 3)
     told = spread(given, tmp_path / "run")
-    assert "the sampler starts again: " in told and "has 1 passes a step, this run has 2" in told
+    assert "the sampler restarts: " in told and "has 1 passes a step, this run has 2" in told
     assert len(curve(tmp_path / "run")) == 6
 
 

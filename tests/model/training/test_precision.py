@@ -55,7 +55,7 @@ def test_auto_takes_bf16_on_a_processor_that_has_it_from_some_width_on(network, 
 
 
 def test_auto_takes_fp32_where_the_processor_has_no_bfloat16(no_bfloat16):
-    assert choose_precision(AUTO, HMAConfig(), CPU) == ("fp32", "this processor has no products of bfloat16")
+    assert choose_precision(AUTO, HMAConfig(), CPU) == ("fp32", "this processor does not support bf16")
 
 
 @pytest.mark.parametrize(("there", "chosen"), [(True, "bf16"), (False, "fp32")])
@@ -72,7 +72,9 @@ def test_what_was_not_measured_stays_in_fp32(bfloat16):
 
 def test_bf16_on_a_processor_without_it_is_refused_in_one_line(shards, tmp_path, no_bfloat16):
     asked = make_recipe({**TINY, "data": shards, "precision": "bf16"})
-    with pytest.raises(RecipeError, match=r"precision=bf16: this processor has no .* — use precision=auto"):
+    with pytest.raises(
+        RecipeError, match=r"precision=bf16: this processor does not support bf16 — use precision=auto"
+    ):
         train(asked, out=tmp_path / "run", show=False)
     assert not (tmp_path / "run").exists()
 
@@ -81,7 +83,7 @@ def test_a_resumed_run_keeps_the_precision_that_it_began_with(shards, tmp_path, 
     given, out = {**TINY, "data": shards}, tmp_path / "run"
     train_until(make_recipe({**given, "precision": "bf16"}), out, 3)
     train(make_recipe({**given, "precision": "auto"}), out=out)  # of this width, auto alone takes fp32
-    assert "precision bf16: as the run began; attention by products" in capsys.readouterr().err
+    assert "precision bf16: as at the start of the run; attention: matrix products" in capsys.readouterr().err
     assert json.loads((out / "recipe.json").read_text())["precision"] == "bf16"
     with pytest.raises(RecipeError, match="precision: 'bf16', now 'fp32'"):
         train(make_recipe(given), out=out, show=False)
@@ -90,7 +92,7 @@ def test_a_resumed_run_keeps_the_precision_that_it_began_with(shards, tmp_path, 
 def test_a_run_says_its_precision_and_attention_first(shards, tmp_path, no_bfloat16, capsys):
     train(make_recipe({**TINY, "data": shards, "precision": "auto"}), out=tmp_path / "run")
     said = capsys.readouterr().err.splitlines()[0]
-    assert "precision fp32: this processor has no products of bfloat16; attention by torch's" in said
+    assert "precision fp32: this processor does not support bf16; attention: torch's" in said
 
 
 def test_a_unet_has_no_attention():

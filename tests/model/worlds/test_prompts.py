@@ -138,5 +138,7 @@ def test_a_prompt_crosses_no_pause(model: HMA, shards: Path, tmp_path: Path) -> 
 
 
 def test_another_robot_needs_a_prompt() -> None:
-    with pytest.raises(HMAError, match="none comes along: it is no robot of the laboratory — give an image"):
+    with pytest.raises(
+        HMAError, match="none is included: it is not one of the toolkit's simulated robots — give an image"
+    ):
         starting_window(small_model(), "arm")

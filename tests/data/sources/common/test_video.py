@@ -204,7 +204,7 @@ def test_pictures_are_turned_and_cropped_as_the_yaml_says(changes, expected) -> 
 
 def test_a_crop_that_leaves_the_picture_is_refused() -> None:
     camera = Camera(name="c", key="k", crop=(4, 0, 8, 8))
-    with pytest.raises(EpisodeError, match=r"crop \[4, 0, 8, 8\] leaves the picture of 8×8"):
+    with pytest.raises(EpisodeError, match=r"crop \[4, 0, 8, 8\] leaves the image of 8×8"):
         prepare(np.zeros((1, 8, 8, 3), np.uint8), camera, 8)
 
 

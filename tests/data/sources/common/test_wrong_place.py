@@ -74,7 +74,7 @@ def test_the_same_fault_of_many_episodes_is_told_once(tmp_path: Path) -> None:
     data.write_bytes(b"")
     found = [one for one in open_source("lerobot").inspect(str(folder)).findings if one.check == "readable"]
     assert len(found) == 1 and found[0].message.startswith(
-        "3 of 3 episodes looked at, such as episode_000000: "
+        "3 of 3 sampled episodes, such as episode_000000: "
     )
     assert str(data) in found[0].message
 
@@ -83,7 +83,7 @@ def test_doctor_names_an_episode_it_could_not_use_and_the_keys_there_are(tmp_pat
     write_toy(tmp_path / "toy.hdf5", [60, 60])
     (tmp_path / "arm.yaml").write_text(ARM_YAML.replace("key: obs/image", "key: obs/nothing"))
     (first, *_) = examine(str(tmp_path / "toy.hdf5"), str(tmp_path / "arm.yaml"))
-    assert first.message.startswith("2 of 2 episodes looked at, such as demo_0: has no 'obs/nothing'")
+    assert first.message.startswith("2 of 2 sampled episodes, such as demo_0: has no 'obs/nothing'")
     toy(tmp_path / "rlds")
     changed = rlds_robot(cameras=[{"name": "primary", "key": "observation/none"}])
     (tmp_path / "rlds.yaml").write_text(changed.to_yaml())

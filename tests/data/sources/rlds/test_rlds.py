@@ -587,7 +587,5 @@ def test_a_folder_of_any_name_is_read(name, tmp_path):
 def test_of_many_episodes_that_cannot_be_read_the_first_is_told(tmp_path):
     toy(tmp_path / "toy", (2,) * 7)
     (tmp_path / "toy" / "features.json").write_text("{}")
-    with pytest.raises(
-        SourceError, match="7 of 7 episodes looked at, such as train/000000: holds none of the"
-    ):
+    with pytest.raises(SourceError, match="7 of 7 sampled episodes, such as train/000000: holds none of the"):
         RLDS.inspect(str(tmp_path / "toy"))
