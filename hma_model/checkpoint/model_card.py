@@ -16,8 +16,8 @@ from hma_data.tokenizers.catalog import other_weights
 from hma_model.config import token_words
 
 _TAGS = ("robotics", "world-model", "video-prediction", "hma")
-# Parts of a card that judge the weights: by `hma evaluate`, and by `hma bench holds`.
-JUDGED = ("evaluation", "holds")
+# Parts of a card that judge the weights: by `hma evaluate`, `hma bench holds` and `hma benchmark`.
+JUDGED = ("evaluation", "holds", "meter")
 _DATASET = re.compile(rf"hf://datasets/({REPOSITORY.pattern})")
 
 # The identifiers that the hub accepts in a card's front matter; it refuses any other.

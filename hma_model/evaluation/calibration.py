@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
+from hma_model.config import HMAConfig
 from hma_model.evaluation.intervals import LEVELS, NATURAL, SHARE, resampled_means, rounded, summary
 
 Floats = NDArray[np.float64]
@@ -93,6 +94,27 @@ class Meter:
         said = [f"{name} {value:.0%}" for name, value in shares.items() if value is not None]
         start = f"uncertainty warns of a state error of {self.doubled_px:.1f} px: {rates}"
         return ", ".join([start, *said])
+
+
+def meter_of(
+    config: HMAConfig, card: Mapping[str, Any], unmask_steps: int, temperature: float, order: str
+) -> tuple[Meter | None, str]:
+    """Return the meter that a robot's card holds, or None and why there is none for such frames.
+
+    A meter that is no better than a clock is returned: what it is good for, `better` and `chooses` say.
+    """
+    if config.video_loss == "regression":
+        return None, NO_UNCERTAINTY
+    if "meter" not in card:
+        return None, "uncertainty is not calibrated: hma benchmark calibrates it"
+    try:
+        meter = Meter.of(card["meter"])
+    except (KeyError, TypeError):
+        return None, "the card's calibration of uncertainty is damaged: hma benchmark writes it anew"
+    if (meter.unmask_steps, meter.temperature, "random") != (unmask_steps, temperature, order):
+        way = f"{meter.unmask_steps} passes at temperature {meter.temperature:g} in random order"
+        return None, f"uncertainty is calibrated for {way} alone"
+    return meter, ""
 
 
 def accumulated(uncertainty: Floats) -> Floats:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.images import opencv, resize
 from hma_data.errors import UsageError
+from hma_model.evaluation.calibration import POWER
 from hma_model.play.pads import describe
 from hma_model.worlds.scenes import Drivable, Float32s, Image, LabScene
 
@@ -79,6 +80,7 @@ class Session:
 
     Attributes:
         row: the world's number for it.
+        meter: calibrated uncertainty; None where `unmetered` says why.
         viewer: who watches; without one the session stands still.
         due: the time of the next step.
         touched: when a person did something last.
@@ -90,7 +92,6 @@ class Session:
         self.name = name
         self.robot = robot
         self._world = world
-        self.sampling = sampling
         self.viewer: Viewer | None = None
         self.due = self.touched = now
         self.paused = True
@@ -100,12 +101,24 @@ class Session:
         self.steps = 0  # single steps asked for
         self.input = 0  # number of the newest input, by which the page measures latency
         self._times: deque[float] = deque(maxlen=40)
+        self._stated = 0.0
+        self.sample(sampling)
         self._begin(number)
         self.row = world.open(robot.embodiment.id, *self._history())
         with ExitStack() as undo:
             undo.callback(world.close, self.row)
             self._set_start()
             undo.pop_all()
+
+    def sample(self, sampling: FrameSampling) -> None:
+        """Go on with another sampling; the meter of uncertainty is that of such frames."""
+        self.sampling = sampling
+        robot = self.robot.embodiment.id
+        way = {"unmask_steps": sampling.passes, "temperature": sampling.temperature, "order": sampling.order}
+        meter, self.unmetered = self._world.meter(robot, **way)
+        if meter is not None and not meter.better:
+            self.unmetered = meter.verdict
+        self.meter = None if self.unmetered else meter
 
     # -- scene and model
 
@@ -139,6 +152,7 @@ class Session:
         true = self._true[-1]
         rate = self.robot.embodiment.rate_hz / self.robot.embodiment.stride
         self._divergence = DivergenceDetector(true, shown, round(rate))
+        self._stated = 0.0
         self._still = true
         return replace(frame, model=jpeg(shown), true=jpeg(true), psnr=psnr(shown, true), still=60.0)
 
@@ -198,6 +212,8 @@ class Session:
             self._true.clear()
         else:
             self._true.append(self._truth)
+        unsure = self._world.uncertainty.get(self.row, math.nan) if self.meter else math.nan
+        self._stated = (self._stated**POWER + unsure**POWER) ** (1 / POWER)
         score = still = None
         if self._truth is not None:
             score = psnr(image, self._truth)
@@ -218,8 +234,16 @@ class Session:
                 "rate": self._rate(now),
                 "input": self.input,
             }
-            facts |= {"action": actions[-1].tolist(), "parted": self.parted}
+            facts |= {"action": actions[-1].tolist(), "parted": self.parted, "meter": self.metered}
             self.viewer.show(frame, facts)
+
+    @property
+    def metered(self) -> dict[str, Any] | None:
+        """Return the state error to expect in the newest frame, and whether to warn; None without a meter."""
+        if self.meter is None or not math.isfinite(self._stated):
+            return None
+        stated = np.array(self._stated)
+        return {"px": round(float(self.meter.expected(stated)), 1), "warns": bool(self.meter.warns(stated))}
 
     @property
     def _state(self) -> Float32s | None:
@@ -238,7 +262,8 @@ class Session:
         return {
             "kind": "status", "paused": self.paused, "replays": self.replays, "fast": self.fast,
             "sampling": vars(self.sampling), "scene": self.number, "frame": self.count, "ended": self.ended,
-            "knows": bool(self._true), "parted": self.parted,
+            "knows": bool(self._true), "parted": self.parted, "meter": self.metered,
+            "unmetered": self.unmetered, "metered": "" if self.meter is None else self.meter.verdict,
         }  # fmt: skip
 
     def opened(self) -> dict[str, Any]:

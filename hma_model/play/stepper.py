@@ -146,7 +146,7 @@ class Stepper:
             raise UsageError(
                 "order", f"this model has no {sampling.order!r}", f"known: {', '.join(self.orders)}"
             )
-        session.sampling = sampling
+        session.sample(sampling)
 
     def close(self, name: str, reason: str = "") -> None:
         """Close a session, and tell its viewer why."""
@@ -197,6 +197,7 @@ class Stepper:
     def _step_together(self, sampling: FrameSampling, sessions: list[Session]) -> None:
         world = self._world
         world.unmask_steps, world.temperature, world.order = vars(sampling).values()
+        world.measure = any(session.meter is not None for session in sessions)
         begun = time.monotonic()
         chunks: dict[int, Float32s] = {}
         rows: dict[int, Session] = {}

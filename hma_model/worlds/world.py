@@ -24,6 +24,7 @@ from hma_data.storage.paths import StrPath
 from hma_data.tokenizers.base import full_name, get_tokenizer
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import POLICY
+from hma_model.evaluation.calibration import Meter, meter_of
 from hma_model.generation.commands import Commands, described
 from hma_model.generation.decode import decode
 from hma_model.generation.engine import products_in
@@ -93,6 +94,19 @@ class World:
         self._sessions: dict[int, _Session] = {}
         self._opened = 0
         self._specs: dict[str, Commands] = {}
+
+    def meter(self, embodiment: str, **sampling: Any) -> tuple[Meter | None, str]:
+        """Return the calibrated uncertainty of a robot's frames, or None and why there is none.
+
+        Args:
+            embodiment: an id.
+            sampling: unmask_steps, temperature and order of the frames; by default those of the world.
+        """
+        source = self.model.source
+        card = source.card(embodiment) if source and embodiment in source.embodiments else {}
+        own: dict[str, Any] = {"unmask_steps": self.unmask_steps, "temperature": self.temperature}
+        own["order"] = self.order
+        return meter_of(self.model.config, card, **own | sampling)
 
     @property
     def sessions(self) -> dict[int, str]:

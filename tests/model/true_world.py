@@ -62,6 +62,9 @@ class TrueWorld:
                     self._advance(first, chunk)
                 self.rows[session] = first
 
+    def meter(self, embodiment: str, **sampling: Any) -> tuple[None, str]:
+        return None, "it is never unsure"
+
     def fork(self, sessions: Sequence[int], n: int) -> "TrueWorld":
         other = copy.copy(self)
         rows = [self.rows[session].copy() for session in sessions for _ in range(n)]

@@ -1,5 +1,6 @@
 """Calibration of uncertainty, with plain loops as the oracle: map, warnings, reliability and risk."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from hma_model.config import HMAConfig
 from hma_model.evaluation import calibration as calibrating
 from hma_model.evaluation.calibration import (
     BINS,
@@ -19,6 +21,7 @@ from hma_model.evaluation.calibration import (
     best_limit,
     calibration,
     fit,
+    meter_of,
 )
 
 WAY: Any = {"unmask_steps": 2, "temperature": 0.5}
@@ -149,3 +152,20 @@ def test_errors_that_never_double_are_warned_of_never() -> None:
     found = calibration(uncertainty, np.ones_like(errors), errors, **WAY)
     assert found["doubling"] == 0 and found["misses"] is None and not found["meter"]["better"]
     assert best_limit(accumulated(uncertainty), np.full(errors.shape[:2], 16)) > 1
+
+
+def test_a_card_gives_a_meter_for_the_frames_that_it_was_measured_on_or_says_why_not() -> None:
+    uncertainty, errors = rollouts(4.0)
+    card = {"meter": calibration(uncertainty, errors, errors, **WAY)["meter"]}
+    tokens = HMAConfig(layers=1, width=32, heads=2)
+    meter, reason = meter_of(tokens, card, 2, 0.5, "random")
+    assert meter is not None and reason == "" and meter.better
+    for way, said in (
+        ((1, 0.5, "random"), "calibrated for 2 passes at temperature 0.5 in random order alone"),
+        ((2, 0.5, "confidence"), "in random order alone"),
+    ):
+        assert said in meter_of(tokens, card, *way)[1]
+    assert "hma benchmark calibrates it" in meter_of(tokens, {}, *way)[1]
+    assert "is damaged" in meter_of(tokens, {"meter": {"limit": 1}}, *way)[1]
+    regression = SimpleNamespace(video_loss="regression")
+    assert meter_of(regression, card, *way) == (None, NO_UNCERTAINTY)  # type: ignore[arg-type]

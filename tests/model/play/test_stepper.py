@@ -1,5 +1,6 @@
 """The stepper of `hma play`: clocks, batches, the truth beside the model, and sessions that end."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from hma_data.errors import UsageError
 from hma_data.lab.simulator import LabSimulator
+from hma_model.evaluation.calibration import Meter
 from hma_model.play.session import FrameSampling, Session
 from hma_model.play.stepper import Stepper
 from hma_model.worlds.scenes import PROMPT_FRAMES, SCENE_SEED
@@ -120,6 +122,36 @@ def test_they_part_when_for_a_second_a_still_is_as_near_to_the_truth_as_the_mode
     assert session.parted == 8
     session.sync()
     assert session.parted is None and session.status()["parted"] is None
+
+
+METER = Meter(2, 0.0, (0.0, 4.0), (1.0, 9.0), 2.0, 3.0, 0.8, 0.5, 0.1, 0.1, better=True, chooses=True)
+
+
+def test_the_meter_of_uncertainty_warns_until_a_sync_and_is_refused_if_no_better_than_a_clock() -> None:
+    bench = Bench()
+    session, _ = bench.open()
+    assert session.metered is None and session.status()["unmetered"] == "it is never unsure"
+    known: dict[int, tuple[Meter | None, str]] = {2: (METER, ""), 3: (replace(METER, better=False), "")}
+    bench.world.meter = lambda robot, **way: known[way["unmask_steps"]]  # type: ignore[method-assign]
+    session.sample(session.sampling)
+    session.sync()
+    bench.world.uncertainty[session.row] = 1.5
+    found = []
+    for _ in range(4):
+        bench.step()
+        found.append(session.metered)
+    assert bench.world.measure
+    roots = [1.5 * count**0.25 for count in (1, 2, 3, 4)]
+    assert found == [{"px": round(1 + 2 * root, 1), "warns": root >= 2} for root in roots]
+    session.sync()
+    assert session.metered == {"px": 1.0, "warns": False}
+    session.sample(replace(session.sampling, passes=3))
+    assert session.metered is None and "no better than a clock" in session.status()["unmetered"]
+    bench.step()
+    session.sample(replace(session.sampling, passes=2))
+    assert session.metered is None  # a frame was not measured
+    session.begin(0)
+    assert session.metered == {"px": 1.0, "warns": False}
 
 
 def test_sync_restarts_the_model_from_the_true_frames_and_their_actions() -> None:
