@@ -22,6 +22,15 @@ from hma_model.cli.options import (
     kept,
 )
 
+MaxError = Annotated[
+    float | None,
+    Option(
+        min=0,
+        help="Largest expected state error at an episode's end, px of 128, by the calibrated uncertainty; "
+        "episodes above it are left out.",
+    ),
+]
+
 
 def policy_eval(
     embodiment: Annotated[
@@ -56,6 +65,7 @@ def policy_eval(
             help="Shards with success labels, for a reward model; default: those of the training run.",
         ),
     ] = None,
+    max_error: MaxError = None,
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
     precision: Precision = "float32",
@@ -76,9 +86,11 @@ def policy_eval(
     from hma_model.policies.rewards import names_reward_model
     from hma_model.policies.scores import evaluate_policies
 
-    evaluate: Any = evaluate_policies
+    evaluate: Any = partial(evaluate_policies, max_error=max_error)
     pages: Any = report
     if names_reward_model(judge):
+        if max_error is not None:
+            raise UsageError("--max-error", "is for simulated robots", "leave it out")
         evaluate = partial(recorded.evaluate_recorded, shards=source)
         pages = recorded
     elif source is not None:
@@ -126,6 +138,7 @@ def augment(
         str, Option(help="Actions: replay, perturb=SHARE of their deviation, or a policy of hma policy-eval.")
     ] = "replay",
     keep: Annotated[float, Option(help="Share of episodes to keep, lowest uncertainty first.")] = 0.5,
+    max_error: MaxError = None,
     judge: Annotated[str, Option(help="Keep only these successes: moved, reached, placed, moved=PX.")] = "",
     lerobot: Annotated[Path | None, Option(help="Also write a LeRobotDataset v3.0 to this folder.")] = None,
     unmask_steps: UnmaskSteps = 2,
@@ -149,8 +162,9 @@ def augment(
 
     there, name = device_name(device), source.resolve().name if source else ""
     settings = Augmentation(
-        embodiment, name, episodes, frames, commands, keep, judge, seed, unmask_steps, temperature, precision
-    )
+        embodiment, name, episodes, frames, commands, keep, max_error, judge, seed, unmask_steps, temperature,
+        precision,
+    )  # fmt: skip
     finished = (out / MANIFEST).is_file() and (lerobot is None or (lerobot / ORIGIN).is_file())
     whole = episodes * frames
     with interruptible(lambda: kept("batches", out)), progress("episodes", whole) as update:

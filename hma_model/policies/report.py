@@ -15,7 +15,7 @@ from hma_data.storage.files import atomic_path
 from hma_model.evaluation.agreement import Estimate
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
-from hma_model.policies.scores import MODEL, SHARED, TRUE, WORK, PolicyEvaluation, Scored
+from hma_model.policies.scores import MODEL, SHARED, TRUE, WORK, Abstention, PolicyEvaluation, Scored
 
 COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "agree", "same actions, sim.")
 LISTED_PAIRS = 6  # pairs of policies that a sentence names
@@ -75,6 +75,8 @@ def sentences(found: PolicyEvaluation) -> list[str]:
         f"model vs simulator, each under its own actions: precision {_share(paired['precision'])}, "
         f"recall {_share(paired['recall'])}, AUROC of scores {paired['auroc']}",
     ]
+    if found.abstention is not None:
+        said.append(abstained(found.abstention))
     if found.refusal:
         said.append(refused(found))
     else:
@@ -93,6 +95,18 @@ def sentences(found: PolicyEvaluation) -> list[str]:
 def refused(found: PolicyEvaluation) -> str:
     """Return the sentence that says why there is no verdict."""
     return f"no verdict: on generated frames {found.refusal}, so the model's success rates are meaningless"
+
+
+def abstained(found: Abstention) -> str:
+    """Return the sentence on what the model says where it does not expect a large error of its own."""
+    start = (
+        f"abstention: {found.judged} of {found.count} episodes end with an expected state error of at most "
+        f"{found.max_error_px:g} px"
+    )
+    if found.generated is None:
+        return f"{start}; nothing is judged"
+    rates = f"precision {_share(found.precision)}, recall {_share(found.recall)}"
+    return f"{start}; of these the judge on generated frames: {found.generated}, {rates}"
 
 
 def _share(found: Estimate) -> str:

@@ -45,6 +45,8 @@ from hma_model.evaluation.agreement import (
     precision_recall,
     share_interval,
 )
+from hma_model.evaluation.calibration import Meter, accumulated
+from hma_model.evaluation.intervals import rounded
 from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.policies.arenas import Arena, Float32s, Image, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy, begin, checked, kept_randomness, seed_samplers
@@ -79,6 +81,7 @@ class Scored:
             simulator under the actions that the policy gave in the model.
         shown: frames of which images are kept.
         true_images, model_images: (N, len(shown), S, S, 3).
+        stated: (N,) how unsure the model was, as a `Meter` takes it; NaN if it is not measured.
     """
 
     policy: str
@@ -87,6 +90,34 @@ class Scored:
     shown: NDArray[np.int64]
     true_images: Image
     model_images: Image
+    stated: Scores
+
+
+@dataclass(frozen=True)
+class Abstention:
+    """What the model says of the episodes in which it does not expect a large error of its own.
+
+    Attributes:
+        max_error_px: the largest state error to expect at the end of an episode that is judged.
+        judged, count: episodes that are judged, and all.
+        generated, precision, recall: of those that are judged, as of `PolicyEvaluation`.
+    """
+
+    max_error_px: float
+    judged: int
+    count: int
+    generated: Accuracy | None
+    precision: Estimate
+    recall: Estimate
+
+    @classmethod
+    def of(cls, meter: Meter, max_error_px: float, scored: Sequence[Scored]) -> "Abstention":
+        """Return what is left of policies' episodes."""
+        kept = meter.expected(np.stack([one.stated for one in scored])) <= max_error_px
+        success = np.stack([one.success for one in scored], axis=1)
+        true, judged = success[REPLAYED][kept], success[MODEL][kept]
+        agreed = accuracy(true, judged) if kept.any() else None
+        return cls(max_error_px, int(kept.sum()), kept.size, agreed, *precision_recall(true, judged))
 
 
 @dataclass(frozen=True)
@@ -105,6 +136,7 @@ class PolicyEvaluation:
         auroc: how well these scores tell the simulator's successes under these actions from its failures.
         paired: "precision", "recall" and "auroc" of the episodes in the model, against the episodes of the
             same start in the simulator, where the policy acted by itself.
+        abstention: of the episodes in which the model expects a small error of its own, if that is asked for.
     """
 
     embodiment: str
@@ -122,6 +154,7 @@ class PolicyEvaluation:
     followed: Estimate
     auroc: Estimate
     paired: dict[str, Estimate]
+    abstention: Abstention | None = None
 
     @property
     def refusal(self) -> str:
@@ -167,6 +200,7 @@ class PolicyEvaluation:
             outcomes[one.policy] = {
                 name: {"scores": scores, "success": success} for name, scores, success in each
             }
+            outcomes[one.policy]["stated_uncertainty"] = rounded(one.stated)
         own = ("embodiment", "checkpoint", "sampling", "seed", "frames")
         return {key: getattr(self, key) for key in own} | {
             "episodes": self.policies[0].scores.shape[1],
@@ -183,6 +217,7 @@ class PolicyEvaluation:
                 "generated_better_than_chance": self.generated.better_than_chance,
             },
             "refused": self.refusal,
+            "abstention": None if self.abstention is None else asdict(self.abstention),
             "paired": {"shared": SHARED, "first_chunks_equal": True}  # else `score_policy` raises
             | {name: asdict(one) for name, one in self.paired.items()},
             "policies": self.rows(),
@@ -204,6 +239,7 @@ def evaluate_policies(
     frames: int = FRAMES,
     judge: str | StateJudge = "moved",
     seed: int = 0,
+    max_error: float | None = None,
     out: StrPath | None = None,
     world: World | None = None,
     on_progress: Progress = lambda done, words: None,
@@ -219,6 +255,8 @@ def evaluate_policies(
         frames: T.
         judge: words as `task_of` takes them, or a trained judge.
         seed: of scenes, policies, judge and intervals; on one device, the same seed gives the same figures.
+        max_error: px of 128; of episodes whose state error is expected to end above it, the model's judgement
+            is left out of `abstention`.
         out: folder that keeps finished policies until `write_report` has written there; None keeps nothing.
         world: a world instead of a checkpoint.
         on_progress: called with the frames done, and what is done.
@@ -226,6 +264,7 @@ def evaluate_policies(
 
     Raises:
         HMAError: a policy fails, the robot has no simulator, or the judge is no better than chance.
+        UsageError: `max_error` is given, and there is no calibrated uncertainty that is of use.
         OutputError: the folder cannot be written, or was begun with other settings.
     """
     names = names_of(policies)
@@ -234,6 +273,7 @@ def evaluate_policies(
         world = world or load_world(checkpoint, **settings)
         sampling = sampling_of(world)
         scenes = Scenes.of(world, embodiment, episodes, seed)
+        meter = None if max_error is None else choosing_meter(world, embodiment)
         made = [read_policy(one, scenes, world) if isinstance(one, str) else one[1] for one in policies]
         keys = [""] * len(made) if folder is None else part_keys(policies, world, embodiment, judge)
         for name, policy in zip(names, made, strict=True):
@@ -288,7 +328,22 @@ def evaluate_policies(
         episode_correlation(scores[MODEL].ravel(), scores[REPLAYED].ravel()),
         auroc(success[REPLAYED], scores[MODEL], seed),
         {"precision": precision, "recall": recall, "auroc": paired},
+        None if meter is None or max_error is None else Abstention.of(meter, max_error, scored),
     )
+
+
+def choosing_meter(world: World, embodiment: str) -> Meter:
+    """Return the meter by which rollouts of a robot can be left out.
+
+    Raises:
+        UsageError: there is none, or it chooses no better than chance.
+    """
+    meter, reason = world.meter(embodiment)
+    if meter is not None and not meter.chooses:
+        reason = f"the surest half of {embodiment}'s rollouts has no smaller error than all: {meter.verdict}"
+    if meter is None or reason:
+        raise UsageError("--max-error", reason, "leave it out")
+    return meter
 
 
 def names_of(policies: Sequence[str | tuple[str, Policy]]) -> list[str]:
@@ -314,7 +369,7 @@ def part_keys(
 
     The rest is in the settings of the folder of work, with which a judge of words always comes out the same.
     """
-    shared = ["paired", world_facts(world), None if isinstance(judge, str) else object_sha256(judge)]
+    shared = ["stated", world_facts(world), None if isinstance(judge, str) else object_sha256(judge)]
     own = [
         (one, policy_facts(one, embodiment)) if isinstance(one, str) else (one[0], object_sha256(one[1]))
         for one in policies
@@ -342,9 +397,17 @@ def score_policy(
     true = TrueArena(scenes, size)
     true_images, acted = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
     model = ModelArena(world, true, judge.probe)
+    unsure = []
+
+    def look(done: float) -> None:
+        unsure.append(model.uncertainty())
+        tell(done, "in the model")
+
+    world.measure = True
     try:
-        model_images, actions = run(name, policy, model, frames, lambda done: tell(done, "in the model"))
+        model_images, actions = run(name, policy, model, frames, look)
     finally:
+        world.measure = False
         model.close()
     _require_paired(name, acted[: scenes.stride], actions[: scenes.stride])
     again = TrueArena(scenes, size, drawn=False)
@@ -356,6 +419,7 @@ def score_policy(
         "scores": np.stack([there, read, replayed]),
         "success": np.stack([there >= limit, judge.success(read), replayed >= limit]),
         "shown": shown,
+        "stated": accumulated(np.stack(unsure, axis=1))[:, -1],
         "true_images": np.stack([true_images[frame] for frame in shown], axis=1),
         "model_images": np.stack([model_images[frame] for frame in shown], axis=1),
     }

@@ -9,6 +9,7 @@ N episodes, P frames of a prompt, T generated frames, A action dims, K = stride 
 """
 
 import hashlib
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -28,6 +29,7 @@ from hma_data.shards.windows import episode_pieces
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
+from hma_model.evaluation.calibration import Meter, accumulated
 from hma_model.evaluation.probe import Probe, train_probe
 from hma_model.evaluation.recorded_state import EPISODES_NEEDED, Reader, recorded_reader, simulated_reader
 from hma_model.generation.decode import cameras_for
@@ -36,7 +38,7 @@ from hma_model.policies.base import Judged, Policy
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import device_facts, world_digests
 from hma_model.policies.judge import StateJudge, task_of, train_judge
-from hma_model.policies.scores import Progress, run
+from hma_model.policies.scores import Progress, choosing_meter, run
 from hma_model.synthetic.recorder import (
     SyntheticEpisode,
     finished,
@@ -69,7 +71,8 @@ class Augmentation:
         episodes: N that are made.
         frames: T.
         commands: `replay`, `perturb=SHARE`, or a policy as `read_policy` takes it.
-        keep: share of the episodes that is kept.
+        keep: share of the episodes that is kept, the surest ones.
+        max_error: px; episodes whose state error is expected to end above it are left out. None leaves none.
         judge: the task whose successes are kept, as `task_of` takes it; empty for none.
         seed: of everything.
         unmask_steps, temperature, precision: as of `World`.
@@ -81,6 +84,7 @@ class Augmentation:
     frames: int = 40
     commands: str = "replay"
     keep: float = 0.5
+    max_error: float | None = None
     judge: str = ""
     seed: int = 0
     unmask_steps: int = 2
@@ -112,8 +116,8 @@ class SyntheticBatch:
     Of a policy's episodes P is one: the actions before it are none of its own.
 
     Attributes:
-        uncertainty: (n,) how unsure the model was of the generated frames, their mean; see `Rollout`. NaN if
-            it is not measured.
+        uncertainty: (n,) how unsure the model was since the true frames, as a `Meter` takes it. NaN if it is
+            not measured.
         success: (n,) as judged; all True without a judge.
         groups: (n,) ids of the real episodes that they begin with.
     """
@@ -184,6 +188,7 @@ def augment(
         given: of the world made from the checkpoint, as of `load_world`: device, compile.
 
     Raises:
+        UsageError: `max_error` is given, and there is no calibrated uncertainty that is of use.
         HMAError: the robot, the shards or the policy do not fit, the folder holds something else, the judge
             is no better than chance, or no episode is left.
     """
@@ -194,6 +199,9 @@ def augment(
         checkpoint, unmask_steps=settings.unmask_steps, temperature=settings.temperature,
         precision=settings.precision, **given,
     )  # fmt: skip
+    meter = None if settings.max_error is None else choosing_meter(world, settings.embodiment)
+    if settings.keep < 1 and meter is None:
+        _warn_of_choice(world, settings)
     if (views := world.model.config.views) > 1 and (shards is None or settings.looked_at):
         fault = f"the simulator shows one camera, and the model sees {views}"
         remedy = "name shards with --from, and leave out --judge and policies that read the robot's state"
@@ -212,7 +220,7 @@ def augment(
             kept = KeptParts(folder / WORK, made_by | device_facts(world.model))
             batches = maker.run(kept, on_progress)
             spec = world.tokenizer.spec
-            chosen = _chosen(batches, settings, UNCERTAINTY_FLAGS[spec.kind])
+            chosen = _chosen(batches, settings, UNCERTAINTY_FLAGS[spec.kind], meter)
             found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
             kept.remove()
         if dataset is not None and not done:
@@ -225,6 +233,15 @@ def augment(
             stated = _stated(world, settings, begins, found.cameras, partial(on_progress, made))
             write_as_lerobot(dataset, folder, world.tokenizer, stated, tell)
     return found
+
+
+def _warn_of_choice(world: World, settings: Augmentation) -> None:
+    """Warn if nobody knows that the surest episodes are better than others."""
+    meter, reason = world.meter(settings.embodiment)
+    if meter is not None and not meter.chooses:
+        reason = "uncertainty chooses no better than chance on this robot"
+    if reason and world.model.config.video_loss != "regression":  # of which the command says more
+        warnings.warn(f"--keep {settings.keep:g}: {reason}", UserWarning, stacklevel=3)
 
 
 def _stated(
@@ -376,7 +393,7 @@ class _Maker:
         return SyntheticBatch(
             np.concatenate([first, generated], axis=1),
             np.concatenate([before, own], axis=1),
-            np.stack(uncertainty).mean(axis=0),
+            accumulated(np.stack(uncertainty, axis=1))[:, -1],
             success,
             np.array(begun.groups),
         )
@@ -432,7 +449,7 @@ class _Maker:
 
 
 def _chosen(
-    batches: Sequence[SyntheticBatch], settings: Augmentation, measure: str
+    batches: Sequence[SyntheticBatch], settings: Augmentation, measure: str, meter: Meter | None
 ) -> list[SyntheticEpisode]:
     """Return the episodes of which the model was least unsure, without those that are judged failures.
 
@@ -444,6 +461,12 @@ def _chosen(
     measured = bool(np.isfinite(unsure).all())
     chosen = np.full(len(unsure), not measured)
     chosen[np.argsort(unsure, kind="stable")[: max(1, round(settings.keep * len(unsure)))]] = True
+    if meter is not None and settings.max_error is not None:
+        expected = meter.expected(unsure)
+        chosen &= expected <= settings.max_error
+        if not chosen.any():
+            fault = f"leaves no episode: the smallest expected error at the end is {expected.min():.1f} px"
+            raise HMAError("--max-error", fault, "give more px, or fewer --frames")
     if not (chosen & success).any():
         fault = f"none of the {chosen.sum()} surest of {len(unsure)} episodes is judged a success"
         raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")

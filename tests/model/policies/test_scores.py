@@ -19,6 +19,7 @@ from hma_data.lab import truth
 from hma_data.lab.simulator import LabSimulator
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.evaluation.agreement import Accuracy
+from hma_model.evaluation.calibration import Meter
 from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.network.model import HMA
 from hma_model.policies import scores
@@ -178,14 +179,18 @@ def test_shares_have_exact_intervals_and_too_few_successes_are_said(world: World
         assert said in replace(found, generated=generated).refusal
 
 
+METER = Meter(2, 0.0, (0.0, 8.0), (1.0, 17.0), 2.0, 3.0, 0.8, 0.5, 0.1, 0.1, better=True, chooses=True)
+UNABLE = replace(METER, chooses=False)
+
+
 def scored_as(name: str, model: np.ndarray, replayed: np.ndarray, limit: float = 5.0) -> Scored:
     """Return a policy with these scores (N,), whose true outcomes are those under the same actions."""
     images = np.zeros((len(model), 1, 8, 8, 3), np.uint8)
     values = np.stack([replayed, model, replayed])
-    return Scored(name, values, values >= limit, np.zeros(1, int), images, images)
+    return Scored(name, values, values >= limit, np.zeros(1, int), images, images, np.arange(len(model)) / 4)
 
 
-def evaluation(judge: StateJudge, policies: list[Scored]) -> PolicyEvaluation:
+def evaluation(judge: StateJudge, policies: list[Scored], **asked: Any) -> PolicyEvaluation:
     """Return what `evaluate_policies` makes of these results."""
     made = {one.policy: one for one in policies}
     with pytest.MonkeyPatch.context() as patch:
@@ -196,7 +201,9 @@ def evaluation(judge: StateJudge, policies: list[Scored]) -> PolicyEvaluation:
         patch.setattr(scores, "begin", lambda *given: None)
         patch.setattr(scores, "checked", lambda *given: None)
         world: Any = FlawlessWorld(World(tiny_model(ROBOT), get_tokenizer("fsq-8")))
-        given: Any = {"world": world, "judge": judge, "episodes": 24, "frames": 4}
+        meters = (METER, "") if "max_error" in asked else (None, "")
+        patch.setattr(FlawlessWorld, "meter", lambda self, robot: meters)
+        given: Any = {"world": world, "judge": judge, "episodes": 24, "frames": 4} | asked
         return evaluate_policies(ROBOT, [(name, Still()) for name in made], **given)
 
 
@@ -218,6 +225,34 @@ def test_no_verdict_where_single_episodes_do_not_agree(judge: StateJudge) -> Non
     page = html(wrong)
     assert page.index("no verdict" if "no verdict" in page else "No verdict") < page.index("<table")
     assert "correlation of success rates" not in page and "correlation of success rates" in html(found)
+
+
+def test_a_model_abstains_where_it_expects_a_large_error_of_its_own(
+    judge: StateJudge, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    true = np.where(np.arange(24) % 2 == 0, 8.0, 2.0)
+    read = np.where(np.arange(24) < 12, true, 10 - true)  # the unsure half is wrong
+    policies = [scored_as(f"p{number}", read, true) for number in range(3)]
+    found = evaluation(judge, policies, max_error=6.5)
+    assert found.precision.value == 0.5 and found.abstention is not None
+    kept = sum(1 + 2 * number / 4 <= 6.5 for number in range(24))  # by the line of the meter
+    assert (found.abstention.judged, found.abstention.count) == (3 * kept, 72) and kept == 12
+    assert found.abstention.precision.value == found.abstention.recall.value == 1
+    assert "abstention: 36 of 72 episodes end with an expected state error of at most 6.5 px" in str(
+        sentences(found)
+    )
+    assert found.to_json()["outcomes"]["p0"]["stated_uncertainty"][4] == 1
+    none = evaluation(judge, policies, max_error=0.5)
+    assert "nothing is judged" in str(sentences(none))
+    assert evaluation(judge, policies).abstention is None
+    for meter, said in (
+        ((None, "it is not calibrated"), "not calibrated"),
+        ((UNABLE, ""), "no smaller error"),
+    ):
+        monkeypatch.setattr(FlawlessWorld, "meter", lambda self, robot, meter=meter: meter)
+        world: Any = FlawlessWorld(World(tiny_model(ROBOT), get_tokenizer("fsq-8")))
+        with pytest.raises(UsageError, match=f"--max-error: .*{said}"):
+            evaluate_policies(ROBOT, ["still"], world=world, judge=judge, max_error=2.0)
 
 
 def test_outcomes_alone_are_no_verdict_where_scores_say_nothing(judge: StateJudge) -> None:

@@ -18,6 +18,7 @@ from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
+from hma_model.evaluation.calibration import Meter
 from hma_model.policies.acting import Acting
 from hma_model.policies.arenas import Scenes, TrueArena
 from hma_model.policies.scripted import Still
@@ -156,7 +157,10 @@ def test_the_first_frames_of_latents_are_the_simulators_at_their_own_size(latent
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["world", "latents"])
-def test_the_surest_episodes_are_kept(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+@pytest.mark.filterwarnings("ignore:--keep")
+def test_the_surest_episodes_are_kept(
+    kind: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     world, measure = request.getfixturevalue(kind), {"world": "millinats", "latents": "millilatents"}[kind]
     augment(tmp_path / "all", asked(), world=world)
     augment(tmp_path / "half", asked(keep=0.5), world=world)
@@ -167,6 +171,23 @@ def test_the_surest_episodes_are_kept(kind: str, request: pytest.FixtureRequest,
     assert unsure["half"] == unsure["all"][:2] and unsure["all"][0] < unsure["all"][-1]
     with pytest.raises(UsageError, match="--keep: is 0"):
         asked(keep=0.0)
+    # A map of the stated uncertainty to itself: the limit is between the second and the third.
+    meter = Meter(2, 0.5, (0.0, 99.0), (0.0, 99.0), 2.0, 3.0, 0.8, 0.5, 0.1, 0.1, better=True, chooses=True)
+    monkeypatch.setattr(World, "meter", lambda self, robot: (meter, ""))
+    limit = (unsure["all"][1] + unsure["all"][2]) / 2000
+    found = augment(tmp_path / "limited", asked(max_error=limit), world=world)
+    assert sum(split["episodes"] for split in found.splits.values()) == 2
+    with pytest.raises(HMAError, match="--max-error: leaves no episode: the smallest expected error"):
+        augment(tmp_path / "none", asked(max_error=0.0), world=world)
+
+
+def test_a_choice_by_uncertainty_that_nobody_has_calibrated_is_warned_of_or_refused(
+    world: World, tmp_path: Path
+) -> None:
+    with pytest.warns(UserWarning, match="--keep 0.5: uncertainty is not calibrated: hma benchmark"):
+        augment(tmp_path / "out", asked(keep=0.5), world=world)
+    with pytest.raises(UsageError, match="--max-error: uncertainty is not calibrated"):
+        augment(tmp_path / "other", asked(max_error=2.0), world=world)
 
 
 @pytest.mark.parametrize(
