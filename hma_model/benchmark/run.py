@@ -9,6 +9,7 @@ version may be compared.
 
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,7 +21,7 @@ from hma_data.lab import FAMILY
 from hma_data.storage.files import write_atomic
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
-from hma_data.storage.paths import StrPath, as_path
+from hma_data.storage.paths import StrPath, as_path, is_repository
 from hma_model.benchmark.measures import (
     choice_figures,
     choose,
@@ -30,6 +31,8 @@ from hma_model.benchmark.measures import (
     turn_back,
 )
 from hma_model.benchmark.planning import WAYS, planning_figures, reached
+from hma_model.checkpoint.folder import EMBEDDED
+from hma_model.checkpoint.io import record_evaluation
 from hma_model.evaluation.calibration import calibration
 from hma_model.evaluation.intervals import NATURAL, rounded, summary
 from hma_model.evaluation.metrics import PSNR_RANGE
@@ -131,7 +134,21 @@ def benchmark(
         found["by_frame"] = by_frame
         write_atomic(folder / RESULTS, json.dumps(found, indent=1))
         kept.remove()
+        _record_meters(checkpoint, world, made)
     return found
+
+
+def _record_meters(checkpoint: StrPath, world: World, made: dict[str, Any]) -> None:
+    """Write the meters into the cards of a checkpoint of this machine, for its other commands."""
+    source = world.model.source
+    label = str(checkpoint)
+    if source is None or source.folder == EMBEDDED or is_repository(label) or "://" in label:
+        return
+    for robot, one in made.items():
+        meter = one["calibration"].get("meter")
+        if meter is not None:
+            with suppress(OSError):  # a folder that may only be read
+                record_evaluation(source, robot, meter, "meter")
 
 
 class _Robot:

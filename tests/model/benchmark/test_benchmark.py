@@ -2,9 +2,11 @@
 
 import json
 import math
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from hma_model.benchmark.measures import REACHED_PX, decisions, no_inverse
 from hma_model.benchmark.planning import difference, plan, verdict
 from hma_model.benchmark.report import compared, read_results, rows, write_report
 from hma_model.benchmark.run import QUICK, RESULTS, WORK, benchmark
+from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.cli import main
 from hma_model.evaluation.agreement import Accuracy
 from hma_model.evaluation.calibration import NO_UNCERTAINTY
@@ -86,6 +89,19 @@ def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(
     assert other["planning"]["truth"] == one["planning"]["truth"]  # the same planner and simulator
     assert one["calibration"] == {"missing": NO_UNCERTAINTY} and "policies" in one
     assert other["inverse"]["return_px"] == other["inverse"]["turn_px"] == 0
+
+
+def test_meters_are_recorded_in_the_cards_of_a_checkpoint_of_this_machine(tmp_path: Path) -> None:
+    folder = tmp_path / "model"
+    shutil.copytree(EMBEDDED, folder)
+    source = Checkpoint.open(folder)
+    world: Any = SimpleNamespace(model=SimpleNamespace(source=source))
+    meter = {"verdict": "uncertainty warns of a state error of 1.7 px", "limit": 2.0}
+    made = {"mover_04": {"calibration": {"meter": meter}}, "rails_03": {"calibration": {"missing": "why"}}}
+    running._record_meters("org/name", world, made)  # a copy of what is on the hub
+    running._record_meters(folder, world, made)
+    assert source.card("mover_04")["meter"] == meter
+    assert "uncertainty warns of a state error of 1.7 px" in (folder / "README.md").read_text()
 
 
 CHOICES = st.tuples(st.integers(1, 4), st.integers(2, 5)).flatmap(
