@@ -27,7 +27,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/storage": (1_640, 10_700, 11),
     "hma_data/tokenizers": (3_290, 23_900, 17),
     "hma_model": (520, 3_100, 3),
-    "hma_model/benchmark": (850, 7_400, 5),
+    "hma_model/benchmark": (860, 7_450, 5),
     "hma_model/checkpoint": (870, 6_500, 5),
     "hma_model/cli": (1_710, 10_700, 12),
     "hma_model/demo": (490, 4_100, 4),
