@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_000, 512_500
 TEST_LINES = 46_850
-DOC_WORDS = 38_150
+DOC_WORDS = 38_450
 
 
 @cache
