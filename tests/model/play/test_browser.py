@@ -20,6 +20,7 @@ from hma_model.play.server import Server, run
 from hma_model.play.stepper import Stepper
 from hma_model.worlds.scenes import RecordedRobot
 from tests.conftest import BlockTokenizer
+from tests.model.play.test_stepper import METER
 from tests.model.true_world import TrueWorld, lab_robots
 
 if TYPE_CHECKING:
@@ -418,6 +419,34 @@ def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", st
     page.keyboard.press("y")
     page.wait_for_selector("#parted:has-text('parted')", state="hidden")
     page.wait_for_selector("#sync:not(.call)")
+
+
+def test_the_border_warns_when_the_calibrated_uncertainty_does(
+    page: "Page", stepper: Stepper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert page.text_content("#meter") == "no error meter"
+    assert page.get_attribute("#meter", "title") == "it is never unsure"
+    session, world = session_of(stepper, page), stepper._world
+    monkeypatch.setattr(world, "meter", lambda robot, **way: (METER, ""))
+
+    def begin() -> None:
+        session.sample(session.sampling)
+        session.begin(0)
+        world.uncertainty[session.row] = 1.5
+
+    stepper.call(begin).result(10)
+    page.click("#step")
+    page.wait_for_selector("#meter:has-text('error ≈ 4.0 px')")
+    assert "warns" not in (page.get_attribute("#stage", "class") or "")
+    page.locator("input[value=fast]").check(force=True)
+    page.click("#run")
+    page.wait_for_selector("#stage.warns")
+    assert (page.text_content("#meter") or "").startswith("unsure: error ≈")
+    assert "misses 10%, false alarms 10%" in (page.get_attribute("#meter", "title") or "")
+    page.keyboard.press("p")
+    page.wait_for_selector("#run:has-text('Run')")
+    page.keyboard.press("y")
+    page.wait_for_selector("#stage:not(.warns)")
 
 
 def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(page, stepper) -> None:
