@@ -14,6 +14,7 @@ P frames of a start, K = stride * action dim.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,10 +109,19 @@ def export_folder(
             report(robot.embodiment.id)
             held = known.get(robot.embodiment.id, UNKNOWN)
             about = describe(robot) | {"holds": held.words, "follows": held.follows is not False}
+            about |= _meter(world, robot.embodiment.id, unmask_steps)
             manifest["robots"].append(about | _write_robot(folder, model, robot, taken[robot.embodiment.id]))
         manifest["runtime"] = write_page(folder, runtime)
         write_atomic(folder / MANIFEST, to_json(manifest))
     return manifest
+
+
+def _meter(world: World, robot: str, unmask_steps: int) -> dict[str, Any]:
+    """Return what the page needs to tell how unsure the model is of a robot, or why it does not."""
+    meter, reason = world.meter(robot, unmask_steps=unmask_steps)
+    if meter is None or not meter.better:
+        return {"meter": None, "unmetered": reason if meter is None else meter.verdict}
+    return {"meter": asdict(meter) | {"verdict": meter.verdict}, "unmetered": ""}
 
 
 def _require_own(out: Path) -> None:

@@ -137,7 +137,7 @@ class StepGraph(nn.Module):
     @property
     def outputs(self) -> list[str]:
         """Return the names of all outputs in the order of `forward`."""
-        return ["image", *(f"next_{port.name}" for port in self.state)]
+        return ["image", *(f"next_{port.name}" for port in self.state), *["uncertainty"][: self.discrete]]
 
     def _draws(self) -> Iterator[Port]:
         config, tokens = self.config, self.config.tokens_per_frame
@@ -164,7 +164,7 @@ class StepGraph(nn.Module):
         return self.trunk.carry(1, self.slots, tokens, torch.float32, torch.device("cpu"))
 
     def forward(self, actions: Tensor, time: Tensor, frame: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
-        """Return the image (S, V·S, 3) uint8, the next time and frame, and the memory.
+        """Return the image (S, V·S, 3) uint8, the next time and frame, the memory, and the entropy of tokens.
 
         Args:
             actions: what the stem gives.
@@ -179,9 +179,12 @@ class StepGraph(nn.Module):
         draws = dict(zip((port.name for port in self.draws), rest[count:], strict=True))
         times = ring_times(self.config, torch.cat([time, time + 1]).long().unsqueeze(0), self.slots)
         times.wanted = 1
-        predict = self._tokens if self.discrete else self._patches
-        stored = predict(frame, self._condition(actions), times, memory, draws)
-        return self._image(stored), time + 1, stored, *memory.tensors()
+        conditioning = self._condition(actions)
+        if not self.discrete:
+            stored = self._patches(frame, conditioning, times, memory, draws)
+            return self._image(stored), time + 1, stored, *memory.tensors()
+        stored, nats = self._tokens(frame, conditioning, times, memory, draws)
+        return self._image(stored), time + 1, stored, *memory.tensors(), nats
 
     def _condition(self, actions: Tensor) -> Conditioning:
         config = self.config
@@ -222,10 +225,10 @@ class StepGraph(nn.Module):
 
     def _tokens(
         self, frame: Tensor, conditioning: Conditioning, times: TimePositions, memory: Any, draws: Any
-    ) -> Tensor:
-        """Return the next frame's tokens (h, w) int32."""
+    ) -> tuple[Tensor, Tensor]:
+        """Return the next frame's tokens (h, w) int32, and their mean entropy (1,) as of `Rollout`."""
         before = self._digits(frame.long())
-        digits = torch.zeros_like(before)
+        digits, nats = torch.zeros_like(before), torch.zeros(1)
         shown = torch.zeros(before.shape[:2], dtype=torch.bool)
         uniform = draws["noise"].clamp(1e-20, 1 - 2**-24)
         gumbel = (-uniform.log()).log() * -draws["temperature"]
@@ -238,13 +241,20 @@ class StepGraph(nn.Module):
         for features, places, own in self._passes(conditioning, times, memory, embed, draws.get("rank")):
             noise = gumbel[:, :, own]
 
-            def choose(scores: Tensor, first: int, noise: Tensor = noise) -> Tensor:
+            unsure: list[Tensor] = []
+
+            def choose(
+                scores: Tensor, first: int, noise: Tensor = noise, unsure: list[Tensor] = unsure
+            ) -> Tensor:
+                likely = scores.softmax(-1)
+                unsure.append(-(likely * likely.clamp_min(1e-30).log()).sum((1, 2, 3)))
                 return (scores + noise[:, first : first + scores.shape[1], :, : scores.shape[3]]).argmax(-1)
 
             copied = _at(before, places) if self.config.copy_previous else None
             made = self._readout.decide(_at(features, places), choose, copied)
             digits = _put(digits, places, made.transpose(1, 2))
-        return self._stored(digits)
+            nats = nats + torch.stack(unsure).sum(0)
+        return self._stored(digits), nats / digits.shape[1]
 
     def _digits(self, frame: Tensor) -> Tensor:
         """Return the digits (1, S, F) of tokens (h, w), those of a square of tokens side by side."""

@@ -108,6 +108,7 @@ async function begin(number) {
   await poster();
   await world.begin(start);
   controls.open(robot, robot.held[start]);
+  metered();
   counted();
   showStart();
   veil("");
@@ -149,6 +150,7 @@ async function make() {
   begun = true;
   frame += 1;
   draw(image);
+  metered();
   controls.used(number);
   if (followed && replaying) controls.follow(chunk.slice(-robot.dimensions.length));
   followed ? drawTruth() : $("unknown").hidden = false;
@@ -158,6 +160,14 @@ async function make() {
   $("fps").title = `The model took ${(now - begunAt).toFixed(0)} ms`;
   counted();
   document.dispatchEvent(new CustomEvent("frame", { detail: { number: frame, chunk, image, ms: now - begunAt } }));
+}
+
+function metered() {  // the error that the model expects of itself
+  const found = world.metered(robot.meter), warns = Boolean(found && found.warns);
+  $("stage").classList.toggle("warns", warns);
+  $("meter").classList.toggle("warns", warns);
+  $("meter").textContent = found ? (warns ? "unsure: " : "") + "error ≈ " + found.px.toFixed(1) + " px" : "no error meter";
+  $("meter").title = robot.meter ? robot.meter.verdict : robot.unmetered;
 }
 
 function size(width, height) { const view = $("view"); if (view.width !== width || view.height !== height) { view.width = width; view.height = height; } }

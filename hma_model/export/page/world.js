@@ -1,5 +1,6 @@
 // Run an exported model in this browser: load the runtime and the graphs, and make frame after frame.
 
+const POWER = 4;  // of the uncertainty, as hma_model.evaluation.calibration sums it
 const TYPES = { int32: Int32Array, float32: Float32Array };
 const BUILDS = {
   webgpu: ["ort.webgpu.min.mjs", "ort-wasm-simd-threaded.asyncify"],
@@ -101,7 +102,7 @@ export class World {  // one robot
   }
 
   constructor(ort, manifest, stem, step, frames, chunks) {
-    Object.assign(this, { ort, manifest, stem, step, temperature: manifest.temperature });
+    Object.assign(this, { ort, manifest, stem, step, temperature: manifest.temperature, unsure: 0 });
     const [starts, known] = frames.shape;
     this.width = chunks.shape[2];
     this.frames = rows(frames, frames.values.length / starts / known);
@@ -116,6 +117,16 @@ export class World {  // one robot
       this.put(this.frames[start * this.known + i]);
       if (i < this.known - 1) await this.advance(this.chunks[start * (this.known - 1) + i]);
     }
+    this.unsure = 0;
+  }
+
+  metered(meter) {  // the state error to expect, and whether to warn; null if the frames are not all of the calibrated kind
+    if (!meter || !Number.isFinite(this.unsure)) return null;
+    const stated = this.unsure ** (1 / POWER), { stated: at, error_px: px } = meter;
+    const i = at.findIndex((one) => one >= stated);
+    if (i <= 0) return { px: i ? px[px.length - 1] : px[0], warns: stated >= meter.limit };
+    const share = (stated - at[i - 1]) / (at[i] - at[i - 1]);
+    return { px: px[i - 1] + share * (px[i] - px[i - 1]), warns: stated >= meter.limit };
   }
 
   put(frame) {
@@ -144,6 +155,8 @@ export class World {  // one robot
     const made = await this.step.run({ actions, ...this.state, ...this.draws() });
     for (const name of Object.keys(this.state)) this.state[name] = made["next_" + name];
     this.before = Float32Array.from(chunk);
+    const calibrated = made.uncertainty && this.temperature === this.manifest.temperature;
+    this.unsure += calibrated ? made.uncertainty.data[0] ** POWER : NaN;
     return made.image.data;
   }
 }

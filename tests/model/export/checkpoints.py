@@ -99,6 +99,7 @@ class Driver:
         """Return the next image."""
         (actions,) = self.stem.run(None, {"chunks": np.stack([self._before, chunk])})
         image, *after = self.step.run(None, {"actions": actions, **self.state, **draws})
+        self.uncertainty = float(after.pop()[0]) if len(after) > len(self.state) else float("nan")
         self.state, self._before = dict(zip(self.state, after, strict=True)), chunk
         return image
 

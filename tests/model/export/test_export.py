@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 import shutil
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[An
     tokenizer = get_tokenizer(model.config.tokenizer["name"])
     driver = Driver(page, robot)
     rollout = Rollout(model, robot, temperature=0.0)
+    rollout.decoding = replace(rollout.decoding, measure=True)
     frames, chunks = torch.from_numpy(driver.frames)[None], torch.from_numpy(driver.chunks)[None]
     rollout.prompt(frames, chunks, seeds=[7])
     draws = drawn_as_torch(driver, model.config, 7)
@@ -49,6 +51,8 @@ def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[An
         image = driver.advance(chunk, next(draws))
         frame = rollout.step(torch.from_numpy(chunk)[None])
         shown = decode(tokenizer, frame[None])[0, 0]
+        if model.config.kind == "discrete":
+            assert driver.uncertainty == pytest.approx(rollout.uncertainty.item(), rel=1e-3)
         found.append((driver.state["frame"], frame[0].numpy(), psnr(image, shown)))
     return found
 
@@ -84,6 +88,7 @@ def test_the_manifest_says_how_to_drive_and_its_digests_fit(tokens: Path) -> Non
     assert named == [("slider_1", "px/s", ["w", "s"]), ("slider_2", "px/s", ["ArrowUp", "ArrowDown"])]
     assert all(dim["low"] < dim["high"] for dim in robot["dimensions"])
     assert robot["hz"] / robot["stride"] > 1
+    assert robot["meter"] is None and "hma benchmark calibrates it" in robot["unmetered"]
     for part in (manifest["step"], robot["stem"]):
         content = (tokens / part["file"]).read_bytes()
         assert (len(content), hashlib.sha256(content).hexdigest()) == (part["bytes"], part["sha256"])
