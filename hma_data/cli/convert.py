@@ -232,7 +232,7 @@ def _shown(name: str) -> "Iterator[Callable[[Progress], None]]":
             for line in state.notices[notices:]:
                 typer.echo(line, err=True)
             for reason in state.retries[retries:]:
-                typer.echo(f"again: a worker {reason}", err=True)
+                typer.echo(f"retrying: a worker {reason}", err=True)
             notices, retries = len(state.notices), len(state.retries)
             words = f"{state.episodes:,}/{state.total_episodes:,} episodes, {human_bytes(state.bytes)}"
             if state.quarantined:

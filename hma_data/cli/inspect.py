@@ -60,7 +60,7 @@ def _list(folder: str, found: "list[Found]", json: bool) -> None:
     if json:
         print_json({"folder": folder, "recordings": [one.to_json() for one in found]})
         return
-    print(f"{folder}: {human_count(len(found), 'recording')}; look at them one by one:")
+    print(f"{folder}: {human_count(len(found), 'recording')}; inspect them one by one:")
     rows = [[one.command, one.format, one.episodes] for one in found]
     print_table(["command", "format", "episodes"], rows)
     for one in found:
@@ -79,7 +79,7 @@ def _print_inspection(report: dict[str, Any]) -> None:
         told = "" if len(lengths) == report["episodes"] else f" of the {len(lengths):,} counted"
         middle = lengths[len(lengths) // 2]
         print(f"episode lengths{told}: min {lengths[0]:,}, median {middle:,}, max {lengths[-1]:,} frames")
-    print(f"looked into: {report['looked_at']:,} of {episodes}")
+    print(f"sampled: {report['looked_at']:,} of {episodes}")
     print_table(COLUMNS, [_row(key) for key in report["keys"]])
     named = {key["key"]: " ".join(key["names"]) for key in report["keys"] if key["names"]}
     print_lines([(f"names of {key}", names) for key, names in named.items()])
@@ -148,5 +148,5 @@ def doctor(
     else:
         print_lines((f"{finding.severity:5} {finding.check}", str(finding)) for finding in found)
         counts = [f"{sum(one.severity == level for one in found)} {level}" for level in reversed(SEVERITIES)]
-        print(f"{target}: {', '.join(counts)}" if found else f"{target}: sound")
+        print(f"{target}: {', '.join(counts)}" if found else f"{target}: no problems found")
     _exit([finding.severity for finding in found], fail_on)

@@ -85,7 +85,7 @@ def export_checkpoint(
     if not chosen:
         raise UsageError("--embodiment", "none has frames to start from", "give shards of one")
     if lacking := [name for name in ids if name not in chosen]:
-        print(f"left out, for want of frames to start from: {', '.join(lacking)}", file=sys.stderr)
+        print(f"left out, no frames to start from: {', '.join(lacking)}", file=sys.stderr)
     from hma_model.checkpoint.io import load
     from hma_model.export.folder import export_folder
 

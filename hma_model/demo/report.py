@@ -73,7 +73,7 @@ def _headline(page: Page, made: DemoRun) -> None:
             tiles.append(
                 (
                     f"{gain:+.1f} dB",
-                    about + f"; not whole after {HELD} frames: {' and '.join(torn)}" * bool(torn),
+                    about + f"; damaged after {HELD} frames: {' and '.join(torn)}" * bool(torn),
                 )
             )
     tiles.append((human_seconds(made.run.seconds), f"of finetuning, {made.run.step:,} steps"))

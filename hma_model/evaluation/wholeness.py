@@ -204,10 +204,10 @@ def left_words(left: dict[str, Left]) -> str:
     """Return what is left in words, and what does not stay whole."""
     if not left:
         return "nothing was large enough to judge"
-    told = [f"{one.share:.0%} of the pixels of {name} (shape {one.shape:.0%})" for name, one in left.items()]
+    told = [f"{one.share:.0%} of {name} left (shape overlap {one.shape:.0%})" for name, one in left.items()]
     torn = [name for name, one in left.items() if not one.whole]
-    verdict = f"not whole: {' and '.join(torn)}" if torn else "whole"
-    return f"{' and '.join(told)}, {verdict}"
+    verdict = f"damaged: {' and '.join(torn)}" if torn else "intact"
+    return f"{', '.join(told)}; {verdict}"
 
 
 def mean_of(values: Any) -> float | None:

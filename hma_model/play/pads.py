@@ -146,9 +146,9 @@ def hint(robot: Drivable) -> str:
     if len(found) > 1:
         ordered = sorted(found, key=lambda pad: pad.zone)  # from left to right, else from above
         said = [" and ".join(shown[i] for i in (pad.x, pad.y) if i is not None) for pad in ordered]
-        return f"Drag on the image, each in its place: {', '.join(said)}"
+        return f"Drag on the image, one area each: {', '.join(said)}"
     ways = (("sideways", found[0].x), ("up or down", found[0].y))
-    return f"Drag on the image: {', '.join(f'{way} {shown[i]}' for way, i in ways if i is not None)}"
+    return f"Drag on the image: {', '.join(f'{way} for {shown[i]}' for way, i in ways if i is not None)}"
 
 
 def labels(robot: Drivable) -> list[str]:

@@ -39,7 +39,7 @@ from hma_data.storage.files import atomic_path, cache_folder
 BATCH_FRAMES = 8  # frames decoded together: 200 MB of 4K images
 TABLE_SUFFIXES = (".csv", ".json", ".npz", ".npy", ".parquet", ".h5", ".hdf5")  # a robot's numbers, perhaps
 MAX_FILES_BESIDE = 2_000  # files among which they are looked for
-ROBOT_VIDEOS_PAGE = "docs/adding-a-robot.md, HDF5 with videos beside it"
+ROBOT_VIDEOS_PAGE = "docs/adding-a-robot.md, HDF5 with separate videos"
 MAX_VIDEOS = 5  # that an inspection searches for hands
 FRAMES_PER_VIDEO = 12
 

@@ -61,10 +61,10 @@ def test_an_object_that_is_turned_keeps_its_shape_and_one_that_lost_a_limb_does_
 def test_what_is_left_is_said_with_whether_it_stays_whole() -> None:
     whole = left_at(found(scene(PLACES), PLACES), FRAMES - 1)
     assert whole == {"the robot": Left(1.0, 1.0), "loose objects": Left(1.0, 1.0)}
-    assert left_words(whole).endswith("100% of the pixels of loose objects (shape 100%), whole")
+    assert left_words(whole).endswith("100% of loose objects left (shape overlap 100%); intact")
     torn = left_at(found(scene(PLACES, bar=False), PLACES), FRAMES - 1)
     assert torn["the robot"].whole and not torn["loose objects"].whole
-    assert left_words(torn).endswith("not whole: loose objects")
+    assert left_words(torn).endswith("damaged: loose objects")
     many = left_at(found(np.roll(scene(PLACES), 1, axis=-1), PLACES), FRAMES - 1)  # other colours
     assert many["the robot"] == Left(0.0, 0.0)
 

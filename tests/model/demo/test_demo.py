@@ -96,8 +96,8 @@ def test_the_report_opens_with_decibels_and_time_under_the_rule_of_evaluate(tmp_
     shown = page.html()
     assert "<b>+2.1 dB</b>" in shown and "after 0.6 s" in shown and "2 min 38 s" in shown
     assert "nats" not in shown
-    assert shown.count("; not whole after 20 frames: the robot<") == 1  # a gain does not stand bare
-    assert "65% of the pixels of the robot (shape 48%)" in shown and "(shape 90%), whole." in shown
+    assert shown.count("; damaged after 20 frames: the robot<") == 1  # a gain does not stand bare
+    assert "65% of the robot left (shape overlap 48%)" in shown and "90%); intact." in shown
     for found in (FOUND, wide):
         assert f"The model {verdict(found)}." in shown
     assert "recorded vs shuffled actions, 0.6 s after the prompt" in shown and "may follow" in shown

@@ -85,9 +85,9 @@ def test_a_drag_to_the_right_or_down_moves_a_part_there(name: str) -> None:
 
 def test_a_robot_says_what_a_drag_on_its_image_does() -> None:
     said = {name: hint(robot) for name, robot in lab_robots("mover_04", "rails_03", "arm4_04").items()}
-    assert said["mover_04"] == "Drag on the image: sideways vx, up or down vy"
-    assert said["rails_03"] == "Drag on the image, each in its place: slider 1, slider 2"
-    assert said["arm4_04"].endswith("each in its place: joint 1 and joint 2, joint 3 and joint 4")
+    assert said["mover_04"] == "Drag on the image: sideways for vx, up or down for vy"
+    assert said["rails_03"] == "Drag on the image, one area each: slider 1, slider 2"
+    assert said["arm4_04"].endswith("one area each: joint 1 and joint 2, joint 3 and joint 4")
 
 
 def test_values_without_names_are_labelled_by_the_end_of_their_key() -> None:
