@@ -62,7 +62,9 @@ def parts_read(probe: Probe) -> NDArray[np.int64]:
     return np.concatenate([probe.own, probe.loose])
 
 
-def choose(world: World, scenes: Scenes, probe: Probe, policy: Policy, frames: int) -> Arrays:
+def choose(
+    world: World, scenes: Scenes, probe: Probe, policy: Policy, frames: int, choices: int = CHOICES
+) -> Arrays:
     """Return what comes of C action sequences of each scene in the simulator and in the model.
 
     Returns:
@@ -72,7 +74,7 @@ def choose(world: World, scenes: Scenes, probe: Probe, policy: Policy, frames: i
     kept = parts_read(probe)
     names = ("psnr", "copy_psnr", "true", "made", "uncertainty")
     found: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
-    for choice in range(CHOICES):
+    for choice in range(choices):
         true = TrueArena(replace(scenes, seed=scenes.seed + 1000 * choice), world.image_shape[0])
         pictures, actions = run("benchmark", policy, true, frames)
         true.scenes = scenes  # the model's random numbers are the same for all sequences of a scene

@@ -26,14 +26,15 @@ def main() -> None:
     bundled = Checkpoint.open(EMBEDDED)
     parser = argparse.ArgumentParser(description="Calibrate the bundled model's uncertainty")
     parser.add_argument("robots", nargs="*", default=bundled.embodiments)
-    parser.add_argument("--scenes", type=int, default=24)
+    parser.add_argument("--scenes", type=int, default=32)
+    parser.add_argument("--sequences", type=int, default=2, help="of actions in each scene")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     world = load_world(EMBEDDED)
     for robot in given.robots:
         scenes = Scenes.of(world, robot, given.scenes, given.seed)
         probe = train_probe(robot, world.tokenizer, scenes.stride, given.seed)
-        arrays = frame_errors(choose(world, scenes, probe, Scripted(NOISE), FRAMES))
+        arrays = frame_errors(choose(world, scenes, probe, Scripted(NOISE), FRAMES, given.sequences))
         found = calibration(
             arrays["uncertainty"], arrays["error_px"], arrays["pixel_rmse"],
             unmask_steps=world.unmask_steps, temperature=world.temperature, seed=given.seed,
