@@ -36,7 +36,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_300, 6),
     "hma_model/lerobot_env": (570, 4_600, 3),
-    "hma_model/network": (3_275, 27_850, 16),
+    "hma_model/network": (3_320, 28_400, 16),
     "hma_model/play": (1_690, 12_200, 8),
     "hma_model/policies": (2_870, 20_400, 14),
     "hma_model/released": (830, 7_200, 4),
