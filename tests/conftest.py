@@ -42,6 +42,14 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return bool(re.search(r"^pytestmark = .*mark\.slow", collection_path.read_text(), re.MULTILINE)) or None
 
 
+LEROBOT = ("test_to_lerobot.py", "test_lerobot_own.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the quick tests that import lerobot first, so that they are all of one worker."""
+    items.sort(key=lambda item: item.path.name not in LEROBOT)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_fixture_setup() -> Generator[None, Any, Any]:
     """Videos are encoded in fixtures too."""

@@ -66,6 +66,7 @@ def said(folder: Path) -> list[tuple[Any, Any]]:
     return [tuple(row[column] for column in columns) for row in rows]
 
 
+@pytest.mark.slow  # of lerobot's import, and of encoding AV1
 def test_shards_state_what_is_said_and_the_export_says_it_again(dataset: Path, tmp_path: Path) -> None:
     robot = arm("lerobot")
     shards = ShardSet(convert(robot, str(dataset), "raw-64", tmp_path / "shards", settings=ALL).out)
@@ -83,6 +84,7 @@ def test_shards_state_what_is_said_and_the_export_says_it_again(dataset: Path, t
     assert not (tmp_path / "out" / "staging").exists()
 
 
+@pytest.mark.slow  # of lerobot's import, and of encoding AV1
 def test_a_strided_export_moves_what_is_said_to_the_next_row(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     strided = Settings(frames="strided", val_fraction=0.0)

@@ -1,4 +1,7 @@
-"""`hma convert --to lerobot`: lerobot reads the frames and numbers that the shards of a recording hold."""
+"""`hma convert --to lerobot`: lerobot reads the frames and numbers that the shards of a recording hold.
+
+Each dataset takes seconds, of lerobot's import and of encoding AV1: one test of the quick tier writes one.
+"""
 
 import json
 import os
@@ -111,6 +114,7 @@ def frame(item: dict, key: str) -> np.ndarray:
     return (item[key].numpy().transpose(1, 2, 0)[None] * 255).round().astype(np.uint8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, frames", [("rlds", "all"), ("hdf5", "all"), ("bag", "all"), ("rlds", "strided")]
 )
@@ -185,6 +189,7 @@ def test_the_dataset_converts_to_the_shards_of_its_recording(tmp_path: Path) -> 
 # -- stopped, killed, refused
 
 
+@pytest.mark.slow
 def test_a_stopped_conversion_goes_on_and_ends_with_the_same_bytes(tmp_path: Path, monkeypatch) -> None:
     data, robot = hdf5(tmp_path)
     to_lerobot(robot, data, tmp_path / "whole")
@@ -245,6 +250,7 @@ def test_a_killed_command_goes_on_and_ends_with_the_same_bytes(tmp_path: Path) -
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.slow
 def test_an_episode_that_cannot_be_read_is_in_quarantine_and_nothing_of_it_in_the_dataset(
     tmp_path: Path,
 ) -> None:
@@ -264,6 +270,7 @@ def test_an_episode_that_cannot_be_read_is_in_quarantine_and_nothing_of_it_in_th
     assert (dataset.meta.total_episodes, len(dataset)) == (1, 9)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_error_and_nothing_is_half_written(tmp_path: Path, monkeypatch) -> None:
     data, robot = hdf5(tmp_path)
     save, calls = Image.Image.save, 0
@@ -285,6 +292,7 @@ def test_a_full_disk_is_one_error_and_nothing_is_half_written(tmp_path: Path, mo
     assert len(opened(tmp_path / "out")) == 27
 
 
+@pytest.mark.slow
 def test_what_is_no_dataset_of_ours_is_left_alone(tmp_path: Path) -> None:
     data, robot = hdf5(tmp_path)
     out = tmp_path / "out"
@@ -302,6 +310,7 @@ def test_what_is_no_dataset_of_ours_is_left_alone(tmp_path: Path) -> None:
     assert opened(out).meta.total_episodes == 3
 
 
+@pytest.mark.slow
 def test_a_dataset_whose_record_is_damaged_can_be_made_anew(tmp_path: Path) -> None:
     data, robot = hdf5(tmp_path)
     out = tmp_path / "out"
@@ -313,6 +322,7 @@ def test_a_dataset_whose_record_is_damaged_can_be_made_anew(tmp_path: Path) -> N
     assert opened(out).meta.total_episodes == 1
 
 
+@pytest.mark.slow
 def test_a_first_episode_without_one_of_its_cameras_is_refused_alone(tmp_path: Path) -> None:
     data, robot = hdf5(tmp_path)
     with h5py.File(data, "a") as file:
@@ -351,6 +361,7 @@ def test_a_tokenizer_for_frames_that_stay_as_they_are_is_refused(
 # -- what else comes along
 
 
+@pytest.mark.slow
 def test_episodes_say_how_they_ended(tmp_path: Path) -> None:
     data, robot = hdf5(tmp_path)
     with h5py.File(data, "a") as file:
@@ -366,6 +377,7 @@ def test_episodes_say_how_they_ended(tmp_path: Path) -> None:
     assert again.episodes["success"].to_pylist() == [True, False, True]
 
 
+@pytest.mark.slow
 def test_frames_in_which_nothing_moves_are_left_out_and_counted(tmp_path: Path) -> None:
     data, robot = hdf5(tmp_path)
     still = {0: [0, 1, 2], 1: [4], 2: [7, 8, 9]}  # of each episode: no command in these frames
@@ -383,6 +395,7 @@ def test_frames_in_which_nothing_moves_are_left_out_and_counted(tmp_path: Path) 
     assert len(dataset) == 27 - 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", ["m/s", "m"])  # a step of so many metres, repeated, is a motion too
 def test_what_may_be_a_motion_in_a_mixed_space_moves_while_it_stays_the_same(
     tmp_path: Path, unit: str

@@ -132,8 +132,10 @@ def test_viewers_of_the_page_get_frames_under_their_commands() -> None:
     assert 0 < result["latency_p50_ms"] <= result["latency_p95_ms"]
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-@pytest.mark.parametrize("changes", [{}, {"checkpointing": True, "optimizer": False, "precision": "bf16"}])
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    [("discrete", {}), ("continuous", {"checkpointing": True, "optimizer": False, "precision": "bf16"})],
+)
 def test_a_training_step_is_measured(kind: str, changes: dict[str, Any]) -> None:
     (result,) = speed.measure_steps(speed.TRAIN.defaults | SMALL | {"steps": 1} | changes, kind)
     assert result["windows_per_second"] == pytest.approx(2 / result["seconds_per_step"], rel=0.05)

@@ -39,8 +39,11 @@ def _rollout(
     )  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("prompt", "actions"), [(1, True), (7, True), (3, False)])
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize(
+    ("layout", "prompt", "actions"),
+    [(layout, prompt, True) for layout in LAYOUTS for prompt in (1, 7)]
+    + [("rotary", 3, False), ("released", 3, False), ("cross", 3, False)],
+)
 def test_the_cache_changes_nothing(layout: str, prompt: int, actions: bool) -> None:
     model = small_model(**LAYOUTS[layout])
     how = {"unmask_steps": 3, "temperature": 0.5}

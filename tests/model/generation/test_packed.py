@@ -169,8 +169,9 @@ def test_without_a_compiler_the_same_frames_are_made_and_it_is_said(monkeypatch:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("temperature", [0.0, 0.5])
-@pytest.mark.parametrize(("order", "digits"), [("random", "chain"), ("confidence", "together")])
+@pytest.mark.parametrize(
+    ("order", "digits", "temperature"), [("random", "chain", 0.5), ("confidence", "together", 0.0)]
+)
 def test_trunk_head_and_unmasking_compile_to_one_graph_of_each_pass(
     order: str, digits: str, temperature: float, graphs: Graphs
 ) -> None:

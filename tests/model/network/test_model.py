@@ -113,7 +113,6 @@ OVERFITS = [  # objective, changes, steps, share of the first losses that the la
         for name in OBJECTIVES
         if name != "forward"
     ),
-    *(("forward", {"conditioning": (one,)}, 200, 0.06) for one in CONDITIONINGS),
     ("forward", {"conditioning": CONDITIONINGS}, 200, 0.06),
     # the noise of a nearly clean sample stays unknown
     ("policy", {"action_loss": "diffusion"}, 200, 0.5),

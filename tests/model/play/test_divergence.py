@@ -13,7 +13,7 @@ SECOND = 10  # frames
 def pendulum(angle: float, blur: float = 0.0) -> np.ndarray:
     """Return an image (64, 64, 3) of a pendulum; its pixels are a share `blur` of grey."""
     image = np.full((64, 64, 3), 230.0)
-    for step in np.linspace(0, 26, 200):
+    for step in np.linspace(0, 26, 40):
         x, y = 32 + step * math.sin(angle), 32 + step * math.cos(angle)
         image[int(y) - 2 : int(y) + 3, int(x) - 2 : int(x) + 3] = (180, 40, 40)
     return ((1 - blur) * image + blur * 200).astype(np.uint8)

