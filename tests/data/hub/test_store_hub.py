@@ -85,20 +85,6 @@ def test_a_set_on_the_hub_is_read_and_verified_by_its_uri(toy_arm, toy_file, hub
         ShardSet("hf://datasets/team/arm/none")
 
 
-def test_an_upload_that_was_cut_off_goes_on_with_what_is_missing(toy_arm, toy_file, hub, whole) -> None:
-    hub.fail("POST .*/commit/", 500, times=0)
-    act = hub.before_commit
-    act += [lambda: None, lambda: hub.fail("POST .*/commit/", 503, times=50)]
-    with pytest.raises(HubError, match=f"{OUT}: .*503.*run the same command again"):
-        run(toy_arm, toy_file)
-    assert "manifest.json" not in published(hub) and published(hub)
-    hub.faults.clear()
-    before = len(dataset(hub).commits)
-    assert run(toy_arm, toy_file).made_shards == 0
-    assert published(hub) == whole
-    assert sum(whole[name] != b"" for name in whole) and len(dataset(hub).commits) > before
-
-
 def test_lost_staging_makes_the_same_shards_and_uploads_none_again(toy_arm, toy_file, hub, whole) -> None:
     run(toy_arm, toy_file)
     before = len(dataset(hub).commits)
