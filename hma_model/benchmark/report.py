@@ -191,7 +191,7 @@ def _curves(curve: dict[str, Any], risk: dict[str, Any]) -> bytes:
         values, ends = np.array(risk[f"{kind}_px"]), np.array(risk[f"{kind}_px_95"], float).T
         look = {"color": COLOURS[number], "fmt": f"{MARKERS[number]}-", "ms": 5, "lw": 1}
         right.errorbar(risk["coverage"], values, yerr=np.abs(ends - values), label=f"surest {kind}", **look)
-    right.legend(frameon=False, fontsize=9)
+    right.legend(frameon=False, fontsize=9, loc="upper left")
     label_axes(right, "share that is kept", "state error, px")
     return svg_bytes(figure)
 
