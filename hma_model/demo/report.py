@@ -46,7 +46,7 @@ def write_report(made: DemoRun) -> Path:
     machine = f"{usable_cores()} cores, {platform.machine()}, {versions}"
     lead = f"Recorded, tokenized, finetuned, published and rolled out by hma demo on {machine}."
     page = Page("HMA Toolkit: a world model learns two new robots", lead)
-    for section in (_headline, _films, _robots, _kept_by_tokens, _rollouts):
+    for section in (_films, _headline, _robots, _kept_by_tokens, _rollouts):
         section(page, made)
     page.section("Sizes and timings")
     page.table(["what", "size"], [[name, human_bytes(size)] for name, size in made.sizes.items()])
@@ -84,10 +84,8 @@ def _headline(page: Page, made: DemoRun) -> None:
 def _films(page: Page, made: DemoRun) -> None:
     prompt = next(iter(made.films.values())).prompt
     page.text(
-        "Left: what happened. Middle: the model with the same actions. Right: the model with the actions of "
-        f"another window. Grey border: the true frames, of which the model gets {prompt}. Green border: "
-        "predicted. The bars are the actions. All images are decoded from tokens. Shown are the held-out "
-        "windows with the most motion, and the other actions that differ most from their own."
+        f"Left: the recording. Middle: the model, from {prompt} frames and the same actions. Right: "
+        "the model with other actions."
     )
     for robot, film in made.films.items():
         page.section(f"{robot}: {find(robot).robot}")
@@ -98,6 +96,11 @@ def _films(page: Page, made: DemoRun) -> None:
         seconds = HELD / film.fps
         left = left_words(made.left[robot])
         page.text(f"In closed loop in new episodes, after {HELD} frames ({seconds:.1f} s): {left}.")
+    page.text(
+        "Grey border: recorded frames. Green border: predicted frames. The bars are the actions. All images "
+        "are decoded from tokens. Shown are the held-out windows with the most motion, and the other actions "
+        "that differ most from their own."
+    )
 
 
 def _robots(page: Page, made: DemoRun) -> None:

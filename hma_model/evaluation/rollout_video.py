@@ -121,8 +121,8 @@ def rollout_video(
     true = roll(batch)
     changed = roll(swapped, truth=true.truth)
     panels = (
-        ("truth", true.truth, batch.actions, length),
-        ("model, true actions", true.predicted, batch.actions, prompt),
+        ("recording", true.truth, batch.actions, length),
+        ("model, same actions", true.predicted, batch.actions, prompt),
         ("model, other actions", changed.predicted, swapped.actions, prompt),
     )
     fps, parts = shards.embodiment.effective_hz, []
@@ -193,7 +193,7 @@ def _column(
     padded = np.pad(barred, ((0, 0), (TITLE_PX, 4), beside, (0, 0)), constant_values=250)
     for t, sheet in enumerate(padded):
         if given == len(film):
-            about = "recorded, decoded from tokens"
+            about = "decoded from tokens"
         else:
             about = "prompt: recorded, decoded" if t < given else "predicted"
         write_text(sheet, name, (8, 17), 0.5)
