@@ -1,7 +1,4 @@
-"""`hma convert --to lerobot`: lerobot reads the frames and numbers that the shards of a recording hold.
-
-Each dataset takes seconds, of lerobot's import and of encoding AV1: one test of the quick tier writes one.
-"""
+"""`hma convert --to lerobot`: lerobot reads the frames and numbers that the shards of a recording hold."""
 
 import json
 import os

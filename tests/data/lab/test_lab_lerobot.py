@@ -16,6 +16,7 @@ from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
 from hma_data.sources.detect import detect
 
+pytestmark = pytest.mark.slow  # of the import of lerobot, and of encoding AV1
 EPISODES, SEED = 2, 3
 
 
@@ -38,7 +39,6 @@ def episodes_of(robot: str, recording: Path) -> list[Episode]:
     return [source.read(str(recording), name, embodiment) for name in source.episode_ids(str(recording))]
 
 
-@pytest.mark.slow
 def test_lerobot_reads_the_rows_and_pictures_that_we_read(recorded: Path, theirs: Any) -> None:
     ours = episodes_of("planar_arm_lerobot", recorded)
     assert len(theirs) == EPISODES * STEPS and len(ours) == EPISODES
@@ -54,7 +54,6 @@ def test_lerobot_reads_the_rows_and_pictures_that_we_read(recorded: Path, theirs
         assert episode.instruction == item["task"] == TASK
 
 
-@pytest.mark.slow
 def test_lerobot_finds_the_robot_and_its_names_in_the_metadata(theirs: Any) -> None:
     robot = find("planar_arm_lerobot")
     assert theirs.meta.info.codebase_version == "v3.0"

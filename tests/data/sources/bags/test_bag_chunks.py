@@ -21,8 +21,9 @@ from tests.data.bag_files import as_cdr as cdr
 RECORDING = make_recording(12)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("room", [1, 1 << 20])
+@pytest.mark.parametrize(
+    ("kind", "room"), [*((kind, 1) for kind in KINDS), ("ros1", 1 << 20), ("mcap-cdr-zstd", 1 << 20)]
+)
 def test_pictures_and_numbers_are_the_recorded_ones_with_and_without_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, room: int
 ) -> None:
@@ -40,7 +41,7 @@ def test_pictures_and_numbers_are_the_recorded_ones_with_and_without_room(
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap-cdr-zstd", "mcap-json", "ros2-sqlite3"])
-@pytest.mark.parametrize("size", [16, 24, 40])
+@pytest.mark.parametrize("size", [16, 40])
 def test_squares_made_one_by_one_are_those_of_whole_batches(tmp_path: Path, kind: str, size: int) -> None:
     for rule in ("short_side_crop", "letterbox", "stretch"):
         robot = arm(

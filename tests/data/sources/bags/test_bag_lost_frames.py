@@ -3,6 +3,8 @@
 Of AV1 that holds where the stream is coded to survive losses; elsewhere dav1d refuses what it can tell.
 """
 
+import tempfile
+from functools import cache
 from pathlib import Path
 
 import av
@@ -45,9 +47,18 @@ REORDERED = {
 }
 
 
-def messages(folder: Path, codec: str, encoder: str, options: dict[str, str]) -> list[bytes]:
+@cache
+def messages(name: str) -> list[bytes]:
     """The packets of a moving picture, as a recorder would put them into messages."""
-    path = folder / {"h264": "v.h264", "h265": "v.hevc"}.get(codec, "v.mkv")
+    codec, encoder, options = {**STREAMS, **REORDERED}[name]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / {"h264": "v.h264", "h265": "v.hevc"}.get(codec, "v.mkv")
+        film(path, encoder, options)
+        with av.open(str(path)) as container:
+            return [bytes(packet) for packet in container.demux(video=0) if packet.size]
+
+
+def film(path: Path, encoder: str, options: dict[str, str]) -> None:
     draw = np.random.default_rng(0)
     ground = draw.integers(0, 255, (12, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1)
     with av.open(str(path), "w") as out:
@@ -59,8 +70,6 @@ def messages(folder: Path, codec: str, encoder: str, options: dict[str, str]) ->
             picture = np.ascontiguousarray(np.roll(ground, (3 * i, 5 * i), (0, 1)))
             out.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         out.mux(stream.encode(None))
-    with av.open(str(path)) as container:
-        return [bytes(packet) for packet in container.demux(video=0) if packet.size]
 
 
 def decoded(packets: list[bytes], codec: str, in_order: bool) -> list[Images | None]:
@@ -79,9 +88,8 @@ def decoded(packets: list[bytes], codec: str, in_order: bool) -> list[Images | N
 
 @pytest.mark.parametrize("name", STREAMS)
 @pytest.mark.parametrize("in_order", [True, False])
-def test_no_picture_is_made_from_one_that_is_missing(tmp_path: Path, name: str, in_order: bool) -> None:
-    codec = STREAMS[name][0]
-    packets = messages(tmp_path, *STREAMS[name])
+def test_no_picture_is_made_from_one_that_is_missing(name: str, in_order: bool) -> None:
+    codec, packets = STREAMS[name][0], messages(name)
     whole = decoded(packets, codec, in_order=True)
     assert len(packets) == FRAMES and all(picture is not None for picture in whole)
     for lost in (1, 5, 8, 13):
@@ -94,9 +102,8 @@ def test_no_picture_is_made_from_one_that_is_missing(tmp_path: Path, name: str, 
 
 
 @pytest.mark.parametrize("name", [*STREAMS, *REORDERED])
-def test_nothing_is_missed_where_nothing_is_missing(tmp_path: Path, name: str) -> None:
-    codec, encoder, options = {**STREAMS, **REORDERED}[name]
-    packets = messages(tmp_path, codec, encoder, options)
+def test_nothing_is_missed_where_nothing_is_missing(name: str) -> None:
+    codec, packets = {**STREAMS, **REORDERED}[name][0], messages(name)
     keyframes = np.array([is_keyframe(packet, codec) for packet in packets])
     decoder = VideoDecoder(codec, keyframes, lambda start: iter(packets[start:]), "x")
     shown = 0
