@@ -163,7 +163,7 @@ class Embodiment(SpecModel):
             return self.sync.rate_hz
         if isinstance(self.frequency_hz, float):
             return self.frequency_hz
-        stated = self.provenance.get("frequency_hz", "nobody states it")
+        stated = self.provenance.get("frequency_hz", "not stated")
         fault = "is null" if self.source.format in ONE_INDEX else "is null, and so is sync.rate_hz"
         if self.frequency_hz:
             fault = f"is unknown ({stated})"
