@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_560, 11_700, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_850, 512_000
-TEST_LINES = 46_840
+TEST_LINES = 46_870
 DOC_WORDS = 38_750
 
 

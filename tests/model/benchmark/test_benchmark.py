@@ -31,6 +31,7 @@ from hma_model.evaluation.metrics import PSNR_LIMIT
 from hma_model.policies.judge import StateJudge, task_of
 from hma_model.simulate import World
 from hma_model.worlds.scenes import Dimension
+from tests.model.evaluation.test_calibration import loops, rollouts
 from tests.model.policies.test_scores import ROBOT, FlawlessWorld, KnownPlaces
 from tests.model.true_world import tiny_model
 
@@ -89,6 +90,33 @@ def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(
     assert other["planning"]["truth"] == one["planning"]["truth"]  # the same planner and simulator
     assert one["calibration"] == {"missing": NO_UNCERTAINTY} and "policies" in one
     assert other["inverse"]["return_px"] == other["inverse"]["turn_px"] == 0
+
+
+def test_the_calibration_is_recomputed_from_what_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uncertainty, errors = rollouts(4.0, scenes=12)
+    made = np.zeros((*errors.shape, 1, 2))
+    made[..., 0, 0] = errors
+    found = {"uncertainty": uncertainty, "true": 0 * made, "made": made}
+    found |= {"psnr": 40 - errors, "copy_psnr": 0 * errors}
+    monkeypatch.setattr(running, "choose", lambda *given: found)
+    none = {way: np.zeros(12, bool) for way in planning.WAYS}
+    monkeypatch.setattr(running._Robot, "_planned", lambda self: none)
+    monkeypatch.setattr(running._Robot, "_policies", lambda self: json.dumps({"missing": "no judge"}))
+    monkeypatch.setattr(running, "turn_back", lambda *given: {"return_px": np.ones(12)})
+    benchmark("it", tmp_path, replace(TINY, scenes=12), world=world_of(FlawlessWorld))
+    written = json.loads((tmp_path / RESULTS).read_text())
+    frames = {name: np.array(values) for name, values in written["by_frame"][ROBOT].items()}
+    stated = np.cumsum(frames["uncertainty"] ** 4, axis=-1) ** 0.25
+    meter, clock, misses, false_alarms, count = loops(stated, frames["error_px"])
+    figures = written["measures"][ROBOT]["calibration"]
+    assert count == 36 and figures["right"] == pytest.approx(meter, abs=1e-4)
+    assert figures["clock"] == pytest.approx(clock, abs=1e-4)
+    assert figures["misses"] == pytest.approx(np.mean(misses), abs=1e-4)
+    assert figures["false_alarms"] == pytest.approx(np.mean(false_alarms), abs=1e-4)
+    rmse = 255 * 10 ** (-(40 - errors) / 20)
+    np.testing.assert_allclose(frames["pixel_rmse"], rmse, atol=1e-3)
 
 
 def test_meters_are_recorded_in_the_cards_of_a_checkpoint_of_this_machine(tmp_path: Path) -> None:
