@@ -30,7 +30,7 @@ def benchmark(
     device: Device = "auto",
     json: Json = False,
 ) -> None:
-    """Measure a checkpoint on simulated robots by a fixed protocol: images, state, planning, uncertainty, policies.
+    """Measure a checkpoint on simulated robots by a fixed protocol: images, state, plans, policies.
 
     Finished parts are kept, and the same command continues.
 
