@@ -39,7 +39,7 @@ PLAIN = (  # key of a robot's figures, measure, key or text of the reference, it
         "calibration.all_px",
         "of all",
     ),
-    ("calibration.right", "rollouts warned in time", "calibration.clock", "by elapsed time"),
+    ("calibration.right", "rollouts warned in time", "calibration.clock", "by a clock"),
     ("calibration.misses", "misses: no warning by the time the error doubles", "", ""),
     ("calibration.false_alarms", "false alarms: no doubling soon after a warning", "", ""),
     ("frames_per_second", "frames per second, one rollout", "frames_per_cpu_second", "per CPU second"),
