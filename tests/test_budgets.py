@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_850, 512_000
 TEST_LINES = 46_870
-DOC_WORDS = 38_740
+DOC_WORDS = 38_790
 
 
 @cache
