@@ -139,7 +139,9 @@ def augment(
     ] = "replay",
     keep: Annotated[float, Option(help="Share of episodes to keep, lowest uncertainty first.")] = 0.5,
     max_error: MaxError = None,
-    judge: Annotated[str, Option(help="Keep only these successes: moved, reached, placed, moved=PX.")] = "",
+    judge: Annotated[
+        str, Option(help="Keep only successes: moved, reached, placed, moved=PX, or of a reward model.")
+    ] = "",
     lerobot: Annotated[Path | None, Option(help="Also write a LeRobotDataset v3.0 to this folder.")] = None,
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,

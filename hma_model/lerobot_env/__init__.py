@@ -40,7 +40,8 @@ class HMAEnvConfig(EnvConfig):
         checkpoint: as `HMA.from_pretrained` takes it.
         embodiment: an id of it; may be left out if it has one.
         horizon: steps of an episode.
-        judge: a task whose success is judged, as of `hma policy-eval --judge`; None for none.
+        judge: a task or a reward model that judges success, as of `hma policy-eval --judge`; None for none.
+        judge_from: shards with success labels, which measure a reward model.
         state: whether policies are told the state, read off the images, where it can be learned.
         prompt: what all episodes start from, as `hma play --prompt`; None draws from the simulator.
         size: side in pixels of the images; None for that of the model.
@@ -54,6 +55,7 @@ class HMAEnvConfig(EnvConfig):
     embodiment: str = ""
     horizon: int = 300
     judge: str | None = None
+    judge_from: str | None = None
     state: bool = True
     prompt: str | None = None
     clip: bool = False
@@ -129,7 +131,7 @@ def made(
     checkpoint: Checkpoint, embodiment: str, n_envs: int, world: World, given: Mapping[str, Any]
 ) -> LeRobotVectorEnv:
     """Return the environments of a robot, with the settings that are given."""
-    keys = ("state", "judge", "task", "horizon", "prompt", "clip", "size")
+    keys = ("state", "judge", "judge_from", "task", "horizon", "prompt", "clip", "size")
     settings = {key: given[key] for key in keys if key in given}
     return LeRobotVectorEnv(checkpoint, embodiment, n_envs, world, **settings)
 

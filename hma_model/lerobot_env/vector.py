@@ -18,7 +18,8 @@ from hma_data.lab.simulator import simulated
 from hma_data.shards.reader import ShardSet
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.evaluation.recorded_state import EPISODES_NEEDED, Reader, recorded_reader, simulated_reader
-from hma_model.policies.judge import StateJudge, task_of, train_judge
+from hma_model.policies.judge import StateJudge, Task, task_of, train_judge
+from hma_model.policies.rewards import RewardModel, labelled_shards, measured_judge, names_reward_model
 from hma_model.worlds.env import WorldModelVectorEnv
 from hma_model.worlds.images import recorded_cameras, seen_cameras, trained_cameras
 from hma_model.worlds.world import World
@@ -59,8 +60,9 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
 
     Observations are `pixels`, by camera if there are several, and `agent_pos`, the state read off the
     images. An environment whose episode has ended stays as it is until the next reset, and costs nothing.
-    The reward is the judge's score so far. Success is judged at the end; of `reached`, which nothing can
-    undo, as soon as it is seen, and that ends the episode. Reader and judge are trained at the first reset.
+    The reward is the judge's score so far. Success is judged at the end; of `reached` and of a reward model,
+    which nothing can undo, as soon as it is seen, and that ends the episode. Reader and judge are trained, or
+    the reward model is measured, at the first reset.
 
     Args:
         checkpoint: of the world.
@@ -68,7 +70,8 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         num_envs: N.
         world: of the checkpoint.
         state: whether to read the state, where one is known.
-        judge: a task in words, as `task_of` takes it; None for no judge: nothing is a success.
+        judge: a task in words, as `task_of` takes it, or a reward model; None: nothing is a success.
+        judge_from: shards whose held-out episodes measure a reward model; by default those of the training.
         task: what policies are told; by default the robot's id.
         horizon: steps of an episode.
         settings: of `WorldModelEnv`: prompt, clip, size.
@@ -86,6 +89,7 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         *,
         state: bool = True,
         judge: str | None = None,
+        judge_from: str | None = None,
         task: str | None = None,
         horizon: int = 300,
         **settings: Any,
@@ -96,6 +100,7 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         self.metadata = self.metadata | {"render_fps": max(1, round(self.metadata["render_fps"]))}
         self.task = self.task_description = task or embodiment
         self._max_episode_steps = horizon
+        self._judged_by, self._judge_from = judge, judge_from
         self._task = None if judge is None else judged_task(embodiment, judge)
         self._cameras = camera_names(checkpoint, embodiment)
         self._train_reader = state_source(checkpoint, embodiment) if state else None
@@ -132,10 +137,15 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         return reader
 
     @cached_property
-    def judge(self) -> StateJudge | None:
-        """Train the judge, and say how often it is right."""
-        if self._task is None:
+    def judge(self) -> StateJudge | RewardModel | None:
+        """Train the judge or measure the reward model, and say how often it is right."""
+        if self._judged_by is None:
             return None
+        if self._task is None:
+            shards = labelled_shards(self.world, self.embodiment, self._judge_from, self._judged_by)
+            found = measured_judge(self._judged_by, self.world, self.embodiment, shards)
+            log.warning("%s: success is what %s says; %s", self.embodiment, found.source, found.sentence)
+            return found.model
         spec = self.envs[0].action_spec
         frames = self._max_episode_steps // spec.stride + 1
         judge = train_judge(self.embodiment, self.world.tokenizer, spec.stride, frames, self._task)
@@ -170,7 +180,7 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
                 new.append(i)
             rewards[i] = self._scores[i]
             self._truncated[i] = truncated
-            lasting = self._task is not None and self._task.name == "reached"
+            lasting = self._task is None or self._task.name == "reached"
             if self.judge is not None and self._frames[i] and (truncated or lasting):
                 self._success[i] = self.judge.success(self._scores[i])
         self.ended = self._success | self._truncated
@@ -201,9 +211,11 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         return seen | ({} if self.reader is None else {"agent_pos": self._states.copy()})
 
 
-def judged_task(embodiment: str, words: str) -> Any:
-    """Return the task that a robot is judged by."""
+def judged_task(embodiment: str, words: str) -> Task | None:
+    """Return the task that a robot is judged by; None if the words name a reward model."""
+    if names_reward_model(words):
+        return None
     if not simulated(embodiment):
-        remedy = "leave the judge out; nothing then counts as a success"
+        remedy = "give a reward model, or leave the judge out; nothing then counts as a success"
         raise UsageError("judge", f"there is none of {embodiment}, which has no simulator", remedy)
     return task_of(embodiment, words)

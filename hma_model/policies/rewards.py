@@ -41,6 +41,7 @@ Images = NDArray[np.uint8]
 LIMIT = 0.5  # least reward of a success, as lerobot's
 FRAMES_AT_ONCE = 64
 NEEDED = 4  # held-out successes, and failures, with which a judge that is always right passes
+SHARDS = "--from SHARDS (lerobot-eval: --env.judge_from)"
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 PREPROCESSOR = "*preprocessor.json"
 VIDEO_MODELS = ("sarm", "robometer", "topreward")  # they score a video and its text, not a frame
@@ -148,6 +149,28 @@ class RewardModel:
         judged: Bools = scores > LIMIT
         return judged
 
+    def __call__(self, images: Images, actions: Any) -> tuple[float, bool]:
+        return self.begun()(images, actions)
+
+    def begun(self) -> "HighestReward":
+        """Return the judge of one episode, as a `WorldModelEnv` takes it."""
+        return HighestReward(self)
+
+
+class HighestReward:
+    """A `RewardModel` in one episode: the highest reward of its frames so far; it never ends the episode."""
+
+    def __init__(self, model: RewardModel) -> None:
+        self._model = model
+        self._seen = 0
+        self._highest = -np.inf
+
+    def __call__(self, images: Images, actions: Any) -> tuple[float, bool]:
+        if len(new := images[self._seen :]):
+            self._highest = max(self._highest, float(self._model.score(new[None])[0]))
+            self._seen = len(images)
+        return self._highest, False
+
 
 @dataclass(frozen=True)
 class RewardJudge:
@@ -220,7 +243,7 @@ def measured_judge(
             f"{shards.folder} has {successes} successes and {len(true) - successes} failures among its "
             "held-out episodes with a success label, too few to measure its accuracy"
         )
-        remedy = f"give --from SHARDS with {NEEDED} or more of each"
+        remedy = f"give {SHARDS} with {NEEDED} or more of each"
         raise HMAError(where, fault, remedy)
     names = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
     model = RewardModel(source, names, embodiment, str(world.model.device))
@@ -252,9 +275,7 @@ def labelled_shards(world: "World", embodiment: str, given: Any, judge: str) -> 
         if shards.embodiment.id == embodiment:
             return shards
     fault = f"no recorded episodes of {embodiment} tell how often it is right"
-    remedy = (
-        f"give --from SHARDS whose held-out episodes have {NEEDED} or more labelled successes and failures"
-    )
+    remedy = f"give {SHARDS} whose held-out episodes have {NEEDED} or more labelled successes and failures"
     raise UsageError(f"judge {judge}", fault, remedy)
 
 

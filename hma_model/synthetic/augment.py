@@ -38,6 +38,7 @@ from hma_model.policies.base import Judged, Policy
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import device_facts, world_digests
 from hma_model.policies.judge import StateJudge, task_of, train_judge
+from hma_model.policies.rewards import RewardModel, labelled_shards, measured_judge, names_reward_model
 from hma_model.policies.scores import Progress, choosing_meter, run
 from hma_model.synthetic.recorder import (
     SyntheticEpisode,
@@ -73,7 +74,7 @@ class Augmentation:
         commands: `replay`, `perturb=SHARE`, or a policy as `read_policy` takes it.
         keep: share of the episodes that is kept, the surest ones.
         max_error: px; episodes whose state error is expected to end above it are left out. None leaves none.
-        judge: the task whose successes are kept, as `task_of` takes it; empty for none.
+        judge: the task, as `task_of` takes it, or the reward model whose successes are kept; empty for none.
         seed: of everything.
         unmask_steps, temperature, precision: as of `World`.
     """
@@ -94,8 +95,13 @@ class Augmentation:
     def __post_init__(self) -> None:
         if not 0 < self.keep <= 1:
             raise UsageError("--keep", f"is {self.keep:g}", "give a share above 0, at most 1")
-        if self.judge:
+        if self.judge and not self.rewarded:
             task_of(self.embodiment, self.judge)
+
+    @property
+    def rewarded(self) -> bool:
+        """Check whether a reward model judges the episodes."""
+        return bool(self.judge) and names_reward_model(self.judge)
 
     @property
     def recorded(self) -> bool:
@@ -106,7 +112,7 @@ class Augmentation:
     def looked_at(self) -> bool:
         """Check whether a probe that was trained on the simulator's images looks at those of the model."""
         stateful = self.commands.startswith(("scripted", "reach", "lerobot:")) and simulated(self.embodiment)
-        return bool(self.judge) or stateful
+        return bool(self.judge and not self.rewarded) or stateful
 
 
 @dataclass(frozen=True)
@@ -275,7 +281,7 @@ class _Maker:
         self.scenes = Scenes.of(world, name, settings.episodes, settings.seed, simulator=shards is None)
         self.robot: Embodiment = self.scenes.robot.embodiment
         self.policy = self._policy(settings.commands)
-        self.judge: StateJudge | None = None
+        self.judge: StateJudge | RewardModel | None = None
         self.probe: Probe | None = None
         self.cameras = [self.robot.primary_camera.name]
         if shards is not None:
@@ -291,7 +297,7 @@ class _Maker:
                 fault = f"{commands!r} needs a policy that acts from images, and {self.robot.id} has none"
                 raise UsageError("--commands", fault, "give replay, perturb=0.3, random or a policy of yours")
             policy = read_policy(commands, self.scenes, self.world)
-            if isinstance(policy, Judged) and not self.settings.judge:
+            if isinstance(policy, Judged) and (not self.settings.judge or self.settings.rewarded):
                 fault = f"{commands!r} plans for what a judge calls success"
                 raise UsageError("--commands", fault, "add --judge moved, or another task")
             return policy
@@ -343,8 +349,14 @@ class _Maker:
         return batches
 
     def _train(self, on_progress: Progress) -> None:
-        """Train the judge, or the probe alone, if they are asked for."""
+        """Train the judge, or the probe alone, if they are asked for; measure a reward model."""
         settings = self.settings
+        if settings.rewarded and self.judge is None:
+            shards = self.shards or labelled_shards(self.world, settings.embodiment, None, settings.judge)
+            tell = partial(on_progress, 0)
+            found = measured_judge(settings.judge, self.world, settings.embodiment, shards, tell)
+            warnings.warn(f"{found.source}: {found.sentence}", UserWarning, stacklevel=2)
+            self.judge = found.model
         if self.probe is not None or not settings.looked_at:
             return
         name = settings.embodiment
@@ -353,14 +365,15 @@ class _Maker:
         stride = self.scenes.stride
         tell = partial(on_progress, 0)
         self.probe = train_probe(name, tokenizer, stride, seed, tell)
-        if settings.judge:
+        if settings.judge and not settings.rewarded:
             task = task_of(name, settings.judge)
             frames = settings.frames + 1
-            self.judge = train_judge(
+            judge = train_judge(
                 name, tokenizer, stride, frames, task, seed=seed, probe=self.probe, tell=tell
             )  # fmt: skip
+            self.judge = judge
             if isinstance(self.policy, Judged):
-                self.policy.judged(self.judge)
+                self.policy.judged(judge)
 
     def _make(self, numbers: range, tell: Callable[[float], None]) -> SyntheticBatch:
         begun = self._simulated(numbers) if self.shards is None else self._recorded(self.shards, numbers)

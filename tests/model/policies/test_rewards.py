@@ -20,11 +20,14 @@ from typer.testing import CliRunner
 from hma_data.errors import HMAError, MissingDependencyError, UsageError
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import get_tokenizer
+from hma_model.checkpoint.folder import Checkpoint
 from hma_model.cli import app
 from hma_model.evaluation.agreement import accuracy
+from hma_model.lerobot_env.vector import LeRobotVectorEnv
 from hma_model.policies.recorded import UNKNOWN, evaluate_recorded, write_report
 from hma_model.policies.rewards import NEEDED, RewardModel, measured_judge
 from hma_model.simulate import World, load_world
+from hma_model.synthetic.augment import Augmentation, augment
 from tests.model.shards import make_shards
 from tests.model.true_world import trained_on
 
@@ -137,6 +140,40 @@ def test_the_command_line_judges_by_a_reward_model(world: World, shards: Path, j
     assert isinstance(CliRunner().invoke(app, words).exception, UsageError)  # there is no training run
 
 
+def test_lerobots_evaluation_is_judged_by_it(
+    world: World, shards: Path, judge: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    checkpoint = Checkpoint.open(shards.parent / "model")
+    given: Any = {"judge": str(judge), "judge_from": str(shards), "prompt": str(shards), "horizon": 8}
+    env = LeRobotVectorEnv(checkpoint, ROBOT, 2, world, state=False, **given)
+    assert isinstance(env.judge, RewardModel) and "true positives 7 of 8" in caplog.text
+    env.reset(seed=[0, 1])
+    images = [[one.image] for one in env.envs]
+    seen = np.zeros((8, 2))
+    for step in range(8):  # an episode that has ended gives no more rewards
+        _, seen[step], _, _, infos = env.step(np.zeros(env.action_space.shape, np.float32))
+        for shown, one in zip(images, env.envs, strict=True):
+            shown.append(one.image)
+    highest = env.judge.score(np.array(images))
+    np.testing.assert_allclose(seen.max(axis=0), highest)
+    assert (infos["is_success"] == (highest > 0.5)).all()
+
+
+def test_synthetic_episodes_that_it_calls_failures_are_left_out(
+    world: World, shards: Path, judge: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    score = RewardModel.score
+
+    def every_second(model: RewardModel, images: Any) -> Any:
+        return score(model, images) if len(images) == 1 else np.array([0.9, 0.1, 0.9, 0.1])
+
+    monkeypatch.setattr(RewardModel, "score", every_second)
+    settings = Augmentation(ROBOT, str(shards), episodes=4, frames=4, keep=1.0, judge=str(judge))
+    with pytest.warns(UserWarning, match="true positives 7 of 8"):
+        made = augment(tmp_path / "made", settings, world=world, shards=shards)
+    assert sum(split["episodes"] for split in made.splits.values()) == 2
+
+
 @pytest.mark.parametrize("policy", ["scripted", "reach:noise=0.5"])
 def test_policies_that_need_a_simulator_are_refused(
     world: World, shards: Path, judge: Path, policy: str
@@ -154,7 +191,7 @@ def test_a_judge_no_better_than_chance_and_too_few_labels_are_refused(
     with pytest.raises(HMAError, match=said):
         measured_judge(str(always), world, ROBOT, ShardSet(shards))
     label(shards, [True, True, False] + [None] * (HELD_OUT - 3))
-    said = f"has 2 successes and 1 failures .* too few .* give --from SHARDS with {NEEDED} or more of each"
+    said = f"has 2 successes and 1 failures .* too few .* give --from SHARDS .* with {NEEDED} or more of each"
     with pytest.raises(HMAError, match=said):
         measured_judge(str(judge), world, ROBOT, ShardSet(shards))
     label(shards, [None] * HELD_OUT)
