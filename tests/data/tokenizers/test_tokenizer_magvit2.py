@@ -338,7 +338,7 @@ def test_weights_of_another_network_are_refused_by_name(tmp_path, state, named):
     ],
 )
 def test_frames_of_another_size_or_dtype_are_refused(tiny, bad):
-    with pytest.raises(TokenizerError, match="takes uint8 pictures"):
+    with pytest.raises(TokenizerError, match="takes uint8 images"):
         tiny.encode(bad)
 
 

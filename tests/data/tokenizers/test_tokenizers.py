@@ -251,7 +251,7 @@ def test_quantisation_passes_the_gradient_of_the_squashing():
     ],
 )
 def test_frames_of_another_size_or_dtype_are_refused(fsq8, frames):
-    with pytest.raises(TokenizerError, match="takes uint8 pictures"):
+    with pytest.raises(TokenizerError, match="takes uint8 images"):
         fsq8.encode(frames)
 
 
@@ -408,7 +408,7 @@ def test_raw_is_measured_as_lossless():
 def test_no_frames_cannot_be_measured(fsq8, tmp_path):
     with pytest.raises(TokenizerError, match="no frame"):
         evaluate(fsq8, [])
-    with pytest.raises(TokenizerError, match="no picture"):
+    with pytest.raises(TokenizerError, match="no image"):
         list(read_films(tmp_path, 128))
 
 

@@ -148,7 +148,7 @@ def test_a_pass_that_finds_no_memory_names_the_batch_that_would_fit(name, monkey
     monkeypatch.setattr(memory, "free_bytes", lambda device: there)
     text = "CUDA out of memory. Tried to allocate 20.00 MiB"
     with (
-        pytest.raises(TrainingError, match="memory: there is not enough .* 20.00 MiB — set ") as refused,
+        pytest.raises(TrainingError, match="memory: too little .* 20.00 MiB — set ") as refused,
         memory_errors(model, recipe, CPU),
     ):
         raise torch.OutOfMemoryError(text)
