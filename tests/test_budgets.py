@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_900, 512_400
 TEST_LINES = 46_905
-DOC_WORDS = 38_800
+DOC_WORDS = 38_850
 
 
 @cache

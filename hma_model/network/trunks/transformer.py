@@ -158,8 +158,9 @@ class _InCache(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:
-        flat = [grad.flatten(0, 1), *ctx.saved_tensors]
-        made = [torch.empty_like(x) for x in ctx.saved_tensors]
+        saved = ctx.saved_tensors  # once: a checkpoint refuses a second time
+        flat = [grad.flatten(0, 1), *saved]
+        made = [torch.empty_like(x) for x in saved]
         for part in zip(*_InCache.parts([*flat, *made]), strict=True):
             of_out, queries, keys, values, of_queries, of_keys, of_values = part
             shares = torch.bmm(queries, keys.mT).softmax(-1)
