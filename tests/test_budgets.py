@@ -21,7 +21,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/inspection": (2_160, 20_150, 9),
     "hma_data/lab": (3_350, 30_800, 16),
     "hma_data/loading": (1_290, 11_000, 6),
-    "hma_data/registry": (1_280, 8_200, 6),
+    "hma_data/registry": (1_280, 8_210, 6),
     "hma_data/shards": (2_540, 19_600, 11),
     "hma_data/sources": (12_670, 105_600, 52),
     "hma_data/storage": (1_640, 10_700, 11),
@@ -35,7 +35,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/export": (910, 6_800, 7),
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_300, 6),
-    "hma_model/lerobot_env": (575, 4_430, 3),
+    "hma_model/lerobot_env": (575, 4_435, 3),
     "hma_model/network": (3_320, 28_400, 16),
     "hma_model/play": (1_690, 12_200, 8),
     "hma_model/policies": (2_880, 20_400, 14),
@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_560, 11_700, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_900, 512_400
-TEST_LINES = 46_905
+TEST_LINES = 46_920
 DOC_WORDS = 38_850
 
 

@@ -153,6 +153,11 @@ class Embodiment(SpecModel):
         return self.action.dims
 
     @property
+    def states_rate(self) -> bool:
+        """Return whether the YAML states the rate of the grid."""
+        return bool(self.sync.rate_hz) or isinstance(self.frequency_hz, float)
+
+    @property
     def rate_hz(self) -> float:
         """Return the rate of the grid in Hz.
 

@@ -64,7 +64,7 @@ class Commands:
                 if part.range:
                     low[at : at + part.dims], high[at : at + part.dims] = part.range
                 at += part.dims
-        rate = None if robot is None else robot.rate_hz
+        rate = robot.rate_hz if robot is not None and robot.states_rate else None
         return cls(embodiment, tuple(names), space.stride, rate, low, high, seen)
 
     def read(self, commands: ArrayLike) -> tuple[Float32s, bool]:

@@ -98,7 +98,7 @@ class HMAEnvConfig(EnvConfig):
         if self.judge is not None:
             judged_task(self.embodiment, self.judge)
         robot = checkpoint.embodiment(self.embodiment)
-        self.fps = max(1, round(robot.rate_hz or 10))
+        self.fps = max(1, round(robot.rate_hz if robot.states_rate else 10))
         self.task = self.task or self.embodiment
         side = self.size or image_shape(checkpoint.config)[0]
         image = PolicyFeature(FeatureType.VISUAL, (side, side, 3))

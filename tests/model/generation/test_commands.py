@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from hma_model.generation import commands
-from hma_model.generation.commands import Commands
+from hma_model.generation.commands import Commands, described
 from hma_model.network.model import HMA
 from tests.model.robots import make_model, save
 
@@ -48,3 +48,13 @@ def test_actions_outside_the_range_are_told_once_of_each_embodiment(tmp_path, mo
 def test_commands_of_unknown_range_have_no_bounds() -> None:
     own = Commands.of(make_model(NAMES), "crane")
     assert own.seen is None and (own.low == -np.inf).all() and own.low.shape == own.high.shape == (3,)
+
+
+def test_a_robot_whose_rate_nobody_states_has_commands(tmp_path, monkeypatch) -> None:
+    save(tmp_path, NAMES)
+    model = HMA.from_pretrained(tmp_path)
+    robot = described(model, "arm")
+    assert robot is not None and Commands.of(model, "arm").rate_hz == robot.rate_hz
+    unstated = robot.model_copy(update={"frequency_hz": "unknown"})
+    monkeypatch.setattr(commands, "described", lambda model, name: unstated)
+    assert Commands.of(model, "arm").rate_hz is None
