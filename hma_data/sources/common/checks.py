@@ -327,7 +327,8 @@ class CameraLook:
         """
         if self.colours:
             # One number a colour: sorting rows takes twenty times as long.
-            codes = np.unique(np.concatenate(self.colours).astype(np.uint32) @ np.uint32([65536, 256, 1]))
+            red, green, blue = np.concatenate(self.colours).astype(np.int64).T
+            codes = np.unique((red << 16) + (green << 8) + blue)
             colours = np.stack([codes >> 16, codes >> 8, codes], axis=1).astype(np.uint8)
             straight, turned = ycbcr_share(colours), ycbcr_share(colours[:, ::-1])
             if straight is not None and turned is not None:
