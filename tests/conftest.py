@@ -43,7 +43,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 LEROBOT = ("test_to_lerobot.py", "test_lerobot_own.py")  # they import lerobot, which one worker does then
-LONG = ("test_notebooks.py",)  # and mypy: no worker waits for them at the end
+LONG = ("test_notebooks.py", "test_tutorials.py")  # and mypy: no worker waits for them at the end
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
