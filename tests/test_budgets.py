@@ -31,7 +31,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/checkpoint": (870, 6_500, 5),
     "hma_model/cli": (1_715, 10_700, 12),
     "hma_model/demo": (490, 4_100, 4),
-    "hma_model/evaluation": (4_560, 36_900, 23),
+    "hma_model/evaluation": (4_570, 37_030, 23),
     "hma_model/export": (910, 6_800, 7),
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_300, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_610, 29_700, 18),
     "hma_model/worlds": (1_560, 11_700, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_900, 512_400
-TEST_LINES = 46_920
+PRODUCT_LINES, PRODUCT_NODES = 64_900, 512_600
+TEST_LINES = 46_930
 DOC_WORDS = 38_850
 
 

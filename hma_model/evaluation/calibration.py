@@ -70,8 +70,14 @@ class Meter:
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> "Meter":
-        """Return the meter of the values of `facts`."""
+        """Return the meter of the values of `facts`; KeyError, TypeError or ValueError if they are none."""
         own = {name: facts[name] for name in cls.__dataclass_fields__}
+        curve = np.array([own["stated"], own["error_px"]], np.float64)
+        rates = [own[name] or 0 for name in ("misses", "false_alarms")]
+        numbers = np.array([own["limit"], own["doubled_px"], own["right"], own["clock"], *rates], np.float64)
+        sound = np.isfinite(curve).all() and np.isfinite(numbers).all() and (np.diff(curve) >= 0).all()
+        if not (sound and curve.size):
+            raise ValueError(f"no meter: {dict(facts)}")
         return cls(**own | {name: tuple(own[name]) for name in ("stated", "error_px")})
 
     def expected(self, stated: Floats) -> Floats:
@@ -109,7 +115,7 @@ def meter_of(
         return None, "uncertainty is not calibrated: hma benchmark calibrates it"
     try:
         meter = Meter.of(card["meter"])
-    except (KeyError, TypeError):
+    except (KeyError, TypeError, ValueError):
         return None, "the card's calibration of uncertainty is damaged: hma benchmark writes it anew"
     if (meter.unmask_steps, meter.temperature, "random") != (unmask_steps, temperature, order):
         way = f"{meter.unmask_steps} passes at temperature {meter.temperature:g} in random order"

@@ -166,6 +166,13 @@ def test_a_card_gives_a_meter_for_the_frames_that_it_was_measured_on_or_says_why
     ):
         assert said in meter_of(tokens, card, *way)[1]
     assert "hma benchmark calibrates it" in meter_of(tokens, {}, *way)[1]
-    assert "is damaged" in meter_of(tokens, {"meter": {"limit": 1}}, *way)[1]
+    broken: tuple[dict[str, Any], ...] = (
+        {"limit": "x"},
+        {"stated": ["a", "b"]},
+        {"error_px": [1.0]},
+        {"right": np.nan},
+    )
+    for damage in ({"limit": 1}, *(card["meter"] | one for one in broken)):
+        assert "is damaged" in meter_of(tokens, {"meter": damage}, *way)[1]
     regression = SimpleNamespace(video_loss="regression")
     assert meter_of(regression, card, *way) == (None, NO_UNCERTAINTY)  # type: ignore[arg-type]
