@@ -8,8 +8,10 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
@@ -21,6 +23,7 @@ import hma_data
 from hma_data.errors import HMAError, OutputError, RecipeError
 from hma_model.config import HMAConfig
 from hma_model.generation.packed import has_bfloat16
+from hma_model.network.linear import Linear
 from hma_model.network.trunks.transformer import PRODUCT_KEYS
 from hma_model.training.recipe import Recipe
 
@@ -29,6 +32,7 @@ LOCK, START = ".lock", ".start"  # START: the checkpoint that the run starts fro
 # A transformer's width and a U-Net's finest channels from which steps in bf16 are faster on a processor with
 # AVX512-BF16 (docs/results.md, Training). At width 64 a transformer's take as long.
 LEAST_WIDTH, LEAST_CHANNELS = 128, 32
+GAIN = 1.2  # how much faster products in bf16 must be to be chosen
 
 
 def choose_device(name: str) -> torch.device:
@@ -80,12 +84,34 @@ def choose_precision(
         return "bf16", f"this {processor} supports bf16"
     if device.type != "cpu" or recipe.compile:
         return "fp32", f"bf16 was not measured {'compiled' if recipe.compile else f'on {device.type}'}"
+    if not bfloat16_pays():
+        return "fp32", f"this {processor} supports bf16, but is no faster in it"
     size, least = config.width, LEAST_WIDTH
     if config.trunk == "unet":
         size, least = config.levels[0], LEAST_CHANNELS
     if size < least:
         return "fp32", f"a network of width {size} is no faster in bf16 on a CPU"
     return "bf16", f"this {processor} supports bf16, and width {size} is faster in it"
+
+
+@cache
+def bfloat16_pays() -> bool:
+    """Measure once whether a linear map on a CPU is clearly faster in bfloat16 than in float32.
+
+    What the processor supports does not tell: with AVX512-BF16 but no AMX, AMD's gain, and Intel's take up to
+    twice as long.
+    """
+    linear, x = Linear(256, 256), torch.zeros(4096, 256)
+
+    def seconds(half: bool) -> float:
+        begun = time.perf_counter()
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            linear(x.bfloat16() if half else x)
+        return time.perf_counter() - begun
+
+    with torch.inference_mode():
+        taken = [(seconds(half=False), seconds(half=True)) for _ in range(8)]
+    return GAIN * min(half for _, half in taken) < min(full for full, _ in taken)
 
 
 def attention_form(recipe: Recipe, config: HMAConfig, device: torch.device) -> str:

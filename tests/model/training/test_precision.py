@@ -24,8 +24,9 @@ UNET = {
 
 @pytest.fixture
 def bfloat16(monkeypatch):
-    """A processor with products of bfloat16."""
+    """A processor with fast products of bfloat16."""
     monkeypatch.setattr(runtime, "has_bfloat16", lambda: True)
+    monkeypatch.setattr(runtime, "bfloat16_pays", lambda: True)
 
 
 @pytest.fixture
@@ -56,6 +57,14 @@ def test_auto_takes_bf16_on_a_processor_that_has_it_from_some_width_on(network, 
 
 def test_auto_takes_fp32_where_the_processor_has_no_bfloat16(no_bfloat16):
     assert choose_precision(AUTO, HMAConfig(), CPU) == ("fp32", "this processor does not support bf16")
+
+
+def test_auto_takes_fp32_where_products_of_bfloat16_are_no_faster(bfloat16, monkeypatch):
+    monkeypatch.setattr(runtime, "bfloat16_pays", lambda: False)
+    precision, reason = choose_precision(AUTO, HMAConfig(width=256), CPU)
+    assert precision == "fp32" and "no faster" in reason
+    asked = make_recipe({"precision": "bf16"})
+    assert choose_precision(asked, HMAConfig(width=256), CPU) == ("bf16", "as the recipe says")
 
 
 @pytest.mark.parametrize(("there", "chosen"), [(True, "bf16"), (False, "fp32")])
