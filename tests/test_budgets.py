@@ -41,12 +41,12 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_880, 20_400, 14),
     "hma_model/released": (825, 7_100, 4),
     "hma_model/synthetic": (1_240, 9_230, 5),
-    "hma_model/training": (3_610, 29_700, 18),
+    "hma_model/training": (3_630, 29_900, 18),
     "hma_model/worlds": (1_560, 11_700, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_900, 512_600
-TEST_LINES = 46_930
-DOC_WORDS = 38_850
+PRODUCT_LINES, PRODUCT_NODES = 64_930, 512_800
+TEST_LINES = 46_960
+DOC_WORDS = 39_800
 
 
 @cache

@@ -110,6 +110,12 @@ def test_every_link_leads_somewhere(page: Path) -> None:
     assert not wrong
 
 
+def test_the_code_that_makes_a_frame_agrees_with_generate() -> None:
+    page = (ROOT / "docs/how-a-frame-is-made.md").read_text()
+    code = page.split("```python\n")[1].split("```")[0]
+    exec(compile(code, "docs/how-a-frame-is-made.md", "exec"), {})  # asserts that the tokens are equal
+
+
 def test_the_tests_that_the_guarantees_name_exist() -> None:
     named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", (DOCS / "guarantees.md").read_text())
     assert named
