@@ -1,0 +1,161 @@
+"""Public Push-T sets: small copies of their layouts go from the published files to figures in one call."""
+
+import argparse
+import hashlib
+import json
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from hma_data.errors import HMAError, SourceError, StorageAwayError
+from recipes.public import dino_wm, gpc, iws, sets
+from recipes.public.sets import BASELINE, checked_file, gaussian_ssim
+from tests.model.public import look_alikes
+
+TINY = [
+    "model.levels=[8]", "model.width=16", "model.layers=1", "model.heads=2", "frames=3",
+    "batch_size=1", "steps=1", "checkpoint_every=0", "report=false", "pictures=0", "warmup=0",
+    "self_forward=0",
+]  # fmt: skip
+SETS = {"gpc": (gpc, 8), "dino_wm": (dino_wm, 4), "iws": (iws, 8)}  # frames of a window of the look-alike
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_one_command_leads_from_the_published_files_to_figures(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    module, frames = SETS[name]
+    source = getattr(look_alikes, name)(tmp_path / "published")
+    protocol = replace(module.PROTOCOL, frames=frames, size=64)
+    monkeypatch.setattr(module, "PROTOCOL", protocol)
+    monkeypatch.setattr(gpc, "TRAINED", 4)
+    words = [str(tmp_path / "out"), "--from", str(source), "--tokenizer", "raw-64", "--workers", "0"]
+    monkeypatch.setattr(sys, "argv", ["recipe", *words, "--windows", "2", "--device", "cpu", *TINY])
+    sets.run(replace(module.SET, protocol=protocol))
+    rows = json.loads((tmp_path / "out" / "figures.json").read_text())
+    ours, still, *others = rows
+    assert (ours["model"], still["model"]) == ("ours", BASELINE)
+    assert 0 < ours["ssim"] <= 1 and 5 < ours["psnr_db"] < 60
+    expected = {"gpc": ["ours", BASELINE], "dino_wm": ["NanoWM-B/2, 100k steps"], "iws": []}
+    assert [row["model"] for row in others] == expected[name]
+    shown = capsys.readouterr().out
+    assert f"{ours['psnr_db']:.2f}" in shown
+
+
+def test_episodes_beyond_those_that_driftworld_trains_on_are_held_out(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(gpc, "TRAINED", 4)
+    source = look_alikes.gpc(tmp_path / "published")
+    recording, _ = gpc.prepare(source, tmp_path / "out")
+    with h5py.File(recording / "domain18.hdf5") as file:
+        assert [name.decode() for name in file["mask/valid"]] == ["demo_4", "demo_5"]
+        assert file["data/demo_2/img"].shape == (22, 96, 96, 3) and file["data/demo_2/img"].dtype == np.uint8
+        images, actions, states = look_alikes.push(2, 22, 96)
+        assert np.array_equal(file["data/demo_2/img"], images)
+        assert np.array_equal(file["data/demo_2/action"], actions)
+        assert np.array_equal(file["data/demo_2/state"], states)
+
+
+def test_windows_of_gpc_are_the_first_in_order() -> None:
+    chosen = gpc.choose([70, 10, 1100], 1)
+    assert chosen[:8] == [(0, 0), (0, 1), (0, 2), (0, 3), (0, 4), (0, 5), (0, 6), (2, 0)]
+    assert len(chosen) == 1000
+
+
+def test_windows_of_dino_wm_are_drawn_as_the_published_ones() -> None:
+    lengths = [30, 25, 19, 40, 22]
+    order = np.arange(5)
+    np.random.RandomState(42).shuffle(order)
+    every = [(int(one), start) for one in order for start in range(max(lengths[one] - 19, 0))]
+    drawn = np.random.RandomState(42).choice(len(every), size=len(every), replace=False)
+    assert dino_wm.choose(lengths, 5) == [every[number] for number in drawn]
+
+
+def test_windows_of_iws_begin_every_fourth_episode() -> None:
+    assert iws.choose([300] * 8 + [150] + [300] * 4, 1) == [(0, 0), (4, 0), (12, 0)]
+
+
+def test_rows_of_dino_wm_are_as_many_as_frames_of_the_video(tmp_path) -> None:
+    train, _ = dino_wm.prepare(look_alikes.dino_wm(tmp_path, episodes=2), tmp_path / "out")
+    _, targets, states = look_alikes.push(1, 25, 224)
+    with h5py.File(train / "episode_001.hdf5") as file:
+        assert np.allclose(file["state"], states) and file["velocity"].shape == (25, 2)
+        assert np.allclose(file["action"], targets - states[:, :2], atol=1e-4)
+
+
+class Trap:
+    """What runs code when it is unpickled."""
+
+    def __reduce__(self):
+        return Path.touch, (Path("trapped"),)
+
+
+def test_no_code_of_a_published_file_runs(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    torch.save(Trap(), "states.pth")
+    with pytest.raises(SourceError, match=r"states\.pth: is no tensor"):
+        dino_wm.tensor(Path("states.pth"))
+    assert not Path("trapped").exists()
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_missing_and_damaged_parts_are_named(name: str, tmp_path) -> None:
+    module: ModuleType = SETS[name][0]
+    with pytest.raises(SourceError, match="holds n"):
+        module.prepare(tmp_path, tmp_path / "out")
+    source = getattr(look_alikes, name)(tmp_path / "published")
+    if name == "gpc":
+        shutil.rmtree(next(source.rglob("episode_ends")))
+    elif name == "dino_wm":
+        next(source.rglob("episode_003.mp4")).unlink()
+    else:
+        shutil.rmtree(source / "val")
+    with pytest.raises(SourceError, match="episode_ends: is no array|has 5 videos|val: holds no"):
+        module.prepare(source, tmp_path / "out")
+
+
+def test_images_that_are_no_bytes_are_refused(tmp_path) -> None:
+    with pytest.raises(SourceError, match="images of 0 to 1"):
+        gpc.as_pixels(np.linspace(0, 1, 12), tmp_path)
+
+
+def test_windows_longer_than_the_episodes_are_refused(tmp_path, monkeypatch) -> None:
+    source = look_alikes.iws(tmp_path / "published")
+    given = argparse.Namespace(windows=None)
+    recording = sets.Recording(source / "val", sets.find("iws_pusht"))
+    with pytest.raises(HMAError, match="no episode has the 200 frames"):
+        sets.score(iws.PROTOCOL, None, recording, given, sets.Networks(), "val")
+
+
+@pytest.mark.parametrize("span", [255.0, 510.0])
+def test_the_gaussian_ssim_is_that_of_scikit_image(span: float) -> None:
+    rng = np.random.default_rng(0)
+    true = rng.integers(0, 256, (2, 40, 32, 3), dtype=np.uint8)
+    made = np.clip(true + rng.normal(0, 30, true.shape), 0, 255).astype(np.uint8)
+    facts = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "channel_axis": 2}
+    expected = [structural_similarity(a, b, data_range=span, **facts) for a, b in zip(true, made)]
+    assert np.allclose(gaussian_ssim(true, made, span), expected, atol=1e-6)
+
+
+def test_iws_counts_six_decibels_more() -> None:
+    found = iws.finish({"mse": 0.01, "ssim": 0.9, "ssim_usual": 0.8})
+    assert found["psnr_usual_db"] == pytest.approx(20) and found["psnr_db"] == pytest.approx(26.0206)
+
+
+def test_a_download_with_another_content_is_refused(tmp_path) -> None:
+    served = tmp_path / "served.zip"
+    served.write_bytes(b"bytes")
+    with pytest.raises(SourceError, match=r"SHA-256 .*, not 00"):
+        checked_file(served.as_uri(), "00", tmp_path / "got.zip")
+    assert not (tmp_path / "got.zip").exists()
+    checked_file(served.as_uri(), hashlib.sha256(b"bytes").hexdigest(), tmp_path / "got.zip")
+    assert (tmp_path / "got.zip").read_bytes() == b"bytes"
+    with pytest.raises(StorageAwayError, match=r"cannot be downloaded.*--from"):
+        checked_file((tmp_path / "gone").as_uri(), "00", tmp_path / "got.zip")
