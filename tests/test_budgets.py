@@ -45,8 +45,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_560, 11_700, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_930, 512_800
-TEST_LINES = 46_960
-DOC_WORDS = 39_800
+TEST_LINES = 47_400
+DOC_WORDS = 39_980
 
 
 @cache
