@@ -7,7 +7,7 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import h5py
 import numpy as np
@@ -16,6 +16,7 @@ import torch
 from skimage.metrics import structural_similarity
 
 from hma_data.errors import HMAError, SourceError, StorageAwayError
+from hma_data.tokenizers.base import get_tokenizer
 from recipes.public import dino_wm, gpc, iws, sets
 from recipes.public.sets import BASELINE, checked_file, gaussian_ssim
 from tests.model.public import look_alikes
@@ -88,6 +89,18 @@ def test_rows_of_dino_wm_are_as_many_as_frames_of_the_video(tmp_path) -> None:
     with h5py.File(train / "episode_001.hdf5") as file:
         assert np.allclose(file["state"], states) and file["velocity"].shape == (25, 2)
         assert np.allclose(file["action"], targets - states[:, :2], atol=1e-4)
+
+
+def test_a_window_has_the_actions_between_its_frames(tmp_path) -> None:
+    _, val = dino_wm.prepare(look_alikes.dino_wm(tmp_path, episodes=1), tmp_path / "out")
+    world = SimpleNamespace(tokenizer=get_tokenizer("raw-64"))
+    window = sets.Recording(val, sets.find("dino_wm_pusht")).window(
+        world, 0, 2, frames=4, context=1, size=224
+    )
+    images, targets, states = look_alikes.push(100, 24, 224)
+    assert np.allclose(window.chunks, (targets - states[:, :2])[2:17].reshape(3, 10), atol=1e-4)
+    assert np.abs(window.true.astype(int) - images[2:18:5]).mean() < 2  # but for the codec
+    assert window.given.shape == (1, 64, 64, 3)
 
 
 class Trap:
