@@ -14,8 +14,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (690, 4_000, 7),
-    "hma_data/cli": (1_550, 10_950, 8),
-    "hma_data/conversion": (4_020, 29_700, 14),
+    "hma_data/cli": (1_550, 11_150, 8),
+    "hma_data/conversion": (4_205, 31_250, 14),
     "hma_data/episodes": (1_670, 14_600, 9),
     "hma_data/hub": (520, 3_800, 3),
     "hma_data/inspection": (2_160, 20_150, 9),
@@ -44,9 +44,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_630, 29_900, 18),
     "hma_model/worlds": (1_560, 11_700, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_930, 512_800
-TEST_LINES = 47_400
-DOC_WORDS = 39_980
+PRODUCT_LINES, PRODUCT_NODES = 65_130, 514_500
+TEST_LINES = 47_570
+DOC_WORDS = 40_070
 
 
 @cache

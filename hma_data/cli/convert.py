@@ -50,6 +50,10 @@ def convert(
         Literal["shards", "lerobot"],
         Option("--to", help="Output format."),
     ] = "shards",
+    lerobot: Annotated[
+        Path | None,
+        Option(help="Also write a LeRobotDataset to this folder; the cameras and the split of the shards."),
+    ] = None,
     source: Annotated[str | None, Option(help="Same as DATA.")] = None,
     tokenizer: Annotated[
         str, Option(help="Name of the tokenizer; see hma tokenizer list.", autocompletion=tokenizers)
@@ -171,6 +175,7 @@ def convert(
         worker_cpus=worker_cpus,
         worker_gpus=worker_gpus,
         to=to,
+        lerobot=lerobot,
     )
     if dry_run:
         if to == "lerobot":
@@ -190,7 +195,7 @@ def convert(
     if summary.made_shards and to == "shards":
         lasting = list(kept_findings(ShardSet(summary.out), weights, device))
     _report(summary, lasting, max_quarantine, json)
-    raise typer.Exit(1 if summary.too_many else 0)
+    raise typer.Exit(1 if any(one.too_many for one in summary.outputs) else 0)
 
 
 def _robot(embodiment: str, source: str | None, tokenizer: str, frequency_hz: float | None) -> "Embodiment":
@@ -247,6 +252,7 @@ def _shown(name: str) -> "Iterator[Callable[[Progress], None]]":
 
 def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> None:
     from hma_data.conversion.job import plan_conversion
+    from hma_data.conversion.lerobot import dataset_plan
     from hma_data.conversion.plan import estimate, idle_workers
     from hma_data.shards.manifest import cameras_line
     from hma_data.storage.remote import place
@@ -257,6 +263,9 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
     plan, uri = plan_conversion(robot, conversion.source, opened.spec, conversion.settings)
     tasks = share.count if share else 1
     cost = estimate(plan, uri, robot, opened, workers, tasks)
+    dataset = None
+    if conversion.lerobot:
+        dataset = dataset_plan(plan, uri, robot).facts["dataset"]
     units = [{"shard": unit.name, "episodes": len(unit), "frames": unit.frames} for unit in plan.units]
     if json:
         print_json(
@@ -272,6 +281,7 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
                 "cameras": plan.facts["cameras"],
                 "pictures": cost.frame_sizes,
                 "shards": units,
+                **({"dataset": dataset} if dataset else {}),
             }
         )
         return
@@ -282,6 +292,8 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
         f"{uri}: {human_count(plan.episodes, 'episode')}, about {plan.frames:,} recorded frames{kept} into "
         f"{human_count(len(units), 'shard')}, about {human_bytes(cost.bytes)}"
     )
+    if dataset:
+        print(f"and into a LeRobotDataset v3.0 of {dataset['fps']} fps, {conversion.lerobot}")
     _print_cameras(
         cameras_line(plan.facts["cameras"], robot), cost.frame_sizes, robot, opened.spec.image_size
     )
@@ -345,34 +357,11 @@ def _report_share(done: "UnfinishedShare", share: "Share | None", json: bool) ->
 def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float, json: bool) -> None:
     from hma_data.shards.schema import flag_words
 
-    manifest = summary.manifest
-    totals = manifest.to_json()["totals"]
     if json:
-        print_json(
-            {
-                "out": str(summary.out),
-                **totals,
-                "bytes": summary.bytes,
-                "splits": manifest.splits,
-                "shards_made": summary.made_shards,
-                "shards_kept": summary.kept_shards,
-                "shards_missing": 0,
-                "seconds": summary.seconds,
-                "cameras": manifest.cameras,
-                "pictures": summary.frame_sizes,
-                "flags": summary.flags,
-                "left_out": summary.left_out,
-                "changed": summary.changed,
-                "warning": summary.warning,
-                "held_out": summary.held_out,
-                "notes": list(summary.notes),
-                "kept": [finding.to_json() for finding in lasting],
-                "reasons": summary.reasons,
-                "too_many_quarantined": summary.too_many,
-            }
-        )
+        print_json(_facts(summary, lasting))
     else:
-        _print_made(summary)
+        for one in summary.outputs:
+            _print_made(one)
         _print_left_out(summary.left_out)
         if summary.held_out:
             print(summary.held_out)
@@ -388,15 +377,44 @@ def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float,
         for finding in lasting:
             warns = finding.severity == "warn"
             typer.echo(f"{'warning: ' * warns}{finding}", err=warns)
-    for reason, count in sorted(summary.reasons.items(), key=lambda item: -item[1])[:REASONS_PRINTED]:
+    reasons = {reason: count for one in summary.outputs for reason, count in one.reasons.items()}
+    for reason, count in sorted(reasons.items(), key=lambda item: -item[1])[:REASONS_PRINTED]:
         typer.echo(f"quarantine: {count:,} × {reason}", err=True)
-    if summary.too_many:
-        typer.echo(
-            f"error: {summary.out}: {human_count(totals['quarantined'], 'episode')} in quarantine, more than "
-            f"--max-quarantine {max_quarantine:g} allows; what was converted is kept "
-            "— see quarantine.jsonl; --exclude leaves them out",
-            err=True,
-        )
+    for one in summary.outputs:
+        if one.too_many:
+            typer.echo(
+                f"error: {one.out}: {human_count(one.manifest.quarantined, 'episode')} in quarantine, more "
+                f"than --max-quarantine {max_quarantine:g} allows; what was converted is kept "
+                "— see quarantine.jsonl; --exclude leaves them out",
+                err=True,
+            )
+
+
+def _facts(summary: "Summary", lasting: "list[Finding]") -> dict[str, Any]:
+    """Return the result for --json."""
+    manifest = summary.manifest
+    facts = {
+        "out": str(summary.out),
+        **manifest.to_json()["totals"],
+        "bytes": summary.bytes,
+        "splits": manifest.splits,
+        "shards_made": summary.made_shards,
+        "shards_kept": summary.kept_shards,
+        "shards_missing": 0,
+        "seconds": summary.seconds,
+        "cameras": manifest.cameras,
+        "pictures": summary.frame_sizes,
+        "flags": summary.flags,
+        "left_out": summary.left_out,
+        "changed": summary.changed,
+        "warning": summary.warning,
+        "held_out": summary.held_out,
+        "notes": list(summary.notes),
+        "kept": [finding.to_json() for finding in lasting],
+        "reasons": summary.reasons,
+        "too_many_quarantined": summary.too_many,
+    }
+    return facts | ({"dataset": _facts(summary.dataset, [])} if summary.dataset else {})
 
 
 def _print_made(summary: "Summary") -> None:

@@ -160,7 +160,7 @@ def _digest_after(earlier: str, pieces: Iterator[str]) -> str:
 
 
 class Content:
-    """The hash of an episode; the caller adds frames camera after camera, in their order.
+    """The hash of an episode; the caller adds the frames of each camera in their order.
 
     Args:
         kept: (N,) frames of the clip that become rows of a camera.
@@ -171,15 +171,17 @@ class Content:
         for numbers in (clip.timestamps, clip.actions, clip.states, clip.action_known, clip.state_known):
             self._add(numbers)
         self._looked_at = looked_at(len(kept))
+        self._seen: dict[str, list[NDArray[np.uint8]]] = {}  # camera -> its frames that are hashed
 
-    def add(self, start: int, frames: NDArray[np.uint8]) -> None:
+    def add(self, camera: str, start: int, frames: NDArray[np.uint8]) -> None:
         """Add the next frames (n, H, W, 3) of a camera; the first of them is its row `start`."""
-        for row in self._looked_at:
-            if start <= row < start + len(frames):
-                self._add(frames[row - start])
+        seen = self._seen.setdefault(camera, [])
+        seen += [frames[row - start].copy() for row in self._looked_at if start <= row < start + len(frames)]
 
     def text(self) -> str:
-        """Return the hash as sixteen hex digits."""
+        """Return the hash as sixteen hex digits; cameras count in the order in which they came first."""
+        for frame in chain(*self._seen.values()):
+            self._add(frame)
         return self._digest.hexdigest()[:16]
 
     def _add(self, numbers: NDArray[Any] | None) -> None:
@@ -221,5 +223,5 @@ def content_of(
         for row in looked_at(len(kept)):
             indices = clip.frame_indices[name][kept[row : row + 1]]
             camera, stream = embodiment.camera(name), clip.episode.streams[name]
-            content.add(row, prepared(stream, indices, camera, spec.image_size, spec.resize_filter))
+            content.add(name, row, prepared(stream, indices, camera, spec.image_size, spec.resize_filter))
     return content.text()

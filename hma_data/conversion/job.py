@@ -8,7 +8,7 @@ the job goes on.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -19,7 +19,7 @@ from hma_data.conversion.engines import LIMITS, Limits
 from hma_data.conversion.engines.local import end_worker_that_starts_workers
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.extend import content_of, extended
-from hma_data.conversion.lerobot import AS_RECORDED, LeRobotHolder, as_dataset, with_dataset
+from hma_data.conversion.lerobot import AS_RECORDED, LeRobotHolder, as_dataset, dataset_plan, with_dataset
 from hma_data.conversion.output import Holder, Made, ShardHolder, Share, known_hashes, refuse_other
 from hma_data.conversion.plan import Plan, Settings, ShardUnit, idle_workers, make_plan
 from hma_data.conversion.publish import HubOutput
@@ -51,6 +51,7 @@ from hma_data.storage.remote import place
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.shapes import get_spec
 
+MERGE = "convert some episodes (--only) into a dataset of their own; lerobot-edit-dataset merges datasets"
 OnProgress = Callable[[Progress], None]
 Target = Literal["shards", "lerobot"]
 
@@ -130,6 +131,8 @@ class Conversion:
         overwrite: delete what `out` holds, if it is a shard set.
         extend: add the episodes that a finished set in `out` does not have yet.
         to: what is made: a shard set, or a LeRobotDataset, for which there is no tokenizer.
+        lerobot: str or path of a LeRobotDataset that is made beside the shards, of the same cameras and
+            split, in one pass over the recording.
         worker_cpus, worker_gpus: what a worker reserves with engine="ray"; fractions let several share a CPU
             or a GPU. None: one GPU where the tokenizer runs on one.
     """
@@ -150,14 +153,13 @@ class Conversion:
     worker_cpus: float = 1.0
     worker_gpus: float | None = None
     to: Target = "shards"
+    lerobot: StrPath | None = None
 
     def __post_init__(self) -> None:
-        if self.to == "lerobot" and self.extend:
-            raise UsageError(
-                "--extend",
-                "works for shards only; a LeRobotDataset is always written from scratch",
-                "give another --out",
-            )
+        if self.to == "lerobot" and self.lerobot is not None:
+            raise UsageError("--lerobot", "writes a dataset beside shards", "leave out --to lerobot")
+        if self.extend and (self.to == "lerobot" or self.lerobot is not None):
+            raise UsageError("--extend", "is for shards alone", MERGE)
         if self.to == "shards" and self.settings.drop_idle:
             fault = "is for --to lerobot: frames left out of shards would be pauses, which no window crosses"
             raise UsageError("--drop-idle", fault)
@@ -175,14 +177,24 @@ class Conversion:
                 outside of `if __name__ == "__main__":`.
         """
         run = _Run(self)
-        with locked(run.folder):
-            if self.overwrite:
-                run.holder.clear()
+        runs = [run] if run.beside is None else [run, run.beside]
+        with ExitStack() as held:
+            for one in runs:
+                held.enter_context(locked(one.folder))
+            for one in runs:
+                if self.overwrite:
+                    one.holder.clear()
             plan, base = run.plan()
             if run.hub and run.hub.prepare() and not self.overwrite:
                 refuse_other(run.out, plan)
             run.make(plan, base, None, on_progress)
-            return run.finish(plan, base, bool(run.made))
+            if run.beside:  # what is left, if the shards of some parts were there already
+                run.beside.make(run.beside.whole, None, None, on_progress)
+            summary = run.finish(plan, base, bool(run.made))
+            if run.beside:
+                dataset = run.beside.finish(run.beside.whole, None, True)
+                summary = replace(summary, dataset=dataset)
+            return summary
 
     def run_share(
         self, share: Share, on_progress: OnProgress = lambda progress: None
@@ -191,8 +203,8 @@ class Conversion:
 
         The bytes are those that `run` alone would write. The share that ends last finishes the set.
         """
-        if self.to == "lerobot":
-            raise UsageError("--shard-index", "is for shards", "convert with more --workers instead")
+        if self.to == "lerobot" or self.lerobot is not None:
+            raise UsageError("--shard-index", "is for shards alone", MERGE)
         run = _Run(self)
         with locked(run.out, share.name):
             plan, base = run.plan()
@@ -213,7 +225,7 @@ class Conversion:
 class _Run:
     """A conversion that runs: its folder, its tokenizer, its plan and what it has learned so far."""
 
-    def __init__(self, given: Conversion) -> None:
+    def __init__(self, given: Conversion, shards: "_Run | None" = None) -> None:
         end_worker_that_starts_workers(given.workers)
         self.given, self.begun, self.out = given, time.monotonic(), place(given.out)
         self.hub = HubOutput.of(self.out) if given.to == "shards" else None
@@ -222,9 +234,15 @@ class _Run:
             self.workers = 0  # no other process sees them
         self._opened: Tokenizer | None = None
         self._spec = self._tokenizer_spec()
-        self.whole, self.uri = plan_conversion(
-            given.embodiment, given.source, self._spec, given.settings, given.to
-        )
+        self.whole: Plan  # of an empty folder
+        self.uri: str
+        if shards:
+            self.uri = shards.uri
+            self.whole = dataset_plan(shards.whole, self.uri, given.embodiment)
+        else:
+            self.whole, self.uri = plan_conversion(
+                given.embodiment, given.source, self._spec, given.settings, given.to
+            )
         if given.to == "lerobot":
             self.holder: Holder = LeRobotHolder(self.out, given.embodiment, self.uri)
         else:
@@ -233,6 +251,9 @@ class _Run:
         self.folder = self.holder.folder
         self.frame_sizes: dict[str, tuple[int, int]] = {}
         self.kept = self.made = 0  # units that were there, and that this run has made
+        self.beside: _Run | None = None  # the run of the dataset that is made beside the shards
+        if given.lerobot is not None:
+            self.beside = _Run(replace(given, to="lerobot", out=given.lerobot, lerobot=None), self)
 
     def _tokenizer_spec(self) -> TokenizerSpec:
         given, tokenizer = self.given, self.given.tokenizer
@@ -306,15 +327,15 @@ class _Run:
         on_progress(progress)
         if todo:
             with self.holder.noting(share) as note:
-                for made in self._made(todo, plan, Counter(progress, on_progress)):
+                for made in self._made(todo, plan, base, Counter(progress, on_progress)):
                     note(made)
                     on_progress(progress)
         self.kept, self.made = progress.kept_shards, len(todo)
 
-    def _made(self, todo: list[ShardUnit], plan: Plan, on_event: Counter) -> Iterator[Made]:
+    def _job(self, plan: Plan) -> Job:
         given = self.given
         weights = None if given.weights is None else as_text(given.weights)
-        job = Job(
+        return Job(
             source=self.uri,
             embodiment=given.embodiment,
             tokenizer=self._spec.name,
@@ -323,14 +344,28 @@ class _Run:
             out=self.folder.absolute(),
             facts=plan.facts,
         )
+
+    def _job_beside(self, base: Manifest | None) -> Job | None:
+        """Return the job of the dataset whose parts are made with the shards; None where there are none."""
+        beside = self.beside
+        if beside is None or base is not None:  # an extended set has other shards
+            return None
+        there = beside.holder.finished(beside.whole, None, False)
+        return beside._job(beside.whole) if len(there) < len(beside.whole.units) else None
+
+    def _made(
+        self, todo: list[ShardUnit], plan: Plan, base: Manifest | None, on_event: Counter
+    ) -> Iterator[Made]:
+        given = self.given
+        work = MakeWork(self._job(plan), self._opened, self._job_beside(base))
         if given.engine == "ray":
             from hma_data.conversion.engines.ray import run as run_ray
 
             cpus, gpus = given.worker_cpus, given.worker_gpus
             if gpus is None:
                 gpus = 1.0 if given.device.startswith("cuda") else 0.0
-            return run_ray(todo, MakeWork(job), self.workers, on_event, given.limits, cpus, gpus)
-        return run_local(todo, MakeWork(job, self._opened), self.workers, on_event, given.limits)
+            return run_ray(todo, work, self.workers, on_event, given.limits, cpus, gpus)
+        return run_local(todo, work, self.workers, on_event, given.limits)
 
     def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Summary:
         """Write what is derived from the shards, publish the set where it is made for a hub, and sum up.
@@ -344,6 +379,8 @@ class _Run:
         episodes = sum(split["episodes"] for split in manifest.splits.values())
         if not episodes:
             self.holder.clear()
+            if self.beside:
+                self.beside.holder.clear()
             worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
             told = "; ".join(f"{count} × {reason}" for reason, count in worst)
             raise SourceError(self.uri, f"gave no usable episode, so nothing was written: {told}")

@@ -16,6 +16,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -27,20 +28,21 @@ from numpy.typing import NDArray
 
 from hma_data.conversion.engines import Report
 from hma_data.conversion.output import Finished, Made, Share, other_plan
-from hma_data.conversion.plan import EPISODES_TRIED, Plan, Settings, ShardUnit, camera_fault, read_clip
+from hma_data.conversion.plan import EPISODES_TRIED, Plan, Settings, ShardUnit, read_clip
 from hma_data.conversion.reading import (
     End,
     Frames,
     Item,
     Job,
+    Pictures,
     ReadEpisode,
-    Seen,
     Tick,
     UnitNotes,
+    frames_of,
     signs_of_life,
 )
 from hma_data.episodes.episode import Clip
-from hma_data.episodes.images import PictureCheck, picture_flags, prepare, upright
+from hma_data.episodes.images import prepare, upright
 from hma_data.errors import EpisodeError, HMAError, OutputError, SourceError, UsageError
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment
 from hma_data.registry.export import lerobot_features, packed_components
@@ -91,6 +93,11 @@ def with_dataset(plan: Plan, uri: str, robot: Embodiment) -> Plan:
     return plan.with_facts({"to": "lerobot", "dataset": facts})
 
 
+def dataset_plan(plan: Plan, uri: str, robot: Embodiment) -> Plan:
+    """Return the plan of the dataset of the same episodes, cameras and units as a plan of shards."""
+    return with_dataset(plan.with_facts({"tokenizer": AS_RECORDED.to_json()}), uri, robot)
+
+
 def _seen(plan: Plan, uri: str, robot: Embodiment, layout: RowLayout) -> dict[str, Any]:
     source = open_source(robot.source.format)
     sizes: dict[str, list[int]] = {}
@@ -120,14 +127,14 @@ class Columns:
     layout: RowLayout
     facts: dict[str, Any]
 
-    @property
+    @cached_property
     def keys(self) -> dict[str, str]:
         """Return camera -> feature: the recording's own for a LeRobotDataset."""
         cameras = [self.layout.embodiment.camera(name) for name in self.layout.cameras]
         own = self.layout.embodiment.source.format == "lerobot"
         return {one.name: one.key if own else f"observation.images.{one.name}" for one in cameras}
 
-    @property
+    @cached_property
     def features(self) -> dict[str, dict[str, Any]]:
         """Return the features, as lerobot takes them."""
         robot, stride = self.layout.embodiment, self.layout.frame_stride
@@ -147,6 +154,27 @@ class Columns:
         if self.facts["times"]:
             found[TIMES] = {"dtype": "float64", "shape": (1,), "names": None}
         return found
+
+    def row(self, episode: ReadEpisode, row: int, pictures: dict[str, Pictures]) -> dict[str, Any]:
+        """Return the values of a row of an episode; its picture of each camera is (H, W, 3)."""
+        clip, stride = episode.clip, self.layout.frame_stride
+        at = int(episode.kept[row])
+        steps = slice(at, at + stride)
+        known = clip.action_known is None or bool(clip.action_known[steps].all())
+        action = clip.actions[steps].reshape(-1)
+        ends = row == len(episode.kept) - 1
+        values: dict[str, Any] = {
+            "action": action if known else np.zeros_like(action),
+            "action_known": np.array([known]),
+            "state_known": np.array([clip.state_known is None or clip.state_known[at]]),
+            SUCCESS: np.array([ends and clip.episode.success is True]),
+            TIMES: np.array([clip.timestamps[at]]),
+        }
+        if clip.states is not None:
+            values["observation.state"] = clip.states[at]
+        values |= {key: pictures[name] for name, key in self.keys.items()}
+        kept = {key: value for key, value in values.items() if key in self.features}
+        return kept | {"task": clip.episode.instruction}
 
     def embodiment(self) -> Embodiment:
         """Return the embodiment that describes the dataset's rows: it makes the same shards of them."""
@@ -200,131 +228,123 @@ def part_folder(folder: Path, unit: str) -> Path:
 
 
 class LeRobotOutput:
-    """The output of a conversion to a LeRobotDataset: of each unit a part."""
+    """The output of a conversion to a LeRobotDataset: of each unit a part.
+
+    Attributes:
+        batch: rows whose frames are decoded together.
+    """
 
     def __init__(self, job: Job) -> None:
         load_lerobot()
         self._job, self._layout = job, job.layout
         self._columns = Columns(self._layout, job.facts["dataset"])
+        pixels = max(height * width for height, width in job.facts["dataset"]["sizes"].values())
+        self.batch = min(MOST_FRAMES, max(1, BATCH_BYTES // (3 * pixels)))
 
     def frames(self, episode: ReadEpisode, report: Report | None) -> Iterator[Frames]:
-        """Yield upright frames (n, H, W, 3) of every camera for the next rows, then for those after."""
-        clip, kept, cameras = episode.clip, episode.kept, self._layout.cameras
-        sizes = self._job.facts["dataset"]["sizes"]
-        checks = {name: PictureCheck() for name in cameras}
-        count = min(MOST_FRAMES, max(1, BATCH_BYTES // max(3 * h * w for h, w in sizes.values())))
-        for start in range(0, len(kept), count):
-            rows = kept[start : start + count]
-            for name in cameras:
-                camera = self._job.embodiment.camera(name)
-                try:
-                    raw = clip.frames_at(name, rows)
-                    if report and not start:
-                        report(Seen(name, *raw.shape[1:3]))
-                    frames = np.ascontiguousarray(upright(raw, camera))
-                    _check_size(episode.ref.id, name, frames, sizes[name])
-                    checks[name].add(prepare(raw, camera, CHECKED))
-                except EpisodeError as fault:
-                    if len(cameras) == 1:
-                        raise
-                    raise camera_fault(episode.ref.id, name, cameras, fault) from fault
-                yield Frames(name, frames)
-        fps = self._job.facts["dataset"]["fps"]
-        episode.language = on_rows(episode.language, clip.timestamps[kept], fps)
-        for name, seen in checks.items():
-            episode.flags |= picture_flags(seen, self._job.embodiment.quality, episode.ref.id, name)
+        """Yield upright frames (n, H, W, 3)."""
+        clip, facts = episode.clip, self._job.facts["dataset"]
+
+        def show(name: str, start: int, rows: NDArray[np.int64]) -> tuple[Pictures, Pictures]:
+            camera = self._job.embodiment.camera(name)
+            raw = clip.frames_at(name, rows)
+            frames = np.ascontiguousarray(upright(raw, camera))
+            _check_size(episode.ref.id, name, frames, facts["sizes"][name])
+            return frames, prepare(raw, camera, CHECKED)
+
+        yield from frames_of(self._job, episode, self.batch, report, show)
+        episode.language = on_rows(episode.language, clip.timestamps[episode.kept], facts["fps"])
+
+    def has(self, unit: ShardUnit) -> bool:
+        """Check whether the part of a unit is there."""
+        return part_folder(self._job.out, unit.name).is_dir()
 
     def make(self, unit: ShardUnit, items: Iterator[Item], report: Report) -> Made:
         """Write the part of a unit; without a usable episode it holds no dataset."""
+        with self.making(unit, report) as part:
+            for item in items:
+                part.add(item)
+        return Made(unit.name, _bytes(part_folder(self._job.out, unit.name)), "")
+
+    @contextmanager
+    def making(self, unit: ShardUnit, report: Report) -> Iterator["PartWriter"]:
+        """Give the part of a unit, which is made of the items added to it; whole or not at all."""
         final = part_folder(self._job.out, unit.name)
-        part = final.with_name(f".{final.name}.part")
-        notes = UnitNotes(self._job, unit)
-        with space_explained(final.parent), signs_of_life(report):
-            shutil.rmtree(part, ignore_errors=True)
-            part.mkdir(parents=True)
+        folder = final.with_name(f".{final.name}.part")
+        with space_explained(final.parent):
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            part = PartWriter(self._job, unit, self._columns, folder, report)
             try:
-                self._write(part, items, notes, report)
-                (part / FOOTER).write_bytes(notes.footer().to_metadata()[FOOTER_KEY])
-                _sync(part)
+                try:
+                    yield part
+                finally:
+                    part.close()
+                (folder / FOOTER).write_bytes(part.notes.footer().to_metadata()[FOOTER_KEY])
+                _sync(folder)
                 shutil.rmtree(final, ignore_errors=True)
-                part.rename(final)
+                folder.rename(final)
                 sync_folder(final.parent)
             finally:
-                shutil.rmtree(part, ignore_errors=True)
-        return Made(unit.name, _bytes(final), "")
+                shutil.rmtree(folder, ignore_errors=True)
 
-    def _write(self, part: Path, items: Iterator[Item], notes: UnitNotes, report: Report) -> None:
-        writer: DatasetWriter | None = None
-        rows = 0  # of the episode that was begun
-        begun: ReadEpisode | None = None
-        waiting: dict[str, NDArray[np.uint8]] = {}
-        total = 0
-        try:
-            for item in items:
-                if isinstance(item, Frames):
-                    assert begun is not None
-                    waiting[item.camera] = item.frames
-                    if len(waiting) < len(self._layout.cameras):
-                        continue
-                    writer = writer or self._open(part)
-                    rows += self._add(writer, begun, rows, waiting)
-                    report(Tick(frames=len(item.frames) * len(waiting)))
-                    waiting = {}
-                elif isinstance(item, End):
-                    assert begun is not None and writer is not None
-                    writer.save_episode()
-                    notes.add(begun, total, report)
-                    total += rows
-                    begun = None
-                else:
-                    if begun is not None and rows and writer is not None:  # what came of it is void
-                        writer.drop_episode()
-                    rows, waiting = 0, {}
-                    begun = item if isinstance(item, ReadEpisode) else None
-                    if isinstance(item, Refused):
-                        notes.refuse(item, report)
-        finally:
-            if writer is not None:
-                writer.close()
 
-    def _open(self, part: Path) -> DatasetWriter:
-        robot, fps = self._job.embodiment, self._job.facts["dataset"]["fps"]
-        return DatasetWriter(part / DATASET, robot.id, fps, self._columns.features, robot.robot)
+class PartWriter:
+    """The part of a unit while it is written.
 
-    def _add(
-        self, writer: DatasetWriter, episode: ReadEpisode, start: int, frames: dict[str, NDArray[np.uint8]]
-    ) -> int:
-        """Add the rows from `start` on that these frames show; return their number."""
-        clip, stride = episode.clip, self._layout.frame_stride
-        count = len(next(iter(frames.values())))
+    Attributes:
+        notes: of the episodes that are written or refused.
+    """
+
+    def __init__(self, job: Job, unit: ShardUnit, columns: Columns, folder: Path, report: Report) -> None:
+        self.notes = UnitNotes(job, unit)
+        self._job, self._columns, self._folder, self._report = job, columns, folder, report
+        self._writer: DatasetWriter | None = None
+        self._begun: ReadEpisode | None = None
+        self._waiting: dict[str, Pictures] = {}  # frames of the next rows, by camera
+        self._rows = self._total = 0  # of the episode that was begun, and of those that are saved
+
+    def add(self, item: Item) -> None:
+        """Add the next item of the unit."""
+        if isinstance(item, Frames):
+            self._add_frames(item)
+        elif isinstance(item, End):
+            assert self._begun is not None and self._writer is not None
+            with signs_of_life(self._report):
+                self._writer.save_episode()
+            self.notes.add(self._begun, self._total, self._report)
+            self._total += self._rows
+            self._begun = None
+        else:
+            if self._begun is not None and self._rows and self._writer is not None:
+                self._writer.drop_episode()  # what came of it is void
+            self._rows, self._waiting = 0, {}
+            self._begun = item if isinstance(item, ReadEpisode) else None
+            if isinstance(item, Refused):
+                self.notes.refuse(item, self._report)
+
+    def close(self) -> None:
+        """Complete the files."""
+        if self._writer is not None:
+            with signs_of_life(self._report):
+                self._writer.close()
+
+    def _add_frames(self, item: Frames) -> None:
+        self._waiting[item.camera] = item.frames
+        if len(self._waiting) < len(self._columns.layout.cameras):
+            return
+        assert self._begun is not None
+        if self._writer is None:
+            robot, fps = self._job.embodiment, self._columns.facts["fps"]
+            features = self._columns.features
+            self._writer = DatasetWriter(self._folder / DATASET, robot.id, fps, features, robot.robot)
+        count = len(item.frames)
         for row in range(count):
-            at = int(episode.kept[start + row])
-            steps = slice(at, at + stride)
-            known = clip.action_known is None or bool(clip.action_known[steps].all())
-            action = clip.actions[steps].reshape(-1)
-            values: dict[str, Any] = {
-                "task": clip.episode.instruction,
-                "action": action if known else np.zeros_like(action),
-            }
-            if clip.states is not None:
-                values["observation.state"] = clip.states[at]
-            for name, key in self._columns.keys.items():
-                values[key] = frames[name][row]
-            values |= self._further(episode, start + row, at, known)
-            writer.add_row(values)
-        return count
-
-    def _further(self, episode: ReadEpisode, row: int, at: int, known: bool) -> dict[str, Any]:
-        clip, features = episode.clip, self._columns.features
-        state_known = clip.state_known is None or clip.state_known[at]
-        ends = row == len(episode.kept) - 1
-        values = {
-            "action_known": np.array([known]),
-            "state_known": np.array([state_known]),
-            SUCCESS: np.array([ends and clip.episode.success is True]),
-            TIMES: np.array([clip.timestamps[at]]),
-        }
-        return {key: value for key, value in values.items() if key in features}
+            pictures = {name: frames[row] for name, frames in self._waiting.items()}
+            self._writer.add_row(self._columns.row(self._begun, self._rows + row, pictures))
+        self._rows += count
+        self._report(Tick(frames=count * len(self._waiting)))
+        self._waiting = {}
 
 
 def _check_size(episode_id: str, camera: str, frames: NDArray[np.uint8], size: list[int]) -> None:
@@ -372,12 +392,9 @@ class LeRobotHolder:
 
     def __init__(self, out: Path, embodiment: Embodiment, uri: str) -> None:
         if is_remote(out):
-            remedy = (
-                "write a folder of this machine, and upload it with hf upload or LeRobotDataset.push_to_hub"
-            )
-            raise UsageError(
-                "--out", f"{out} is no folder of this machine, and lerobot writes no other", remedy
-            )
+            fault = "is no folder of this machine, and lerobot writes no other"
+            remedy = "write one, and upload it with hf upload or LeRobotDataset.push_to_hub"
+            raise UsageError(str(out), fault, remedy)
         self.out, self._robot, self._uri = out, embodiment, uri
         self.folder = out.absolute().with_name(f".{out.absolute().name}.parts")
 
@@ -495,7 +512,7 @@ class LeRobotHolder:
             return None
         path = self.out / CONVERSION
         if not path.is_file() or not (self.out / "meta" / "info.json").is_file():
-            raise OutputError(self.out, "holds something else", "choose an empty or new --out")
+            raise OutputError(self.out, "holds something else", "choose an empty or new folder")
         return path
 
 

@@ -1,7 +1,8 @@
 """Read the episodes of a unit of work one by one, ahead of what is made of them.
 
 Episodes come as items (see `Item`), so that no more than a few frames are in memory. An episode that cannot
-be read becomes a refusal with its reason; what is no episode's fault ends the job.
+be read becomes a refusal with its reason; what is no episode's fault ends the job. Several outputs may be
+made of what is read once.
 
 n frames of a camera, H×W pixels, or S×S where they are resized.
 """
@@ -12,7 +13,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any, cast
@@ -22,11 +23,13 @@ from numpy.typing import NDArray
 
 from hma_data.conversion.engines import Attempt, Report, Step
 from hma_data.conversion.extend import kept_frames
-from hma_data.conversion.plan import ShardUnit, read_clip
+from hma_data.conversion.plan import ShardUnit, camera_fault, read_clip
 from hma_data.episodes.align import pauses, rate_flags
-from hma_data.episodes.episode import Clip
+from hma_data.episodes.episode import Clip, OneByOne, Stream
 from hma_data.episodes.idle import idle_rows
+from hma_data.episodes.images import PictureCheck, picture_flags
 from hma_data.errors import (
+    EpisodeError,
     HMAError,
     MissingDependencyError,
     OutputError,
@@ -126,35 +129,41 @@ class End:
 # An episode is begun by itself, goes on with its frames, and ends with End; or it is refused.
 Item = ReadEpisode | Frames | End | Refused
 ReadFrames = Callable[[ReadEpisode, Report | None], Iterator[Frames]]
+Show = Callable[[str, int, NDArray[np.int64]], tuple[Pictures, Pictures]]
 
 
 def read_unit(
-    job: Job, unit: ShardUnit, frames: ReadFrames, report: Report, attempt: Attempt
-) -> Iterator[Item]:
-    """Read the episodes of a unit, each as the items that `Item` names.
+    job: Job, unit: ShardUnit, readers: Sequence[ReadFrames], report: Report, attempt: Attempt
+) -> Iterator[tuple[int, Item]]:
+    """Read the episodes of a unit once for all outputs, each as the items that `Item` names.
 
     This runs ahead in a thread. An episode may begin again, or be refused, after some of its frames; its
-    earlier items are then void.
+    earlier items are then void. One output may refuse an episode that another takes.
 
     Args:
-        frames: yields the frames of an episode as the output needs them, and adds to the episode's flags; it
-            is given `report` for the first episode alone, to report what it has seen.
+        readers: of each output: yields the frames of an episode as the output needs them, and adds to the
+            episode's flags; the last is given `report` for the first episode, to report what it has seen.
+
+    Yields:
+        the number of an output, and its next item.
     """
     source = open_source(job.embodiment.source.format)
     if isinstance(source, Expecting):
         with suppress(HMAError):  # reading raises it too, for the episode at fault
             source.expect(job.source, [ref.id for _, ref in unit.episodes])
     for place, (index, ref) in enumerate(unit.episodes):
+        missing = dict(enumerate(readers))  # of the outputs that do not have the episode yet
         if ref.id in attempt.refused:
-            yield Refused(ref.id, "Fatal", f"{ref.id}: reading it {attempt.refused[ref.id]}")
+            refused = Refused(ref.id, "Fatal", f"{ref.id}: reading it {attempt.refused[ref.id]}")
+            yield from ((output, refused) for output in missing)
             continue
         report(Step(ref.id))
         for wait_s in (*WAITS_S, None):
             try:
-                episode = _begin(job, source, index, ref)
-                yield episode
-                yield from frames(episode, None if place else report)
-                yield End()
+                for output, item in _read(job, source, index, ref, missing, None if place else report):
+                    if isinstance(item, End):
+                        del missing[output]
+                    yield output, item
                 break
             except (*FATAL, MemoryError):
                 raise
@@ -169,8 +178,75 @@ def read_unit(
                     remedy = "everything finished is kept: run the same command again"
                     raise OutputError(job.source, f"storage does not answer: {fault}", remedy) from fault
                 text = str(fault) if isinstance(fault, HMAError) else f"{type(fault).__name__}: {fault}"
-                yield Refused(ref.id, type(fault).__name__, text)
+                refused = Refused(ref.id, type(fault).__name__, text)
+                yield from ((output, refused) for output in missing)
                 break
+
+
+def _read(
+    job: Job,
+    source: Source,
+    index: int,
+    ref: EpisodeRef,
+    readers: Mapping[int, ReadFrames],
+    report: Report | None,
+) -> Iterator[tuple[int, Item]]:
+    """Yield the items of an episode for each output in turn; raise the fault of one when the others end."""
+    episode = _begin(job, source, index, ref)
+    if len(readers) > 1:
+        streams = episode.clip.episode.streams
+        for name, stream in list(streams.items()):
+            streams[name] = _DecodedOnce(stream)
+    going: dict[int, Iterator[Frames]] = {}
+    for output, frames in readers.items():
+        own = replace(episode, flags=dict(episode.flags), tokens=defaultdict(list))
+        going[output] = frames(own, report if output == max(readers) else None)
+        yield output, own
+    fault: EpisodeError | None = None
+    while going:
+        for output in list(going):
+            try:
+                item = next(going[output], None)
+            except EpisodeError as refused:
+                fault = refused
+                del going[output]
+                continue
+            if item is None:
+                del going[output]
+            yield output, item or End()
+    if fault is not None:
+        raise fault
+
+
+class _DecodedOnce:
+    """A stream that keeps the frames it decoded last, for several readers that go on in step."""
+
+    def __init__(self, stream: Stream) -> None:
+        self.timestamps = stream.timestamps
+        self._stream = stream
+        self._indices: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._frames: Pictures = np.zeros((0, 1, 1, 3), np.uint8)
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Pictures:
+        """See episode.Stream."""
+        wanted = np.asarray(indices, np.int64)
+        if not np.isin(wanted, self._indices).all():
+            distinct = np.unique(wanted)
+            self._frames = self._stream.frames(distinct)
+            self._indices = distinct
+        return self._frames[np.searchsorted(self._indices, wanted)]
+
+    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Pictures]:
+        """See episode.OneByOne."""
+        own = self._stream if isinstance(self._stream, OneByOne) else None
+        if own and least:
+            return iter(own.each(indices, least))
+        try:
+            return iter(self.frames(indices))
+        except EpisodeError:
+            if own is None:
+                raise
+            return iter(own.each(indices))  # they may differ in size
 
 
 def _begin(job: Job, source: Source, index: int, ref: EpisodeRef) -> ReadEpisode:
@@ -183,6 +259,33 @@ def _begin(job: Job, source: Source, index: int, ref: EpisodeRef) -> ReadEpisode
         kept = kept[~idle]
         flags |= {"idle_frames": int(idle.sum())} if idle.any() else {}
     return ReadEpisode(index, ref, clip, kept, flags, _language(clip))
+
+
+def frames_of(
+    job: Job, episode: ReadEpisode, count: int, report: Report | None, show: Show
+) -> Iterator[Frames]:
+    """Yield the frames of every camera for the next `count` rows, then for those after; flag what they show.
+
+    Args:
+        show: (camera, first row, frames of the clip (n,)) -> its frames (n, H, W, 3) as the output takes
+            them, and as they are checked.
+    """
+    cameras = job.layout.cameras
+    checks = {name: PictureCheck() for name in cameras}
+    for start in range(0, len(episode.kept), count):
+        for name in cameras:
+            try:
+                if report and not start:
+                    report(Seen(name, *episode.clip.frames_at(name, episode.kept[:1]).shape[1:3]))
+                frames, checked = show(name, start, episode.kept[start : start + count])
+            except EpisodeError as fault:
+                if len(cameras) == 1:
+                    raise
+                raise camera_fault(episode.ref.id, name, cameras, fault) from fault
+            checks[name].add(checked)
+            yield Frames(name, frames)
+    for name, seen in checks.items():
+        episode.flags |= picture_flags(seen, job.embodiment.quality, episode.ref.id, name)
 
 
 def _language(clip: Clip) -> list[dict[str, Any]]:

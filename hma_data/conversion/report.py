@@ -53,6 +53,7 @@ class Summary:
         notes: what else to mend before training, as `hma doctor` says it: no window, pauses.
         held_out: how many episodes are for validation, and by what rule; empty for a LeRobotDataset without.
         bytes: of the files.
+        dataset: the result of the LeRobotDataset that was made beside the shards.
     """
 
     out: Path
@@ -70,6 +71,12 @@ class Summary:
     notes: tuple[str, ...] = ()
     held_out: str = ""
     bytes: int = 0
+    dataset: "Summary | None" = None
+
+    @property
+    def outputs(self) -> "list[Summary]":
+        """Return the results of all that was made."""
+        return [self] if self.dataset is None else [self, self.dataset]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Make one unit of a conversion: what is read of its episodes becomes a shard, or a part of a LeRobotDataset.
+"""Make one unit of a conversion: its episodes become a shard, a part of a LeRobotDataset, or both.
 
 A unit is whole or absent. An episode that cannot be used is listed with its reason in the shard's footer, or
 in the part's. The bytes do not depend on the engine that runs the work.
@@ -9,7 +9,7 @@ n frames of a camera, S×S pixels.
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from hma_data.conversion.engines import Attempt, Report, Work
 from hma_data.conversion.extend import Content
-from hma_data.conversion.lerobot import LeRobotOutput
+from hma_data.conversion.lerobot import LeRobotOutput, PartWriter
 from hma_data.conversion.output import Made
-from hma_data.conversion.plan import ShardUnit, camera_fault
+from hma_data.conversion.plan import ShardUnit
 from hma_data.conversion.reading import (
     End,
     Frames,
@@ -28,16 +28,15 @@ from hma_data.conversion.reading import (
     Job,
     Pictures,
     ReadEpisode,
-    Seen,
     Tick,
     UnitNotes,
+    frames_of,
     prefetch,
     read_unit,
     signs_of_life,
 )
 from hma_data.cpu import usable_cores
-from hma_data.episodes.images import PictureCheck, picture_flags, prepared
-from hma_data.errors import EpisodeError
+from hma_data.episodes.images import prepared
 from hma_data.shards.schema import Refused, RowLayout
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
@@ -59,65 +58,83 @@ class Output(Protocol):
 
 @dataclass(frozen=True)
 class MakeWork:
-    """A maker of a worker's function; it can be pickled, so that any engine can send it."""
+    """A maker of a worker's function; it can be pickled, so that any engine can send it.
+
+    Attributes:
+        job: of the shards, or of the LeRobotDataset.
+        tokenizer: of the shards, if it is open already.
+        beside: of the LeRobotDataset whose parts are made with the shards.
+    """
 
     job: Job
     tokenizer: Tokenizer | None = None
+    beside: Job | None = None
 
     def __call__(self, workers: int) -> Work:
         """Open the output once for this worker, and return the worker's function."""
-        job, output = self.job, self._output()
+        job, beside = self.job, LeRobotOutput(self.beside) if self.beside else None
+        output = self._output(beside.batch if beside else FRAMES_A_BATCH)
         threads = max(1, usable_cores() // workers) if self.tokenizer is None else None
 
         def work(unit: ShardUnit, report: Report, attempt: Attempt) -> Made:
             if threads and "torch" in sys.modules:  # applies to the calling thread alone
                 sys.modules["torch"].set_num_threads(threads)
             report(Tick())  # the worker's start, which may take seconds, is no part of the rate
-            items = read_unit(job, unit, output.frames, report, attempt)
+            both = beside is not None and not beside.has(unit)
+            readers = [output.frames, beside.frames] if beside and both else [output.frames]
+            items = read_unit(job, unit, readers, report, attempt)
             # A second attempt reads one step at a time, which shows whose fault it is.
-            done = output.make(unit, items if attempt.number else prefetch(items), report)
+            items = items if attempt.number else prefetch(items)
+            # The shards count what is done; the dataset gives signs of life alone.
+            making = beside.making(unit, lambda _: report(Tick())) if beside and both else nullcontext()
+            with making as part:
+                done = output.make(unit, _of_first(items, part), report)
             report(Tick(bytes=done.bytes))
             return done
 
         return work
 
-    def _output(self) -> Output:
+    def _output(self, batch: int) -> Output:
         if self.job.facts.get("to") == "lerobot":
             return LeRobotOutput(self.job)
         tokenizer = self.tokenizer
         if tokenizer is None:
             tokenizer = get_tokenizer(self.job.tokenizer, weights=self.job.weights, device=self.job.device)
-        return ShardOutput(self.job, tokenizer)
+        return ShardOutput(self.job, tokenizer, batch)
+
+
+def _of_first(items: Iterator[tuple[int, Item]], others: PartWriter | None) -> Iterator[Item]:
+    """Yield the items of the first output; add those of the second to its part."""
+    for output, item in items:
+        if output and others is not None:
+            others.add(item)
+        else:
+            yield item
 
 
 class ShardOutput:
-    """The output of a conversion to shards: tokens of frames, and numbers."""
+    """The output of a conversion to shards: tokens of frames, and numbers.
 
-    def __init__(self, job: Job, tokenizer: Tokenizer) -> None:
-        self._job, self._tokenizer = job, tokenizer
+    Args:
+        batch: rows whose frames are decoded together.
+    """
+
+    def __init__(self, job: Job, tokenizer: Tokenizer, batch: int) -> None:
+        self._job, self._tokenizer, self._batch = job, tokenizer, batch
 
     def frames(self, episode: ReadEpisode, report: Report | None) -> Iterator[Frames]:
-        """Yield squares (n, S, S, 3), camera after camera."""
-        layout, clip, kept = self._job.layout, episode.clip, episode.kept
-        spec = layout.tokenizer
-        content = Content(clip, kept)
-        for name in layout.cameras:
+        """Yield squares (n, S, S, 3)."""
+        clip, spec = episode.clip, self._job.layout.tokenizer
+        content = Content(clip, episode.kept)
+
+        def show(name: str, start: int, rows: NDArray[np.int64]) -> tuple[Pictures, Pictures]:
             camera, stream = self._job.embodiment.camera(name), clip.episode.streams[name]
-            seen = PictureCheck()
-            try:
-                if report:
-                    report(Seen(name, *clip.frames_at(name, kept[:1]).shape[1:3]))
-                for start in range(0, len(kept), FRAMES_A_BATCH):
-                    indices = clip.frame_indices[name][kept[start : start + FRAMES_A_BATCH]]
-                    frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
-                    content.add(start, frames)
-                    seen.add(frames)
-                    yield Frames(name, frames)
-            except EpisodeError as fault:
-                if len(layout.cameras) == 1:
-                    raise
-                raise camera_fault(episode.ref.id, name, layout.cameras, fault) from fault
-            episode.flags |= picture_flags(seen, self._job.embodiment.quality, episode.ref.id, name)
+            indices = clip.frame_indices[name][rows]
+            frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
+            content.add(name, start, frames)
+            return frames, frames
+
+        yield from frames_of(self._job, episode, self._batch, report, show)
         episode.content = content.text()
 
     def make(self, unit: ShardUnit, items: Iterator[Item], report: Report) -> Made:

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from hma_data.conversion import lerobot
+from hma_data.conversion import lerobot, reading
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.report import Summary
@@ -24,6 +24,7 @@ from hma_data.episodes.images import prepare
 from hma_data.errors import OutputError, ShardError, SourceError, UsageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
+from hma_data.sources.hdf5.source import Hdf5Source
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.cli import main
 from tests.command import ROOT, hma_process
@@ -265,6 +266,26 @@ def test_an_episode_that_cannot_be_read_is_in_quarantine_and_nothing_of_it_in_th
     assert summary.manifest.quarantined == 2
     dataset = opened(tmp_path / "out")
     assert (dataset.meta.total_episodes, len(dataset)) == (1, 9)
+
+
+def test_no_sign_of_life_comes_from_an_episode_that_hangs(tmp_path: Path, monkeypatch) -> None:
+    data, robot = hdf5(tmp_path)
+    monkeypatch.setattr(reading, "SIGN_EVERY_S", 0.01)
+    read, signs, heard = Hdf5Source.read, 0, []
+
+    def slow(self, *words):
+        before = signs
+        time.sleep(0.3)
+        heard.append(signs - before)
+        return read(self, *words)
+
+    def count(progress) -> None:
+        nonlocal signs
+        signs += 1
+
+    monkeypatch.setattr(Hdf5Source, "read", slow)
+    to_lerobot(robot, data, tmp_path / "out", replace(SMALL, limit=1), on_progress=count)
+    assert signs and not any(heard)
 
 
 @pytest.mark.slow
