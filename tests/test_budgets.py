@@ -35,7 +35,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/export": (910, 6_800, 7),
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_300, 6),
-    "hma_model/lerobot_env": (575, 4_435, 3),
+    "hma_model/lerobot_env": (580, 4_470, 3),
     "hma_model/network": (3_320, 28_400, 16),
     "hma_model/play": (1_690, 12_200, 8),
     "hma_model/policies": (2_880, 20_400, 14),
@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_130, 514_500
 TEST_LINES = 47_570
-DOC_WORDS = 40_070
+DOC_WORDS = 40_080
 
 
 @cache

@@ -178,7 +178,10 @@ def require_fit(config: HMAEnvConfig) -> None:
             raise UsageError(where, f"takes {key}, and {config.embodiment} gives {', '.join(own)}", remedy)
         if there is None:
             fault = f"takes {key}, which cannot be estimated from the images of {config.embodiment} here"
-            raise UsageError(where, fault, "give a policy that acts from images alone")
+            remedy = "give a policy that acts from images alone"
+            if key == "observation.state" and not config.state:
+                fault, remedy = f"takes {key}, and --env.state=false omits it", "leave out --env.state"
+            raise UsageError(where, fault, remedy)
         if feature.type is not FeatureType.VISUAL and tuple(there.shape) != tuple(feature.shape):
             fault = f"has {feature.shape[0]} values of {key}, {config.embodiment} has {there.shape[0]}"
             raise UsageError(where, fault, "give a policy of this robot")

@@ -115,7 +115,7 @@ def test_settings_that_are_wrong(given: dict[str, Any], said: str) -> None:
     ("inputs", "rename", "state", "said"),
     [
         ({}, "", True, f"""takes {CAMERA}, and {ROBOT} gives action, observation.image,"""),
-        ({"state": 2}, RENAME, False, "takes observation.state, which cannot be estimated from the images"),
+        ({"state": 2}, RENAME, False, "takes observation.state, and --env.state=false omits it"),
         ({"state": 3}, RENAME, True, f"has 3 values of observation.state, {ROBOT} has 2"),
         ({"actions": 3}, RENAME, True, f"has 3 values of action, {ROBOT} has 2"),
     ],
