@@ -37,7 +37,7 @@ def bench(
     settings: Annotated[list[str] | None, Argument(metavar="KEY=VALUE", help="Benchmark settings.")] = None,
     json: Json = False,
 ) -> None:
-    """Run a benchmark on generated data; nothing is downloaded.
+    """Measure the speed and quality of the toolkit on generated data.
 
     Example: hma bench loader frames=1000000 --json
     """

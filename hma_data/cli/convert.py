@@ -52,7 +52,7 @@ def convert(
     ] = "shards",
     lerobot: Annotated[
         Path | None,
-        Option(help="Also write a LeRobotDataset to this folder; the cameras and the split of the shards."),
+        Option(help="Also write a LeRobotDataset to this folder, with the shards' cameras and split."),
     ] = None,
     source: Annotated[str | None, Option(help="Same as DATA.")] = None,
     tokenizer: Annotated[
@@ -60,7 +60,7 @@ def convert(
     ] = TOKENIZER,
     weights: Annotated[str | None, _rare(help="Tokenizer weights other than the default.")] = None,
     device: Annotated[str, Option(help="Device of the tokenizer: cpu, cuda, mps.")] = "cpu",
-    workers: Annotated[int, Option(min=0, help="Processes; 0: this one, without crash protection.")] = 1,
+    workers: Annotated[int, Option(min=0, help="Worker processes; 0: none, without crash protection.")] = 1,
     engine: Annotated[Literal["local", "ray"], _jobs(help="Engine that runs the workers.")] = "local",
     worker_cpus: Annotated[float, _jobs(min=0, help="CPUs per Ray worker.")] = 1.0,
     worker_gpus: Annotated[
@@ -70,7 +70,7 @@ def convert(
     only: Annotated[list[str] | None, _chosen("Episode to take")] = None,
     exclude: Annotated[list[str] | None, _chosen("Episode to leave out")] = None,
     frames: Annotated[
-        Literal["all", "strided"], _data(help="Keep all rows, or one per stride of the model.")
+        Literal["all", "strided"], _data(help="Keep all rows, or only those at the model's rate.")
     ] = "all",
     drop_idle: Annotated[
         bool,
@@ -92,8 +92,8 @@ def convert(
     val_fraction: Annotated[
         float | None,
         _data(
-            help="Validation share of episodes; default: 5 %, for small sets 5 episodes or a quarter, "
-            "with --to lerobot none."
+            help="Validation share of episodes; default: 5 %, but at least 5 episodes (of fewer than 20 a "
+            "quarter); with --to lerobot 0."
         ),
     ] = None,
     seed: Annotated[int, _data(help="Seed of the split.")] = 0,

@@ -199,7 +199,7 @@ def generate(
     seed: Annotated[int, Option(min=0, help="Seed of the rollout.")] = 0,
     cameras: Cameras = None,
 ) -> None:
-    """Write a video of the recording next to the prediction from its first frames and its actions.
+    """Write a video: a recording next to the prediction from its first frames and its actions.
 
     Example: hma generate runs/first shards/my_arm --out rollout.mp4
     """

@@ -60,13 +60,14 @@ def export_checkpoint(
     """Export robots of a checkpoint; return the manifest."""
     import sys
 
+    from hma_model.export import require_onnx
+
+    require_onnx()  # before torch is imported
     from hma_data.errors import UsageError
     from hma_data.shards.reader import ShardSet
-    from hma_model.export.files import require_onnx
     from hma_model.hub.publish import located
     from hma_model.worlds.scenes import Drivable, drivable, trained_on
 
-    require_onnx()
     sets = list(map(ShardSet, data))
     require_checkpoint(checkpoint)
     opened, ids = located(checkpoint, embodiments)

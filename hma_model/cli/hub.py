@@ -34,11 +34,13 @@ def push(
         bool, Option("--film/--no-film", help="Make a video for the card if the run's shards exist.")
     ] = True,
     page: Annotated[
-        bool, Option("--page", help="Publish a page too that drives these robots, as hma export writes it.")
+        bool, Option("--page", help="Also publish the page that hma export writes, to drive these robots.")
     ] = False,
     space: Annotated[
         str | None,
-        Option(metavar="ORG/NAME", help="Make a static Space of that page as well; needs --page."),
+        Option(
+            metavar="ORG/NAME", help="Also publish that page as a static Hugging Face Space; needs --page."
+        ),
     ] = None,
     private: Private = False,
 ) -> None:

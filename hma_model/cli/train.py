@@ -20,7 +20,7 @@ Words = Annotated[
     list[str] | None,
     Argument(metavar="DATA|KEY=VALUE", help="Shard sets, and recipe keys such as model.layers=4."),
 ]
-Out = Annotated[Path | None, Option("--out", help="The run's folder.")]
+Out = Annotated[Path | None, Option("--out", help="The run's folder; required, here or as out=DIR.")]
 Force = Annotated[bool, Option("--force", help="Resume even if the recipe or the shards changed.")]
 MODELS = "Models"  # the panel of `hma --help`
 STOPPED = "the run's checkpoints are kept; the same command continues from the newest"
@@ -102,9 +102,9 @@ def finetune(
         str, Option("--from", help="A checkpoint, a run's folder, a URI, or ORG/NAME[@REVISION].")
     ],
     words: Words = None,
-    data: Annotated[list[str] | None, Option(help="Same as DATA, one shard set; repeat it for more.")] = None,
+    data: Annotated[list[str] | None, Option(help="One shard set, as in DATA; repeat it for more.")] = None,
     freeze_trunk: Annotated[
-        bool, Option("--freeze-trunk", help="Train only stems and heads; freeze the trunk.")
+        bool, Option("--freeze-trunk", help="Train only stems and heads; keep the trunk as it is.")
     ] = False,
     recipe: Annotated[
         str | None,
@@ -114,7 +114,7 @@ def finetune(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Train a new stem and head on a trained trunk; run it again to resume.
+    """Finetune a checkpoint on new robots: their stems and heads, and the trunk; run it again to resume.
 
     Example: hma finetune shards/my_arm --from team/model --freeze-trunk --out runs/my_arm
     """

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from hma_data.errors import MissingDependencyError, install_command
 from hma_data.storage.files import atomic_path, file_sha256
 from hma_model.export.graphs import Port, example
 
@@ -24,16 +23,6 @@ if TYPE_CHECKING:
 
 OPSET = 18  # of ONNX: runtimes of 2023 and later know it
 SMALL = 64  # values of a tensor that stays float32
-
-
-def require_onnx() -> None:
-    """Raise MissingDependencyError unless the packages that write ONNX are installed."""
-    try:
-        import onnx  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ImportError as fault:
-        remedy = install_command("export")
-        raise MissingDependencyError("hma export", f"needs {fault.name}", remedy) from fault
 
 
 def rounded[M: nn.Module](module: M) -> M:

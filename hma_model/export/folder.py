@@ -25,7 +25,8 @@ from hma_data import __version__
 from hma_data.episodes.images import opencv
 from hma_data.errors import OutputError
 from hma_data.storage.files import new_folder, read_json, to_json, write_atomic
-from hma_model.export.files import facts, require_onnx, write_graph
+from hma_model.export import require_onnx
+from hma_model.export.files import facts, write_graph
 from hma_model.export.graphs import Port, StemGraph, StepGraph, require_exportable
 from hma_model.export.page import require_runtime, write_page
 from hma_model.export.starts import Start, round_weights, take_starts
