@@ -58,7 +58,7 @@ def atomic_path(final: Path) -> Iterator[Path]:
         reason = "its folder is a file" if below_file else fault.strerror or fault
         raise OutputError(where, f"cannot be written: {reason}", remedy) from fault
     finally:
-        with suppress(NotADirectoryError):  # the folder is a file
+        with suppress(OSError):  # the folder is a file, or may only be read
             part.unlink(missing_ok=True)
 
 

@@ -2,9 +2,9 @@
 
 import json
 import shutil
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
+from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import OutputError
-from hma_data.storage.files import atomic_path, write_atomic
+from hma_data.storage.files import write_atomic
 
 SETTINGS = "settings.json"
+DIGEST_BYTES = 32  # of the SHA-256 behind the arrays of a part
 
 
 class KeptParts:
@@ -30,11 +31,11 @@ class KeptParts:
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         self.folder = folder
-        folder.mkdir(exist_ok=True)
         path, text = folder / SETTINGS, json.dumps(settings, indent=1)
-        if any(folder.glob("*.npz")) and path.exists() and path.read_text(encoding="utf-8") != text:
+        begun = path.read_bytes() if path.exists() else None
+        if any(folder.glob("*.npz")) and begun != text.encode():
             fault = "was begun with other settings"
-            raise OutputError(folder.parent, fault, "give the same ones, or another folder")
+            raise OutputError(folder.parent, fault, f"give the same ones, another folder, or delete {folder}")
         write_atomic(path, text)
 
     def path(self, key: str) -> Path:
@@ -45,10 +46,8 @@ class KeptParts:
         """Return the arrays of a part: those kept, else those that `make` returns, which are then kept."""
         found = kept_arrays(self.path(key))
         if found is None:
-            arrays: Any = dict(make())
-            with atomic_path(self.path(key)) as part, part.open("wb") as file:
-                np.savez(file, **arrays)
-            found = arrays
+            found = dict(make())
+            keep_arrays(self.path(key), found)
         return found
 
     def remove(self) -> None:
@@ -56,10 +55,21 @@ class KeptParts:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
+def keep_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write an .npz file with its SHA-256 behind it, which np.load passes over."""
+    file, named = BytesIO(), dict[str, Any](arrays)
+    np.savez_compressed(file, **named)
+    write_atomic(path, file.getvalue() + sha256(file.getvalue()).digest())
+
+
 def kept_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
-    """Return the arrays of an .npz file that an interrupted job kept; None if it is absent or damaged."""
+    """Return the arrays that `keep_arrays` wrote; None if the file is absent, damaged or not of this form."""
     try:
-        with np.load(path) as arrays:
-            return dict(arrays)
-    except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error):
+        content = path.read_bytes()
+    except OSError:
         return None
+    data, digest = content[:-DIGEST_BYTES], content[-DIGEST_BYTES:]
+    if sha256(data).digest() != digest:
+        return None
+    with np.load(BytesIO(data)) as arrays:
+        return dict(arrays)

@@ -1,14 +1,14 @@
 """Show results of the benchmark: as a table for a model card, as a page, and two of them compared."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hma_data.errors import HMAError, UsageError
+from hma_data.errors import OutputError, UsageError
 from hma_data.storage.files import write_atomic
 from hma_data.tables import Table
+from hma_model.benchmark import run
 from hma_model.benchmark.run import NAME, RESULTS
 from hma_model.evaluation.intervals import interval, rounded
 from hma_model.evaluation.pages import Page
@@ -200,16 +200,14 @@ def read_results(path: Path) -> dict[str, Any]:
     """Return the results in a file, or in the folder that the benchmark wrote.
 
     Raises:
-        HMAError: there is none.
+        OutputError: there is none, or it is damaged.
     """
     path = path / RESULTS if path.is_dir() else path
+    found = run.read_results(path)
     try:
-        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        if found["benchmark"] != NAME:
-            raise ValueError
-    except (OSError, ValueError, TypeError, KeyError):
-        remedy = f"give the {RESULTS} of a finished hma benchmark, or its folder"
-        raise HMAError(str(path), "holds no results of the benchmark", remedy) from None
+        compared(found, found)
+    except (KeyError, TypeError, ValueError, AttributeError) as fault:
+        raise OutputError(path, f"lacks figures ({type(fault).__name__}: {fault})", run.REMEDY) from fault
     return found
 
 

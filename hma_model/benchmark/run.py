@@ -7,10 +7,13 @@ The protocol has a name and a version. A change of what is measured makes anothe
 version may be compared.
 """
 
+import hashlib
 import json
+import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,6 +49,7 @@ from hma_model.worlds.world import World, load_world
 
 NAME, VERSION = "hma-benchmark", 2
 WORK, RESULTS = ".benchmark", "benchmark.json"
+REMEDY = f"give the {RESULTS} of a finished hma benchmark; delete a damaged one to measure again"
 NOISE = 0.5  # share of random chunks in the action sequences of a choice
 Progress = Callable[[float, str], None]
 
@@ -100,7 +104,7 @@ def benchmark(
 
     Raises:
         UsageError: the checkpoint has none of the robots.
-        OutputError: the folder was begun with other settings.
+        OutputError: the folder was begun with other settings, or its results are damaged.
     """
     folder = as_path(out)
     with locked(folder):
@@ -117,25 +121,47 @@ def benchmark(
         facts |= {"digests": {robot: world_digests(world, robot) for robot in robots}}
         facts = json.loads(json.dumps(facts))
         if (folder / RESULTS).exists():
-            found: dict[str, Any] = json.loads((folder / RESULTS).read_text(encoding="utf-8"))
+            found = read_results(folder / RESULTS)
             if any(found.get(key) != value for key, value in facts.items()):
                 raise OutputError(folder, "holds the results of other settings", "give another folder")
-            return found
-        kept = KeptParts(folder / WORK, facts)
-        made, by_scene, by_frame = {}, {}, {}
-        for number, robot in enumerate(robots):
+        else:
+            kept = KeptParts(folder / WORK, facts)
+            made, by_scene, by_frame = {}, {}, {}
+            for number, robot in enumerate(robots):
 
-            def tell(words: str, number: int = number, robot: str = robot) -> None:
-                on_progress(number, f"{robot}, {words}")
+                def tell(words: str, number: int = number, robot: str = robot) -> None:
+                    on_progress(number, f"{robot}, {words}")
 
-            one = _Robot(world, robot, protocol, seed, kept, tell)
-            made[robot], by_scene[robot], by_frame[robot] = one.measured()
-        found = facts | {"checkpoint": str(checkpoint), "measures": made, "by_scene": by_scene}
-        found["by_frame"] = by_frame
-        write_atomic(folder / RESULTS, json.dumps(found, indent=1))
-        kept.remove()
-        _record_meters(checkpoint, world, made)
+                one = _Robot(world, robot, protocol, seed, kept, tell)
+                made[robot], by_scene[robot], by_frame[robot] = one.measured()
+            found = facts | {"checkpoint": str(checkpoint), "measures": made, "by_scene": by_scene}
+            found["by_frame"] = by_frame
+            write_atomic(folder / RESULTS, json.dumps(found | {"sha256": _digest(found)}, indent=1))
+        shutil.rmtree(folder / WORK, ignore_errors=True)  # of a job killed here, too
+        _record_meters(checkpoint, world, found["measures"])
     return found
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """Return the results in benchmark.json.
+
+    Raises:
+        OutputError: it is missing or damaged.
+    """
+    try:
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        if found["benchmark"] != NAME:
+            raise ValueError
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        raise OutputError(path, "holds no results of the benchmark", REMEDY) from None
+    digest = found.pop("sha256", None)  # results of older versions have none
+    if digest not in (None, _digest(found)):
+        raise OutputError(path, "is damaged or edited: its SHA-256 is another one", REMEDY)
+    return found
+
+
+def _digest(found: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(found).encode()).hexdigest()
 
 
 def _record_meters(checkpoint: StrPath, world: World, made: dict[str, Any]) -> None:
@@ -147,7 +173,7 @@ def _record_meters(checkpoint: StrPath, world: World, made: dict[str, Any]) -> N
     for robot, one in made.items():
         meter = one["calibration"].get("meter")
         if meter is not None:
-            with suppress(OSError):  # a folder that may only be read
+            with suppress(OutputError):  # a folder that may only be read
                 record_evaluation(source, robot, meter, "meter")
 
 

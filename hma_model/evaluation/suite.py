@@ -30,8 +30,8 @@ from hma_data.loading.views import Cameras
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import atomic_path, finite
-from hma_data.storage.kept import kept_arrays
+from hma_data.storage.files import finite
+from hma_data.storage.kept import keep_arrays, kept_arrays
 from hma_data.storage.paths import StrPath, as_path, as_text, is_repository
 from hma_model.checkpoint.folder import EMBEDDED
 from hma_model.checkpoint.io import record_evaluation
@@ -222,7 +222,7 @@ def _record(label: str, model: "HMA", part: Part, settings: EvaluationSettings) 
     figures = ("episodes", "windows", "psnr_action_gain_last", "psnr_action_gain_last_95")
     facts = {"verdict": said, "follows": follows(part.found)}
     facts |= {name: part.found.get(name) for name in figures}
-    with suppress(OSError):  # a folder that may only be read
+    with suppress(OutputError):  # a folder that may only be read
         record_evaluation(source, part.found["embodiment"], facts)
 
 
@@ -251,14 +251,13 @@ def _keep(folder: Path, mark: str, part: Part) -> None:
     arrays: Any = {f"predicted.{kind}": values for kind, values in part.predicted.items()}
     arrays |= {f"by_window.{name}": values for name, values in part.by_window.items()}
     arrays["found"] = np.array(json.dumps(part.found))
-    with atomic_path(_path(folder, mark, part.found["embodiment"])) as path, path.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+    keep_arrays(_path(folder, mark, part.found["embodiment"]), arrays)
 
 
 def _kept(folder: Path, mark: str, label: str, shards: ShardSet) -> Part | None:
     """Return a part that is done, under the names of this command; None if it is not done, or damaged."""
     arrays = kept_arrays(_path(folder, mark, shards.embodiment.id))
-    if arrays is None or "found" not in arrays:
+    if arrays is None:
         return None
     found = json.loads(str(arrays.pop("found"))) | {"checkpoint": label, "data": str(shards.folder)}
     sorted_out: dict[str, dict[str, Any]] = {"predicted": {}, "by_window": {}}

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.errors import OutputError, UsageError
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.benchmark import planning
 from hma_model.benchmark import run as running
@@ -245,8 +245,48 @@ def test_the_card_the_page_and_a_comparison(
     assert json.loads(capsys.readouterr().out)[0]["robot"] == ROBOT
     with pytest.raises(UsageError, match="differ in seed"):
         compared(one, {**other, "seed": 1})
-    with pytest.raises(HMAError, match="holds no results of the benchmark"):
-        read_results(tmp_path / "nothing" / RESULTS)
     with pytest.raises(UsageError, match="none of the benchmark's robots: absent"):
         benchmark("it", tmp_path / "none", replace(TINY, robots=("absent",)), world=world_of(FlawlessWorld))
     assert main(["benchmark"]) == 2
+
+
+def test_damaged_results_are_refused_with_what_to_do(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    path = tmp_path / RESULTS
+    for damage in (None, b"", b"[1]", b"\xff", b"[" * 100_000, b"{}"):
+        if damage is not None:
+            path.write_bytes(damage)
+        with pytest.raises(OutputError, match="benchmark.json: holds no results of the benchmark — give the"):
+            read_results(path)
+    with pytest.raises(OutputError, match="delete a damaged one to measure again"):
+        benchmark("it", tmp_path, TINY, world=world_of(FlawlessWorld))
+    whole = (folders[0] / RESULTS).read_text()
+    path.write_text(whole.replace('"decision": 1.0', '"decision": 0.9'))
+    with pytest.raises(OutputError, match="is damaged or edited"):
+        read_results(tmp_path)
+    path.write_text(json.dumps({key: value for key, value in json.loads(whole).items() if key != "sha256"}))
+    assert read_results(path) == read_results(folders[0])  # of an older version
+    path.write_text('{"benchmark": "hma-benchmark", "measures": {"a": 1}}')
+    with pytest.raises(OutputError, match="lacks figures"):
+        read_results(path)
+
+
+def test_finished_results_of_a_killed_job_still_record_meters_and_remove_its_parts(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(folders[0], tmp_path / "out")
+    (tmp_path / "out" / WORK).mkdir()
+    recorded: list[Any] = []
+    monkeypatch.setattr(running, "_record_meters", lambda *given: recorded.append(given[2]))
+    found = benchmark("it", tmp_path / "out", TINY, world=world_of(FlawlessWorld))
+    assert recorded == [found["measures"]] and not (tmp_path / "out" / WORK).exists()
+
+
+def test_a_checkpoint_that_may_only_be_read_gets_no_meter_and_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*given: Any) -> None:
+        raise OutputError(tmp_path, "cannot be written: Permission denied")
+
+    monkeypatch.setattr(running, "record_evaluation", refused)
+    world: Any = SimpleNamespace(model=SimpleNamespace(source=SimpleNamespace(folder=tmp_path)))
+    running._record_meters(tmp_path, world, {"mover_04": {"calibration": {"meter": {}}}})
