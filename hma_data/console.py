@@ -26,7 +26,7 @@ class Update(Protocol):
 
 
 def run_script(main: Callable[[], None]) -> None:
-    """Run a script; an error of the toolkit becomes one line on stderr and an exit code, as of `hma`.
+    """Run a script; an error of the toolkit, or of a file, becomes one line on stderr and an exit code.
 
     With HMA_DEBUG in the environment, errors show where they happened.
     """
@@ -36,6 +36,12 @@ def run_script(main: Callable[[], None]) -> None:
         if os.environ.get("HMA_DEBUG"):
             raise
         raise SystemExit(fail(str(fault), fault.exit_code)) from None
+    except OSError as fault:
+        if os.environ.get("HMA_DEBUG"):
+            raise
+        remedy = "free space or see to the permissions, and run the same command again"
+        where = fault.filename or "a file"
+        raise SystemExit(fail(f"{where}: {fault.strerror or fault} — {remedy}", 1)) from None
     except KeyboardInterrupt:
         raise SystemExit(fail("interrupted", 130)) from None
 

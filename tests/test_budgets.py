@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (690, 4_000, 7),
+    "hma_data": (695, 4_040, 7),
     "hma_data/cli": (1_550, 11_150, 8),
     "hma_data/conversion": (4_205, 31_250, 14),
     "hma_data/episodes": (1_670, 14_600, 9),
@@ -24,10 +24,10 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/registry": (1_280, 8_210, 6),
     "hma_data/shards": (2_540, 19_600, 11),
     "hma_data/sources": (12_670, 105_600, 52),
-    "hma_data/storage": (1_640, 10_700, 11),
+    "hma_data/storage": (1_645, 10_735, 11),
     "hma_data/tokenizers": (3_280, 23_800, 17),
     "hma_model": (520, 3_050, 3),
-    "hma_model/benchmark": (860, 7_450, 5),
+    "hma_model/benchmark": (880, 7_500, 5),
     "hma_model/checkpoint": (870, 6_500, 5),
     "hma_model/cli": (1_715, 10_700, 12),
     "hma_model/demo": (490, 4_100, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_630, 29_900, 18),
     "hma_model/worlds": (1_560, 11_700, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_130, 514_500
-TEST_LINES = 47_570
+PRODUCT_LINES, PRODUCT_NODES = 65_169, 514_761
+TEST_LINES = 47_681
 DOC_WORDS = 40_080
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from hma_data.console import run_script
 from hma_data.errors import SourceError
-from hma_data.storage.files import atomic_path
+from hma_data.storage.files import atomic_path, write_atomic
 from hma_model.evaluation.metrics import psnr
 from recipes.public.rollouts import Images
 from recipes.public.sets import Chosen, Figures, Protocol, PublicSet, checked_file, gaussian_ssim, run
@@ -35,16 +35,17 @@ NUMBERS = {"action": "rel_actions.pth", "state": "states.pth", "velocity": "velo
 
 
 def download(folder: Path, given: argparse.Namespace) -> None:
-    """Download and unpack the set; a folder that is there is kept."""
-    if (folder / "pusht_noise" / "val").is_dir():
+    """Download and unpack the set; one that is unpacked is kept."""
+    unpacked = folder / ".unpacked"
+    if unpacked.is_file():
         return
     archive = folder / "pusht_noise.zip"
     if not archive.is_file():
         checked_file(URL, SHA256, archive)
     with zipfile.ZipFile(archive) as zipped:
         names = [name for name in zipped.namelist() if not Path(name).name.startswith("._")]
-        names.sort(key=lambda name: "/val/" in name)  # the last part says that all is there
         zipped.extractall(folder, names)
+    write_atomic(unpacked, "")
 
 
 def prepare(source: Path, out: Path) -> tuple[Path, Path]:
@@ -75,11 +76,10 @@ def write_rows(folder: Path) -> None:
         final = folder / f"{video.stem}.hdf5"
         if final.is_file():
             continue
-        number, rows = int(video.stem.removeprefix("episode_")), frame_count(video)
+        name, rows = video.stem.removeprefix("episode_"), frame_count(video)
+        number = int(name) if name.isdecimal() else len(videos)
         if number >= len(videos) or not 0 < rows <= most["action"][1]:
-            said = (
-                f"has {rows} frames, number {number}; the numbers are of {most['action']} episodes and rows"
-            )
+            said = f"has {rows} frames, number {name}; the numbers are of {most['action']} episodes and rows"
             raise SourceError(video, said, "unpack the set again")
         with atomic_path(final) as part, h5py.File(part, "w") as file:
             for key, values in numbers.items():
@@ -87,7 +87,7 @@ def write_rows(folder: Path) -> None:
 
 
 def tensor(path: Path) -> Any:
-    """Return a tensor's values (N, T, …) as float32; no code of the file is run.
+    """Return a tensor's values (N, T, V) as float32; no code of the file is run.
 
     Raises:
         SourceError: the file is missing, damaged, or holds something else than a tensor.
@@ -96,7 +96,10 @@ def tensor(path: Path) -> Any:
 
     try:
         values = torch.load(path, map_location="cpu", weights_only=True)
-        return values.float().numpy()
+        found = values.float().numpy()
+        if found.ndim != 3:
+            raise ValueError(found.shape)
+        return found
     except Exception as fault:  # torch raises several kinds
         raise SourceError(path, f"is no tensor: {type(fault).__name__}", "unpack the set again") from fault
 

@@ -66,7 +66,7 @@ def repack(folder: Path, path: Path) -> None:
     """Write the episodes of a Zarr folder as data/demo_N of an HDF5 file."""
     series = {key: ZarrArray(folder / "data" / key) for key in ("img", "state", "action")}
     stored = ZarrArray(folder / "meta" / "episode_ends")
-    ends = stored.rows(0, len(stored)).astype(np.int64)
+    ends = stored.rows(0, len(stored)).astype(np.int64).ravel()
     lengths = {key: len(values) for key, values in series.items()}
     if not len(ends) or (np.diff(ends, prepend=0) <= 0).any() or ends[-1] > min(lengths.values()):
         said = f"has episodes that end at {ends[-3:].tolist()}, and series of {lengths} rows"

@@ -63,17 +63,20 @@ def export(world: World, given: argparse.Namespace) -> int:
     """Write the videos and summary.json; return the number of episodes.
 
     Raises:
-        UsageError: a task or model is no name of a folder, or fewer than three episodes are long enough.
+        UsageError: a task or model is no name of a folder, no frame is given or predicted, or fewer than
+            three episodes are long enough.
     """
     for option, name in (("--task", given.task), ("--name", given.name)):
         if not name or set(name) & set("/\\") or name.startswith("."):
             raise UsageError(option, f"{name!r} is no name of a folder", "give letters, digits and _")
+    if not 0 < given.context < given.frames:
+        said = f"is {given.context}, of {given.frames} --frames"
+        raise UsageError("--context", said, "give 1 or more, and fewer than --frames")
     recording = Recording(given.recording, find(given.embodiment))
     span = (given.frames - 1) * recording.robot.stride + 1
-    wanted = range(len(recording.ids)) if given.episodes is None else given.episodes
-    chosen = [
-        number for number in wanted if number < len(recording.ids) and recording.lengths[number] >= span
-    ]
+    known = range(len(recording.ids))
+    wanted = known if given.episodes is None else given.episodes
+    chosen = [number for number in wanted if number in known and recording.lengths[number] >= span]
     if len(chosen) < len(VARIANTS):
         said = f"has {len(chosen)} of the chosen episodes with {span} frames; {len(VARIANTS)} are needed"
         raise UsageError(given.recording, said, "give more or longer episodes, or fewer --frames")

@@ -11,6 +11,7 @@ T rows of an array.
 """
 
 import json
+import math
 import zlib
 from collections.abc import Callable
 from functools import lru_cache
@@ -25,7 +26,8 @@ from numpy.typing import NDArray
 
 from hma_data.errors import SourceError
 
-MAX_CHUNK = 1 << 30  # bytes
+MAX_BYTES = 1 << 30  # of a chunk, and of rows that are read together
+MAX_OVERHEAD = 1 << 16  # bytes of a chunk's file above twice those of its values
 HEADER = 16  # bytes of a Blosc frame
 SHUFFLED, COPIED, BIT_SHUFFLED, WHOLE = 0x1, 0x2, 0x4, 0x10  # its flags
 MAX_STREAMS, MIN_STREAM = 16, 128  # a block is split into a stream a byte of its type, within these limits
@@ -43,11 +45,23 @@ def _zlib(data: bytes, size: int) -> bytes:
 
 
 def _zstd(data: bytes, size: int) -> bytes:
+    if (claimed := zstandard.frame_content_size(data)) > size:  # which would be allocated
+        raise ValueError(f"a frame of {claimed} bytes, {size} are expected")
     return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
 
 
 BLOSC: dict[int, Decompress] = {1: _lz4, 3: _zlib, 4: _zstd}
 BLOSC_NAMES = {0: "blosclz", 2: "snappy"}
+DAMAGE = (
+    OSError,
+    ValueError,
+    RuntimeError,
+    IndexError,
+    ZeroDivisionError,
+    zlib.error,
+    zstandard.ZstdError,
+    lz4.block.LZ4BlockError,
+)
 
 
 class ZarrArray:
@@ -64,18 +78,18 @@ class ZarrArray:
         self.folder = folder
         try:
             facts = json.loads((folder / ".zarray").read_text())
-            self.shape, self._chunks = tuple(facts["shape"]), tuple(facts["chunks"])
-            self.dtype, self._codec = np.dtype(facts["dtype"]), facts["compressor"]
-        except (OSError, ValueError, KeyError, TypeError) as fault:
+            self.shape, self._chunks = _sides(facts["shape"]), _sides(facts["chunks"])
+            self.dtype, self._codec = np.dtype(facts["dtype"]), (facts["compressor"] or {"id": None})["id"]
+            self._empty = self.dtype.type(facts.get("fill_value") or 0)
+            self._separator = {".": ".", "/": "/"}[facts.get("dimension_separator", ".")]
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as fault:
             said = f"is no array of Zarr's format 2 ({type(fault).__name__}: {fault})"
             raise SourceError(folder, said, "download the set again") from fault
-        self._empty = facts.get("fill_value") or 0
-        self._separator = facts.get("dimension_separator", ".")
-        self._bytes = int(np.prod(self._chunks)) * self.dtype.itemsize
+        self._bytes = math.prod(self._chunks) * self.dtype.itemsize
         if facts.get("filters") or facts.get("order", "C") != "C" or self.dtype.kind not in KINDS:
             said = f"has filters {facts.get('filters')}, order {facts.get('order')}, type {self.dtype}"
             raise SourceError(folder, said, "convert it with the zarr package")
-        if not 0 < self._bytes <= MAX_CHUNK or len(self._chunks) != len(self.shape):
+        if not 0 < self._bytes <= MAX_BYTES or len(self._chunks) != len(self.shape):
             raise SourceError(folder, f"has chunks {self._chunks} of shape {self.shape}", "download it again")
         self._read = lru_cache(4)(self._chunk)
 
@@ -83,7 +97,14 @@ class ZarrArray:
         return int(self.shape[0])
 
     def rows(self, start: int, stop: int) -> NDArray[Any]:
-        """Return the rows (T, …) from `start` to before `stop`."""
+        """Return the rows (T, …) from `start` to before `stop`.
+
+        Raises:
+            SourceError: a chunk is damaged, or they have more than MAX_BYTES.
+        """
+        if (stop - start) * math.prod(self.shape[1:]) * self.dtype.itemsize > MAX_BYTES:
+            said = f"has rows {start} to {stop} of shape {self.shape[1:]}, more than {MAX_BYTES:,} bytes"
+            raise SourceError(self.folder, said, "download the set again")
         found = np.empty((stop - start, *self.shape[1:]), self.dtype)
         first = range(start // self._chunks[0], -(-stop // self._chunks[0]))
         others = [range(-(-side // chunk)) for side, chunk in zip(self.shape[1:], self._chunks[1:])]
@@ -103,13 +124,15 @@ class ZarrArray:
         if not path.is_file():
             return np.full(self._chunks, self._empty, self.dtype)
         try:
+            if path.stat().st_size > 2 * self._bytes + MAX_OVERHEAD:
+                raise ValueError(f"{path.stat().st_size} bytes are stored, {self._bytes} are expected")
             data = self._decoded(path.read_bytes(), path)
             return np.frombuffer(data, self.dtype).reshape(self._chunks)
-        except (ValueError, RuntimeError, IndexError, zlib.error, zstandard.ZstdError) as fault:
+        except DAMAGE as fault:
             raise SourceError(path, f"is damaged: {fault}", "download the set again") from fault
 
     def _decoded(self, data: bytes, path: Path) -> bytes:
-        codec = self._codec["id"] if self._codec else None
+        codec = self._codec
         if codec is None:
             return data
         if codec == "blosc":
@@ -117,6 +140,13 @@ class ZarrArray:
         if codec not in ("zlib", "zstd"):
             raise SourceError(path, f"is compressed by {codec}", "convert it with the zarr package")
         return (_zlib if codec == "zlib" else _zstd)(data, self._bytes)
+
+
+def _sides(values: Any) -> tuple[int, ...]:
+    """Return the sides of an array or of its chunks."""
+    if not values or not all(isinstance(side, int) and side >= 0 for side in values):
+        raise ValueError(f"sides {values}")
+    return tuple(values)
 
 
 def unblosc(data: bytes, size: int, path: Path) -> bytes:

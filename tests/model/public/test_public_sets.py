@@ -5,6 +5,7 @@ import hashlib
 import json
 import shutil
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -116,6 +117,37 @@ def test_no_code_of_a_published_file_runs(tmp_path, monkeypatch) -> None:
     with pytest.raises(SourceError, match=r"states\.pth: is no tensor"):
         dino_wm.tensor(Path("states.pth"))
     assert not Path("trapped").exists()
+    for values in (torch.zeros(()), torch.zeros(3), {"values": 1}):
+        torch.save(values, "states.pth")
+        with pytest.raises(SourceError, match=r"states\.pth: is no tensor"):
+            dino_wm.tensor(Path("states.pth"))
+
+
+@pytest.mark.parametrize("name", ["episode_x", "episode_-1", "episode_9"])
+def test_a_video_without_its_number_is_named(name: str, tmp_path) -> None:
+    source = look_alikes.dino_wm(tmp_path, episodes=1)
+    video = next(source.rglob("episode_000.mp4"))
+    video.rename(video.with_stem(name))
+    with pytest.raises(SourceError, match=f"{name}.mp4: has 24 frames, number"):
+        dino_wm.prepare(source, tmp_path / "out")
+
+
+def test_an_unpacking_that_was_killed_is_done_again(tmp_path, monkeypatch) -> None:
+    with zipfile.ZipFile(tmp_path / "pusht_noise.zip", "w") as zipped:
+        for name in ("train/a", "val/a", "val/b"):
+            zipped.writestr(f"pusht_noise/{name}", "content")
+
+    def stop(*given: object) -> None:
+        (tmp_path / "pusht_noise" / "val").mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(zipfile.ZipFile, "extractall", stop)
+        dino_wm.download(tmp_path, argparse.Namespace())
+    dino_wm.download(tmp_path, argparse.Namespace())
+    assert (tmp_path / "pusht_noise" / "val" / "b").read_text() == "content"
+    (tmp_path / "pusht_noise.zip").unlink()
+    dino_wm.download(tmp_path, argparse.Namespace())  # is unpacked
 
 
 @pytest.mark.parametrize("name", SETS)

@@ -85,7 +85,9 @@ def test_tasks_share_a_folder(world: World, tmp_path: Path) -> None:
         ({"task": "a/b"}, "--task.*no name of a folder"),
         ({"name": ".."}, "--name.*no name of a folder"),
         ({"frames": 7}, "has 0 of the chosen episodes with 7 frames; 3 are needed"),
-        ({"episodes": [0, 1, 99]}, "has 2 of the chosen"),
+        ({"episodes": [0, 1, 99, -1]}, "has 2 of the chosen"),
+        ({"context": 0}, "--context: is 0, of 4 --frames"),
+        ({"context": 4}, "--context: is 4, of 4 --frames"),
     ],
 )
 def test_what_cannot_be_written_is_refused(changes, said: str, world: World, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import base64
 import json
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ FRAMES = {
     "zlib": "AgFgBGAJAABgCQAAgAAAABQAAAASAAAAeNpjYBgFwxs02A8EDQC0owsyGAAAAHjaY2BosGcAg2FB2w9emsFhJNEAVx"
     "k1YhoAAAB42mNgYHBgYGCwZxgxtMMQoBuGPA0AQ5089hgAAAB42mNgcHBgYGiwZ6A73TBKD2MaAHKKbHY=",
 }
+CLAIMS = (
+    b"\x28\xb5\x2f\xfd\xe0" + (1 << 40).to_bytes(8, "little") + b"\1\0\0"
+)  # Zstandard that claims 2^40 bytes
 REFUSED = {  # the same values; only the header counts
     "bit shuffle": "AgEkBGAJAABgCQAAngAAAA==",
     "blosclz": "AgEBBGAJAABgCQAAiQAAAA==",
@@ -64,6 +68,14 @@ def test_rows_are_put_together_from_chunks(compressor: str | None, tmp_path: Pat
         ({"chunks": [1 << 20, 1 << 20]}, "has chunks"),
         ({"compressor": {"id": "lzma"}}, "compressed by lzma"),
         ({"shape": None}, "no array of Zarr's format 2"),
+        ({"shape": []}, "no array of Zarr's format 2"),
+        ({"shape": [-4, 2]}, "no array of Zarr's format 2"),
+        ({"chunks": ["4", 2]}, "no array of Zarr's format 2"),
+        ({"compressor": "zlib"}, "no array of Zarr's format 2"),
+        ({"fill_value": "words"}, "no array of Zarr's format 2"),
+        ({"dimension_separator": "/../"}, "no array of Zarr's format 2"),
+        ({"shape": [1 << 40, 2]}, "has rows 0 to 1099511627776"),
+        ({"shape": [4, 1 << 40]}, "more than 1,073,741,824 bytes"),
     ],
 )
 def test_other_forms_are_refused(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
@@ -71,13 +83,30 @@ def test_other_forms_are_refused(changes: dict[str, Any], said: str, tmp_path: P
     facts = json.loads((tmp_path / "a" / ".zarray").read_text()) | changes
     (tmp_path / "a" / ".zarray").write_text(json.dumps(facts))
     with pytest.raises(SourceError, match=said):
-        ZarrArray(tmp_path / "a").rows(0, 4)
+        array = ZarrArray(tmp_path / "a")
+        array.rows(0, len(array))
 
 
-@pytest.mark.parametrize("content", [b"", b"\2\1\x21\4", zlib.compress(b"short"), b"x" * 40])
-@pytest.mark.parametrize("compressor", ["zlib", "blosc", None])
+@pytest.mark.parametrize(
+    "content", [b"", b"\2\1\x21\4", zlib.compress(b"short"), b"x" * 40, CLAIMS, bytes(1 << 17)]
+)
+@pytest.mark.parametrize("compressor", ["zlib", "blosc", "zstd", None])
 def test_a_damaged_chunk_is_named(content: bytes, compressor: str | None, tmp_path: Path) -> None:
     write_zarr(tmp_path / "a", np.ones((4, 2), np.float32), (4, 2), compressor)
     (tmp_path / "a" / "0.0").write_bytes(content)
     with pytest.raises(SourceError, match=r"0\.0: is damaged"):
         ZarrArray(tmp_path / "a").rows(0, 4)
+
+
+@pytest.mark.parametrize("frame", ["lz4", "zstd", "zlib"])
+def test_damaged_frames_are_refused_whatever_is_damaged(frame: str, tmp_path: Path) -> None:
+    whole = base64.b64decode(FRAMES[frame])
+    write_zarr(tmp_path / "a", np.ones((300, 2), np.float32), (300, 2), "blosc")
+    rng = np.random.default_rng(0)
+    for place in (*range(40), *rng.integers(40, len(whole), 20)):
+        for value in (0, 255, whole[place] ^ 1):
+            damaged = bytearray(whole)
+            damaged[place] = value
+            (tmp_path / "a" / "0.0").write_bytes(damaged)
+            with suppress(SourceError):
+                ZarrArray(tmp_path / "a").rows(0, 300)
