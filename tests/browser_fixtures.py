@@ -15,14 +15,25 @@ FLAGS = (
 )  # fmt: skip
 
 
+EMULATED_GPU = (
+    "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--use-vulkan=swiftshader",
+    "--enable-features=Vulkan", "--ignore-gpu-blocklist",
+)  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def browser() -> Iterator["Browser"]:
+    yield from launched(FLAGS)
+
+
+def launched(flags: tuple[str, ...]) -> Iterator["Browser"]:
+    """Launch Chromium with these flags."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         found = shutil.which("chromium") or playwright.chromium.executable_path
         if not shutil.which(found):
             pytest.skip("no Chromium: playwright install chromium")
-        launched = playwright.chromium.launch(executable_path=found, args=list(FLAGS))
-        yield launched
-        launched.close()
+        made = playwright.chromium.launch(executable_path=found, args=list(flags))
+        yield made
+        made.close()

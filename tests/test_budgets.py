@@ -32,7 +32,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/cli": (1_715, 10_700, 12),
     "hma_model/demo": (490, 4_100, 4),
     "hma_model/evaluation": (4_570, 37_030, 23),
-    "hma_model/export": (910, 6_800, 7),
+    "hma_model/export": (930, 7_010, 7),
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_300, 6),
     "hma_model/lerobot_env": (580, 4_470, 3),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_630, 29_900, 18),
     "hma_model/worlds": (1_560, 11_700, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_169, 514_761
-TEST_LINES = 47_681
+PRODUCT_LINES, PRODUCT_NODES = 65_200, 515_060
+TEST_LINES = 47_740
 DOC_WORDS = 40_080
 
 

@@ -51,6 +51,7 @@ def write_graph(
     assert program is not None
     made = program.model_proto
     _strip(made)
+    _pad(made)
     _halve(made)
     with atomic_path(path) as part:
         part.write_bytes(made.SerializeToString())
@@ -82,6 +83,31 @@ def _strip(model: "ModelProto") -> None:
     for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.initializer):
         part.ClearField("metadata_props")
         part.ClearField("doc_string")
+
+
+def _pad(model: "ModelProto") -> None:
+    """Pad the inputs of convolutions to a multiple of four channels.
+
+    onnxruntime-web 1.30 computes others wrongly on WebGPU, if their kernel is larger than a pixel.
+    """
+    from onnx import helper, numpy_helper
+
+    weights = {tensor.name: tensor for tensor in model.graph.initializer}
+    nodes = []
+    for node in model.graph.node:
+        if node.op_type == "Conv" and (tensor := weights.get(node.input[1])):
+            kernel = numpy_helper.to_array(tensor)
+            missing = -kernel.shape[1] % 4
+            if missing and max(kernel.shape[2:]) > 1:
+                padded = np.pad(kernel, ((0, 0), (0, missing), (0, 0), (0, 0)))
+                tensor.CopyFrom(numpy_helper.from_array(padded, tensor.name))
+                ends = numpy_helper.from_array(np.array([0] * 5 + [missing, 0, 0]), f"{tensor.name}_ends")
+                model.graph.initializer.append(ends)
+                nodes.append(helper.make_node("Pad", [node.input[0], ends.name], [f"{tensor.name}_in"]))
+                node.input[0] = f"{tensor.name}_in"
+        nodes.append(node)
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
 
 
 def _halve(model: "ModelProto") -> None:

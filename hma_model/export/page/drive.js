@@ -30,18 +30,28 @@ async function main() {
   document.title = $("model").textContent = manifest.model;
   $("robot").replaceChildren(...manifest.robots.map((one) => new Option(one.id + (one.about && " — " + one.about) + (one.holds && " · " + one.holds), one.id)));
   $("temperature-row").hidden = manifest.temperature === null;
-  backend = asked.get("backend") === "webgpu" && await hasGpu() ? "webgpu" : "wasm";
+  const asks = asked.get("backend"), gpu = asks !== "wasm" && await hasGpu(asks === "webgpu");
   const named = manifest.robots.find((one) => one.id === asked.get("robot"));
   robot = named || manifest.robots[0];
   await poster();
   const graph = loader.part(manifest.step);
   graph.catch(() => {});  // it is awaited below
-  ort = await openRuntime(manifest, loader, backend, Number(asked.get("threads")));
-  step = await ort.InferenceSession.create(await graph, { executionProviders: backend === "webgpu" ? ["webgpu", "wasm"] : ["wasm"] });
+  ort = await openRuntime(manifest, loader, gpu ? "webgpu" : "wasm", Number(asked.get("threads")));
+  const open = async (...providers) => ort.InferenceSession.create(await graph, { executionProviders: providers });
+  backend = gpu && asks === "webgpu" ? "webgpu" : "wasm";
+  step = backend === "webgpu" ? await open("webgpu", "wasm") : await open("wasm");
+  await openRobot();
+  if (gpu && backend === "wasm") await tryGpu(() => open("webgpu", "wasm"));
   document.body.dataset.backend = backend;
   $("backend").textContent = backend === "webgpu" ? "WebGPU" : `WASM, ${ort.env.wasm.numThreads} thread${ort.env.wasm.numThreads > 1 ? "s" : ""}`;
-  await openRobot();
   loop();
+}
+
+async function tryGpu(open) {  // a driver may compute wrongly, and the processor may be faster
+  const found = await open().catch(() => null);
+  if (!found || !await world.better(found).catch(() => false)) return;
+  step = world.step = found;
+  backend = "webgpu";
 }
 
 async function isolate() {  // a service worker keeps files for offline use; loaded once more, the page may use threads
@@ -66,8 +76,11 @@ async function prune() {  // forget the files of an older export
   }
 }
 
-async function hasGpu() {
-  try { return Boolean(navigator.gpu && await navigator.gpu.requestAdapter()); } catch { return false; }
+async function hasGpu(emulated) {  // one that the processor emulates is slow
+  try {
+    const found = navigator.gpu && await navigator.gpu.requestAdapter();
+    return Boolean(found) && (emulated || !(found.info && found.info.isFallbackAdapter || found.isFallbackAdapter));
+  } catch { return false; }
 }
 
 async function poster() {  // show the start at once

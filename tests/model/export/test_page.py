@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 from hma_model.export.page import VERSION, write_page
+from tests.browser_fixtures import EMULATED_GPU, FLAGS, launched
 from tests.model.export.checkpoints import ROBOT, Driver
 
 if TYPE_CHECKING:
@@ -51,16 +53,28 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def site(tokens: Path, runtime: Path, tmp_path: Path) -> Path:
-    """A folder whose sub-folder `sub/page` is an export with the runtime."""
-    page = Path(shutil.copytree(tokens, tmp_path / "site" / "sub" / "page"))
+    return with_runtime(tokens, runtime, tmp_path)
+
+
+def with_runtime(export: Path, runtime: Path, folder: Path) -> Path:
+    """Return a folder whose sub-folder `sub/page` is an export with the runtime."""
+    page = Path(shutil.copytree(export, folder / "site" / "sub" / "page"))
     manifest = json.loads((page / "manifest.json").read_text())
     manifest["runtime"] = write_page(page, runtime)
     (page / "manifest.json").write_text(json.dumps(manifest))
-    return tmp_path / "site"
+    return folder / "site"
 
 
 @pytest.fixture
 def server(site: Path) -> Iterator[http.server.ThreadingHTTPServer]:
+    with served(site) as made:
+        yield made
+
+
+@contextmanager
+def served(site: Path) -> Iterator[http.server.ThreadingHTTPServer]:
+    """Serve a folder on loopback."""
+
     class Handler(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *arguments: Any) -> None:
             pass
@@ -189,6 +203,39 @@ def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(
     page.evaluate("caches.delete('hma-export')")
     page.reload()
     assert said(page) == "manifest.json is missing here: this page belongs into a folder of hma export"
+
+
+@pytest.mark.parametrize("trunk", ["tokens", "pixels"])
+def test_webgpu_makes_the_frames_of_wasm(
+    trunk: str, request: pytest.FixtureRequest, tmp_path: Path, runtime: Path
+) -> None:
+    with served(with_runtime(request.getfixturevalue(trunk), runtime, tmp_path)) as server:
+        flags = (*(flag for flag in FLAGS if flag != "--disable-gpu"), *EMULATED_GPU)
+        for browser in launched(flags):
+            images = [drawn(browser, server, backend) for backend in ("wasm", "webgpu", "")]
+    for backend, (label, shown) in zip(("WASM", "WebGPU", "WASM"), images, strict=True):
+        assert label.startswith(backend)  # an emulated GPU is asked for by name alone
+        far = [np.abs(one.astype(int) - other) for one, other in zip(shown, images[0][1], strict=True)]
+        assert max(one.max() for one in far) <= 1
+
+
+def drawn(browser: "Browser", server: Any, backend: str) -> tuple[str, list[Any]]:
+    """Return the named backend, and two images of equal draws."""
+    context = browser.new_context()
+    context.set_default_timeout(PATIENCE)
+    page = context.new_page()
+    page.add_init_script(
+        KEEP_FRAMES.replace("0.5", "(window.drawn = (window.drawn ?? 1) * 16807 % 2147483647) / 2147483647")
+    )
+    page.goto(address(server).replace("backend=wasm", f"backend={backend}"))
+    page.wait_for_selector("body[data-backend]")
+    page.focus("#stage")
+    for count in (1, 2):
+        page.keyboard.press("n")
+        page.wait_for_function(f"kept.length >= {count}")
+    found = page.text_content("#backend") or "", page.evaluate("kept.map((one) => one[1])")
+    context.close()
+    return found[0], [np.frombuffer(base64.b64decode(image), np.uint8) for image in found[1]]
 
 
 def test_a_browser_without_simd_is_one_clear_line(page: "Page", server: Any) -> None:
