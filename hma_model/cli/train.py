@@ -164,7 +164,7 @@ def _print(result: "TrainResult") -> None:
         from hma_model.config import token_words
 
         unit = token_words(Checkpoint.open(result.checkpoint).config.merge)
-        print(f"held-out loss {found:.4f} nats per {unit}; token frequencies alone {base:.4f}")
+        print(f"held-out loss {found:.4f} nats per {unit}; baseline (token frequencies) {base:.4f}")
     if result.skipped:
         print(f"{result.skipped} steps were skipped; see skipped in {result.out}/metrics.jsonl")
     if (result.out / "report.html").is_file():

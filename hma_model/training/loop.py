@@ -168,8 +168,8 @@ def _loop(
             run.save()
     rows = sorted(run.train_data.realised(), key=lambda row: -row["intended"])
     if run.ranks.main and any(row["samples"] for row in rows):
-        shares = (f"{r['embodiment']} {r['realised']:.1%} ({r['intended']:.1%} intended)" for r in rows)
-        log.note(f"drawn: {', '.join(shares)}")
+        shares = (f"{r['embodiment']} {r['realised']:.1%} (mixture {r['intended']:.1%})" for r in rows)
+        log.note(f"windows: {', '.join(shares)}")
     if stopped:
         log.note(f"stopped by a signal and saved at step {run.step}; run the same command to continue")
 

@@ -101,7 +101,7 @@ def test_what_cannot_be_a_folder_is_wrong_usage(recipe, out):
 def test_every_line_of_progress_is_said_once(recipe, tmp_path, capsys):
     train(recipe(), out=tmp_path / "run")
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == len(set(lines)) and lines[-1].startswith("drawn: ")
+    assert len(lines) == len(set(lines)) and lines[-1].startswith("windows: ")
     shown = "\n".join(lines)
     assert "step 6/6: loss arm" in shown and "validation" in shown and "\x1b" not in shown
 
