@@ -3,6 +3,7 @@
 Files of a store are written on this machine and then uploaded. JSON is read and written here as well.
 """
 
+import glob
 import hashlib
 import json
 import math
@@ -140,11 +141,16 @@ def new_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder to fill; it gets the given name when the block ends without an error.
 
     It replaces an older folder of that name. On an error the new folder is deleted and the older one stays as
-    it was.
+    it was. What a killed writer of that name left is deleted too.
     """
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    mark = f"{PARTIAL}{uuid.uuid4().hex[:12]}"
+    for left in folder.parent.glob(f".{glob.escape(folder.name)}{PARTIAL}*"):
+        pid, dot, rest = left.name.rpartition(PARTIAL)[2].partition(".")
+        needed = rest.endswith("-old") and not folder.exists()  # killed between the two renames
+        if dot and not needed and not _is_running(int(pid)):
+            shutil.rmtree(left, ignore_errors=True)
+    mark = f"{PARTIAL}{os.getpid()}.{uuid.uuid4().hex[:12]}"
     new, old = folder.with_name(f".{folder.name}{mark}"), folder.with_name(f".{folder.name}{mark}-old")
     new.mkdir()
     try:

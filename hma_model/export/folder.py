@@ -13,7 +13,8 @@
 P frames of a start, K = stride * action dim.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +29,7 @@ from hma_data.storage.files import new_folder, read_json, to_json, write_atomic
 from hma_model.export import require_onnx
 from hma_model.export.files import facts, write_graph
 from hma_model.export.graphs import Port, StemGraph, StepGraph, require_exportable
-from hma_model.export.page import require_runtime, write_page
+from hma_model.export.page import page_names, require_runtime, write_page
 from hma_model.export.starts import Start, round_weights, take_starts
 from hma_model.play.holding import UNKNOWN, holdings
 from hma_model.play.pads import describe
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 FORMAT, FORMAT_VERSION = "hma-export", 1
-MANIFEST = "manifest.json"
+MANIFEST, STEP, ROBOTS = "manifest.json", "step.onnx", "robots"
 COLUMNS = 10  # true images in a row of a picture
 QUALITY = 90  # of WebP
 
@@ -75,7 +76,7 @@ def export_folder(
     Raises:
         CheckpointError: no graph can be written of such a model.
         MissingDependencyError: the extra `export` is not installed.
-        OutputError: `out` holds something else.
+        OutputError: `out` holds something else, or cannot be written.
         UsageError: `runtime` is not that package.
     """
     require_onnx()
@@ -86,7 +87,7 @@ def export_folder(
     world = World(model, tokenizer)
     taken = {robot.embodiment.id: take_starts(world, robot, starts) for robot in robots}
     loss, halved = round_weights(model, tokenizer, taken) if half else (None, False)
-    with new_folder(out) as folder:
+    with _written(out) as folder:
         report("step.onnx, which all robots share")
         step = StepGraph(model, tokenizer, unmask_steps).eval()
         manifest: dict[str, Any] = {
@@ -99,7 +100,7 @@ def export_folder(
             "image": list(world.image_shape),
             "weights": "float16" if halved else "float32",
             "float16_loss_db": loss,
-            "step": write_graph(folder / "step.onnx", step, step.inputs, step.outputs),
+            "step": write_graph(folder / STEP, step, step.inputs, step.outputs),
             "state": [vars(port) for port in step.state],
             "draws": [vars(port) for port in step.draws if port.law],
             "temperature": world.temperature if model.config.kind == "discrete" else None,
@@ -125,6 +126,17 @@ def _meter(world: World, robot: str, unmask_steps: int) -> dict[str, Any]:
     return {"meter": asdict(meter) | {"verdict": meter.verdict}, "unmetered": ""}
 
 
+@contextmanager
+def _written(out: Path) -> Iterator[Path]:
+    """Give the folder to fill; see `new_folder`."""
+    try:
+        with new_folder(out) as folder:
+            yield folder
+    except OSError as fault:
+        said = f"cannot be written: {fault.strerror or fault}"
+        raise OutputError(out, said, "free space or choose another --out") from fault
+
+
 def _require_own(out: Path) -> None:
     """Raise OutputError if a folder holds something else than an export."""
     if not out.exists():
@@ -133,12 +145,16 @@ def _require_own(out: Path) -> None:
         return
     if not (out / MANIFEST).is_file() or read_json(out / MANIFEST).get("format") != FORMAT:
         raise OutputError(out, "holds something else than an export", "choose another --out")
+    ours = {MANIFEST, STEP, ROBOTS} | page_names()
+    if foreign := sorted(item.name for item in out.iterdir() if item.name not in ours):
+        fault = f"holds files that are not of the export: {', '.join(foreign[:3])}"
+        raise OutputError(out, fault, "it would be replaced: move them out, or choose another --out")
 
 
 def _write_robot(folder: Path, model: "HMA", robot: Drivable, starts: Sequence[Start]) -> dict[str, Any]:
     """Write the files of a robot; return what the manifest says of them."""
     name = robot.embodiment.id
-    home = folder / "robots" / name
+    home = folder / ROBOTS / name
     home.mkdir(parents=True)
     chunks = Port("chunks", (2, model.embodiments[name].chunk_dim), "float32")
     stem = write_graph(home / "stem.onnx", StemGraph(model, name).eval(), [chunks], ["actions"])

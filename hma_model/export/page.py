@@ -43,6 +43,11 @@ def write_page(folder: Path, runtime: Path | None) -> dict[str, Any]:
     return {"base": "ort/", "version": read_json(runtime / "package.json")["version"], "files": hashes}
 
 
+def page_names() -> set[str]:
+    """Return the names of the page's files, and of the folder of its runtime."""
+    return {"ort", *SHARED, *(source.name for source in (files("hma_model.export") / "page").iterdir())}
+
+
 def require_runtime(runtime: Path) -> None:
     """Raise UsageError unless a folder is the npm package onnxruntime-web with the files of the page."""
     missing = [name for name in HASHES if not (runtime / "dist" / name).is_file()]

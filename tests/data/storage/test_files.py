@@ -1,0 +1,42 @@
+"""Folders appear whole or not at all; what killed writers left is deleted by the next one."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from hma_data.storage.files import PARTIAL, new_folder
+
+
+def left(tmp_path: Path, name: str) -> Path:
+    """Make what a killed writer left of the folder `out`, or of another one."""
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "file").write_text("left")
+    return tmp_path / name
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_the_next_writer_deletes_what_a_killed_one_left(tmp_path: Path, there: bool) -> None:
+    dead = 1 << 22  # above the highest process id
+    left(tmp_path, f".out{PARTIAL}{dead}.abc")
+    old = left(tmp_path, f".out{PARTIAL}{dead}.abc-old")
+    others = [f".out{PARTIAL}{os.getppid()}.abc", f".other{PARTIAL}{dead}.abc", f".out{PARTIAL}abc"]
+    for name in others:
+        left(tmp_path, name)
+    if there:
+        (tmp_path / "out").mkdir()
+    with new_folder(tmp_path / "out") as folder:
+        assert old.exists() != there  # all that is left of the folder, if it is not there
+        (folder / "file").write_text("new")
+    with new_folder(tmp_path / "out") as folder:
+        (folder / "file").write_text("new")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*others, "out"])
+
+
+def test_an_error_leaves_the_older_folder(tmp_path: Path) -> None:
+    left(tmp_path, "out")
+    with pytest.raises(KeyError), new_folder(tmp_path / "out") as folder:
+        (folder / "file").write_text("new")
+        raise KeyError
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert (tmp_path / "out" / "file").read_text() == "left"
