@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (695, 4_040, 7),
     "hma_data/cli": (1_550, 11_150, 8),
-    "hma_data/conversion": (4_205, 31_250, 14),
+    "hma_data/conversion": (4_210, 31_330, 14),
     "hma_data/episodes": (1_670, 14_600, 9),
     "hma_data/hub": (520, 3_800, 3),
     "hma_data/inspection": (2_160, 20_150, 9),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_630, 29_900, 18),
     "hma_model/worlds": (1_560, 11_700, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_222, 515_335
-TEST_LINES = 47_833
+PRODUCT_LINES, PRODUCT_NODES = 65_230, 515_452
+TEST_LINES = 47_861
 DOC_WORDS = 40_080
 
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import pyarrow as pa
@@ -158,6 +159,11 @@ class Conversion:
     def __post_init__(self) -> None:
         if self.to == "lerobot" and self.lerobot is not None:
             raise UsageError("--lerobot", "writes a dataset beside shards", "leave out --to lerobot")
+        if self.lerobot is not None:
+            one, other = (Path(as_text(folder)).resolve() for folder in (self.out, self.lerobot))
+            if one.is_relative_to(other) or other.is_relative_to(one):
+                fault = f"is {self.lerobot}, --out {self.out}: one is inside the other"
+                raise UsageError("--lerobot", fault, "name two folders that lie beside each other")
         if self.extend and (self.to == "lerobot" or self.lerobot is not None):
             raise UsageError("--extend", "is for shards alone", MERGE)
         if self.to == "shards" and self.settings.drop_idle:

@@ -395,8 +395,8 @@ class LeRobotHolder:
             fault = "is no folder of this machine, and lerobot writes no other"
             remedy = "write one, and upload it with hf upload or LeRobotDataset.push_to_hub"
             raise UsageError(str(out), fault, remedy)
-        self.out, self._robot, self._uri = out, embodiment, uri
-        self.folder = out.absolute().with_name(f".{out.absolute().name}.parts")
+        self.out, self._robot, self._uri = out.resolve() if out.is_symlink() else out, embodiment, uri
+        self.folder = self.out.absolute().with_name(f".{self.out.absolute().name}.parts")
 
     def clear(self) -> None:
         """Delete the dataset and the parts; refuse what else is there."""
@@ -508,6 +508,8 @@ class LeRobotHolder:
 
     def _conversion(self) -> Path | None:
         """Return the file of a dataset of ours in `out`; None where nothing is there."""
+        if self.out.is_file():
+            raise OutputError(self.out, "is a file", "choose an empty or new folder")
         if not self.out.is_dir() or not any(self.out.iterdir()):
             return None
         path = self.out / CONVERSION

@@ -147,3 +147,31 @@ def test_what_a_dataset_beside_shards_cannot_have_is_refused_with_what_to_do(tmp
         replace(beside, extend=True)
     with pytest.raises(UsageError, match="--shard-index.*lerobot-edit-dataset merges"):
         beside.run_share(Share(0, 2))
+
+
+@pytest.mark.parametrize("out, dataset", [("a", "a/b"), ("a/b", "a"), ("a", "b/../a")])
+def test_one_folder_inside_the_other_is_refused_before_anything_is_written(
+    out: str, dataset: str, tmp_path: Path
+) -> None:
+    data, robot = hdf5(tmp_path)
+    with pytest.raises(UsageError, match="--lerobot: is .*one is inside the other — name two folders"):
+        Conversion(robot, str(data), "fsq-8", tmp_path / out, lerobot=tmp_path / dataset)
+
+
+def test_a_file_in_place_of_the_dataset_is_refused_before_the_work(tmp_path: Path) -> None:
+    data, robot = hdf5(tmp_path)
+    before = contents(tmp_path)
+    with pytest.raises(OutputError, match="three.hdf5: is a file — choose an empty or new folder"):
+        convert(robot, str(data), "fsq-8", tmp_path / "shards", settings=BOTH, lerobot=data)
+    assert contents(tmp_path) == before
+
+
+def test_a_link_to_an_empty_folder_takes_the_dataset(tmp_path: Path) -> None:
+    data, robot = hdf5(tmp_path)
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "set").symlink_to(tmp_path / "disk")
+    convert(
+        robot, str(data), to="lerobot", tokenizer="", out=tmp_path / "set", settings=replace(BOTH, limit=1)
+    )
+    assert (tmp_path / "set" / "meta" / "info.json").is_file() and (tmp_path / "set").is_symlink()
+    assert not list(tmp_path.glob(".*"))
