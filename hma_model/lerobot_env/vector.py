@@ -163,6 +163,8 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         self._frames[:] = 0
         for facts in (self._scores, self._success, self._truncated):
             facts[:] = 0
+        if isinstance(self.judge, StateJudge):  # of scores below 0, which distances are, 0 would be the best
+            self._scores[:] = self.judge.score(np.stack([env.image for env in self.envs])[:, None])
         self._read(np.arange(self.num_envs))
         return self._seen(), infos
 

@@ -89,6 +89,20 @@ def test_an_episode_that_has_ended_stays_as_it_is(
     assert not env.reset()[1].get("is_success") and not env.ended.any()
 
 
+def test_the_reward_before_the_first_frame_is_the_score_of_the_start(
+    env: vector.LeRobotVectorEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Distance(Certain):
+        def score(self, images: np.ndarray) -> np.ndarray:
+            assert images.shape == (2, 1, *env.world.image_shape)
+            return np.array([-7.0, -5.0])
+
+    monkeypatch.setattr(vector.LeRobotVectorEnv, "judge", Distance())
+    monkeypatch.setattr(vector, "StateJudge", Distance)
+    env.reset(seed=[0, 1])
+    assert env.step(np.zeros((2, 2), np.float32))[1].tolist() == [-7, -5]
+
+
 def test_features_are_read_from_the_checkpoint() -> None:
     config = HMAEnvConfig(embodiment=ROBOT)
     assert config.features["action"].shape == (2,) and config.features["agent_pos"].shape == (2,)
