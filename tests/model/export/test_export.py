@@ -31,7 +31,7 @@ from tests.model.export.checkpoints import ROBOT, Driver, drawn_as_torch
 from tests.model.true_world import BlockLatents, latent_model
 
 pytestmark = pytest.mark.slow  # exporting a graph takes a quarter of a minute
-FRAMES = 40
+FRAMES = 100
 
 
 def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[Any, Any, float]]:
@@ -52,7 +52,7 @@ def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[An
         frame = rollout.step(torch.from_numpy(chunk)[None])
         shown = decode(tokenizer, frame[None])[0, 0]
         if model.config.kind == "discrete":
-            assert driver.uncertainty == pytest.approx(rollout.uncertainty.item(), rel=1e-3)
+            assert driver.uncertainty == pytest.approx(rollout.uncertainty.item(), rel=1e-2)
         found.append((driver.state["frame"], frame[0].numpy(), psnr(image, shown)))
     return found
 
@@ -71,7 +71,9 @@ def test_every_bundled_robot_makes_the_tokens_of_torch(tmp_path: Path) -> None:
     assert manifest["weights"] == "float16" and manifest["step"]["bytes"] < 15e6
     for robot in checkpoint.embodiments:
         made = closed_loop(tmp_path / "page", checkpoint, robot)
-        assert all(np.array_equal(own, theirs) for own, theirs, _ in made), robot
+        # Two values of a digit may score alike up to rounding: at most one token in a thousand.
+        assert np.mean([own != theirs for own, theirs, _ in made]) < 1e-3, robot
+        assert min(score for *_, score in made) > 45, robot
 
 
 def test_the_manifest_says_how_to_drive_and_its_digests_fit(tokens: Path) -> None:
