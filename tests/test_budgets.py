@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_240, 515_500
 TEST_LINES = 47_880
-DOC_WORDS = 40_230
+DOC_WORDS = 40_280
 
 
 @cache
