@@ -17,4 +17,4 @@ def test_the_held_out_loss_names_what_it_is_of(merge, unit, tmp_path, capsys) ->
             skipped=0, seconds=1.0,
         )
     )  # fmt: skip
-    assert f"held-out loss 2.0000 nats per {unit}; token frequencies" in capsys.readouterr().out
+    assert f"held-out loss 2.0000 nats per {unit}; baseline (token frequencies)" in capsys.readouterr().out
