@@ -35,7 +35,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/export": (950, 7_180, 7),
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_300, 6),
-    "hma_model/lerobot_env": (580, 4_520, 3),
+    "hma_model/lerobot_env": (585, 4_550, 3),
     "hma_model/network": (3_320, 28_400, 16),
     "hma_model/play": (1_690, 12_200, 8),
     "hma_model/policies": (2_880, 20_400, 14),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_630, 29_900, 18),
     "hma_model/worlds": (1_560, 11_700, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_240, 515_500
+PRODUCT_LINES, PRODUCT_NODES = 65_240, 515_550
 TEST_LINES = 47_880
 DOC_WORDS = 40_280
 
