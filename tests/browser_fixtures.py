@@ -1,7 +1,7 @@
 """A headless Chromium for tests of pages; a test module takes it by `pytest_plugins`."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import pytest
@@ -22,18 +22,19 @@ EMULATED_GPU = (
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator["Browser"]:
-    yield from launched(FLAGS)
-
-
-def launched(flags: tuple[str, ...]) -> Iterator["Browser"]:
-    """Launch Chromium with these flags."""
+def chromium() -> Iterator[Callable[[tuple[str, ...]], "Browser"]]:
+    """A function that launches Chromium with flags; the caller closes it."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         found = shutil.which("chromium") or playwright.chromium.executable_path
         if not shutil.which(found):
             pytest.skip("no Chromium: playwright install chromium")
-        made = playwright.chromium.launch(executable_path=found, args=list(flags))
-        yield made
-        made.close()
+        yield lambda flags: playwright.chromium.launch(executable_path=found, args=list(flags))
+
+
+@pytest.fixture(scope="module")
+def browser(chromium: Callable[[tuple[str, ...]], "Browser"]) -> Iterator["Browser"]:
+    made = chromium(FLAGS)
+    yield made
+    made.close()

@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_560, 11_700, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_240, 515_550
-TEST_LINES = 47_880
+TEST_LINES = 47_890
 DOC_WORDS = 40_280
 
 

@@ -8,8 +8,8 @@ import os
 import shutil
 import subprocess
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from hma_model.export.page import VERSION, write_page
-from tests.browser_fixtures import EMULATED_GPU, FLAGS, launched
+from tests.browser_fixtures import EMULATED_GPU, FLAGS
 from tests.model.export.checkpoints import ROBOT, Driver
 
 if TYPE_CHECKING:
@@ -207,13 +207,16 @@ def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(
 
 @pytest.mark.parametrize("trunk", ["tokens", "pixels"])
 def test_webgpu_makes_the_frames_of_wasm(
-    trunk: str, request: pytest.FixtureRequest, tmp_path: Path, runtime: Path
+    trunk: str,
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+    runtime: Path,
+    chromium: Callable[[tuple[str, ...]], "Browser"],
 ) -> None:
-    with served(with_runtime(request.getfixturevalue(trunk), runtime, tmp_path)) as server:
-        flags = (*(flag for flag in FLAGS if flag != "--disable-gpu"), *EMULATED_GPU)
-        for browser in launched(flags):
-            asked = ("wasm", "webgpu", "") if trunk == "pixels" else ("wasm", "webgpu")
-            found = [drawn(browser, server, backend) for backend in asked]
+    asked = ("wasm", "webgpu", "") if trunk == "pixels" else ("wasm", "webgpu")
+    browser = chromium((*(flag for flag in FLAGS if flag != "--disable-gpu"), *EMULATED_GPU))
+    with served(with_runtime(request.getfixturevalue(trunk), runtime, tmp_path)) as server, closing(browser):
+        found = [drawn(browser, server, backend) for backend in asked]
     for label, (said, image) in zip(("WASM", "WebGPU", "WASM"), found):
         assert said.startswith(label)  # an emulated GPU is asked for by name alone
         assert np.abs(image.astype(int) - found[0][1]).max() <= 1
