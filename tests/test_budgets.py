@@ -24,7 +24,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/registry": (1_280, 8_210, 6),
     "hma_data/shards": (2_540, 19_600, 11),
     "hma_data/sources": (12_670, 105_600, 52),
-    "hma_data/storage": (1_655, 10_840, 11),
+    "hma_data/storage": (1_655, 10_880, 11),
     "hma_data/tokenizers": (3_280, 23_800, 17),
     "hma_model": (520, 3_050, 3),
     "hma_model/benchmark": (880, 7_500, 5),
@@ -32,7 +32,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/cli": (1_715, 10_700, 12),
     "hma_model/demo": (490, 4_100, 4),
     "hma_model/evaluation": (4_570, 37_030, 23),
-    "hma_model/export": (950, 7_180, 7),
+    "hma_model/export": (955, 7_360, 7),
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_300, 6),
     "hma_model/lerobot_env": (585, 4_550, 3),
@@ -44,9 +44,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_630, 29_900, 18),
     "hma_model/worlds": (1_560, 11_700, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_240, 515_550
-TEST_LINES = 47_890
-DOC_WORDS = 40_280
+PRODUCT_LINES, PRODUCT_NODES = 65_250, 515_750
+TEST_LINES = 48_000
+DOC_WORDS = 40_290
 
 
 @cache

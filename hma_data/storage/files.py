@@ -141,16 +141,18 @@ def new_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder to fill; it gets the given name when the block ends without an error.
 
     It replaces an older folder of that name. On an error the new folder is deleted and the older one stays as
-    it was. What a killed writer of that name left is deleted too.
+    it was. What a killed writer of that name left on this machine is deleted too.
     """
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    for left in folder.parent.glob(f".{glob.escape(folder.name)}{PARTIAL}*"):
-        pid, dot, rest = left.name.rpartition(PARTIAL)[2].partition(".")
-        needed = rest.endswith("-old") and not folder.exists()  # killed between the two renames
-        if dot and not needed and not _is_running(int(pid)):
+    # Another machine that shares the disk may be writing it too, and its processes are not seen here.
+    own = f"{PARTIAL}{hashlib.sha256(platform.node().encode()).hexdigest()[:8]}."
+    for left in folder.parent.glob(f".{glob.escape(folder.name)}{own}*"):
+        pid = left.name.rpartition(own)[2].partition(".")[0]
+        needed = left.name.endswith("-old") and not folder.exists()  # killed between the two renames
+        if pid.isdecimal() and not needed and not _is_running(int(pid)):
             shutil.rmtree(left, ignore_errors=True)
-    mark = f"{PARTIAL}{os.getpid()}.{uuid.uuid4().hex[:12]}"
+    mark = f"{own}{os.getpid()}.{uuid.uuid4().hex[:12]}"
     new, old = folder.with_name(f".{folder.name}{mark}"), folder.with_name(f".{folder.name}{mark}-old")
     new.mkdir()
     try:

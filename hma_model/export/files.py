@@ -92,20 +92,26 @@ def _pad(model: "ModelProto") -> None:
     """
     from onnx import helper, numpy_helper
 
-    weights = {tensor.name: tensor for tensor in model.graph.initializer}
-    nodes = []
-    for node in model.graph.node:
-        if node.op_type == "Conv" and (tensor := weights.get(node.input[1])):
-            kernel = numpy_helper.to_array(tensor)
-            missing = -kernel.shape[1] % 4
-            if missing and max(kernel.shape[2:]) > 1:
-                padded = np.pad(kernel, ((0, 0), (0, missing), (0, 0), (0, 0)))
-                tensor.CopyFrom(numpy_helper.from_array(padded, tensor.name))
-                ends = numpy_helper.from_array(np.array([0] * 5 + [missing, 0, 0]), f"{tensor.name}_ends")
-                model.graph.initializer.append(ends)
-                nodes.append(helper.make_node("Pad", [node.input[0], ends.name], [f"{tensor.name}_in"]))
-                node.input[0] = f"{tensor.name}_in"
+    weights = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    nodes, added = [], {}
+    for number, node in enumerate(model.graph.node):
+        kernel = weights.get(node.input[1]) if node.op_type == "Conv" else None
+        missing = 0 if kernel is None else -kernel.shape[1] % 4
+        grouped = any(one.name == "group" and one.i > 1 for one in node.attribute)
+        if kernel is not None and missing and not grouped and max(kernel.shape[2:]) > 1:
+            sides = kernel.ndim - 2
+            padded = np.pad(kernel, ((0, 0), (0, missing), *[(0, 0)] * sides))
+            ends = np.array([0] * (kernel.ndim + 1) + [missing] + [0] * sides)
+            weight, pads, channels = f"{node.input[1]}_padded", f"pads_{number}", f"padded_{number}"
+            added |= {weight: padded, pads: ends}  # convolutions may share a weight
+            nodes.append(helper.make_node("Pad", [node.input[0], pads], [channels]))
+            node.input[0], node.input[1] = channels, weight
         nodes.append(node)
+    used = {name for node in nodes for name in node.input}
+    kept = [tensor for tensor in model.graph.initializer if tensor.name in used]
+    kept += [numpy_helper.from_array(values, name) for name, values in added.items()]
+    del model.graph.initializer[:]
+    model.graph.initializer.extend(kept)
     del model.graph.node[:]
     model.graph.node.extend(nodes)
 

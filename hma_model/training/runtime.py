@@ -98,8 +98,8 @@ def choose_precision(
 def bfloat16_pays() -> bool:
     """Measure once whether a linear map on a CPU is clearly faster in bfloat16 than in float32.
 
-    What the processor supports does not tell: with AVX512-BF16 but no AMX, AMD's gain, and Intel's take up to
-    twice as long.
+    What the processor supports does not tell: with AVX512-BF16 and no AMX, an AMD EPYC gained, and an Intel
+    Xeon took 1.7 times as long for a product.
     """
     linear, x = Linear(256, 256), torch.zeros(4096, 256)
 

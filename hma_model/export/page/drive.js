@@ -48,10 +48,13 @@ async function main() {
 }
 
 async function tryGpu(open) {  // a driver may compute wrongly, and the processor may be faster
-  const found = await open().catch(() => null);
-  if (!found || !await world.better(found).catch(() => false)) return;
-  step = world.step = found;
-  backend = "webgpu";
+  const held = [...document.querySelectorAll("button, select")].filter((one) => !one.disabled);
+  for (const one of held) one.disabled = true;  // a session makes one frame at a time
+  try {
+    const found = await open();
+    if (await world.better(found)) { step = world.step = found; backend = "webgpu"; }
+  } catch { /* it stays on WebAssembly */ }
+  for (const one of held) one.disabled = false;
 }
 
 async function isolate() {  // a service worker keeps files for offline use; loaded once more, the page may use threads

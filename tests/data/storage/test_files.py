@@ -1,6 +1,7 @@
 """Folders appear whole or not at all; what killed writers left is deleted by the next one."""
 
 import os
+import platform
 from pathlib import Path
 
 import pytest
@@ -15,12 +16,25 @@ def left(tmp_path: Path, name: str) -> Path:
     return tmp_path / name
 
 
+def mark(tmp_path: Path) -> str:
+    """Return what a writer of this machine puts between a folder's name and its process id."""
+    with new_folder(tmp_path / "any") as folder:
+        name = folder.name
+    (tmp_path / "any").rmdir()
+    return name.removeprefix(".any").rsplit(".", 2)[0] + "."
+
+
 @pytest.mark.parametrize("there", [True, False])
 def test_the_next_writer_deletes_what_a_killed_one_left(tmp_path: Path, there: bool) -> None:
-    dead = 1 << 22  # above the highest process id
-    left(tmp_path, f".out{PARTIAL}{dead}.abc")
-    old = left(tmp_path, f".out{PARTIAL}{dead}.abc-old")
-    others = [f".out{PARTIAL}{os.getppid()}.abc", f".other{PARTIAL}{dead}.abc", f".out{PARTIAL}abc"]
+    dead, own = 1 << 22, mark(tmp_path)  # above the highest process id
+    left(tmp_path, f".out{own}{dead}.abc")
+    old = left(tmp_path, f".out{own}{dead}.abc-old")
+    others = [
+        f".out{own}{os.getppid()}.abc",
+        f".other{own}{dead}.abc",
+        f".out{own}mine.abc",
+        f".out{PARTIAL}abc",
+    ]
     for name in others:
         left(tmp_path, name)
     if there:
@@ -40,3 +54,13 @@ def test_an_error_leaves_the_older_folder(tmp_path: Path) -> None:
         raise KeyError
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert (tmp_path / "out" / "file").read_text() == "left"
+
+
+def test_what_another_machine_writes_on_a_shared_disk_stays(tmp_path: Path, monkeypatch) -> None:
+    dead = left(tmp_path, f".out{mark(tmp_path)}{1 << 22}.abc")
+    monkeypatch.setattr(platform, "node", lambda: "elsewhere")
+    with new_folder(tmp_path / "out"):
+        assert dead.exists()
+    monkeypatch.undo()
+    with new_folder(tmp_path / "out"):
+        assert not dead.exists()

@@ -31,7 +31,7 @@ from tests.model.export.checkpoints import ROBOT, Driver, drawn_as_torch
 from tests.model.true_world import BlockLatents, latent_model
 
 pytestmark = pytest.mark.slow  # exporting a graph takes a quarter of a minute
-FRAMES = 100
+FRAMES, EXACT = 100, 40
 
 
 def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[Any, Any, float]]:
@@ -46,13 +46,14 @@ def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[An
     draws = drawn_as_torch(driver, model.config, 7)
     low, high = np.transpose([(dim["low"], dim["high"]) for dim in driver.robot["dimensions"]])
     actions, found = np.random.default_rng(3), []
-    for _ in range(FRAMES):
+    for number in range(FRAMES):
         chunk = actions.uniform(low, high, (driver.robot["stride"], len(low))).astype(np.float32).reshape(-1)
         image = driver.advance(chunk, next(draws))
         frame = rollout.step(torch.from_numpy(chunk)[None])
         shown = decode(tokenizer, frame[None])[0, 0]
         if model.config.kind == "discrete":
-            assert driver.uncertainty == pytest.approx(rollout.uncertainty.item(), rel=1e-2)
+            near = 1e-3 if number < EXACT else 1e-2
+            assert driver.uncertainty == pytest.approx(rollout.uncertainty.item(), rel=near), (robot, number)
         found.append((driver.state["frame"], frame[0].numpy(), psnr(image, shown)))
     return found
 
@@ -71,7 +72,8 @@ def test_every_bundled_robot_makes_the_tokens_of_torch(tmp_path: Path) -> None:
     assert manifest["weights"] == "float16" and manifest["step"]["bytes"] < 15e6
     for robot in checkpoint.embodiments:
         made = closed_loop(tmp_path / "page", checkpoint, robot)
-        # Two values of a digit may score alike up to rounding: at most one token in a thousand.
+        assert all(np.array_equal(own, theirs) for own, theirs, _ in made[:EXACT]), robot
+        # Later two scores may be alike up to rounding: those of `arm1_03` were 1e-6 apart in frame 42.
         assert np.mean([own != theirs for own, theirs, _ in made]) < 1e-3, robot
         assert min(score for *_, score in made) > 45, robot
 

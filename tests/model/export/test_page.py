@@ -36,6 +36,15 @@ document.addEventListener("frame", ({ detail: { chunk, image } }) => {
 });
 """
 
+# Chromium calls its emulated GPU real, and each interval is shorter, or longer, than the one before.
+REAL_GPU = """
+if (self.GPUAdapterInfo) {
+  Object.defineProperty(GPUAdapterInfo.prototype, "isFallbackAdapter", { get: () => false });
+}
+let asked = 0;
+"""
+SHORTER, LONGER = "performance.now = () => 1e6 - 1e6 / ++asked;", "performance.now = () => ++asked ** 2;"
+
 
 @pytest.fixture(scope="session")
 def runtime(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -222,11 +231,29 @@ def test_webgpu_makes_the_frames_of_wasm(
         assert np.abs(image.astype(int) - found[0][1]).max() <= 1
 
 
-def drawn(browser: "Browser", server: Any, backend: str) -> tuple[str, Any]:
+@pytest.mark.parametrize(("clock", "taken"), [(LONGER, "WASM"), (SHORTER, "WebGPU")])
+def test_a_gpu_is_taken_if_it_makes_the_same_image_in_less_time(
+    clock: str,
+    taken: str,
+    pixels: Path,
+    tmp_path: Path,
+    runtime: Path,
+    chromium: Callable[[tuple[str, ...]], "Browser"],
+) -> None:
+    browser = chromium((*(flag for flag in FLAGS if flag != "--disable-gpu"), *EMULATED_GPU))
+    with served(with_runtime(pixels, runtime, tmp_path)) as server, closing(browser):
+        said, image = drawn(browser, server, "", REAL_GPU + clock)
+        assert said.startswith(taken)
+        assert np.abs(image.astype(int) - drawn(browser, server, "wasm")[1]).max() <= 1
+
+
+def drawn(browser: "Browser", server: Any, backend: str, script: str = "") -> tuple[str, Any]:
     """Return the backend that the page names, and the first image of equal draws."""
     context = browser.new_context()
     context.set_default_timeout(PATIENCE)
     page = context.new_page()
+    page.on("pageerror", lambda fault: pytest.fail(str(fault)))
+    page.add_init_script(script)
     draw = "(window.drawn = (window.drawn ?? 1) * 16807 % 2147483647) / 2147483647"
     page.add_init_script(KEEP_FRAMES.replace("0.5", draw))
     page.goto(address(server).replace("backend=wasm", f"backend={backend}"))
@@ -234,7 +261,7 @@ def drawn(browser: "Browser", server: Any, backend: str) -> tuple[str, Any]:
     page.focus("#stage")
     page.keyboard.press("n")
     page.wait_for_function("kept.length")
-    if backend == "webgpu" and not page.evaluate("navigator.gpu?.requestAdapter().then(Boolean)"):
+    if (script or backend == "webgpu") and not page.evaluate("navigator.gpu?.requestAdapter().then(Boolean)"):
         pytest.skip("this platform's Chromium emulates no GPU")
     said, image = page.text_content("#backend") or "", page.evaluate("kept[0][1]")
     context.close()
