@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_250, 515_750
 TEST_LINES = 48_000
-DOC_WORDS = 40_290
+DOC_WORDS = 40_330
 
 
 @cache
