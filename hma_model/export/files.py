@@ -93,7 +93,8 @@ def _pad(model: "ModelProto") -> None:
     from onnx import helper, numpy_helper
 
     weights = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
-    nodes, added = [], {}
+    nodes: list[Any] = []
+    added: dict[str, Any] = {}
     for number, node in enumerate(model.graph.node):
         kernel = weights.get(node.input[1]) if node.op_type == "Conv" else None
         missing = 0 if kernel is None else -kernel.shape[1] % 4
