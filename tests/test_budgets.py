@@ -32,7 +32,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/cli": (1_715, 10_700, 12),
     "hma_model/demo": (490, 4_100, 4),
     "hma_model/evaluation": (4_570, 37_030, 23),
-    "hma_model/export": (956, 7_360, 7),
+    "hma_model/export": (990, 7_660, 7),
     "hma_model/generation": (1_720, 14_100, 10),
     "hma_model/hub": (1_060, 8_300, 6),
     "hma_model/lerobot_env": (585, 4_550, 3),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_630, 29_900, 18),
     "hma_model/worlds": (1_560, 11_700, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_250, 515_750
-TEST_LINES = 48_000
+PRODUCT_LINES, PRODUCT_NODES = 65_290, 516_050
+TEST_LINES = 48_020
 DOC_WORDS = 40_330
 
 

@@ -21,7 +21,7 @@ from hma_model.export.graphs import Port, example
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-OPSET = 18  # of ONNX: runtimes of 2023 and later know it
+OPSET = 20  # of ONNX: the first with Gelu; runtimes of 2024 and later know it
 SMALL = 64  # values of a tensor that stays float32
 
 
@@ -53,6 +53,17 @@ def write_graph(
     _strip(made)
     _pad(made)
     _halve(made)
+    with atomic_path(path) as part:
+        part.write_bytes(made.SerializeToString())
+    return facts(path)
+
+
+def write_part(whole: Path, path: Path, inputs: Sequence[str], outputs: Sequence[str]) -> dict[str, Any]:
+    """Write the part of a graph that computes some outputs from some inputs, and return its file's facts."""
+    from onnx import load
+    from onnx.utils import Extractor
+
+    made = Extractor(load(whole)).extract_model(list(inputs), list(outputs))
     with atomic_path(path) as part:
         part.write_bytes(made.SerializeToString())
     return facts(path)

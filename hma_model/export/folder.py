@@ -2,6 +2,8 @@
 
     manifest.json            what is in the folder; written last
     step.onnx                one frame of any robot
+    page-step.onnx           for the page: the same without its image
+    page-image.onnx          for the page: the image of a frame
     robots/ID/stem.onnx      what commands of a robot mean to the step
     robots/ID/frames.npy     (starts, P, …) known frames, as the step takes them
     robots/ID/chunks.npy     (starts, P - 1, K) commands between them; NaN where they are unknown
@@ -27,7 +29,7 @@ from hma_data.episodes.images import opencv
 from hma_data.errors import OutputError
 from hma_data.storage.files import new_folder, read_json, to_json, write_atomic
 from hma_model.export import require_onnx
-from hma_model.export.files import facts, write_graph
+from hma_model.export.files import facts, write_graph, write_part
 from hma_model.export.graphs import Port, StemGraph, StepGraph, require_exportable
 from hma_model.export.page import page_names, require_runtime, write_page
 from hma_model.export.starts import Start, round_weights, take_starts
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
 
 FORMAT, FORMAT_VERSION = "hma-export", 1
 MANIFEST, STEP, ROBOTS = "manifest.json", "step.onnx", "robots"
+PARTS = ("page-step.onnx", "page-image.onnx")
 COLUMNS = 10  # true images in a row of a picture
 QUALITY = 90  # of WebP
 
@@ -101,6 +104,7 @@ def export_folder(
             "weights": "float16" if halved else "float32",
             "float16_loss_db": loss,
             "step": write_graph(folder / STEP, step, step.inputs, step.outputs),
+            "page": _write_parts(folder, step),
             "state": [vars(port) for port in step.state],
             "draws": [vars(port) for port in step.draws if port.law],
             "temperature": world.temperature if model.config.kind == "discrete" else None,
@@ -116,6 +120,16 @@ def export_folder(
         manifest["runtime"] = write_page(folder, runtime)
         write_atomic(folder / MANIFEST, to_json(manifest))
     return manifest
+
+
+def _write_parts(folder: Path, step: StepGraph) -> dict[str, Any]:
+    """Write the two graphs of the page, which makes an image while it computes the next frame."""
+    image, *others = step.outputs
+    names = [port.name for port in step.inputs]
+    return {
+        "step": write_part(folder / STEP, folder / PARTS[0], names, others),
+        "image": write_part(folder / STEP, folder / PARTS[1], ["next_frame"], [image]),
+    }
 
 
 def _meter(world: World, robot: str, unmask_steps: int) -> dict[str, Any]:
@@ -145,7 +159,7 @@ def _require_own(out: Path) -> None:
         return
     if not (out / MANIFEST).is_file() or read_json(out / MANIFEST).get("format") != FORMAT:
         raise OutputError(out, "holds something else than an export", "choose another --out")
-    ours = {MANIFEST, STEP, ROBOTS} | page_names()
+    ours = {MANIFEST, STEP, *PARTS, ROBOTS} | page_names()
     if foreign := sorted(item.name for item in out.iterdir() if item.name not in ours):
         fault = f"holds files that are not of the export: {', '.join(foreign[:3])}"
         raise OutputError(out, fault, "it would be replaced: move them out, or choose another --out")

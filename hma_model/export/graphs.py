@@ -20,6 +20,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hma_data.errors import CheckpointError
@@ -232,6 +233,7 @@ class StepGraph(nn.Module):
         shown = torch.zeros(before.shape[:2], dtype=torch.bool)
         uniform = draws["noise"].clamp(1e-20, 1 - 2**-24)
         gumbel = (-uniform.log()).log() * -draws["temperature"]
+        values = max(self.config.digits)
 
         def embed(masked: Tensor) -> Tensor:
             return self._embed.of_digits(
@@ -246,14 +248,14 @@ class StepGraph(nn.Module):
             def choose(
                 scores: Tensor, first: int, noise: Tensor = noise, unsure: list[Tensor] = unsure
             ) -> Tensor:
-                likely = scores.softmax(-1)
-                unsure.append(-(likely * likely.clamp_min(1e-30).log()).sum((1, 2, 3)))
+                unsure.append(scores)
                 return (scores + noise[:, first : first + scores.shape[1], :, : scores.shape[3]]).argmax(-1)
 
             copied = _at(before, places) if self.config.copy_previous else None
             made = self._readout.decide(_at(features, places), choose, copied)
             digits = _put(digits, places, made.transpose(1, 2))
-            nats = nats + torch.stack(unsure).sum(0)
+            likely = torch.cat([_widened(scores, values) for scores in unsure], dim=1).softmax(-1)
+            nats = nats - (likely * likely.clamp_min(1e-30).log()).sum((1, 2, 3))
         return self._stored(digits), nats / digits.shape[1]
 
     def _digits(self, frame: Tensor) -> Tensor:
@@ -306,6 +308,12 @@ class StepGraph(nn.Module):
             kept = [view.long() if self.discrete else view.half().float() for view in views]
             images = [self.tokenizer.pixels(view).add(1).mul(127.5).round().clamp(0, 255) for view in kept]
         return torch.cat(images, dim=-1)[0].permute(1, 2, 0).to(torch.uint8)
+
+
+def _widened(scores: Tensor, values: int) -> Tensor:
+    """Return the scores (1, F, k, V) of a digit with so many values; none is likelier for it."""
+    missing = values - scores.shape[-1]
+    return F.pad(scores, (0, missing), value=torch.finfo(scores.dtype).min) if missing else scores
 
 
 def _at(values: Tensor, places: Tensor | None) -> Tensor:

@@ -1,14 +1,14 @@
 // The page of an exported model: choose a robot and a start, and drive.
 
 import { Controls, cap, fill } from "./controls.js";
-import { Loader, World, openReplays, openRuntime, readManifest } from "./world.js";
+import { Decoder, Loader, World, fetchRuntime, openReplays, readManifest, startRuntime } from "./world.js";
 
 const $ = (id) => document.getElementById(id);
 const asked = new URLSearchParams(location.search);
-let manifest, ort, step, backend, robot, world = null, start = 0;
-let paused = true, begun = false, wanted = 0, frame = 0, times = [], due = 0, opening = 0;
+let manifest, ort, model, backend, robot, world = null, start = 0;
+let paused = true, begun = false, wanted = 0, made = 0, frame = 0, times = [], due = 0, opening = 0;  // frames computed, and shown
 let replays = null, replaying = false;  // recorded actions and true images from each start, and whether they are followed
-let making = Promise.resolve();  // one frame at a time
+let making = Promise.resolve(), showing = Promise.resolve();  // a frame at a time, and the image of the one before
 const loader = new Loader((done, total) => {
   $("bar").max = Math.max(total, done); $("bar").value = done;
   $("veil-text").textContent = `Loading: ${(done / 1e6).toFixed(1)} MB`;
@@ -34,16 +34,27 @@ async function main() {
   const named = manifest.robots.find((one) => one.id === asked.get("robot"));
   robot = named || manifest.robots[0];
   await poster();
-  const graph = loader.part(manifest.step);
-  graph.catch(() => {});  // it is awaited below
-  ort = await openRuntime(manifest, loader, gpu ? "webgpu" : "wasm", Number(asked.get("threads")));
-  const open = async (...providers) => ort.InferenceSession.create(await graph, { executionProviders: providers });
+  const graphs = [loader.part(manifest.page.step), loader.part(manifest.page.image)];
+  for (const graph of graphs) graph.catch(() => {});  // they are awaited below
+  const runtime = await fetchRuntime(manifest, loader, gpu ? "webgpu" : "wasm");
+  const threads = crossOriginIsolated ? Number(asked.get("threads")) || Math.min(4, navigator.hardwareConcurrency || 1) : 1;
+  const half = Math.max(1, threads >> 1);  // for images
+  ort = await startRuntime(runtime, Math.max(1, threads - half));
+  const open = async (graph, ...providers) => ort.InferenceSession.create(await graph, { executionProviders: providers });
+  const onGpu = async () => {
+    const [step, decoder] = [await open(graphs[0], "webgpu", "wasm"), await open(graphs[1], "webgpu", "wasm")];
+    return { step, decoder: { image: async (frame) => (await decoder.run({ next_frame: frame })).image.data } };
+  };
   backend = gpu && asks === "webgpu" ? "webgpu" : "wasm";
-  step = backend === "webgpu" ? await open("webgpu", "wasm") : await open("wasm");
+  if (backend === "webgpu") model = await onGpu();
+  else {
+    const [step, decoder] = await Promise.all([open(graphs[0], "wasm"), graphs[1].then((graph) => Decoder.open(runtime, graph, half))]);
+    model = { step, decoder };
+  }
   await openRobot();
-  if (gpu && backend === "wasm") await tryGpu(() => open("webgpu", "wasm"));
+  if (gpu && backend === "wasm") await tryGpu(onGpu);
   document.body.dataset.backend = backend;
-  $("backend").textContent = backend === "webgpu" ? "WebGPU" : `WASM, ${ort.env.wasm.numThreads} thread${ort.env.wasm.numThreads > 1 ? "s" : ""}`;
+  $("backend").textContent = backend === "webgpu" ? "WebGPU" : `WASM, ${ort.env.wasm.numThreads + half} threads`;
   loop();
 }
 
@@ -52,7 +63,7 @@ async function tryGpu(open) {  // a driver may compute wrongly, and the processo
   for (const one of held) one.disabled = true;  // a session makes one frame at a time
   try {
     const found = await open();
-    if (await world.better(found)) { step = world.step = found; backend = "webgpu"; }
+    if (await world.better(found)) { model.decoder.close(); model = world.model = found; backend = "webgpu"; }
   } catch { /* it stays on WebAssembly */ }
   for (const one of held) one.disabled = false;
 }
@@ -71,7 +82,7 @@ async function isolate() {  // a service worker keeps files for offline use; loa
 
 async function prune() {  // forget the files of an older export
   if (!self.caches) return;
-  const versions = new Set([manifest.runtime.version, ...[manifest.step, ...manifest.robots.flatMap((one) => [one.stem, ...(one.replays ? one.replays.strips : [])])].map((part) => part.sha256.slice(0, 12))]);
+  const versions = new Set([manifest.runtime.version, ...[...Object.values(manifest.page), ...manifest.robots.flatMap((one) => [one.stem, ...(one.replays ? one.replays.strips : [])])].map((part) => part.sha256.slice(0, 12))]);
   const cache = await caches.open("hma-export");
   for (const request of await cache.keys()) {
     const version = new URL(request.url).searchParams.get("v");
@@ -101,7 +112,8 @@ async function openRobot() {
   $("robot").value = robot.id;
   start = 0;
   await making;
-  const opened = await World.open(ort, manifest, robot, loader, step);
+  await showing;
+  const opened = await World.open(ort, manifest, robot, loader, model);
   if (turn !== opening) return;  // another robot was chosen meanwhile
   opened.temperature = manifest.temperature === null ? null : Number($("temperature").value);
   world = opened;
@@ -118,9 +130,11 @@ async function openRobot() {
 async function begin(number) {
   start = number;
   run(false);
-  begun = false; frame = 0; wanted = 0;
+  begun = false; wanted = 0;
   follow(false); showTruth(false);
   await making;
+  await showing;
+  made = frame = 0;
   await poster();
   await world.begin(start);
   controls.open(robot, robot.held[start]);
@@ -135,7 +149,8 @@ async function begin(number) {
 async function loop() {
   for (;;) {
     const now = performance.now();
-    if (world && (wanted > 0 || !paused) && now >= due) {
+    const ended = replaying && made === replays[start].chunks.length;  // its last image is still to come
+    if (world && (wanted > 0 || !paused) && !ended && now >= due) {
       making = make().catch(fail);
       await making;
     }
@@ -156,30 +171,40 @@ function pause(ms) {
 async function make() {
   controls.look();
   const current = world, followed = replaying, action = controls.action.length ? controls.action : controls.targets, number = controls.input;
-  const chunk = followed ? [...replays[start].chunks[frame]] : Array.from({ length: robot.stride }, () => action).flat();
+  const chunk = followed ? [...replays[start].chunks[made]] : Array.from({ length: robot.stride }, () => action).flat();
   const begunAt = performance.now(), period = 1000 * robot.stride / robot.hz;
-  const image = await current.advance(chunk);
+  await current.advance(chunk);
   if (current !== world) return;
   wanted = Math.max(0, wanted - 1);
   const now = performance.now();
   due = $("fast").checked ? now : Math.max(due + period, now);
   begun = true;
+  made += 1;
+  const error = current.metered(robot.meter);
+  await showing;
+  if (current === world) showing = show(current, current.image(), { number, chunk, followed, error, begunAt }).catch(fail);
+}
+
+async function show(current, made, { number, chunk, followed, error, begunAt }) {  // while the next frame is computed
+  const image = await made;
+  if (current !== world) return;
+  const now = performance.now();
   frame += 1;
   draw(image);
-  metered();
+  metered(error);
   controls.used(number);
   if (followed && replaying) controls.follow(chunk.slice(-robot.dimensions.length));
   followed ? drawTruth() : $("unknown").hidden = false;
-  if (followed && frame === replays[start].chunks.length) { follow(false); run(false); }
   times = [...times.filter((time) => now - time < 4000), now];
   $("fps").textContent = times.length > 1 ? (1000 * (times.length - 1) / (now - times[0])).toFixed(1) : "–";
   $("fps").title = `The model took ${(now - begunAt).toFixed(0)} ms`;
+  if (followed && replaying && frame === replays[start].chunks.length) { follow(false); run(false); }
   counted();
   document.dispatchEvent(new CustomEvent("frame", { detail: { number: frame, chunk, image, ms: now - begunAt } }));
 }
 
-function metered() {  // the error that the model expects of itself
-  const found = world.metered(robot.meter), warns = Boolean(found && found.warns);
+function metered(found = world.metered(robot.meter)) {  // the error that the model expects of itself
+  const warns = Boolean(found && found.warns);
   $("stage").classList.toggle("warns", warns);
   $("meter").classList.toggle("warns", warns);
   $("meter").textContent = found ? (warns ? "unsure: " : "") + "error ≈ " + found.px.toFixed(1) + " px" : "no error meter";

@@ -56,16 +56,19 @@ export async function readManifest() {
   return manifest;
 }
 
-export async function openRuntime(manifest, loader, backend, threads) {
+export function fetchRuntime(manifest, loader, backend) {  // the files of ONNX Runtime Web
   if (!WebAssembly.validate(new Uint8Array(SIMD))) throw new Error("This browser has no WebAssembly with SIMD: use one of 2021 or later (Safari 16.4)");
   const [library, engine] = BUILDS[backend], { base, files, version } = manifest.runtime;
   const load = (name) => loader.bytes(`${base}${name}?v=${version}`, { integrity: files[name] });
-  const [script, glue, binary] = await Promise.all([load(library), load(`${engine}.mjs`), load(`${engine}.wasm`)]);
+  return Promise.all([load(library), load(`${engine}.mjs`), load(`${engine}.wasm`)]);
+}
+
+export async function startRuntime([script, glue, binary], threads) {
   const address = (content) => URL.createObjectURL(new Blob([content], { type: "text/javascript" }));
   const ort = await import(address(script));
   ort.env.wasm.wasmPaths = { mjs: address(glue) };
   ort.env.wasm.wasmBinary = binary;
-  ort.env.wasm.numThreads = crossOriginIsolated ? threads || Math.min(4, navigator.hardwareConcurrency || 1) : 1;
+  ort.env.wasm.numThreads = threads;
   ort.env.logLevel = "error";
   return ort;
 }
@@ -94,15 +97,39 @@ const product = (shape) => shape.reduce((one, other) => one * other, 1);
 
 function normal() { return Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random()); }
 
-export class World {  // one robot
-  static async open(ort, manifest, robot, loader, step) {
-    const [graph, frames, chunks] = await Promise.all([loader.part(robot.stem), readNumbers(robot.frames, loader), readNumbers(robot.chunks, loader)]);
-    const stem = await ort.InferenceSession.create(graph, { executionProviders: ["wasm"] });  // too small for a GPU
-    return new World(ort, manifest, stem, step, frames, chunks);
+export class Decoder {  // makes images in a worker, while the page computes the next frame
+  constructor() {
+    this.worker = new Worker(new URL("decoder.js", import.meta.url), { type: "module" });
   }
 
-  constructor(ort, manifest, stem, step, frames, chunks) {
-    Object.assign(this, { ort, manifest, stem, step, temperature: manifest.temperature, unsure: 0 });
+  static async open(runtime, graph, threads) {
+    const made = new Decoder();
+    await made.ask({ runtime, graph, threads });
+    return made;
+  }
+
+  ask(message) {  // one question at a time
+    return new Promise((done, failed) => {
+      this.worker.onmessage = ({ data: { fault, image } }) => fault ? failed(new Error(fault)) : done(image);
+      this.worker.onerror = () => failed(new Error("decoder.js does not run in this browser: use one of 2023 or later"));
+      this.worker.postMessage(message);
+    });
+  }
+
+  image({ type, data, dims }) { return this.ask({ type, data, dims }); }
+
+  close() { this.worker.terminate(); }
+}
+
+export class World {  // one robot
+  static async open(ort, manifest, robot, loader, model) {
+    const [graph, frames, chunks] = await Promise.all([loader.part(robot.stem), readNumbers(robot.frames, loader), readNumbers(robot.chunks, loader)]);
+    const stem = await ort.InferenceSession.create(graph, { executionProviders: ["wasm"] });  // too small for a GPU
+    return new World(ort, manifest, stem, model, frames, chunks);
+  }
+
+  constructor(ort, manifest, stem, model, frames, chunks) {
+    Object.assign(this, { ort, manifest, stem, model, temperature: manifest.temperature, unsure: 0 });
     const [starts, known] = frames.shape;
     this.width = chunks.shape[2];
     this.frames = rows(frames, frames.values.length / starts / known);
@@ -155,23 +182,25 @@ export class World {  // one robot
     return { actions, ...this.state, ...this.draws() };
   }
 
-  async better(session) {  // whether it makes the same image as `step`, and faster
+  async better(other) {  // whether that model makes the same image as this one, in less time
     const inputs = await this.inputs(new Float32Array(this.width)), found = [];
-    for (const one of [this.step, session]) {
-      await one.run(inputs);  // the first run also compiles
-      const begun = performance.now(), { image } = await one.run(inputs);
-      found.push({ ms: performance.now() - begun, pixels: image.data });
+    const make = async ({ step, decoder }) => decoder.image((await step.run(inputs)).next_frame);
+    for (const model of [this.model, other]) {
+      await make(model);  // the first run also compiles
+      const begun = performance.now(), pixels = await make(model);
+      found.push({ ms: performance.now() - begun, pixels });
     }
-    const [own, other] = found, off = own.pixels.reduce((sum, value, i) => sum + Math.abs(value - other.pixels[i]), 0);
-    return other.ms < own.ms && off < own.pixels.length;  // a level each
+    const [own, its] = found, off = own.pixels.reduce((sum, value, i) => sum + Math.abs(value - its.pixels[i]), 0);
+    return its.ms < own.ms && off < own.pixels.length;  // a level each
   }
 
-  async advance(chunk) {  // returns the next image as RGB bytes
-    const made = await this.step.run(await this.inputs(chunk));
+  async advance(chunk) {  // compute the next frame
+    const made = await this.model.step.run(await this.inputs(chunk));
     for (const name of Object.keys(this.state)) this.state[name] = made["next_" + name];
     this.before = Float32Array.from(chunk);
     const calibrated = made.uncertainty && this.temperature === this.manifest.temperature;
     this.unsure += calibrated ? made.uncertainty.data[0] ** POWER : NaN;
-    return made.image.data;
   }
+
+  image() { return this.model.decoder.image(this.state.frame); }  // of the newest frame, as RGB bytes
 }

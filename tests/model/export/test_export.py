@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 
@@ -86,7 +87,7 @@ def test_the_manifest_says_how_to_drive_and_its_digests_fit(tokens: Path) -> Non
     assert all(dim["low"] < dim["high"] for dim in robot["dimensions"])
     assert robot["hz"] / robot["stride"] > 1
     assert robot["meter"] is None and "hma benchmark calibrates it" in robot["unmetered"]
-    for part in (manifest["step"], robot["stem"]):
+    for part in (manifest["step"], *manifest["page"].values(), robot["stem"]):
         content = (tokens / part["file"]).read_bytes()
         assert (len(content), hashlib.sha256(content).hexdigest()) == (part["bytes"], part["sha256"])
     assert np.load(tokens / robot["frames"]).shape[:2] == (3, 4) and len(robot["held"]) == 3
@@ -117,6 +118,22 @@ def test_shapes_are_fixed_and_no_operator_depends_on_data(tokens: Path, pixels: 
         assert not {"Loop", "If", "Scan", "NonZero"} & {node.op_type for node in graph.node}
         shapes = [port.type.tensor_type.shape.dim for port in (*graph.input, *graph.output)]
         assert all(side.HasField("dim_value") for shape in shapes for side in shape)
+
+
+def test_the_two_graphs_of_the_page_make_what_the_step_makes(tokens: Path, pixels: Path) -> None:
+    for page in (tokens, pixels):
+        driver = Driver(page, ROBOT)
+        parts = driver.about["page"]
+        step, image = (onnxruntime.InferenceSession(page / parts[name]["file"]) for name in ("step", "image"))
+        draws = driver.draws(np.random.default_rng(1))
+        actions = np.zeros(
+            next(port.shape for port in step.get_inputs() if port.name == "actions"), np.float32
+        )
+        inputs = {"actions": actions, **driver.state, **draws}
+        shown, *whole = driver.step.run(None, inputs)
+        for own, theirs in zip(step.run(None, inputs), whole, strict=True):
+            assert np.array_equal(own, theirs)
+        assert np.array_equal(*image.run(None, {"next_frame": whole[1]}), shown)
 
 
 def test_weights_are_stored_as_float16(tokens: Path) -> None:

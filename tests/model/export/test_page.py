@@ -198,14 +198,15 @@ def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(
     page: "Page", server: Any, site: Path
 ) -> None:
     folder = site / "sub" / "page"
-    whole = (folder / "step.onnx").read_bytes()
-    (folder / "step.onnx").write_bytes(whole[:-1000])
+    graph = folder / "page-step.onnx"
+    whole = graph.read_bytes()
+    graph.write_bytes(whole[:-1000])
     page.goto(address(server))
     expected = (
-        f"step.onnx has {len(whole) - 1000} bytes instead of {len(whole)}: copy the exported folder again"
+        f"{graph.name} has {len(whole) - 1000} bytes instead of {len(whole)}: copy the exported folder again"
     )
     assert said(page) == expected
-    (folder / "step.onnx").write_bytes(whole)
+    graph.write_bytes(whole)
     page.click("#again")
     page.wait_for_selector("#veil", state="hidden")
     (folder / "manifest.json").unlink()
