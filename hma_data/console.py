@@ -64,19 +64,15 @@ MANY_ROWS = 500  # laying out more than this with rich takes seconds
 SECONDS_BETWEEN_LINES = 10  # of progress off a terminal
 
 
-def print_table(
-    columns: Sequence[str], rows: Sequence[Sequence[Any]], title: str = "", repeated: int = 1
-) -> None:
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: str = "") -> None:
     """Print a table to standard output: numbers aligned right, full width when it is not a terminal.
 
-    Where a terminal is too narrow for numbers, the table is cut into several below each other; where it is
-    too narrow for words, each row becomes a paragraph.
+    Where a terminal is too narrow for it, each row becomes a paragraph.
 
     Args:
         columns: headings.
         rows: a cell for each column; a Decimal is a number whose digits are all shown.
         title: printed above.
-        repeated: so many of the first columns begin each part of a table that is cut.
     """
     from rich.box import SIMPLE
     from rich.console import Console
@@ -91,26 +87,16 @@ def print_table(
         return
     is_terminal = sys.stdout.isatty()
     console = Console(width=None if is_terminal else 200, soft_wrap=not is_terminal, highlight=False)
-    numeric = [_is_numeric([row[i] for row in rows]) for i in range(len(columns))]
-    parts = [list(range(len(columns)))]
     if is_terminal and sum(widths) + GAP * len(columns) > console.width:
-        if not all(numeric[repeated:]):
-            _print_paragraphs(console, columns, cells, title)
-            return
-        parts = _parts(widths, repeated, console.width)
-    for part in parts:
-        above = Text(title) if title and part is parts[0] else None
-        table = Table(title=above, title_justify="left", box=SIMPLE, pad_edge=False)
-        for i in part:
-            table.add_column(
-                Text(columns[i]),
-                justify="right" if numeric[i] else "left",
-                no_wrap=numeric[i],
-                overflow="ellipsis" if i else "fold",  # users type the first into the next command
-            )
-        for row in cells:
-            table.add_row(*(Text(row[i]) for i in part))
-        console.print(table)
+        _print_paragraphs(console, columns, cells, title)
+        return
+    table = Table(title=Text(title) if title else None, title_justify="left", box=SIMPLE, pad_edge=False)
+    for i, name in enumerate(columns):
+        numeric = _is_numeric([row[i] for row in rows])
+        table.add_column(Text(name), justify="right" if numeric else "left", no_wrap=numeric)
+    for row in cells:
+        table.add_row(*map(Text, row))
+    console.print(table)
 
 
 def _print_paragraphs(console: Any, columns: Sequence[str], cells: list[list[str]], title: str) -> None:
@@ -128,21 +114,6 @@ def _print_paragraphs(console: Any, columns: Sequence[str], cells: list[list[str
             if cell not in ("", "-")
         )
         console.print(Padding(named, (0, 0, 0, 2)))
-
-
-def _parts(widths: Sequence[int], repeated: int, room: int) -> list[list[int]]:
-    """Divide the columns into parts that fit a terminal, each with the first ones again."""
-    first = list(range(repeated))
-    names = min(sum(widths[:repeated]) + GAP * repeated, room // 2)  # longer names are folded
-    parts: list[list[int]] = []
-    left = -1
-    for i in range(repeated, len(widths)):
-        left -= widths[i] + GAP
-        if left < 0 or not parts:
-            parts.append([*first])
-            left = room - names - widths[i] - GAP
-        parts[-1].append(i)
-    return parts or [first]
 
 
 def _is_numeric(values: Sequence[Any]) -> bool:

@@ -31,9 +31,9 @@ class Table:
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
 
-    def print(self, title: str = "", repeated: int = 1) -> None:
-        """Print it to standard output; arguments as of `print_table`."""
-        print_table(self.columns, self.rows, title, repeated)
+    def print(self, title: str = "") -> None:
+        """Print it to standard output below a title; see `print_table`."""
+        print_table(self.columns, self.rows, title)
 
     def markdown(self) -> str:
         """Return it as Markdown; texts may hold markup."""

@@ -13,19 +13,19 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (695, 4_040, 7),
-    "hma_data/cli": (1_550, 11_150, 8),
-    "hma_data/conversion": (4_210, 31_330, 14),
-    "hma_data/episodes": (1_670, 14_600, 9),
-    "hma_data/hub": (520, 3_800, 3),
-    "hma_data/inspection": (2_160, 20_150, 9),
-    "hma_data/lab": (3_350, 30_800, 16),
-    "hma_data/loading": (1_290, 11_000, 6),
-    "hma_data/registry": (1_280, 8_210, 6),
-    "hma_data/shards": (2_540, 19_600, 11),
-    "hma_data/sources": (12_670, 105_600, 52),
-    "hma_data/storage": (1_655, 10_880, 11),
-    "hma_data/tokenizers": (3_280, 23_800, 17),
+    "hma_data": (663, 3_750, 7),
+    "hma_data/cli": (1_545, 11_038, 8),
+    "hma_data/conversion": (4_191, 31_210, 14),
+    "hma_data/episodes": (1_671, 14_646, 9),
+    "hma_data/hub": (512, 3_787, 3),
+    "hma_data/inspection": (2_153, 20_120, 9),
+    "hma_data/lab": (3_327, 30_626, 16),
+    "hma_data/loading": (1_285, 10_976, 6),
+    "hma_data/registry": (1_278, 8_202, 6),
+    "hma_data/shards": (2_533, 19_482, 11),
+    "hma_data/sources": (12_577, 104_916, 52),
+    "hma_data/storage": (1_655, 10_881, 11),
+    "hma_data/tokenizers": (3_274, 23_686, 17),
     "hma_model": (520, 3_050, 3),
     "hma_model/benchmark": (880, 7_500, 5),
     "hma_model/checkpoint": (870, 6_500, 5),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_630, 29_900, 18),
     "hma_model/worlds": (1_560, 11_700, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_290, 516_050
+PRODUCT_LINES, PRODUCT_NODES = 65_124, 514_806
 TEST_LINES = 48_020
 DOC_WORDS = 40_330
 

@@ -157,11 +157,9 @@ def _notes(judged: "list[RegistryEntry]") -> Iterator[tuple[Path, str]]:
 
 
 def _line(problem: dict[str, str | None]) -> str:
-    """Return a problem as text, as `Problem` of the registry does, without importing it."""
-    text = f"{problem['path']}: {problem['fault']}" if problem["path"] else str(problem["fault"])
-    if problem["value"] is not None:
-        text += f" (is {problem['value']})"
-    return text + (f"; allowed: {problem['allowed']}" if problem["allowed"] else "")
+    from hma_data.registry.embodiment import Problem
+
+    return str(Problem(**problem))  # type: ignore[arg-type]  # path and fault are texts
 
 
 @registry_app.command("schema")

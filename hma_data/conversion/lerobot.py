@@ -52,7 +52,7 @@ from hma_data.sources.base import open_source
 from hma_data.sources.lerobot.language import on_rows, write_language
 from hma_data.sources.lerobot.writer import ORIGIN, DatasetWriter, join_datasets, load_lerobot, set_splits
 from hma_data.storage.fetch import disk_is_full
-from hma_data.storage.files import PART, sync_folder
+from hma_data.storage.files import new_folder, remove_partial, sync_folder
 from hma_data.storage.locks import LOCK
 from hma_data.storage.remote import is_remote
 from hma_data.tokenizers.base import TokenizerSpec
@@ -270,23 +270,13 @@ class LeRobotOutput:
     def making(self, unit: ShardUnit, report: Report) -> Iterator["PartWriter"]:
         """Give the part of a unit, which is made of the items added to it; whole or not at all."""
         final = part_folder(self._job.out, unit.name)
-        folder = final.with_name(f".{final.name}.part")
-        with space_explained(final.parent):
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir(parents=True)
+        with space_explained(final.parent), new_folder(final) as folder:
             part = PartWriter(self._job, unit, self._columns, folder, report)
             try:
-                try:
-                    yield part
-                finally:
-                    part.close()
-                (folder / FOOTER).write_bytes(part.notes.footer().to_metadata()[FOOTER_KEY])
-                _sync(folder)
-                shutil.rmtree(final, ignore_errors=True)
-                folder.rename(final)
-                sync_folder(final.parent)
+                yield part
             finally:
-                shutil.rmtree(folder, ignore_errors=True)
+                part.close()
+            (folder / FOOTER).write_bytes(part.notes.footer().to_metadata()[FOOTER_KEY])
 
 
 class PartWriter:
@@ -369,11 +359,6 @@ def space_explained(where: Path) -> Iterator[None]:
         raise
 
 
-def _sync(folder: Path) -> None:
-    for path in (*folder.rglob("*"), folder):
-        sync_folder(path)
-
-
 def _bytes(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
@@ -418,7 +403,8 @@ class LeRobotHolder:
                 raise other_plan(self.out, plan.facts, dataset.plan)
             return planned
         if not shared:
-            self._remove_unfinished()
+            remove_partial(self.folder)
+            shutil.rmtree(self.folder / DATASET, ignore_errors=True)
         done = set()
         for name in planned:
             part = part_folder(self.folder, name)
@@ -487,17 +473,13 @@ class LeRobotHolder:
         pq.write_table(episodes, whole / EPISODES, compression="zstd")
         (whole / QUARANTINE).write_text(derived.quarantine, encoding="utf-8")
         (whole / CONVERSION).write_text(manifest.to_text(), encoding="utf-8")
-        _sync(whole)
+        for path in (*whole.rglob("*"), whole):
+            sync_folder(path)
         if self.out.is_dir():
             self.out.rmdir()  # it is empty
         whole.rename(self.out)
         sync_folder(self.out.parent)
         return manifest
-
-    def _remove_unfinished(self) -> None:
-        for item in self.folder.iterdir() if self.folder.is_dir() else ():
-            if item.name.endswith(PART) or item.name == DATASET:
-                shutil.rmtree(item, ignore_errors=True)
 
     def _dataset(self) -> Manifest | None:
         """Return what the dataset in `out` says of its conversion; None where there is none."""

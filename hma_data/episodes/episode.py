@@ -4,7 +4,7 @@ An Episode is lazy: it knows its times and values, and decodes a picture only wh
 T frames, A values a sample; times are float64 seconds, pictures uint8 RGB.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -161,25 +161,33 @@ class Pictures:
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return pictures by index; see Stream."""
-        if not len(indices):
-            return np.zeros((0, 1, 1, 3), np.uint8)
-        first = self._decode(int(indices[0]))
-        if len(indices) == 1:
-            return first[None]
-        pictures = np.empty((len(indices), *first.shape), np.uint8)
-        pictures[0] = first
-        for i, index in enumerate(indices[1:], 1):
-            picture = self._decode(int(index))
-            if picture.shape != first.shape:
-                sizes = f"{first.shape} and {picture.shape}"
-                raise EpisodeError("", f"images change size within the episode: {sizes}")
-            pictures[i] = picture
-        return pictures
+        return stacked(self.each(indices), len(indices))
 
     def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[NDArray[np.uint8]]:
         """Yield pictures one by one; see OneByOne."""
         more = (least,) if self._reduces else ()
         return (self._decode(int(index), *more) for index in indices)
+
+
+def of_one_size(pictures: Iterable[NDArray[np.uint8]], where: str) -> Iterator[NDArray[np.uint8]]:
+    """Yield pictures (H, W, 3); raise EpisodeError at the first whose size differs."""
+    first: tuple[int, ...] = ()
+    for picture in pictures:
+        first = first or picture.shape
+        if picture.shape != first:
+            sizes = f"{first} and {picture.shape}"
+            raise EpisodeError(where, f"images change size within the episode: {sizes}")
+        yield picture
+
+
+def stacked(pictures: Iterable[NDArray[np.uint8]], count: int, where: str = "") -> NDArray[np.uint8]:
+    """Return pictures of one size as (count, H, W, 3); only one of them is in memory twice."""
+    found: NDArray[np.uint8] = np.zeros((0, 1, 1, 3), np.uint8)
+    for i, picture in enumerate(of_one_size(pictures, where)):
+        if i == 0:
+            found = np.empty((count, *picture.shape), np.uint8)
+        found[i] = picture
+    return found
 
 
 def rate_times(length: int, hz: float) -> Floats:

@@ -8,7 +8,6 @@ those that are not in the registry.
 
 import os
 import re
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from importlib import import_module
 from pathlib import Path
 
 from hma_data.errors import MissingDependencyError, OutputError, UsageError, install_command
+from hma_data.storage.files import atomic_path
 from hma_data.storage.paths import StrPath, as_path
 
 Progress = Callable[[int, int], None]
@@ -62,27 +62,9 @@ def record(
     final = as_path(out) / name
     if final.exists():
         raise OutputError(final, "exists already", "remove it or record into another folder")
-    with whole(final) as part:
+    with atomic_path(final) as part:
         import_module(module).record(part, robot, _counted(episodes, on_progress), seed)
     return final
-
-
-@contextmanager
-def whole(final: StrPath) -> Iterator[Path]:
-    """Give a path to write a recording to, a file or a folder; it becomes `final` when the block ends.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    final = as_path(final)
-    try:
-        final.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=final.parent, prefix=f".{final.name}-") as folder:
-            yield Path(folder) / final.name
-            (Path(folder) / final.name).rename(final)
-    except OSError as fault:
-        remedy = "check the free space and the permissions"
-        raise OutputError(final, f"cannot be written: {fault}", remedy) from fault
 
 
 def _counted(episodes: int, on_progress: Progress | None) -> Iterator[int]:

@@ -34,7 +34,8 @@ _AGAIN = "save or push it again"
 def atomic_path(final: Path) -> Iterator[Path]:
     """Give a path beside `final` to write to; it becomes `final` when the block ends without an error.
 
-    For a file of a store, the path is on this machine, and the file is uploaded when the block ends.
+    A folder may be made there too, where `final` is none yet; see also `new_folder`. For a file of a store,
+    the path is on this machine, and the file is uploaded when the block ends.
 
     Raises:
         OutputError: the folder cannot be written, or the disk is full.
@@ -59,6 +60,7 @@ def atomic_path(final: Path) -> Iterator[Path]:
         reason = "its folder is a file" if below_file else fault.strerror or fault
         raise OutputError(where, f"cannot be written: {reason}", remedy) from fault
     finally:
+        shutil.rmtree(part, ignore_errors=True)
         with suppress(OSError):  # the folder is a file, or may only be read
             part.unlink(missing_ok=True)
 

@@ -48,7 +48,7 @@ def benchmark(
         if json:
             print_json([dict(zip(table.columns, row, strict=True)) for row in table.rows])
         else:
-            table.print(repeated=2)
+            table.print()
         return
     protocol = QUICK if quick else FULL
     there = device_name(device)
@@ -66,5 +66,5 @@ def benchmark(
         return
     from hma_data.tables import Table
 
-    Table(COLUMNS, rows(found)).print(repeated=2)
+    Table(COLUMNS, rows(found)).print()
     print(f"open {page}")

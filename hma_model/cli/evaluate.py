@@ -121,7 +121,7 @@ def _print(parts: "Sequence[Part]") -> None:
             if about:
                 print(about)
     else:
-        comparison(parts, intervals=False).print(repeated=2)
+        comparison(parts, intervals=False).print()
     print_lines(absences(parts))
     for whose, said in verdicts(parts):
         print(f"{whose} {said}")

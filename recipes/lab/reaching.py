@@ -41,8 +41,9 @@ import cv2
 import numpy as np
 
 from hma_data.console import run_script
-from hma_data.lab import family, record, whole
+from hma_data.lab import family, record
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
+from hma_data.storage.files import atomic_path
 
 ROBOT, SEED = "mover_04", 51
 REACH_S = 2.0  # of an episode
@@ -80,7 +81,7 @@ def main() -> None:
     (given.out / f"{ROBOT}.yaml").write_text(family.embodiment(ROBOT).to_yaml(), encoding="utf-8")
     final = given.out / "reach.hdf5"
     if not final.exists():
-        with whole(final) as part:
+        with atomic_path(final) as part:
             record_reaching(part, ROBOT, range(given.reaches), SEED)
     print(f"{final}: {given.reaches} episodes")
     final = given.out / f"{ROBOT}.hdf5"
@@ -89,7 +90,7 @@ def main() -> None:
     print(f"{final}: {given.play} episodes")
     final = given.out / "lerobot"
     if given.lerobot and not final.exists():
-        with whole(final) as part:
+        with atomic_path(final) as part:
             robot = family.embodiment(ROBOT)
             camera = robot.cameras[0].model_copy(update={"size": (SIDE, SIDE)})
             write_lerobot(part, robot.model_copy(update={"cameras": (camera,)}), reaches(given.reaches))

@@ -35,7 +35,6 @@ from numpy.typing import NDArray
 
 from hma_data.console import human_bytes, human_seconds, interruptible, progress
 from hma_data.errors import HMAError, MissingDependencyError, OutputError, UsageError
-from hma_data.lab import whole
 from hma_data.lab.writers import (
     Demo,
     Message,
@@ -228,7 +227,7 @@ def record_simulator(
     files = list(_record_all(simulator, kept, episodes, seed, perturb))
     for final, own in zip(finals, ([f for f, k in files if not k], [f for f, k in files if k]), strict=False):
         if not final.exists():
-            with whole(final) as part:
+            with atomic_path(final) as part:
                 write(part, embodiment, map(Recorded.load, own))
     shutil.rmtree(kept)
     return finals

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats
+from hma_data.episodes.episode import Floats, of_one_size, stacked
 from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images, decode_image, opencv
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.bag import Bag
@@ -514,13 +514,13 @@ class StillStream:
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """See episode.Stream."""
         distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
-        stacked = _stack(self.each(distinct), len(distinct))
-        return stacked if np.array_equal(inverse, np.arange(len(stacked))) else stacked[inverse]
+        found = stacked(self.each(distinct), len(distinct))
+        return found if np.array_equal(inverse, np.arange(len(found))) else found[inverse]
 
     def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""
         where, read = self._messages.where, self._messages.read(indices)
-        return _of_one_size((picture(m, self._kind, where, self._levels, least) for m in read), where)
+        return of_one_size((picture(m, self._kind, where, self._levels, least) for m in read), where)
 
 
 class VideoStream:
@@ -551,33 +551,10 @@ class VideoStream:
         wanted = [int(i) + self._lead for i in indices]
         found = self._decoder.frames(wanted)
         distinct = list(found)
-        stacked = _stack(_of_one_size(iter(found.values()), self._messages.where), len(found))
-        return stacked[[distinct.index(i) for i in wanted]]
+        images = stacked(found.values(), len(found), self._messages.where)
+        return images[[distinct.index(i) for i in wanted]]
 
     def _from(self, start: int) -> Iterator[bytes]:
         for block in range(start, self._count, BLOCK):
             for message in self._messages.read(range(block, min(block + BLOCK, self._count))):
                 yield payload(message)
-
-
-def _of_one_size(images: Iterator[Images], where: str) -> Iterator[Images]:
-    """Yield the images; raise EpisodeError at the first whose size differs."""
-    first: tuple[int, ...] = ()
-    for item in images:
-        first = first or item.shape
-        if item.shape != first:
-            shapes = sorted({first, item.shape})
-            raise EpisodeError(where, f"images change size within the episode: {shapes}")
-        yield item
-
-
-def _stack(images: Iterator[Images], count: int) -> Images:
-    """Stack images to (count, H, W, 3), one at a time, so that only one image is in memory twice."""
-    first = next(images, None)
-    if first is None:
-        return np.zeros((0, 1, 1, 3), np.uint8)
-    stacked = np.empty((count, *first.shape), np.uint8)
-    stacked[0] = first
-    for i, item in enumerate(images, start=1):
-        stacked[i] = item
-    return stacked

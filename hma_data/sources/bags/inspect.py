@@ -46,7 +46,6 @@ from hma_data.sources.common.survey import Survey, sampled
 
 MAX_BYTES = 1 << 30  # of messages measured, over all bags
 MAX_MESSAGES = 300_000
-MAX_LENGTHS = 1000
 MAX_FIELDS = 64  # most numeric keys of a topic whose values are checked
 MAX_HELD = 1 << 16  # most numbers of a key in memory
 MAX_WIDTH = 4096  # most values of an action or state; wider fields are maps or point clouds
@@ -184,26 +183,14 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
         told, remedy = (faults[0].message, faults[0].remedy) if faults else ("no bag holds a message", "")
         own = told.removeprefix(f"{uri}: ")
         raise SourceError(uri, own if own != told else f"nothing to inspect: {told}", remedy)
-    keys = tuple(survey.key(key) for key in _with_offsets(first.keys, clocks, survey))
+    keys = _with_offsets(first.keys, clocks, survey)
     camera = next((key for key in keys if key.kind == "camera"), None)
     frames = [counts[camera.key] for counts in lengths] if camera else []
     facts = {} if str(first.bag.path) == uri else {"keys and rates of": str(first.bag.path)}
     if budget.spent:
         facts["measured up to"] = f"{MAX_MESSAGES:,} messages or {MAX_BYTES >> 20:,} MiB; counts are whole"
-    return Inspection(
-        format="rosbag",
-        uri=uri,
-        episodes=len(bags),
-        keys=keys,
-        frames=sum(frames) if camera and len(lengths) == len(bags) else None,
-        lengths=tuple(frames[:MAX_LENGTHS]),
-        hz=camera.hz if camera else None,
-        robot=first.bag.notes().get("robot") or None,
-        facts=facts,
-        looked_at=len(survey.looked),
-        findings=survey.findings(keys),
-        checks=survey.checks(),
-    )
+    hz, robot = survey.key(camera).hz if camera else None, first.bag.notes().get("robot") or None
+    return survey.inspection("rosbag", uri, keys, frames, facts, hz=hz, robot=robot)
 
 
 def _with_offsets(keys: list[KeyInfo], clocks: list[dict[str, _Clock]], survey: Survey) -> list[KeyInfo]:

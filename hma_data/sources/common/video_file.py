@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats
+from hma_data.episodes.episode import Floats, stacked
 from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images
 from hma_data.errors import EpisodeError
 from hma_data.storage.kinds import unreadable
@@ -170,15 +170,8 @@ class VideoFile:
                 f"{self.path} has {len(self)} frames, asked for {wanted.min()} to {wanted.max()}"
             )
         unique, places = np.unique(wanted, return_inverse=True)
-        found: Images = np.zeros((0, self.table.height, self.table.width, 3), np.uint8)
         with _explained(str(self.path)):
-            for place, index in enumerate(unique.tolist()):
-                image = self._image(index)
-                if not place:
-                    found = np.empty((len(unique), *image.shape), np.uint8)
-                if image.shape != found.shape[1:]:
-                    raise EpisodeError(self.path, "its frames change size")
-                found[place] = image
+            found = stacked(map(self._image, unique.tolist()), len(unique), str(self.path))
         return found if np.array_equal(places, np.arange(len(found))) else found[places]
 
     def close(self) -> None:
@@ -280,6 +273,23 @@ class VideoFile:
         plane = rgb.planes[0]  # its bytes are copied once, into the array that `frames` returns
         lines = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: rgb.height, : rgb.width * 3]
         return np.rot90(lines.reshape(rgb.height, rgb.width, 3), _quarters(frame))
+
+
+class FilmRows:
+    """A camera's Stream: `rows` frames of a video file, at times (T,) of the recording's own.
+
+    Args:
+        indices: of the frames in the file; all of them by default.
+    """
+
+    def __init__(self, file: VideoFile, times: Floats, indices: NDArray[np.int64] | None = None) -> None:
+        self.timestamps = times
+        self._file, self._indices = file, np.arange(len(file)) if indices is None else indices
+        self.rows = len(self._indices)
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See episode.Stream."""
+        return self._file.frames(self._indices[np.asarray(indices, np.int64)])
 
 
 def _quarters(frame: Any) -> int:

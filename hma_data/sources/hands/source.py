@@ -24,21 +24,18 @@ T frames of an episode.
 
 import hashlib
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Episode, Floats, Signal
-from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import HandsLayout, Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
 from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.common.survey import listed
-from hma_data.sources.common.video_file import VideoFile
+from hma_data.sources.common.video_file import FilmRows, VideoFile
 from hma_data.sources.hands.detect import HandModels, MediaPipeHands, load_models
 from hma_data.sources.hands.labels import LabelSet, open_labels
 from hma_data.sources.hands.runs import (
@@ -162,17 +159,6 @@ class HandsSource:
         return self._detector[2:]
 
 
-class _RunFrames:
-    """The Stream of a run: the frames of a video with the indices (T,)."""
-
-    def __init__(self, file: VideoFile, indices: NDArray[np.int64]) -> None:
-        self.timestamps = file.timestamps[indices]
-        self._file, self._indices = file, indices
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        return self._file.frames(self._indices[np.asarray(indices, np.int64)])
-
-
 open = HandsSource
 
 
@@ -236,7 +222,8 @@ def _episode(
     span = start, stop = runs.spans[chosen]
     marks = labels.frames[start:stop]
     every = layout.pictures == "every"
-    stream = _RunFrames(file, np.arange(marks[0], marks[-1]) if every else marks[:-1])
+    shown = np.arange(marks[0], marks[-1]) if every else marks[:-1]
+    stream = FilmRows(file, file.timestamps[shown], shown)
     steps = np.diff(file.timestamps[marks[:-1]])
     usual = np.median(steps) if len(steps) else 0.0
     regular = bool((np.abs(steps - usual) <= INTERVAL_TOLERANCE * usual).all())

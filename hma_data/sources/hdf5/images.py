@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats
+from hma_data.episodes.episode import Floats, stacked
 from hma_data.episodes.images import Images, decode_image
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import Hdf5Layout
@@ -169,8 +169,4 @@ class ImageRows:
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
         """See Stream."""
         images = self.each(indices)
-        if not isinstance(images, list):
-            return images
-        if len({image.shape for image in images}) > 1:
-            raise EpisodeError(self._place, f"{self._key!r} has images of several sizes")
-        return np.stack(images) if images else np.zeros((0, 1, 1, 3), np.uint8)
+        return stacked(images, len(images), self._where) if isinstance(images, list) else images

@@ -35,6 +35,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
 from hma_data.sources.common.checks import seconds_a_unit, seconds_of
 from hma_data.sources.common.places import file_fingerprint
+from hma_data.sources.common.video_file import FilmRows, VideoFile
 from hma_data.sources.hdf5.file import (
     TEXT_KEYS,
     WHOLE_FILE,
@@ -55,7 +56,7 @@ from hma_data.sources.hdf5.file import (
 from hma_data.sources.hdf5.images import ImageRows, image_kind
 from hma_data.sources.hdf5.inspect import inspect
 from hma_data.sources.hdf5.videos import SUFFIXES as VIDEO_SUFFIXES
-from hma_data.sources.hdf5.videos import VideoRows, is_video, video_fingerprints, video_path
+from hma_data.sources.hdf5.videos import is_video, video_fingerprints, video_path
 from hma_data.storage.paths import StrPath, as_text
 
 _SPLITS = {"train": "train"} | dict.fromkeys(("valid", "val", "validation"), "val")
@@ -141,10 +142,11 @@ class Hdf5Source:
             if embodiment.state:
                 observed = _vector(group, embodiment.state, where)
                 check(embodiment.state.components[0].key, len(observed))
-            cameras: dict[str, ImageRows | VideoRows] = {}
+            cameras: dict[str, ImageRows | FilmRows] = {}
             for camera in embodiment.cameras:
                 if is_video(camera.key):
-                    cameras[camera.name] = VideoRows(video_path(place.file, camera, layout), times)
+                    video = VideoFile(video_path(place.file, camera, layout))
+                    cameras[camera.name] = FilmRows(video, times)
                 else:
                     cameras[camera.name] = self._images(place, group, camera.key, layout, times)
                 check(camera.key, cameras[camera.name].rows, layout.frames_missing * is_video(camera.key))

@@ -9,17 +9,12 @@ T rows of an episode, N frames of a video.
 """
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hma_data.episodes.episode import Floats
-from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import Camera, Hdf5Layout
 from hma_data.sources.common.inspection import KeyInfo
@@ -34,27 +29,6 @@ FILE = "{file}"  # in a key: the HDF5 file's name without its ending
 MAX_LISTED = 1_000  # files beside an HDF5 file among which videos are looked for
 MAX_VIDEOS = 8  # videos of one episode
 _NAME = re.compile(r"\{(\w+)\}")
-
-
-class VideoRows:
-    """A camera's Stream: the frames of a video file, `rows` in all.
-
-    Args:
-        path: of the video.
-        times: (T,) seconds of the rows; frames after the last one are not used.
-
-    Raises:
-        EpisodeError: the file is missing, damaged or no video.
-    """
-
-    def __init__(self, path: Path, times: Floats) -> None:
-        self.timestamps = times
-        self._file = VideoFile(path)
-        self.rows = len(self._file)
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """See Stream."""
-        return self._file.frames(indices)
 
 
 def is_video(key: str) -> bool:

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.align import nearest
 from hma_data.episodes.episode import Floats
-from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.sources.lerobot.metadata import Metadata, Span, episode_name
@@ -211,15 +210,3 @@ def frames_of_rows(
 
 def _part(span: Span) -> str:
     return "" if span.stop is None else f" from {span.start:.3f} to {span.stop:.3f} s"
-
-
-class FilmRows:
-    """A camera's Stream: the frames of a video file with the indices (T,), at the times (T,) of the rows."""
-
-    def __init__(self, file: VideoFile, times: Floats, indices: NDArray[np.int64]) -> None:
-        self.timestamps = times
-        self._file, self._indices = file, indices
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """See Stream."""
-        return self._file.frames(self._indices[np.asarray(indices, np.int64)])

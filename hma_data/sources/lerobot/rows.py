@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats, rate_times
+from hma_data.episodes.episode import Floats, of_one_size, rate_times, stacked
 from hma_data.episodes.images import Images, decode_image
 from hma_data.errors import EpisodeError
 from hma_data.sources.lerobot.metadata import Folder, Metadata, parquet_explained
@@ -212,18 +212,12 @@ class StillImages:
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
         """See Stream."""
-        images = list(self.each(indices))
-        return np.stack(images) if images else np.zeros((0, 1, 1, 3), np.uint8)
+        return stacked(self.each(indices), len(indices))
 
     def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""
-        shape: tuple[int, ...] = ()
-        for index in map(int, indices):
-            image = decode_image(self._bytes(index), self._where(index), least)
-            if shape and image.shape != shape:
-                raise EpisodeError(self._rows.path, f"{self._key!r} has images of several sizes")
-            shape = image.shape
-            yield image
+        images = (decode_image(self._bytes(i), self._where(i), least) for i in map(int, indices))
+        return of_one_size(images, f"{self._rows.path} {self._key}")
 
     def codec(self) -> str | None:
         """Return png or jpeg, from the first image; None for anything else."""

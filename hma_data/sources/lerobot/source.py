@@ -26,7 +26,8 @@ from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
 from hma_data.sources.common.places import file_fingerprint
-from hma_data.sources.lerobot.films import FilmRows, fit_of, frames_of_rows, open_video
+from hma_data.sources.common.video_file import FilmRows
+from hma_data.sources.lerobot.films import fit_of, frames_of_rows, open_video
 from hma_data.sources.lerobot.inspect import inspect
 from hma_data.sources.lerobot.language import language_of
 from hma_data.sources.lerobot.metadata import Folder, Metadata, episode_name

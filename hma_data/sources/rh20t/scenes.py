@@ -11,7 +11,6 @@ T samples, A values of a sample.
 """
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Floats
-from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError
 from hma_data.sources.common.pickles import read_dict
 from hma_data.sources.common.places import leaves, local_path, nothing_there
-from hma_data.sources.common.video_file import VideoFile
+from hma_data.sources.common.video_file import FilmRows, VideoFile
 from hma_data.sources.rh20t import SCENE
 from hma_data.storage.files import read_json
 
@@ -168,7 +166,7 @@ class Scene:
         return self._tables[name]
 
 
-class Film:
+class Film(FilmRows):
     """A camera's Stream: the frames of its film, at the times of its timestamps.npy.
 
     Attributes:
@@ -186,11 +184,7 @@ class Film:
         if self.lacking < 0:
             fault = f"has {len(self.file)} frames, {STAMPS} beside it only {len(stamps)} times"
             raise EpisodeError(self.file.path, fault)
-        self.timestamps: Floats = stamps[: len(self.file)].astype(np.float64) / 1e3
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """See Stream."""
-        return self.file.frames(indices)
+        super().__init__(self.file, stamps[: len(self.file)].astype(np.float64) / 1e3)
 
 
 def _rows(table: dict[Any, Any], serial: str, path: Path) -> list[tuple[int, Any]]:

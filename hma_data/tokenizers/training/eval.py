@@ -29,6 +29,7 @@ from hma_data.episodes.sheets import grid, write_png
 from hma_data.errors import MissingDependencyError, TokenizerError
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
+from hma_data.tables import Table
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 
 Frames = NDArray[np.uint8]
@@ -296,11 +297,11 @@ def to_markdown(results: Results) -> str:
     columns = {
         name: column for name, column in COLUMNS.items() if any(column[0] in r for r in results.values())
     }
-    lines = ["| of | " + " | ".join(columns) + " |", "|" + " --- |" * (len(columns) + 1)]
-    for name, result in results.items():
-        cells = [show(result[key]) if key in result else "–" for key, show in columns.values()]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    rows = [
+        [name, *(show(result[key]) if key in result else None for key, show in columns.values())]
+        for name, result in results.items()
+    ]
+    return Table(["of", *columns], rows).markdown() + "\n"
 
 
 def write_report(folder: StrPath, title: str, results: Results, notes: list[str]) -> list[Path]:

@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.images import Filter, FrameToRGB, prepare, resize
+from hma_data.episodes.images import Filter, prepare, resize
 from hma_data.errors import EpisodeError, RecipeError, SourceError, TokenizerError
+from hma_data.sources.common.video_file import VideoFile
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.training.recipe import DrawnSource, FileSource
@@ -120,7 +121,6 @@ def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
     Raises:
         TokenizerError: the file cannot be decoded.
     """
-    import av
     import cv2
 
     if path.suffix.lower() not in VIDEOS:
@@ -130,16 +130,11 @@ def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
         yield np.ascontiguousarray(picture[:, :, ::-1])
         return
     try:
-        with av.open(str(path)) as container:
-            count = sum(1 for _ in container.decode(video=0))
-        wanted = set(_evenly(count, frames))
-        with av.open(str(path)) as container:
-            to_rgb = FrameToRGB()
-            for index, frame in enumerate(container.decode(video=0)):
-                if index in wanted:
-                    yield to_rgb(frame).to_ndarray()
-    except (av.FFmpegError, IndexError) as fault:  # a container without video has no stream 0
-        raise TokenizerError(path, f"cannot be decoded as a video: {fault}") from fault
+        video = VideoFile(path)
+        for index in _evenly(len(video), frames):
+            yield video.frames([index])[0]
+    except EpisodeError as fault:
+        raise TokenizerError(path, f"cannot be decoded as a video: {fault.fault}") from fault
 
 
 def recording_films(

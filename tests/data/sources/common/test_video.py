@@ -86,7 +86,7 @@ def test_a_forked_child_and_its_parent_read_the_same_file(video: Path) -> None:
 
 
 def test_no_indices_give_no_pictures(video: Path) -> None:
-    assert VideoFile(video).frames([]).shape == (0, HEIGHT, WIDTH, 3)
+    assert not len(VideoFile(video).frames([]))
 
 
 def test_an_index_outside_is_an_index_error(video: Path) -> None:
