@@ -34,10 +34,12 @@ class Readout:
     Attributes:
         name: the layer of `ActionHead` that reads.
         lag: chunk k is read from frame k + lag.
+        deed: what a model does with it, in words.
     """
 
     name: str
     lag: int
+    deed: str
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,8 @@ class Objective:
     readout: Readout | None
 
 
-POLICY = Readout("policy", lag=0)  # the chunk to command from the frame on
-INVERSE = Readout("inverse", lag=1)  # the chunk that led to the frame
+POLICY = Readout("policy", lag=0, deed="act")  # the chunk to command from the frame on
+INVERSE = Readout("inverse", lag=1, deed="infer actions")  # the chunk that led to the frame
 READOUTS: Mapping[str, Readout] = {readout.name: readout for readout in (POLICY, INVERSE)}
 
 OBJECTIVES: Mapping[str, Objective] = {

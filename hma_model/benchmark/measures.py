@@ -14,17 +14,19 @@ are px of an image of 128 by 128.
 
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_model.arrays import Float32s, Floats, Images, Ints
 from hma_model.evaluation.agreement import share_interval
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded, summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, psnr
 from hma_model.evaluation.probe import Probe
-from hma_model.policies.arenas import Float32s, Image, ModelArena, Scenes, TrueArena
+from hma_model.policies.arenas import ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Policy
 from hma_model.policies.scores import run
 from hma_model.worlds.scenes import Dimension
@@ -37,27 +39,23 @@ INVERSE_SHARE = 0.5  # of the range of training, up to which actions are drawn
 WARM_FRAMES, TIMED_FRAMES = 3, 20
 
 
-def played(world: World, true: TrueArena, actions: Sequence[Float32s]) -> tuple[Image, NDArray[np.float64]]:
+def played(world: World, true: TrueArena, actions: Sequence[Float32s]) -> tuple[Images, Floats]:
     """Return the model's images (N, T + 1, S, S, 3) under given actions, from the beginning of `true`.
 
     With them comes how unsure the model was of the generated ones, (N, T) as of `Rollout`.
     """
     model = ModelArena(world, true, None)
     images, unsure = [model.made], []
-    world.measure = True
-    try:
+    with closing(model), world.drawing(measure=True):
         for action in actions:
             model.step(action)
             if model.fresh:
                 images.append(model.made)
                 unsure.append(model.uncertainty())
-    finally:
-        world.measure = False
-        model.close()
     return np.stack(images, axis=1), np.stack(unsure, axis=1)
 
 
-def parts_read(probe: Probe) -> NDArray[np.int64]:
+def parts_read(probe: Probe) -> Ints:
     """Return the numbers of the parts whose places the probe reads."""
     return np.concatenate([probe.own, probe.loose])
 

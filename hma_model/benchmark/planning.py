@@ -12,15 +12,14 @@ truth fails too, the planner does.
 N scenes, M candidates of each, H frames ahead, S pixels a side, A action dims.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from hma_data.lab import truth
+from hma_model.arrays import Bools, Float32s, Floats, Images
 from hma_model.evaluation.agreement import share_interval
 from hma_model.evaluation.intervals import rounded
 from hma_model.evaluation.probe import Probe
@@ -28,9 +27,6 @@ from hma_model.policies.arenas import Scenes
 from hma_model.policies.planning import Cost, goal_distance
 from hma_model.worlds.scenes import LabScene
 from hma_model.worlds.world import World
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 HORIZON, CANDIDATES, ELITES, ROUNDS = 5, 16, 4, 3
 MOST_SD = 3.0  # standard deviations from the mean action, up to which candidates go
@@ -87,7 +83,9 @@ def reached(world: World, scenes: Scenes, probe: Probe, way: str) -> Bools:
     elif way == "truth":
         found = plan(in_truth, low, high, count, rng)
     else:
-        with _likeliest(world):
+        with world.drawing(
+            unmask_steps=1, temperature=0.0
+        ):  # the likeliest frames in one pass, as `plan:cem` does
             cost.open([scene.prompt for scene in begun])
             found = plan(in_model, low, high, count, rng)
         for session in cost.sessions:
@@ -100,7 +98,7 @@ def reached(world: World, scenes: Scenes, probe: Probe, way: str) -> Bools:
     return near
 
 
-def _after(scene: LabScene, actions: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _after(scene: LabScene, actions: Float32s) -> Images:
     """Return the picture after actions (steps, A), of a copy of a scene."""
     simulator = scene.simulator.copy()
     for action in actions:
@@ -111,17 +109,6 @@ def _after(scene: LabScene, actions: NDArray[np.float32]) -> NDArray[np.uint8]:
 def _places(scenes: list[LabScene], probe: Probe) -> Floats:
     """Return the places (N, P, 2) of the robot's readable parts."""
     return np.stack([truth.parts_of(one.simulator.simulation)[1][probe.own] for one in scenes])
-
-
-@contextmanager
-def _likeliest(world: World) -> Iterator[None]:
-    """Let a world show the likeliest frames in one pass, as `plan:cem` does."""
-    before = world.unmask_steps, world.temperature
-    world.unmask_steps, world.temperature = 1, 0.0
-    try:
-        yield
-    finally:
-        world.unmask_steps, world.temperature = before
 
 
 def difference(one: Bools, other: Bools) -> tuple[float, list[float]]:

@@ -11,20 +11,19 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hma_data.errors import HMAError, OutputError, UsageError
 from hma_data.lab import FAMILY
 from hma_data.storage.files import write_atomic
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
-from hma_data.storage.paths import StrPath, as_path, is_repository
+from hma_data.storage.paths import StrPath, as_path
+from hma_model.arrays import Bools
 from hma_model.benchmark.measures import (
     choice_figures,
     choose,
@@ -34,8 +33,7 @@ from hma_model.benchmark.measures import (
     turn_back,
 )
 from hma_model.benchmark.planning import WAYS, planning_figures, reached
-from hma_model.checkpoint.folder import EMBEDDED
-from hma_model.checkpoint.io import record_evaluation
+from hma_model.checkpoint.io import record_locally
 from hma_model.evaluation.calibration import calibration
 from hma_model.evaluation.intervals import NATURAL, rounded, summary
 from hma_model.evaluation.metrics import PSNR_RANGE
@@ -116,7 +114,7 @@ def benchmark(
                 str(checkpoint), fault, "use hma evaluate and hma policy-eval for its own robots"
             )
         facts = {"benchmark": NAME, "version": VERSION, "seed": seed} | asdict(protocol) | {"robots": robots}
-        facts |= {"unmask_steps": world.unmask_steps, "temperature": world.temperature}
+        facts |= {"unmask_steps": world.decoding.unmask_steps, "temperature": world.decoding.temperature}
         facts |= world_facts(world) | device_facts(world.model)
         facts |= {"digests": {robot: world_digests(world, robot) for robot in robots}}
         facts = json.loads(json.dumps(facts))
@@ -138,7 +136,9 @@ def benchmark(
             found["by_frame"] = by_frame
             write_atomic(folder / RESULTS, json.dumps(found | {"sha256": _digest(found)}, indent=1))
         shutil.rmtree(folder / WORK, ignore_errors=True)  # of a job killed here, too
-        _record_meters(checkpoint, world, found["measures"])
+        for robot, measured in found["measures"].items():
+            if meter := measured["calibration"].get("meter"):  # for other commands
+                record_locally(checkpoint, world.model.source, robot, meter, "meter")
     return found
 
 
@@ -162,19 +162,6 @@ def read_results(path: Path) -> dict[str, Any]:
 
 def _digest(found: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(found).encode()).hexdigest()
-
-
-def _record_meters(checkpoint: StrPath, world: World, made: dict[str, Any]) -> None:
-    """Write the meters into the cards of a checkpoint of this machine, for its other commands."""
-    source = world.model.source
-    label = str(checkpoint)
-    if source is None or source.folder == EMBEDDED or is_repository(label) or "://" in label:
-        return
-    for robot, one in made.items():
-        meter = one["calibration"].get("meter")
-        if meter is not None:
-            with suppress(OutputError):  # a folder that may only be read
-                record_evaluation(source, robot, meter, "meter")
 
 
 class _Robot:
@@ -211,9 +198,10 @@ class _Robot:
         )
         found, by_scene = choice_figures(arrays, self.seed)
         by_frame = frame_errors(arrays)
+        way = self.world.decoding
         found["calibration"] = calibration(
             by_frame["uncertainty"], by_frame["error_px"], by_frame["pixel_rmse"],
-            unmask_steps=self.world.unmask_steps, temperature=self.world.temperature, seed=self.seed,
+            unmask_steps=way.unmask_steps, temperature=way.temperature, seed=self.seed,
         )  # fmt: skip
         self.tell("actions and their inverses")
         if missing := no_inverse(self.scenes.dimensions):
@@ -240,7 +228,7 @@ class _Robot:
         found |= {name: rounded(value, 2) for name, value in timed.items()}
         return found, by_scene, {name: rounded(values) for name, values in by_frame.items()}
 
-    def _planned(self) -> dict[str, NDArray[np.bool_]]:
+    def _planned(self) -> dict[str, Bools]:
         """Return which goals are reached in each of WAYS."""
         found = {}
         for way in WAYS:

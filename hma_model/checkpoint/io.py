@@ -5,17 +5,19 @@
 
 import shutil
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hma_data.errors import CheckpointError, HMAError
+from hma_data.errors import CheckpointError, HMAError, OutputError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.storage.files import file_sha256, new_folder, to_json, write_atomic
-from hma_data.storage.paths import StrPath, as_path
+from hma_data.storage.paths import StrPath, as_path, is_repository
 from hma_model.checkpoint import weights
 from hma_model.checkpoint.folder import (
     CARD,
     CONFIG,
+    EMBEDDED,
     FORMAT_VERSION,
     HEAD,
     LIBRARY,
@@ -192,6 +194,20 @@ def record_evaluation(
     if card.get(part) != facts:
         write_atomic(checkpoint.path(embodiment, CARD), to_json(card | {part: dict(facts)}))
         write_readme(checkpoint)
+
+
+def record_locally(
+    label: StrPath,
+    source: Checkpoint | None,
+    embodiment: str,
+    facts: Mapping[str, Any],
+    part: str = "evaluation",
+) -> None:
+    """Do as `record_evaluation` if a command's checkpoint, `label`, is the user's own on this machine."""
+    if source is None or source.folder == EMBEDDED or is_repository(label) or "://" in str(label):
+        return
+    with suppress(OutputError):  # a folder that may only be read
+        record_evaluation(source, embodiment, facts, part)
 
 
 def remove(folder: StrPath) -> None:

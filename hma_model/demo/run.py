@@ -10,7 +10,7 @@ import json
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hma_data import lab
 from hma_data.console import human_bytes, progress
@@ -35,11 +35,9 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
 from hma_model.demo.report import write_report
 from hma_model.demo.results import HELD, TIMINGS, DemoRun
-
-if TYPE_CHECKING:
-    from hma_model.evaluation.rollout_video import RolloutVideo
-    from hma_model.evaluation.rollouts import Sampling
-    from hma_model.evaluation.wholeness import Left
+from hma_model.evaluation.rollout_video import RolloutVideo
+from hma_model.evaluation.rollouts import Sampling
+from hma_model.evaluation.wholeness import Left
 
 START, ROBOTS = EMBEDDED_NAME, HELD_OUT  # the trunk, and robots that it has not seen
 RECIPE = "demo"
@@ -50,7 +48,7 @@ OURS = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS, 
 WINDOWS = 24  # held-out windows of each robot; the figures are means over them
 HELD_ROLLOUTS, HELD_SEED = 4, 55  # of other episodes than the recorded ones, driven for HELD frames
 LONGEST = 10  # frames of a window of the film
-FILM: "Sampling" = {"unmask_steps": 8, "order": "confidence"}  # slower than the figures, and limbs stay whole
+FILM: Sampling = {"unmask_steps": 8, "order": "confidence"}  # slower than the figures, and limbs stay whole
 
 
 def demo(out: StrPath, *, episodes: int = 32, steps: int | None = None, seed: int = 0) -> Path:
@@ -213,7 +211,7 @@ def roll_out(made: DemoRun) -> None:
     from hma_model.generation.decode import default_prompt
     from hma_model.network.model import HMA
 
-    def roll(robot: str) -> tuple[dict[str, Any], "RolloutVideo", dict[str, "Left"]]:
+    def roll(robot: str) -> tuple[dict[str, Any], RolloutVideo, dict[str, Left]]:
         shards = made.sets[robot]
         model = HMA.from_pretrained(str(made.pulled[robot]), embodiments=[robot]).eval()
         tokenizer = tokenizer_of(shards)

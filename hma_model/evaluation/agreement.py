@@ -12,11 +12,10 @@ from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from hma_model.arrays import Bools, Floats
 
 RESAMPLES = 2000
 MIN_POLICIES, MIN_EPISODES = 3, 8  # fewer say nothing about a correlation

@@ -18,15 +18,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
+from hma_model.arrays import Bools, Floats, Ints
 from hma_model.config import HMAConfig
 from hma_model.evaluation.intervals import LEVELS, NATURAL, SHARE, resampled_means, rounded, summary
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 POWER = 4
 LEAD_FRAMES = 5

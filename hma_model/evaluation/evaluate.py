@@ -14,17 +14,18 @@ B batch, T frames, P predicted frames, N windows.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
+from hma_data.tokenizers.base import Tokenizer
+from hma_model.arrays import Floats, Ints
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import OBJECTIVES
 from hma_model.evaluation.actions import gaussian, shuffled, without_actions
@@ -50,14 +51,10 @@ from hma_model.evaluation.perceptual import FeatureCollector, Networks
 from hma_model.evaluation.rollouts import RolloutImages, rollout
 from hma_model.evaluation.scores import ROLLOUT_KINDS, Rolled, Scores
 from hma_model.generation.decode import cameras_for, default_prompt
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-    from hma_model.network.model import HMA
+from hma_model.network.model import HMA
 
 DRAWS = 5  # of other windows' actions, and of Gaussian ones
 PAPER_BATCH = 4  # the paper's perplexity is a mean over batches of so many windows
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -107,7 +104,7 @@ class WindowPlan:
     windows: int
 
     @classmethod
-    def of(cls, model: "HMA", shards: ShardSet, settings: EvaluationSettings) -> "WindowPlan":
+    def of(cls, model: HMA, shards: ShardSet, settings: EvaluationSettings) -> "WindowPlan":
         """Return the plan; raise CheckpointError or UsageError where the three do not fit together."""
         require_tokenizer(model.config, shards.spec, shards.folder)
         cameras = cameras_for(model, shards, settings.cameras)
@@ -146,8 +143,8 @@ class Measured:
 
 
 def measure(
-    model: "HMA",
-    tokenizer: "Tokenizer",
+    model: HMA,
+    tokenizer: Tokenizer,
     data: StrPath | ShardSet,
     settings: EvaluationSettings = EvaluationSettings(),
     networks: Networks | None = None,
@@ -233,10 +230,10 @@ def measure(
 
 
 def _losses(
-    model: "HMA",
+    model: HMA,
     shards: ShardSet,
     batches: list[Batch],
-    episodes: NDArray[np.int64],
+    episodes: Ints,
     cameras: Cameras,
     draws: int,
     seed: int,
@@ -273,7 +270,7 @@ def _losses(
 def _paper(
     roll: Callable[..., RolloutImages],
     batches: list[Batch],
-    episodes: NDArray[np.int64],
+    episodes: Ints,
     shards: ShardSet,
     by_window: dict[str, Floats],
     draws: int,
@@ -304,8 +301,8 @@ def _paper(
 
 
 def _notes(
-    model: "HMA",
-    joined: "Mapping[str, Scores]",
+    model: HMA,
+    joined: Mapping[str, Scores],
     table: Mapping[str, Any],
     still: int,
     count: int,

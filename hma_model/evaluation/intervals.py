@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit  # scipy.stats would take half a second to import
 
-Floats = NDArray[np.float64]
+from hma_model.arrays import Floats
+
 Episodes = Sequence[int] | NDArray[Any] | None  # (N,) which windows belong together; None: none do
 RESAMPLES, LEVELS = 1000, (2.5, 97.5)
 ANY, NATURAL, SHARE = (-math.inf, math.inf), (0.0, math.inf), (0.0, 1.0)  # what values may be

@@ -9,7 +9,7 @@ B batch, T frames, F digits, V values a digit.
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,11 +21,10 @@ from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import FIRST_CAMERA, Cameras, Views
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
+from hma_model.arrays import Floats, Ints
 from hma_model.config import OBJECTIVES
 from hma_model.evaluation.metrics import teacher_forced
-
-if TYPE_CHECKING:
-    from hma_model.network.model import HMA
+from hma_model.network.model import HMA
 
 BASELINE_FRAMES = 200_000
 
@@ -77,7 +76,7 @@ def windows(
     yield from map(dataset.batch, parts)
 
 
-def episodes_of(batches: Sequence[Batch]) -> NDArray[np.int64]:
+def episodes_of(batches: Sequence[Batch]) -> Ints:
     """Return the episode (N,) of each window; windows whose episode is unknown count as one each."""
     return np.concatenate([np.arange(len(b)) if b.episode is None else b.episode.numpy() for b in batches])
 
@@ -97,7 +96,7 @@ def no_window(shards: ShardSet, split: str, frames: int) -> UsageError:
 
 @torch.no_grad()
 def validation_losses(
-    model: "HMA", batches: Iterable[Batch], seed: int = 0, objective: str = "forward"
+    model: HMA, batches: Iterable[Batch], seed: int = 0, objective: str = "forward"
 ) -> tuple[Means, Means]:
     """Return the losses and accuracies of the windows, by embodiment.
 
@@ -121,7 +120,7 @@ def validation_losses(
     return losses, accuracy
 
 
-def masked_val_loss(model: "HMA", batches: Iterable[Batch]) -> float:
+def masked_val_loss(model: HMA, batches: Iterable[Batch]) -> float:
     """Return the mean loss over windows: nats a token of each fully masked frame given the true past."""
     return validation_losses(model, batches)[0].mean()
 
@@ -131,7 +130,7 @@ def digit_frequencies(
     max_frames: int = BASELINE_FRAMES,
     cameras: Cameras = FIRST_CAMERA,
     factored: Sequence[int] | None = None,
-) -> list[NDArray[np.float64]]:
+) -> list[Floats]:
     """Return the frequency of each value of each digit in train: F arrays (V,), add-one smoothed.
 
     `factored` states the values of each digit, low digit first; by default it is the tokenizer's.

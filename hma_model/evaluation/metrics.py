@@ -8,7 +8,7 @@ N images of (H, W, C); B batch, T frames, h,w token grid; F factored digits, V v
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,17 +18,15 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from hma_data.errors import UsageError
+from hma_data.loading.dataset import Batch
+from hma_model.arrays import Floats
 from hma_model.evaluation.intervals import NATURAL, Episodes, ends_of, interval
 from hma_model.network.conditioning import Groups, align
 from hma_model.network.copying import known_digits
+from hma_model.network.model import HMA
 from hma_model.network.objectives import Layout
 from hma_model.network.stem import to_digits
 
-if TYPE_CHECKING:
-    from hma_data.loading.dataset import Batch
-    from hma_model.network.model import HMA
-
-Floats = NDArray[np.float64]
 Values = NDArray[Any]
 SSIM_WINDOW = 7
 WHITE = 255.0  # the span of the values of images
@@ -142,7 +140,7 @@ def token_hits(logits: Tensor, tokens: Tensor, factored: Sequence[int]) -> Tenso
 
 
 @torch.no_grad()
-def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
+def teacher_forced(model: HMA, batch: Batch) -> tuple[Tensor, Tensor]:
     """Score each frame from the second on, fully masked, given as much true past as a window holds.
 
     One pass scores a whole window: its input is the true frames, then each frame from the second on again,
@@ -172,7 +170,7 @@ def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def masked_scores(
-    model: "HMA", batch: "Batch", generator: torch.Generator | None = None
+    model: HMA, batch: Batch, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
     """Score the tokens that training would mask, among its masks and replaced digits (paper section 3).
 
@@ -196,7 +194,7 @@ def masked_scores(
     return nats, hits
 
 
-def _at_once(model: "HMA", batch: "Batch") -> Tensor:
+def _at_once(model: HMA, batch: Batch) -> Tensor:
     """Return scores (B, T-1, h, w, F, V) of the masked frames, computed in one pass."""
     assert batch.tokens is not None
     config, frames = model.config, model.frame_values(batch.tokens)
@@ -212,13 +210,13 @@ def _at_once(model: "HMA", batch: "Batch") -> Tensor:
     return groups.unsort(model.token_readout.split(scores)).unflatten(2, config.token_grid)
 
 
-def _part(batch: "Batch", frames: slice) -> "Batch":
+def _part(batch: Batch, frames: slice) -> Batch:
     assert batch.tokens is not None
     known = batch.action_mask[:, frames]
     return replace(batch, tokens=batch.tokens[:, frames], actions=batch.actions[:, frames], action_mask=known)
 
 
-def _scored(model: "HMA", batch: "Batch", logits: Tensor) -> tuple[Tensor, Tensor]:
+def _scored(model: HMA, batch: Batch, logits: Tensor) -> tuple[Tensor, Tensor]:
     """Score the last frames of a batch, as many as `logits` has."""
     assert batch.tokens is not None
     config, last = model.config, batch.tokens[:, -logits.shape[1] :]

@@ -26,9 +26,8 @@ from torch import Tensor
 from hma_data.errors import UsageError
 from hma_data.storage.files import file_sha256
 from hma_data.storage.paths import StrPath, as_text
+from hma_model.arrays import Floats, Images, Ints
 
-Images = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 Network = Callable[[Tensor], Tensor]
 I3D_SIDE = 224  # pixels of the short side of I3D's videos
 SHORT_VIDEO, STRETCHED_FRAMES = 10, 16  # frames below which a video is stretched, and those that it then has
@@ -56,7 +55,7 @@ class Networks:
     facts: dict[str, dict[str, str]] = field(default_factory=dict)
 
     @torch.no_grad()
-    def lpips_of(self, truth: Images, made: Images) -> NDArray[np.float64]:
+    def lpips_of(self, truth: Images, made: Images) -> Floats:
         """Return the LPIPS distance (…,) of pictures (…, S, S, 3) from true ones."""
         assert self.lpips is not None
         pairs = zip(_channels(truth).split(BATCH_SIZE), _channels(made).split(BATCH_SIZE))
@@ -124,7 +123,7 @@ def _channels(pictures: Images) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(flat)).permute(0, 3, 1, 2).float()
 
 
-def stretched(frames: int) -> NDArray[np.int64]:
+def stretched(frames: int) -> Ints:
     """Return the indices of the frames that I3D sees of a video."""
     if frames >= SHORT_VIDEO:
         return np.arange(frames)

@@ -1,11 +1,8 @@
-"""Read the state of a laboratory robot off pictures, and measure how whole they are.
+"""Read the state of a laboratory robot off pictures, and how much of each part they show.
 
 A probe is a small network (`hma_model.evaluation.state_reader`). It learns from episodes that nothing is
 measured on; its own error is that on other episodes. The T of a pusher is found by its shape instead: a
 network reads the place of a disc to a pixel and that of a T to five, because it does not see how the T lies.
-
-A picture may lose a limb and still have small errors of its pixels. `wholeness` therefore counts the pixels
-of each part's colour, wherever they are. A true picture of another time has some 0.9.
 
 N pictures of S pixels a side, P parts. Places are px of a picture of 128 by 128.
 """
@@ -13,15 +10,15 @@ N pictures of S pixels a side, P parts. Places are px of a picture of 128 by 128
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import nn
 
 from hma_data.episodes.images import prepare
 from hma_data.lab import pusht, simulator, truth
 from hma_data.lab.pusher import Tee, rotation
+from hma_data.tokenizers.base import Tokenizer
+from hma_model.arrays import Bools, Floats, Images, Ints
 from hma_model.evaluation.state_reader import (
     INPUT_SIDE,
     UNREADABLE_SHARE,
@@ -31,19 +28,12 @@ from hma_model.evaluation.state_reader import (
     trained,
 )
 
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-
-Floats = NDArray[np.float64]
-Images = NDArray[np.uint8]
-
 TRAINING_STEPS, LEARNING_RATE = 400, 1e-2
 EPISODES, HELD_OUT_EPISODES = 40, 8  # simulated, and of them those that the probe's error is measured on
 EPISODE_FRAMES, FRAME_STRIDE = 60, 2  # of an episode; one in so many is kept
 FIRST_EPISODE = 1_000_000  # the number of a probe's first episode; those that are measured count from 0
 LEAST_SPREAD_PX = 1.0  # a part that moves less is no part of the state
 COLOUR_DISTANCE = 45.0  # of RGB, up to which two colours are one
-LEAST_PIXELS = 3  # of a part that is seen
 ANGLES = 48  # of a T that are tried
 FARTHEST_PX = 20.0  # px of the arena; a pixel farther out of the T counts as that far
 FIRST_STEP, LAST_STEP = 8.0, 0.4  # px of the arena, of the search
@@ -77,7 +67,7 @@ class TeeFinder:
             found[row, -2:] = pusht.PX * middles
         return found
 
-    def find(self, pixels: NDArray[np.bool_]) -> Floats | None:
+    def find(self, pixels: Bools) -> Floats | None:
         """Return the places (2, 2) of the T that has the pixels (S, S); None if they are too few."""
         side = len(pixels)
         size = truth.SIZE / pusht.PX / side  # px of the arena
@@ -138,17 +128,17 @@ class Probe:
     tee: TeeFinder | None = None
 
     @property
-    def readable(self) -> NDArray[np.bool_]:
+    def readable(self) -> Bools:
         """Return (P,) whether a part moves and the probe reads its place."""
         return (self.spread > LEAST_SPREAD_PX) & (self.error <= UNREADABLE_SHARE * self.spread)
 
     @property
-    def own(self) -> NDArray[np.int64]:
+    def own(self) -> Ints:
         """Return the numbers of the readable parts that are the robot's own."""
         return np.flatnonzero(self.readable[: self.driven])
 
     @property
-    def loose(self) -> NDArray[np.int64]:
+    def loose(self) -> Ints:
         """Return the numbers of the readable parts that lie loose."""
         return self.driven + np.flatnonzero(self.readable[self.driven :])
 
@@ -169,21 +159,11 @@ class Probe:
         counts: Floats = (stands[..., None] & self._colored(flat)).sum(axis=(1, 2), dtype=np.float64)
         return counts.reshape(*pictures.shape[:-3], len(self.colors))
 
-    def _colored(self, small: Images) -> NDArray[np.bool_]:
+    def _colored(self, small: Images) -> Bools:
         """Return (N, 64, 64, P), which pixels have a part's colour."""
         values = small.astype(np.float32)
         near = [np.linalg.norm(values - color, axis=-1) <= COLOUR_DISTANCE for color in self.colors]
         return np.stack(near, axis=-1)
-
-    def wholeness(self, pictures: Images, true: Images) -> Floats:
-        """Return how much of the robot of true pictures (…, S, S, 3) others show; 1 is all of it.
-
-        It is the mean over the robot's readable parts that the true picture shows.
-        """
-        wanted, given = (self.areas(some)[..., self.own] for some in (true, pictures))
-        seen = wanted >= LEAST_PIXELS
-        kept: Floats = np.where(seen, np.minimum(given / np.maximum(wanted, 1), 1), 0).sum(axis=-1)
-        return kept / np.maximum(seen.sum(axis=-1), 1)
 
 
 def state_errors(probe: Probe, pictures: Images, parts: Floats) -> Floats:
@@ -201,20 +181,20 @@ def state_errors(probe: Probe, pictures: Images, parts: Floats) -> Floats:
     return errors
 
 
-def as_seen(robot: str, tokenizer: "Tokenizer", pictures: Images) -> Images:
+def as_seen(robot: str, tokenizer: Tokenizer, pictures: Images) -> Images:
     """Return a recorder's pictures (N, …) as the tokenizer takes them (N, S, S, 3)."""
     spec, (camera, *_) = tokenizer.spec, simulator.embodiment(robot).cameras
     return prepare(pictures, camera, spec.image_size, spec.resize_filter)
 
 
-def as_shown(tokenizer: "Tokenizer", pictures: Images) -> Images:
+def as_shown(tokenizer: Tokenizer, pictures: Images) -> Images:
     """Return pictures (N, S, S, 3) as the tokenizer reconstructs them."""
     return tokenizer.decode(tokenizer.encode(pictures))
 
 
 def train_probe(
     robot: str,
-    tokenizer: "Tokenizer",
+    tokenizer: Tokenizer,
     stride: int,
     seed: int = 0,
     tell: Callable[[str], None] = lambda words: None,
@@ -236,7 +216,7 @@ def train_probe(
 
 
 def shown_episodes(
-    robot: str, tokenizer: "Tokenizer", stride: int, seed: int, tell: Callable[[str], None]
+    robot: str, tokenizer: Tokenizer, stride: int, seed: int, tell: Callable[[str], None]
 ) -> tuple[Images, list[truth.TrueEpisode]]:
     """Return simulated episodes, and their pictures (N, S, S, 3) as the tokenizer shows them.
 

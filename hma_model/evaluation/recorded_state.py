@@ -15,27 +15,23 @@ N pictures or windows, T frames, P predicted frames, S values of a state.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns
+from hma_data.tokenizers.base import Tokenizer
+from hma_model.arrays import Floats, Images, Ints
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded
 from hma_model.evaluation.losses import episodes_of
 from hma_model.evaluation.probe import shown_episodes
 from hma_model.evaluation.state_reader import UNREADABLE_SHARE, StateNetwork, outputs, resized, trained
 from hma_model.generation.decode import decode
 
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-
-Floats = NDArray[np.float64]
-Images = NDArray[np.uint8]
 Tell = Callable[[str], None]
 
 TRAINING_STEPS, LEARNING_RATE = 600, 4e-3
@@ -63,7 +59,7 @@ class Reader:
     spread: Floats
 
     @property
-    def readable(self) -> NDArray[np.int64]:
+    def readable(self) -> Ints:
         """Return the numbers of the values that change and that it reads."""
         return np.flatnonzero((self.std > LEAST_STD) & (self.error <= UNREADABLE_SHARE * self.spread))
 
@@ -112,7 +108,7 @@ def learn(
 
 
 def measure_recorded_state(
-    tokenizer: "Tokenizer",
+    tokenizer: Tokenizer,
     shards: ShardSet,
     batches: Sequence[Batch],
     predicted: Mapping[str, Sequence[Tensor]],
@@ -189,7 +185,7 @@ def measure_recorded_state(
 
 
 def recorded_reader(
-    tokenizer: "Tokenizer", shards: ShardSet, cameras: Cameras, seed: int, tell: Tell = lambda words: None
+    tokenizer: Tokenizer, shards: ShardSet, cameras: Cameras, seed: int, tell: Tell = lambda words: None
 ) -> Reader | None:
     """Train the reader of a set on its training split; None if all of its states are unknown in part.
 
@@ -214,16 +210,14 @@ _kept_reader = lru_cache(maxsize=16)(recorded_reader)  # several checkpoints sha
 
 
 def simulated_reader(
-    robot: str, tokenizer: "Tokenizer", stride: int, seed: int, tell: Tell = lambda words: None
+    robot: str, tokenizer: Tokenizer, stride: int, seed: int, tell: Tell = lambda words: None
 ) -> Reader:
     """Train the reader of a laboratory robot on simulated episodes; arguments as of `train_probe`."""
     pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
     return learn(pictures, np.concatenate([one.states for one in made]).astype(np.float64), seed, tell=tell)
 
 
-def _values(
-    shards: ShardSet, reader: Reader, own: NDArray[np.int64], errors: dict[str, Floats]
-) -> list[dict[str, Any]]:
+def _values(shards: ShardSet, reader: Reader, own: Ints, errors: dict[str, Floats]) -> list[dict[str, Any]]:
     """Return for each value that is read its errors at the last step, in its own unit."""
     state = shards.embodiment.state
     assert state is not None

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from hma_data.console import human_count
 from hma_data.errors import HMAError
@@ -24,6 +23,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.recorded import Recorded
 from hma_data.storage.files import to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
+from hma_model.arrays import Images, Ints
 from hma_model.evaluation.losses import windows
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import over_horizon
@@ -42,7 +42,6 @@ from hma_model.evaluation.tables import (
 from hma_model.evaluation.verdict import verdict
 from hma_model.generation.decode import decode
 
-Images = NDArray[np.uint8]
 GAP_COLOUR = (128, 128, 128)
 GAP_PX, MARK_PX = 3, 4  # between frames, and of the line below them
 STRIP_FRAMES = 12  # at most
@@ -233,7 +232,7 @@ def difference(one: Images, other: Images) -> Images:
     return shown
 
 
-def strip(film: Images, columns: NDArray[np.int64], prompt: int) -> bytes:
+def strip(film: Images, columns: Ints, prompt: int) -> bytes:
     """Return frames (T, H, W, 3) side by side as a WebP; a line tells those that the model got."""
     from PIL import Image
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hma_data.episodes.sheets import (
     gif_bytes,
@@ -28,15 +27,14 @@ from hma_data.loading.views import FIRST_CAMERA, Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
+from hma_data.tokenizers.base import Tokenizer
+from hma_model.arrays import Bools, Float32s, Images
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.actions import shuffled
 from hma_model.evaluation.losses import no_window, windows
 from hma_model.evaluation.rollouts import Sampling, rollout
 from hma_model.generation.decode import cameras_for
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-    from hma_model.network.model import HMA
+from hma_model.network.model import HMA
 
 PANEL_PX = 192  # minimum width in pixels at which a picture is shown
 HOLD_SECONDS = 0.9  # seconds for which the end of a window stands, where another one follows
@@ -55,13 +53,13 @@ class RolloutVideo:
     pixels that show the robot, with their borders.
     """
 
-    frames: NDArray[np.uint8]
+    frames: Images
     fps: float
     prompt: int
-    actions: NDArray[np.float32]
-    images: NDArray[np.bool_]
+    actions: Float32s
+    images: Bools
 
-    def dark(self) -> NDArray[np.uint8]:
+    def dark(self) -> Images:
         """Return the frames for a dark page: what is drawn around the images is light on dark."""
         drawn = self.frames[:, ~self.images].astype(np.int16)  # (T, pixels, 3)
         # Mirroring the lightness of a colour keeps its hue, as inverting each channel would not.
@@ -72,8 +70,8 @@ class RolloutVideo:
 
 
 def rollout_video(
-    model: "HMA",
-    tokenizer: "Tokenizer",
+    model: HMA,
+    tokenizer: Tokenizer,
     shards: ShardSet,
     *,
     split: str = "val",
@@ -172,9 +170,7 @@ def lively_windows(
     return [int(numbers[i]) for i in chosen], [int(numbers[i]) for i in far]
 
 
-def _column(
-    name: str, film: NDArray[np.uint8], actions: NDArray[np.float32], shards: ShardSet, given: int
-) -> NDArray[np.uint8]:
+def _column(name: str, film: Images, actions: Float32s, shards: ShardSet, given: int) -> Images:
     """Return a panel's frames (T, H, W, 3): title, picture with a border, and its actions as bars.
 
     The border tells the first `given` frames, which are true, from those that the model predicts.
@@ -205,7 +201,7 @@ def _scale(width: int) -> int:
     return max(1, -(-PANEL_PX // width))
 
 
-def _image_pixels(shown: Sequence[int], image: Sequence[int], panels: int) -> NDArray[np.bool_]:
+def _image_pixels(shown: Sequence[int], image: Sequence[int], panels: int) -> Bools:
     """Return (H, W), the pixels of a film's frame that are images (h, w) or their borders."""
     height, width = (side * _scale(image[1]) + 2 * BORDER_PX for side in image)
     found = np.zeros(shown, np.bool_)
@@ -214,7 +210,7 @@ def _image_pixels(shown: Sequence[int], image: Sequence[int], panels: int) -> ND
     return found
 
 
-def _with_time(film: NDArray[np.uint8], prompt: int) -> NDArray[np.uint8]:
+def _with_time(film: Images, prompt: int) -> Images:
     """Add a line below the frames that grows with time, in the colours of the borders."""
     count, _, width = film.shape[:3]
     out = np.pad(film, ((0, 0), (0, 8), (0, 0), (0, 0)), constant_values=250)
@@ -243,7 +239,7 @@ def write_video(path: StrPath, film: RolloutVideo) -> None:
 
 
 def write_sheets(
-    model: "HMA",
+    model: HMA,
     sets: Mapping[str, ShardSet],
     out: Path,
     step: int,

@@ -5,21 +5,19 @@ B batch, T frames, P frames of the prompt, S pixels a side, C cameras.
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypedDict, Unpack
+from typing import TypedDict, Unpack
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch
+from hma_data.tokenizers.base import Tokenizer
+from hma_model.arrays import Bools, Images
 from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.generation.decode import decode, default_prompt
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-    from hma_model.network.model import HMA
+from hma_model.network.model import HMA
 
 
 class Sampling(TypedDict, total=False):
@@ -29,7 +27,6 @@ class Sampling(TypedDict, total=False):
     temperature: float | None
     order: str
     sample_steps: int | None
-    noise_level: float
     precision: str
     compile: bool
 
@@ -44,21 +41,21 @@ class RolloutImages:
     """
 
     prompt: int
-    predicted: NDArray[np.uint8]
-    truth: NDArray[np.uint8]
+    predicted: Images
+    truth: Images
     stored: Tensor
-    finite: NDArray[np.bool_]
+    finite: Bools
 
 
 def rollout(
-    model: "HMA",
-    tokenizer: "Tokenizer",
+    model: HMA,
+    tokenizer: Tokenizer,
     batch: Batch,
     frames: int | None = None,
     *,
     prompt: int | None = None,
     seed: int = 0,
-    truth: NDArray[np.uint8] | None = None,
+    truth: Images | None = None,
     **sampling: Unpack[Sampling],
 ) -> RolloutImages:
     """Predict the frames that follow the first frames of each window, given its actions.

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from hma_data.loading.dataset import Batch
+from hma_model.arrays import Bools, Floats
 from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, Episodes, horizon_summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, SSIM_RANGE, psnr, ssim
@@ -20,7 +20,6 @@ from hma_model.evaluation.perceptual import FeatureCollector
 from hma_model.evaluation.rollouts import RolloutImages
 
 ROLLOUT_KINDS = ("true", "shuffled", "none", "copy")
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class Scores:
     psnr: Floats
     ssim: Floats
     lpips: Floats | None
-    finite: NDArray[np.bool_]
+    finite: Bools
 
     @classmethod
     def of(cls, pictures: RolloutImages, judge: FeatureCollector | None = None) -> "Scores":

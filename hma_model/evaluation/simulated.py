@@ -12,33 +12,29 @@ B episodes, T frames, P predicted frames, S pixels a side, K = stride·A.
 """
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from hma_data.lab import simulator, truth
 from hma_data.loading.dataset import Batch
+from hma_data.tokenizers.base import Tokenizer
+from hma_model.arrays import Float32s, Floats, Images
 from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded, summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, perplexity_summary, psnr, teacher_forced
 from hma_model.evaluation.probe import Probe, as_seen, state_errors, train_probe
 from hma_model.evaluation.rollouts import RolloutImages, Sampling, rollout
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-    from hma_model.network.model import HMA
+from hma_model.network.model import HMA
 
 PERTURBATION = 0.1  # standard deviations of the actions, as the paper's
 FIRST_EPISODE = 500_000  # its number; drift's episodes count from 0, those of probes from a million
-Floats = NDArray[np.float64]
-Images = NDArray[np.uint8]
 
 
 def measure_state(
-    model: "HMA",
-    tokenizer: "Tokenizer",
+    model: HMA,
+    tokenizer: Tokenizer,
     robot: str,
     *,
     frames: int,
@@ -94,7 +90,7 @@ def measure_state(
     return found | {"perturbed": _perturbed(model, true, roll(other), batch, other, seed)}
 
 
-def perturbed(chunks: NDArray[np.float32], dims: int, prompt: int, seed: int) -> NDArray[np.float32]:
+def perturbed(chunks: Float32s, dims: int, prompt: int, seed: int) -> Float32s:
     """Return chunks (B, T, K) with noise of PERTURBATION standard deviations, after the prompt."""
     steps = chunks.reshape(*chunks.shape[:2], -1, dims)
     noise = np.random.default_rng([seed, 3]).normal(size=steps.shape) * steps.std(axis=(0, 1, 2))
@@ -102,7 +98,7 @@ def perturbed(chunks: NDArray[np.float32], dims: int, prompt: int, seed: int) ->
     return (steps + PERTURBATION * noise).reshape(chunks.shape).astype(np.float32)
 
 
-def _batch(model: "HMA", tokenizer: "Tokenizer", robot: str, made: list[truth.TrueEpisode]) -> Batch:
+def _batch(model: HMA, tokenizer: Tokenizer, robot: str, made: list[truth.TrueEpisode]) -> Batch:
     """Return simulated episodes as windows."""
     stored = np.stack([tokenizer.encode(as_seen(robot, tokenizer, one.pictures)) for one in made])
     actions = torch.from_numpy(np.stack([one.chunks for one in made]))
@@ -128,7 +124,7 @@ def _controllability(probe: Probe, ways: dict[str, Images], parts: Floats, seed:
 
 
 def _perturbed(
-    model: "HMA", true: RolloutImages, made: RolloutImages, batch: Batch, other: Batch, seed: int
+    model: HMA, true: RolloutImages, made: RolloutImages, batch: Batch, other: Batch, seed: int
 ) -> dict[str, Any]:
     """Return PSNR and perplexity under the true actions, and under the perturbed ones."""
     found: dict[str, Any] = {"scale": PERTURBATION}

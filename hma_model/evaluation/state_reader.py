@@ -14,13 +14,10 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hma_data.episodes.images import opencv
-
-Floats = NDArray[np.float64]
-Images = NDArray[np.uint8]
+from hma_model.arrays import Floats, Images
 
 INPUT_SIDE, MAP_SIDE = 64, 32  # pixels of the images that a network sees, and cells of its maps
 CHANNELS, SHARPNESS = 16, 4.0

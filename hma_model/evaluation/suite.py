@@ -12,12 +12,11 @@ bytes of results.json.
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,19 +30,17 @@ from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import finite
-from hma_data.storage.kept import keep_arrays, kept_arrays
-from hma_data.storage.paths import StrPath, as_path, as_text, is_repository
-from hma_model.checkpoint.folder import EMBEDDED
-from hma_model.checkpoint.io import record_evaluation
+from hma_data.storage.kept import KeptParts
+from hma_data.storage.paths import StrPath, as_path, as_text
+from hma_data.tokenizers.base import Tokenizer
+from hma_model.arrays import Floats
+from hma_model.checkpoint.io import record_locally
 from hma_model.evaluation.evaluate import EvaluationSettings, WindowPlan, measure
 from hma_model.evaluation.perceptual import Networks
 from hma_model.evaluation.recorded_state import measure_recorded_state
 from hma_model.evaluation.simulated import measure_state
 from hma_model.evaluation.verdict import follows, verdict
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-    from hma_model.network.model import HMA
+from hma_model.network.model import HMA
 
 FIGURES_VERSION = 6  # raise it when the same part gives other figures
 PARTS, RESULTS = "parts", "results.json"
@@ -62,8 +59,18 @@ class Part:
     checkpoint: str
     data: str
     found: dict[str, Any]
-    by_window: dict[str, NDArray[np.float64]]
+    by_window: dict[str, Floats]
     predicted: dict[str, NDArray[Any]]
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]], label: str, shards: ShardSet) -> "Part":
+        """Return a part of the arrays that are kept of it, under the names of this command."""
+        found = {"checkpoint": label, "data": str(shards.folder)} | json.loads(str(arrays["found"]))
+        by_window, predicted = (
+            {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
+            for start in ("by_window.", "predicted.")
+        )
+        return cls(label, str(shards.folder), found, by_window, predicted)
 
 
 def evaluate_all(
@@ -90,7 +97,7 @@ def evaluate_all(
         OutputError: the folder holds something else.
     """
     settings, networks = settings or EvaluationSettings(), networks or Networks()
-    folder = None if out is None else _folder(as_path(out))
+    kept = None if out is None else KeptParts(_folder(as_path(out)), {})
     sets = [ShardSet(item) for item in data]
     _once([as_text(item) for item in checkpoints], "checkpoint")
     _once([shards.embodiment.id for shards in sets], "embodiment")
@@ -105,14 +112,14 @@ def evaluate_all(
     shown = short_paths(list(dict.fromkeys(one.label for one in work)))
     with progress("evaluate", sum(one.frames for one in work)) as update:
         for one in work:
+            robot = one.shards.embodiment.id
+            about = f"{shown[one.label]}, {robot}"
+            measured = partial(_measured, one, settings, networks, partial(_tell, update, done, about))
             mark = fingerprint(one.model, one.shards, settings, networks)
-            part = _kept(folder, mark, one.label, one.shards) if folder else None
-            about = f"{shown[one.label]}, {one.shards.embodiment.id}"
-            if part is None:
-                part = _measured(one, settings, networks, partial(_tell, update, done, about))
-                if folder:
-                    _keep(folder, mark, part)
-            _record(one.label, one.model, part, settings)
+            arrays = measured() if kept is None else kept.part(f"{robot}-{mark}", measured)
+            part = Part.of(arrays, one.label, one.shards)
+            if settings.split == "val":
+                record_locally(one.label, one.model.source, robot, judged(part.found))
             parts.append(part)
             done += one.frames
             update(done, about)
@@ -129,13 +136,13 @@ class _Work:
     """A checkpoint and a shard set that go together; `frames` are predicted for their rollouts."""
 
     label: str
-    model: "HMA"
+    model: HMA
     shards: ShardSet
     cameras: Cameras
     frames: int
 
     @classmethod
-    def of(cls, label: str, model: "HMA", shards: ShardSet, settings: EvaluationSettings) -> "_Work":
+    def of(cls, label: str, model: HMA, shards: ShardSet, settings: EvaluationSettings) -> "_Work":
         plan = WindowPlan.of(model, shards, settings)
         if settings.state and not simulated(shards.embodiment.id) and not shards.embodiment.state:
             fault = "is not one of the toolkit's simulated robots, and its shards have no states"
@@ -150,7 +157,7 @@ def _once(names: Sequence[str], what: str) -> None:
         raise UsageError(twice, f"is the {what} of two arguments", "give each once")
 
 
-def fingerprint(model: "HMA", shards: ShardSet, settings: EvaluationSettings, networks: Networks) -> str:
+def fingerprint(model: HMA, shards: ShardSet, settings: EvaluationSettings, networks: Networks) -> str:
     """Return sixteen hex digits that stand for a part: its checkpoint, set and settings."""
     robot, source = shards.embodiment.id, model.source
     assert source, "the models of a suite are loaded from checkpoints"
@@ -170,13 +177,14 @@ def fingerprint(model: "HMA", shards: ShardSet, settings: EvaluationSettings, ne
 
 
 @lru_cache(maxsize=1)
-def _tokenizer(folder: str, device: str) -> "Tokenizer":
+def _tokenizer(folder: str, device: str) -> Tokenizer:
     return tokenizer_of(ShardSet(folder), device=device)
 
 
 def _measured(
     work: _Work, settings: EvaluationSettings, networks: Networks, tell: Callable[..., None]
-) -> Part:
+) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a part: `by_window.NAME`, `predicted.KIND`, and the figures as JSON."""
     model, shards, robot = work.model, work.shards, work.shards.embodiment.id
     tokenizer = _tokenizer(str(shards.folder), str(model.device))
     tell(0, "losses first")
@@ -201,35 +209,27 @@ def _measured(
         found["missing"]["state"] = (
             "not measured: the shards have no states, and the robot is none of the toolkit's simulated ones"
         )
-    label = work.label
-    found = {"checkpoint": label, "data": str(shards.folder), **found}
     if networks.facts:
         found["networks"] = networks.facts
-    rows = {name: values.round(6) for name, values in measured.by_window.items()}
-    predicted = {kind: torch.cat(made).cpu().numpy() for kind, made in measured.predicted.items()}
-    if model.config.kind == "discrete":
-        predicted = {kind: values.astype(np.uint32) for kind, values in predicted.items()}
-    return Part(label, str(shards.folder), finite(found), rows, predicted)
+    arrays = {f"by_window.{name}": values.round(6) for name, values in measured.by_window.items()}
+    for kind, made in measured.predicted.items():
+        values = torch.cat(made).cpu().numpy()
+        arrays[f"predicted.{kind}"] = values.astype(
+            np.uint32 if model.config.kind == "discrete" else values.dtype
+        )
+    return arrays | {"found": np.array(json.dumps(finite(found)))}
 
 
-def _record(label: str, model: "HMA", part: Part, settings: EvaluationSettings) -> None:
-    """Write the verdict on held-out episodes into the card of a checkpoint of this machine."""
-    source = model.source
-    fetched = is_repository(label) or "://" in label
-    if source is None or source.folder == EMBEDDED or fetched or settings.split != "val":
-        return
-    said = verdict(part.found)
+def judged(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the verdict on a part for a model card, with the figures behind it."""
     figures = ("episodes", "windows", "psnr_action_gain_last", "psnr_action_gain_last_95")
-    facts = {"verdict": said, "follows": follows(part.found)}
-    facts |= {name: part.found.get(name) for name in figures}
-    with suppress(OutputError):  # a folder that may only be read
-        record_evaluation(source, part.found["embodiment"], facts)
-
-
-# -- the folder
+    return {"verdict": verdict(found), "follows": follows(found)} | {
+        name: found.get(name) for name in figures
+    }
 
 
 def _folder(out: Path) -> Path:
+    """Return the folder of finished parts in an output, made if necessary."""
     file = next((path for path in (out, *out.parents) if path.is_file()), None)
     if file:
         raise OutputError(file, "is a file, not a folder", "name another folder")
@@ -239,29 +239,4 @@ def _folder(out: Path) -> Path:
         (out / PARTS).mkdir(parents=True, exist_ok=True)
     except OSError as fault:
         raise OutputError(out, f"cannot be written: {fault.strerror}", "choose another --out") from fault
-    return out
-
-
-def _path(folder: Path, mark: str, robot: str) -> Path:
-    return folder / PARTS / f"{robot}-{mark}.npz"
-
-
-def _keep(folder: Path, mark: str, part: Part) -> None:
-    """Write a part as one file of arrays, which appears whole."""
-    arrays: Any = {f"predicted.{kind}": values for kind, values in part.predicted.items()}
-    arrays |= {f"by_window.{name}": values for name, values in part.by_window.items()}
-    arrays["found"] = np.array(json.dumps(part.found))
-    keep_arrays(_path(folder, mark, part.found["embodiment"]), arrays)
-
-
-def _kept(folder: Path, mark: str, label: str, shards: ShardSet) -> Part | None:
-    """Return a part that is done, under the names of this command; None if it is not done, or damaged."""
-    arrays = kept_arrays(_path(folder, mark, shards.embodiment.id))
-    if arrays is None:
-        return None
-    found = json.loads(str(arrays.pop("found"))) | {"checkpoint": label, "data": str(shards.folder)}
-    sorted_out: dict[str, dict[str, Any]] = {"predicted": {}, "by_window": {}}
-    for key, values in arrays.items():
-        kind, _, name = key.partition(".")
-        sorted_out[kind][name] = values
-    return Part(label, str(shards.folder), found, sorted_out["by_window"], sorted_out["predicted"])
+    return out / PARTS

@@ -16,13 +16,12 @@ from hma_data.episodes.images import opencv, prepare
 from hma_data.lab import truth
 from hma_data.lab.simulator import embodiment
 from hma_data.lab.truth import TrueEpisode
+from hma_model.arrays import Bools, Float32s, Floats, Images
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
-Images = NDArray[np.uint8]
-Masks = NDArray[np.bool_]
 
 NEAR = 60.0  # distance of RGB within which a pixel has an object's colour
 FEWEST = 12  # pixels of an object below which it is hidden, and not judged
@@ -44,7 +43,7 @@ class Found:
     robot: str
     true: Images
     made: Images
-    parts: NDArray[np.float64]
+    parts: Floats
     driven: int
 
 
@@ -82,7 +81,7 @@ def rolled(
     tokenizer: "Tokenizer",
     robot: str,
     stored: NDArray[Any],
-    chunks: NDArray[np.float32],
+    chunks: Float32s,
     *,
     options: dict[str, Any],
     frames: Sequence[int],
@@ -108,7 +107,7 @@ def rolled(
     return decode(tokenizer, torch.stack(kept, dim=1))
 
 
-def colors_of(found: Found) -> NDArray[np.float64]:
+def colors_of(found: Found) -> Floats:
     """Return the colour (P, 3) of each part: the commonest at its place in the true frames."""
     side, count = found.true.shape[2], found.parts.shape[2]
     places = np.clip((found.parts * side / truth.SIZE).astype(int), 0, side - 1)
@@ -117,34 +116,34 @@ def colors_of(found: Found) -> NDArray[np.float64]:
     return np.stack([np.median(pixels, axis=0) for pixels in taken])
 
 
-def distinct(colors: NDArray[np.float64]) -> NDArray[np.float64]:
+def distinct(colors: Floats) -> Floats:
     """Return the colours (C, 3) without those near an earlier one: places of one object differ a little."""
-    kept: list[NDArray[np.float64]] = []
+    kept: list[Floats] = []
     for color in colors:
         if all(np.linalg.norm(color - other) >= NEAR for other in kept):
             kept.append(color)
     return np.reshape(kept, (-1, 3))
 
 
-def masks_of(images: Images, colors: NDArray[np.float64]) -> Masks:
+def masks_of(images: Images, colors: Floats) -> Bools:
     """Return the pixels (C, …, S, S) that have each of the colours (C, 3) and no other one rather."""
     far = np.stack([np.linalg.norm(images.astype(np.float32) - color, axis=-1) for color in colors])
     return (far < NEAR) & (far == far.min(axis=0))
 
 
-def palettes(found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def palettes(found: Found) -> tuple[Floats, Floats]:
     """Return the colours of the robot's own parts and of loose objects, (C, 3) each."""
     colors = colors_of(found)
     return distinct(colors[: found.driven]), distinct(colors[found.driven :])
 
 
-def shares(true: Masks, made: Masks) -> NDArray[np.float64]:
+def shares(true: Bools, made: Bools) -> Floats:
     """Return the pixels in the model as a share of the true ones (C, B); NaN where an object is hidden."""
     areas, kept = true.sum((-1, -2)), made.sum((-1, -2))
     return np.where(areas >= FEWEST, kept / np.maximum(areas, 1), np.nan)
 
 
-def best_overlap(true: Masks, made: Masks) -> float:
+def best_overlap(true: Bools, made: Bools) -> float:
     """Return the overlap of an object with the true one (S, S) after the best shift and turn."""
     if not made.any():
         return 0.0
@@ -159,12 +158,12 @@ def best_overlap(true: Masks, made: Masks) -> float:
     return best
 
 
-def overlap(one: Masks, other: Masks) -> float:
+def overlap(one: Bools, other: Bools) -> float:
     """Return the pixels that two objects share, of those that either has."""
     return float((one & other).sum() / max((one | other).sum(), 1))
 
 
-def centre(mask: Masks) -> NDArray[np.float64]:
+def centre(mask: Bools) -> Floats:
     """Return the mean place (x, y) of an object's pixels."""
     return np.array([axis.mean() for axis in np.nonzero(mask)[::-1]])
 
@@ -208,10 +207,3 @@ def left_words(left: dict[str, Left]) -> str:
     torn = [name for name, one in left.items() if not one.whole]
     verdict = f"damaged: {' and '.join(torn)}" if torn else "intact"
     return f"{', '.join(told)}; {verdict}"
-
-
-def mean_of(values: Any) -> float | None:
-    """Return the mean of the finite values, None if there are none."""
-    kept = np.asarray(values, dtype=np.float64)
-    kept = kept[np.isfinite(kept)]
-    return round(float(kept.mean()), 3) if kept.size else None

@@ -107,7 +107,7 @@ def export_folder(
             "page": _write_parts(folder, step),
             "state": [vars(port) for port in step.state],
             "draws": [vars(port) for port in step.draws if port.law],
-            "temperature": world.temperature if model.config.kind == "discrete" else None,
+            "temperature": world.decoding.temperature if model.config.kind == "discrete" else None,
             "robots": [],
         }
         known = holdings(model.source) if model.source else {}

@@ -8,20 +8,17 @@ import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.registry.embodiment import Embodiment, find
+from hma_model.arrays import Bools, Float32s
 from hma_model.checkpoint.folder import Checkpoint
-
-if TYPE_CHECKING:
-    from hma_model.network.network import Network
-
-Float32s = NDArray[np.float32]
+from hma_model.network.network import Network
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ class Commands:
     seen: Float32s | None
 
     @classmethod
-    def of(cls, model: "Network", embodiment: str) -> "Commands":
+    def of(cls, model: Network, embodiment: str) -> "Commands":
         """Return the commands of an embodiment of a model.
 
         Raises:
@@ -99,7 +96,7 @@ class Commands:
         self.unknown(values[None])
         return values
 
-    def unknown(self, rows: Float32s) -> NDArray[np.bool_]:
+    def unknown(self, rows: Float32s) -> Bools:
         """Return which commands (n, A) are unknown; raise HMAError for values that mean nothing."""
         unknown = np.asarray(np.isnan(rows).all(axis=1))
         if not np.isfinite(rows[~unknown]).all():
@@ -129,7 +126,7 @@ class OutsideRangeWarning(UserWarning):
 
 
 def warn_outside(
-    model: "Network", actions: Tensor, embodiments: str | Sequence[str], known: Tensor | None = None
+    model: Network, actions: Tensor, embodiments: str | Sequence[str], known: Tensor | None = None
 ) -> None:
     """Warn of known actions outside the range seen in training; once of each embodiment of a model.
 
@@ -156,14 +153,14 @@ def warn_outside(
                 warnings.warn(f"{said}. Shown only once", OutsideRangeWarning, stacklevel=4)
 
 
-def _known(model: "Network", embodiment: str) -> Commands | None:
+def _known(model: Network, embodiment: str) -> Commands | None:
     """Return the commands of an embodiment; None if the checkpoint that tells them is no longer there."""
     with suppress(CheckpointError):
         return Commands.of(model, embodiment)
     return None
 
 
-def described(model: "Network", embodiment: str) -> Embodiment | None:
+def described(model: Network, embodiment: str) -> Embodiment | None:
     """Return the YAML of an embodiment of a model: its checkpoint's, else the registry's; None without one.
 
     Raises:
@@ -182,18 +179,18 @@ def described(model: "Network", embodiment: str) -> Embodiment | None:
         return None
 
 
-def card(model: "Network", embodiment: str) -> dict[str, Any]:
+def card(model: Network, embodiment: str) -> dict[str, Any]:
     """Return the card of an embodiment of a model; empty if the model is not from a checkpoint."""
     kept = _checkpoint(model, embodiment)
     return {} if kept is None else kept.card(embodiment)
 
 
-def _checkpoint(model: "Network", embodiment: str) -> Checkpoint | None:
+def _checkpoint(model: Network, embodiment: str) -> Checkpoint | None:
     kept = model.source
     return kept if kept and embodiment in kept.embodiments else None
 
 
-def _seen(model: "Network", embodiment: str) -> Float32s | None:
+def _seen(model: Network, embodiment: str) -> Float32s | None:
     kept = _checkpoint(model, embodiment)
     action = {} if kept is None else kept.stats(embodiment)["action"]
     if "min" not in action or "max" not in action:

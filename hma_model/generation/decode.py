@@ -3,21 +3,17 @@
 B batch, T frames, h,w grid, S pixels a side, C cameras.
 """
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from hma_data.errors import UsageError
 from hma_data.loading.views import FIRST_CAMERA, Cameras, view_count
 from hma_data.shards.reader import ShardSet
+from hma_data.tokenizers.base import Tokenizer
 from hma_data.tokenizers.network import NetworkTokenizer
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-    from hma_model.network.network import Network
+from hma_model.arrays import Images
+from hma_model.network.network import Network
 
 
 def default_prompt(length: int) -> int:
@@ -25,7 +21,7 @@ def default_prompt(length: int) -> int:
     return max(1, length // 3)
 
 
-def decode(tokenizer: "Tokenizer", stored: Tensor) -> NDArray[np.uint8]:
+def decode(tokenizer: Tokenizer, stored: Tensor) -> Images:
     """Decode ids (B, T, C·h, w) or latents (B, T, c, C·H, W) to pictures (B, T, S, C·S, 3), side by side."""
     views, rows = stored.flatten(0, 1), tokenizer.spec.grid[0]
     if isinstance(tokenizer, NetworkTokenizer) and not stored.is_cpu:  # tokens stay on the GPU
@@ -39,7 +35,7 @@ def decode(tokenizer: "Tokenizer", stored: Tensor) -> NDArray[np.uint8]:
     return pictures.reshape(*stored.shape[:2], *pictures.shape[1:])
 
 
-def cameras_for(model: "Network", shards: ShardSet, cameras: Cameras | None = None) -> Cameras:
+def cameras_for(model: Network, shards: ShardSet, cameras: Cameras | None = None) -> Cameras:
     """Return the cameras that a model sees: those given, or those that it was trained on.
 
     Raises:

@@ -29,12 +29,11 @@ class Passes:
 
     Attributes:
         passive: no actions at all; None as long as no step has told.
-        noise_level: that the model is told of frames that it made itself; 0 tells nothing.
     """
 
     def __init__(self, model: Network, engine: Engine, state: RowState, caching: bool) -> None:
         self.model, self.config, self.engine, self.state = model, model.config, engine, state
-        self.caching, self.noise_level = caching, 0.0
+        self.caching = caching
         self.passive: bool | None = None
 
     def begin(self, rows: list[int]) -> list[Pass]:
@@ -70,10 +69,7 @@ class Passes:
         values = torch.cat([fresh, part.lay_out(frame.values).unsqueeze(1)], dim=1)
         masked = torch.zeros(values.shape[:3], dtype=torch.bool, device=values.device)
         masked[:, -1] = part.lay_out(frame.masked)
-        levels = None
-        if whole and part.levels is not None:
-            levels = torch.nn.functional.pad(part.levels, (0, 1))  # of the new frame nothing is told
-        x = self._embed(values, masked, levels)
+        x = self.model.embed(values, masked.unsqueeze(-1))
         if not self.caching:
             return x, part.conditioning, part.times, None
         conditioning = part.conditioning if first else part.conditioning.last()
@@ -111,18 +107,16 @@ class Passes:
         begin = [max(min(self.state.times[row], last) - 1, 0) for row in rows]  # of idle rows any will do
         times = self.state.cached_times(rows, begin, 2)
         times.wanted = 1
-        before = times.positions[:, :1]
-        past, levels = self.state.past(rows, before), self._levels(rows, before)
-        return Pass(past, levels, times, self._condition(rows, times.positions))
+        past = self.state.past(rows, times.positions[:, :1])
+        return Pass(past, times, self._condition(rows, times.positions))
 
     def _whole(self, rows: list[int], members: list[int]) -> Pass:
         """Return the pass over all frames and the next one of those rows of a step that are at one time."""
         chosen = [rows[i] for i in members]
         times = window_times(self.config, self.state.times[chosen[0]] + 1, self.model.device)
-        before = times.positions[:-1].unsqueeze(0)
-        past, levels = self.state.past(chosen, before), self._levels(chosen, before)
+        past = self.state.past(chosen, times.positions[:-1].unsqueeze(0))
         conditioning = self._condition(chosen, times.positions.unsqueeze(0))
-        return Pass(past, levels, times, conditioning, among=self.state.tensor(members))
+        return Pass(past, times, conditioning, among=self.state.tensor(members))
 
     def _past_features(self, rows: list[int], count: int, late: int) -> Tensor:
         """Add `count` known frames, `late` before the next one, to the cache; return their features."""
@@ -134,7 +128,7 @@ class Passes:
         positions = times.positions if times.positions.dim() > 1 else times.positions.unsqueeze(0)
         past = self.state.past(rows, positions)
         masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
-        x = self._embed(past, masked, self._levels(rows, positions))
+        x = self.model.embed(past, masked.unsqueeze(-1))
         return self.engine.trunk(x, self._condition(rows, positions), times, carried)
 
     def _compute(self, frame: TokenFrame | PatchFrame, part: Pass, first: bool) -> tuple[Tensor, Tensor]:
@@ -146,15 +140,6 @@ class Passes:
         if part.lanes is None:
             return features, at
         return features[part.lanes], at if len(at) == 1 else at[part.lanes]
-
-    def _embed(self, values: Tensor, masked: Tensor, levels: Tensor | None) -> Tensor:
-        """Embed frames (n, T, S) of which some tokens are masked, (n, T, S) bool, as (n, T, S, D)."""
-        return self.model.embed(values, masked.unsqueeze(-1), corruption=levels)
-
-    def _levels(self, rows: list[int], positions: Tensor) -> Tensor | None:
-        """Return the noise (n, T) that the model is told of the frames at times (1 or n, T)."""
-        level = self.noise_level
-        return self.state.made(rows, positions) * level if level else None
 
     def _carried(self) -> Carried:
         """Return what the trunk carries of the rows' past frames."""

@@ -32,8 +32,6 @@ from hma_model.generation.unmask import (
     Decoding,
     PatchFrame,
     TokenFrame,
-    check,
-    default_temperature,
     masked_after,
 )
 from hma_model.network.conditioning import Groups
@@ -54,7 +52,7 @@ class Rollout:
             may not reach the rollout.
         embodiment: one id for all, or one a row.
         batch: B.
-        unmask_steps, temperature, order, sample_steps, noise_level: as in `HMA.generate`.
+        unmask_steps, temperature, order, sample_steps: as in `HMA.generate`.
         generator: of the seeds of rows that get none.
         cache: keep keys and values of past frames.
         compile: compile the passes over one or two frames, on a GPU with CUDA graphs; the first frames then
@@ -63,6 +61,7 @@ class Rollout:
             rows beside it.
 
     Attributes:
+        decoding: the settings of unmasking; they may be replaced between steps.
         state: the state of the rows.
         passes: of the trunk over their frames.
         uncertainty: (n,) of the rows of the last step, if `decoding` measures it. Of tokens, the mean entropy
@@ -80,33 +79,20 @@ class Rollout:
         temperature: float | None = None,
         order: str = "random",
         sample_steps: int | None = None,
-        noise_level: float = 0.0,
         generator: torch.Generator | None = None,
         cache: bool = True,
         compile: bool = False,
         precision: str = "float32",
     ) -> None:
         self.model, self.config = model, model.config
-        warmth = default_temperature(model.config) if temperature is None else temperature
-        decoding = Decoding(unmask_steps, warmth, order, sample_steps, noise_level)
-        check(decoding, self.config)
+        self.decoding = Decoding.of(model.config, unmask_steps, temperature, order, sample_steps)
         self.batch, self.caching = batch, cache
         self.engine = Engine(model, precision, compile and cache)
         Groups.of(embodiment, batch)  # checks that there are as many ids as rows
         names = [embodiment] * batch if isinstance(embodiment, str) else list(embodiment)
         self.state = RowState(model, names, generator, cache)
         self.passes = Passes(model, self.engine, self.state, cache)
-        self.decoding = decoding
         self.told = False  # some prompt had actions
-
-    @property
-    def decoding(self) -> Decoding:
-        """Return the settings of unmasking; they may be replaced between steps."""
-        return self._decoding
-
-    @decoding.setter
-    def decoding(self, given: Decoding) -> None:
-        self._decoding, self.passes.noise_level = given, given.noise_level
 
     # -- rows ---------------------------------------------------------------------------------------------
 
@@ -158,9 +144,9 @@ class Rollout:
         self.state.begin(chosen, names, values[:, last], given.frames(last), seeds)
         self.told = self.told or actions is not None
 
-    def fork(self, n: int) -> "Rollout":
-        """Return a new rollout that has every row n times, side by side, with the same random numbers."""
-        rows = [row for row in range(self.batch) for _ in range(n)]
+    def fork(self, n: int, rows: Sequence[int] | None = None) -> "Rollout":
+        """Return a new rollout that has some rows n times, side by side, with the same random numbers."""
+        rows = [row for row in self._chosen(rows) for _ in range(n)]
         names = [self.state.embodiments[row] for row in rows]
         other = Rollout(
             self.model, names, len(rows), generator=self.state.shared, cache=self.caching,
@@ -312,7 +298,7 @@ class Rollout:
         """Return the next frame (n, S) of rows: begin with a masked one, and unmask it step by step."""
         frame, passes = self._blank(rows), self.passes.begin(rows)
         left = tokens = self.config.tokens_per_frame
-        steps = 1 if self.config.whole_frames else self.decoding.steps
+        steps = 1 if self.config.whole_frames else self.decoding.unmask_steps
         for step in range(steps):
             count = left - masked_after(step, steps, tokens)
             if count <= 0:

@@ -27,7 +27,7 @@ class Snapshot:
     """A copy of the state of n rows.
 
     Attributes:
-        embodiments, times, pending, prompts: as of `RowState`.
+        embodiments, times, pending: as of `RowState`.
         generators: the states of the generators.
         frames, chunks, known: the rows of the buffers.
         carried: the rows of what the trunk carries; None if there is nothing yet.
@@ -37,7 +37,6 @@ class Snapshot:
     embodiments: tuple[str, ...]
     times: tuple[int, ...]
     pending: tuple[int, ...]
-    prompts: tuple[int, ...]
     generators: tuple[Tensor | None, ...]
     frames: Tensor
     chunks: Tensor
@@ -53,7 +52,6 @@ class Snapshot:
             embodiments=tuple(self.embodiments[row] for row in rows),
             times=tuple(self.times[row] for row in rows),
             pending=tuple(self.pending[row] for row in rows),
-            prompts=tuple(self.prompts[row] for row in rows),
             generators=tuple(self.generators[row] for row in rows),
             frames=self.frames[index],
             chunks=self.chunks[index],
@@ -68,14 +66,12 @@ class Pass:
 
     Attributes:
         past: (rows, T - 1, S) the frames before the new one that the first pass computes.
-        levels: (rows, T - 1) the noise that the model is told of them; None for none.
         times, conditioning: of the T frames.
         among: numbers of the pass's rows among those of the step; None if they are the same.
         lanes: numbers of the step's rows among those of the pass; None if they are the same.
     """
 
     past: Tensor
-    levels: Tensor | None
     times: TimePositions
     conditioning: Conditioning
     among: Tensor | None = None
@@ -105,7 +101,6 @@ class RowState:
         embodiments: the id of each row.
         times: the time of each row's next frame; 0 if the row has no prompt.
         pending: how many of each row's newest frames are not in the cache yet.
-        prompts: the time of each row's first frame that is not its prompt's.
         generators: of each row's random numbers; None until a row without a seed draws.
         frames: (B, R, S) ids of the trunk's tokens, or scaled patches (B, R, S, C).
         chunks, known: (B, R, K) float32 raw and (B, R) bool, the chunk in force at each frame.
@@ -118,7 +113,7 @@ class RowState:
         self.model, self.config, self.shared, self.caching = model, model.config, generator, caching
         self.embodiments = list(embodiments)
         batch, config = len(self.embodiments), model.config
-        self.times, self.pending, self.prompts = [0] * batch, [0] * batch, [0] * batch
+        self.times, self.pending = [0] * batch, [0] * batch
         self.generators: list[torch.Generator | None] = [None] * batch
         slots = config.frames + (not config.released)
         blank = self.blank(batch).unsqueeze(1)
@@ -165,7 +160,7 @@ class RowState:
         self.chunks[index, :count, :width], self.known[index, :count] = given.chunks, given.known
         for i, row in enumerate(rows):
             self.embodiments[row] = names[i]
-            self.times[row] = self.pending[row] = self.prompts[row] = count
+            self.times[row] = self.pending[row] = count
             self.generators[row] = None if seeds is None else self._seeded(seeds[i])
 
     def put_chunk(self, rows: Sequence[int], late: int, chunk: Tensor | None, known: Tensor | None) -> None:
@@ -184,10 +179,8 @@ class RowState:
             self.times[row], self.pending[row] = self.times[row] + 1, 1
 
     def put_seen(self, rows: Sequence[int], frames: Tensor) -> None:
-        """Add the next frame (n, S) of each row, which no pass has computed; it counts as the prompt's."""
+        """Add the next frame (n, S) of each row, which no pass has computed."""
         pending = [self.pending[row] + 1 for row in rows]
-        for row in rows:
-            self.prompts[row] += self.prompts[row] == self.times[row]
         self.put_frame(rows, frames)
         for row, count in zip(rows, pending):
             self.pending[row] = count
@@ -205,10 +198,6 @@ class RowState:
         """Return the frames (n, T, S) at times (n or 1, T)."""
         return self.frames[self.tensor(rows).unsqueeze(1), positions % self.slots]
 
-    def made(self, rows: Sequence[int], positions: Tensor) -> Tensor:
-        """Return whether the frames at times (n or 1, T) are not the prompt's, (n, T) bool."""
-        return positions >= self.tensor([self.prompts[row] for row in rows]).unsqueeze(1)
-
     def slide(self, rows: Sequence[int]) -> None:
         """Drop the oldest frame of rows whose window is full, and give the others the times before theirs.
 
@@ -222,7 +211,6 @@ class RowState:
             buffer[index] = buffer[index].roll(-1, dims=1)
         for row in full:
             self.times[row] = self.pending[row] = self.config.frames - 1
-            self.prompts[row] = max(self.prompts[row] - 1, 0)
 
     def grow(self, rows: Sequence[int]) -> None:
         """Make slots for the next frame of rows that keep all their frames."""
@@ -288,7 +276,7 @@ class RowState:
     def snapshot(self, rows: Sequence[int]) -> Snapshot:
         """Return a copy of the state of rows."""
         states = tuple(None if one is None else one.get_state() for one in self.generators)
-        lists = tuple(self.embodiments), tuple(self.times), tuple(self.pending), tuple(self.prompts), states
+        lists = tuple(self.embodiments), tuple(self.times), tuple(self.pending), states
         return Snapshot(*lists, self.frames, self.chunks, self.known, self.carried).take(rows)
 
     def restore(self, rows: Sequence[int], kept: Snapshot) -> None:
@@ -303,7 +291,6 @@ class RowState:
         for i, row in enumerate(rows):
             self.embodiments[row] = kept.embodiments[i]
             self.times[row], self.pending[row] = kept.times[i], kept.pending[i]
-            self.prompts[row] = kept.prompts[i]
             state, self.generators[row] = kept.generators[i], None
             if state is not None:
                 generator = self.generators[row] = self._seeded(0)

@@ -23,31 +23,35 @@ from hma_model.network.head import LatentReadout, RegressionReadout, TokenReadou
 TEMPERATURE = 0.5
 
 
-def default_temperature(config: HMAConfig) -> float:
-    """Return the temperature at which a model's frames are drawn unless the caller says otherwise."""
-    return TEMPERATURE if config.kind == "discrete" else 0.0
-
-
 @dataclass(frozen=True)
 class Decoding:
     """The settings of unmasking.
 
     Attributes:
-        steps: number of passes a frame.
+        unmask_steps: number of passes a frame.
         temperature: 0 takes the likeliest token, else it divides the logits; for the diffusion head it is the
             share of fresh noise in a step.
         order: "random" or "confidence"; patches have no confidence.
         sample_steps: sampling steps of the diffusion head; None for the configuration's.
-        noise_level: the share of a generated frame's digits that the model is told to distrust.
         measure: add up how unsure the model is of what it decides; see `uncertainty` of the frames.
     """
 
-    steps: int = 2
+    unmask_steps: int = 2
     temperature: float = TEMPERATURE
     order: str = "random"
     sample_steps: int | None = None
-    noise_level: float = 0.0
     measure: bool = False
+
+    @classmethod
+    def of(
+        cls, config: HMAConfig, steps: int, temperature: float | None, order: str, sample_steps: int | None
+    ) -> "Decoding":
+        """Return the settings for a model, with its own temperature by default; raise as `check`."""
+        if temperature is None:
+            temperature = TEMPERATURE if config.kind == "discrete" else 0.0
+        made = cls(steps, temperature, order, sample_steps)
+        check(made, config)
+        return made
 
 
 def masked_after(step: int, steps: int, tokens: int) -> int:
@@ -230,13 +234,11 @@ def _gather(features: Tensor, chosen: Tensor) -> Tensor:
 
 def check(decoding: Decoding, config: HMAConfig) -> None:
     """Raise HMAError for a setting that a model does not take."""
-    kind, told = config.kind, config.told_noise
+    kind = config.kind
     orders = ("random", "confidence") if kind == "discrete" else ("random",)
     for name, value, allowed, remedy in (
-        ("unmask_steps", decoding.steps, decoding.steps >= 1, "give at least 1"),
+        ("unmask_steps", decoding.unmask_steps, decoding.unmask_steps >= 1, "give at least 1"),
         ("temperature", decoding.temperature, decoding.temperature >= 0, "give at least 0"),
-        ("noise_level", decoding.noise_level, 0 <= decoding.noise_level <= 1, "give a share from 0 to 1"),
-        ("noise_level", decoding.noise_level, told or not decoding.noise_level, "train with told_noise"),
         ("order", decoding.order, decoding.order in orders, f"a {kind} model takes {' or '.join(orders)}"),
     ):
         if not allowed:

@@ -25,10 +25,11 @@ from lerobot.processor import (
 from torch import Tensor
 
 from hma_data.errors import UsageError
+from hma_model.config import POLICY
 from hma_model.hub.publish import located
 from hma_model.lerobot_env import in_one_line, only_embodiment
 from hma_model.lerobot_env.vector import camera_names
-from hma_model.worlds.world import load_world, require_actor
+from hma_model.worlds.world import load_world
 
 NO_TRAINING = "is trained by hma train with objectives={policy: 1.0}, and not by lerobot"
 
@@ -80,7 +81,7 @@ class WorldModelPolicy(PreTrainedPolicy):
                 unmask_steps=config.unmask_steps,
                 temperature=config.temperature,
             )
-            require_actor(self._world.model.config, config.checkpoint)
+            self._world.model.require_readout(POLICY, config.checkpoint)
             self._commands = self._world.action_spec(self._embodiment)
         self.network = self._world.model  # lerobot moves it and counts its parameters
         self._sessions: list[int] = []

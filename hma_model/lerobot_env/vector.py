@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hma_data.errors import UsageError
 from hma_data.lab.simulator import simulated
 from hma_data.shards.reader import ShardSet
+from hma_model.arrays import Float32s, Ints
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.evaluation.recorded_state import EPISODES_NEEDED, Reader, recorded_reader, simulated_reader
 from hma_model.policies.judge import StateJudge, Task, task_of, train_judge
@@ -24,7 +25,6 @@ from hma_model.worlds.env import WorldModelVectorEnv
 from hma_model.worlds.images import recorded_cameras, seen_cameras, trained_cameras
 from hma_model.worlds.world import World
 
-Float32s = NDArray[np.float32]
 Observations = dict[str, Any]
 NEW_ROLLOUT = "lerobot_new_rollout"  # an option with which lerobot's evaluation begins each batch
 SYNTHETIC = "synthetic"  # an observation of 1; in lerobot's recordings it tells that no robot did this
@@ -201,7 +201,7 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         value = getattr(self, name)
         return tuple(value(*args, **kwargs)) if callable(value) else (value,) * self.num_envs
 
-    def _read(self, rows: NDArray[np.int64]) -> None:
+    def _read(self, rows: Ints) -> None:
         """Read the states of environments off their newest images."""
         if self.reader is not None and len(rows):
             self._states[rows] = self.reader.read(np.stack([self.envs[i].image for i in rows]))

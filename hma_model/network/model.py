@@ -82,6 +82,7 @@ class HMA(Network):
         embodiment: str | Sequence[str],
         action_mask: Tensor | None = None,
         true: Tensor | None = None,
+        frame: Tensor | None = None,
     ) -> Tensor:
         """Compute the scores of every token of a window.
 
@@ -92,28 +93,14 @@ class HMA(Network):
             action_mask: (B, T) bool, True where a chunk is known; by default all are.
             true: (B, T, h, w) int64 tokens whose digits a chain's later digits are given; by default those
                 are the likeliest.
+            frame: (B,) int64, the only frame of each window to score; T of the result is then 1.
 
         Returns:
             (B, T, h, w, F, V) float32, low digit first; with `merge`, of the trunk's tokens and their digits.
         """
         self._require("discrete", "video_logits")
         groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
-        conditioning = self.condition_window(actions, action_mask, groups, times)
-        return self.logits_under(conditioning, tokens, groups, times, true)
-
-    def logits_under(
-        self,
-        conditioning: Conditioning,
-        tokens: Tensor,
-        groups: Groups,
-        times: TimePositions,
-        true: Tensor | None = None,
-        frame: Tensor | None = None,
-    ) -> Tensor:
-        """Compute `video_logits` under a conditioning that `condition_window` has computed.
-
-        With `frame` (B,) int64, only that frame of each window is scored, and T is 1.
-        """
+        conditioning = self._condition_window(actions, action_mask, groups, times)
         values = groups.sort(self.frame_values(tokens))
         x = self.embed(values)
         given = None if true is None else to_digits(groups.sort(self.frame_values(true)), self.config.digits)
@@ -149,18 +136,7 @@ class HMA(Network):
         """
         self._require("continuous", "video_conditions")
         groups, times = Groups.of(embodiment, len(latents)), self.time_positions(latents.shape[1])
-        conditioning = self.condition_window(actions, action_mask, groups, times)
-        return self.conditions_under(conditioning, latents, mask, groups, times)
-
-    def conditions_under(
-        self,
-        conditioning: Conditioning,
-        latents: Tensor,
-        mask: Tensor,
-        groups: Groups,
-        times: TimePositions,
-    ) -> Tensor:
-        """Compute `video_conditions` under a conditioning that `condition_window` has computed."""
+        conditioning = self._condition_window(actions, action_mask, groups, times)
         patches, pixels = patchify(latents, self.config.patch), patchify(mask.unsqueeze(2), self.config.patch)
         x = self.embed(groups.sort(patches), groups.sort(pixels))
         before = None
@@ -229,7 +205,6 @@ class HMA(Network):
         cache: bool = True,
         sample_steps: int | None = None,
         known: Tensor | None = None,
-        noise_level: float = 0.0,
         precision: str = "float32",
         compile: bool = False,
     ) -> Tensor:
@@ -249,8 +224,6 @@ class HMA(Network):
             sample_steps: sampling steps of the diffusion head.
             known: (B, P + frames) bool, False where a chunk is unknown, as `action_mask` in training; by
                 default all are known.
-            noise_level: how corrupted the model is to take its own frames for, 0 to 1. For models trained
-                with `told_noise`.
             precision: "float32"; "bf16" or "int8" for products in these.
             compile: compile the trunk; the first frames then take a minute or more.
 
@@ -263,12 +236,19 @@ class HMA(Network):
         made = generate(
             self, prompt, actions, embodiment, frames, mask=known, unmask_steps=unmask_steps,
             temperature=temperature, generator=generator, order=order, cache=cache, sample_steps=sample_steps,
-            noise_level=noise_level, precision=precision, compile=compile,
+            precision=precision, compile=compile,
         )  # fmt: skip
         if actions is not None:
             used = prompt.shape[1] + frames - 1
             warn_outside(self, actions[:, :used], embodiment, None if known is None else known[:, :used])
         return made
+
+    def _condition_window(
+        self, actions: Tensor | None, known: Tensor | None, groups: Groups, times: TimePositions
+    ) -> Conditioning:
+        """Return the trunk's conditioning by chunks (B, T, K), of which some are known (B, T)."""
+        given = None if actions is None else align(self.config, actions, known, len(times.positions))
+        return self.condition(given, groups, times.positions)
 
     def _require(self, kind: str, name: str) -> None:
         if self.config.kind != kind:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from hma_data.errors import CheckpointError, HMAError
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.config import OBJECTIVES, POLICY, ActionSpace, HMAConfig, Readout
-from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
+from hma_model.network.conditioning import ActionConditioning, Groups, condition
 from hma_model.network.head import (
     ActionHead,
     Generators,
@@ -172,14 +172,6 @@ class Network(nn.Module):
         """Return the trunk's conditioning; the function of this name explains the arguments."""
         return condition(self.trunk, self.stem, given, groups, positions, unsort)
 
-    def condition_window(
-        self, actions: Tensor | None, known: Tensor | None, groups: Groups, times: TimePositions
-    ) -> Conditioning:
-        """Return the trunk's conditioning by chunks (B, T, K), of which some are known (B, T)."""
-        frames = len(times.positions)
-        given = None if actions is None else align(self.config, actions, known, frames)
-        return self.condition(given, groups, times.positions)
-
     def time_positions(self, frames: int) -> TimePositions:
         """Return the times of a window of this many frames."""
         if frames > self.config.frames and self.config.released:
@@ -241,15 +233,15 @@ class Network(nn.Module):
             return features[:, :, -self.config.action_tokens :].mean(2)
         return features.mean(2)
 
-    def require_readout(self, readout: Readout) -> None:
+    def require_readout(self, readout: Readout, where: object = None) -> None:
         """Raise HMAError unless an objective of the training trained a readout: else it returns noise."""
         if readout in self.config.trained_readouts:
             return
-        where = self.source.name if self.source else "the model"
+        where = where or (self.source.name if self.source else "the model")
         objectives = ", ".join(name for name, weight in self.config.objectives.items() if weight)
-        wanted = " or ".join(name for name, one in OBJECTIVES.items() if one.readout == readout)
-        fault = f"was not trained to predict actions by {readout.name!r}, but for {objectives}"
-        raise HMAError(where, fault, f"train one with the objective {wanted}")
+        wanted = [f"{{{name}: 1.0}}" for name, one in OBJECTIVES.items() if one.readout == readout]
+        fault = f"was not trained to {readout.deed}, but for {objectives}"
+        raise HMAError(where, fault, f"train one with objectives={' or '.join(wanted)}")
 
     def read_chunks(self, pooled: Tensor, groups: Groups, readout: Readout, generator: Generators) -> Tensor:
         """Read chunks (B, T, K) in the batch's order off action features (B, T, D) sorted by embodiment.

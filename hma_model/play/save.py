@@ -16,8 +16,9 @@ from hma_data.episodes.sheets import gif_bytes, write_mp4, write_text
 from hma_data.registry.embodiment import Embodiment
 from hma_data.registry.export import packed_components
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
+from hma_model.arrays import Images
 from hma_model.play.session import Frame, Session
-from hma_model.worlds.scenes import Drivable, Image
+from hma_model.worlds.scenes import Drivable
 
 FILE_KINDS = {  # name -> media type and ending
     "mp4": ("video/mp4", ".mp4"),
@@ -87,13 +88,13 @@ def told_by(session: Session, kind: str) -> Told:
     return tell
 
 
-def _counted(frames: Sequence[Frame], side: int, truth: str, on_progress: Told) -> Iterator[Image]:
+def _counted(frames: Sequence[Frame], side: int, truth: str, on_progress: Told) -> Iterator[Images]:
     for done, panel in enumerate(panels(frames, side, truth), 1):
         yield panel
         on_progress("writing frames" if done < len(frames) else "encoding the film", done, len(frames))
 
 
-def panels(frames: Sequence[Frame], side: int, truth: str) -> Iterator[Image]:
+def panels(frames: Sequence[Frame], side: int, truth: str) -> Iterator[Images]:
     """Return the model's images, and the true ones beside them, with titles; an unknown one is white."""
     wide = any(frame.true is not None for frame in frames)
     for frame in frames:
@@ -105,7 +106,7 @@ def panels(frames: Sequence[Frame], side: int, truth: str) -> Iterator[Image]:
         yield np.concatenate(shown, axis=1)
 
 
-def _panel(title: str, data: bytes, side: int) -> Image:
+def _panel(title: str, data: bytes, side: int) -> Images:
     import cv2
 
     image = decode_image(data, "a frame")
@@ -148,7 +149,7 @@ def lerobot_episode(robot: Drivable, frames: Sequence[Frame]) -> tuple[LeRobotEp
     return LeRobotEpisode(seen, actions, state, "driven by hand in a world model", hold=stride), own
 
 
-class _Views(Sequence[Image]):
+class _Views(Sequence[Images]):
     """One of several views side by side in JPEG images; an image is decoded when it is asked for."""
 
     def __init__(self, images: Sequence[bytes], view: int, views: int) -> None:

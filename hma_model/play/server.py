@@ -13,13 +13,15 @@ import socket
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 from urllib.parse import parse_qs, quote, urlsplit
 
 import anyio
 import numpy as np
+import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
@@ -28,19 +30,15 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from hma_data.errors import HMAError, UsageError
+from hma_data.tokenizers.base import Tokenizer
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.play import messages
 from hma_model.play.holding import UNKNOWN, Holding, holdings
 from hma_model.play.pads import describe, labels
 from hma_model.play.save import FILE_KINDS, film, told_by
-from hma_model.play.session import Frame, FrameSampling, Session
+from hma_model.play.session import Frame, Session
 from hma_model.play.stepper import Stepper
 from hma_model.worlds.scenes import Drivable
-
-if TYPE_CHECKING:
-    import uvicorn
-
-    from hma_data.tokenizers.base import Tokenizer
 
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -392,7 +390,10 @@ class Connection:
                     session.replays = message.on
                     session.ended = False
                 case messages.SampleMessage():
-                    way = FrameSampling(message.passes, round(message.temperature, 1), message.order)
+                    warmth = round(message.temperature, 1)
+                    way = replace(
+                        session.sampling, unmask_steps=message.passes, temperature=warmth, order=message.order
+                    )
                     self.stepper.change(session, way)
             self.tell(session.status())
         except HMAError as fault:

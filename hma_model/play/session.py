@@ -9,32 +9,22 @@ import math
 from collections import deque
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hma_data.episodes.images import opencv, resize
 from hma_data.errors import UsageError
+from hma_model.arrays import Float32s, Images
 from hma_model.evaluation.calibration import POWER
+from hma_model.generation.unmask import Decoding
 from hma_model.play.pads import describe
-from hma_model.worlds.scenes import Drivable, Float32s, Image, LabScene
-
-if TYPE_CHECKING:
-    from hma_model.worlds.world import World
+from hma_model.worlds.scenes import Drivable, LabScene
+from hma_model.worlds.world import World
 
 RESTART_FRAMES = 8  # frames that a restart of the model is given
 KEPT_FRAMES = 3000  # frames to save
 QUALITY = 92  # of JPEG
-
-
-@dataclass(frozen=True)
-class FrameSampling:
-    """The way in which a frame is decoded: passes, temperature, and the order random or confidence."""
-
-    passes: int
-    temperature: float
-    order: str
 
 
 @dataclass(frozen=True)
@@ -87,7 +77,7 @@ class Session:
     """
 
     def __init__(
-        self, name: str, robot: Drivable, number: int, world: "World", sampling: FrameSampling, now: float
+        self, name: str, robot: Drivable, number: int, world: World, sampling: Decoding, now: float
     ) -> None:
         self.name = name
         self.robot = robot
@@ -110,12 +100,10 @@ class Session:
             self._set_start()
             undo.pop_all()
 
-    def sample(self, sampling: FrameSampling) -> None:
+    def sample(self, sampling: Decoding) -> None:
         """Go on with another sampling; the meter of uncertainty is that of such frames."""
         self.sampling = sampling
-        robot = self.robot.embodiment.id
-        way = {"unmask_steps": sampling.passes, "temperature": sampling.temperature, "order": sampling.order}
-        meter, self.unmetered = self._world.meter(robot, **way)
+        meter, self.unmetered = self._world.meter(self.robot.embodiment.id, **vars(sampling))
         if meter is not None and not meter.better:
             self.unmetered = meter.verdict
         self.meter = None if self.unmetered else meter
@@ -132,7 +120,7 @@ class Session:
         self.number = number
         self.scene = self.robot.scene(number)
         prompt = self.scene.prompt
-        self._true: deque[Image] = deque(prompt.frames, maxlen=RESTART_FRAMES)
+        self._true: deque[Images] = deque(prompt.frames, maxlen=RESTART_FRAMES)
         self._chunks: deque[Float32s] = deque(prompt.chunks, maxlen=RESTART_FRAMES - 1)
         self.held = self.scene.action.copy()
         self.frames: deque[Frame] = deque(maxlen=KEPT_FRAMES)
@@ -172,7 +160,7 @@ class Session:
         self._world.reset(self.row, *self._history())
         self._last = self._restarted(self._last)
 
-    def _history(self) -> tuple[Image, Float32s]:
+    def _history(self) -> tuple[Images, Float32s]:
         """Return the true last frames, and the chunks between them."""
         frames = list(self._true)
         chunks = list(self._chunks)
@@ -201,7 +189,7 @@ class Session:
         """Give the place in the world back."""
         self._world.close(self.row)
 
-    def take(self, image: Image, now: float, took: float) -> None:
+    def take(self, image: Images, now: float, took: float) -> None:
         """Take the model's image (H, W, 3) of the step, which took so many seconds, and show it."""
         self.steps = max(0, self.steps - 1)
         self.count += 1
@@ -259,9 +247,11 @@ class Session:
 
     def status(self) -> dict[str, Any]:
         """Return the settings that the page shows, as plain values."""
+        way = self.sampling
+        sampling = {"passes": way.unmask_steps, "temperature": way.temperature, "order": way.order}
         return {
             "kind": "status", "paused": self.paused, "replays": self.replays, "fast": self.fast,
-            "sampling": vars(self.sampling), "scene": self.number, "frame": self.count, "ended": self.ended,
+            "sampling": sampling, "scene": self.number, "frame": self.count, "ended": self.ended,
             "knows": bool(self._true), "parted": self.parted, "meter": self.metered,
             "unmetered": self.unmetered, "metered": "" if self.meter is None else self.meter.verdict,
         }  # fmt: skip
@@ -282,7 +272,7 @@ class Session:
         return [*([self.start] if self.count == len(self.frames) else []), *self.frames]
 
 
-def jpeg(image: Image) -> bytes:
+def jpeg(image: Images) -> bytes:
     """Return an image (H, W, 3) RGB as a JPEG with colours at full size."""
     cv2 = opencv()
     settings = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
@@ -291,7 +281,7 @@ def jpeg(image: Image) -> bytes:
     return data
 
 
-def psnr(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
+def psnr(one: Images, other: Images) -> float:
     """Return the peak signal-to-noise ratio of two images in dB, 60 at most."""
     error = float(np.mean((one.astype(np.float32) - other.astype(np.float32)) ** 2))
     return 60.0 if error < 0.065 else round(10 * math.log10(255**2 / error), 2)
@@ -323,7 +313,7 @@ class DivergenceDetector:
         parted: number of that frame; None so far.
     """
 
-    def __init__(self, true: Image, shown: Image, second: int) -> None:
+    def __init__(self, true: Images, shown: Images, second: int) -> None:
         self.parted: int | None = None
         self._second = max(MIN_ROW, second)
         self._first = _thumbnail(true)
@@ -331,7 +321,7 @@ class DivergenceDetector:
         self._moments = self._first[None]  # (n, S, S, 3) true ones, the oldest first
         self._lost = 0  # frames in a row
 
-    def look(self, number: int, image: Image, true: Image) -> None:
+    def look(self, number: int, image: Images, true: Images) -> None:
         """Compare the model's frame of a number with the true one."""
         if self.parted is not None:
             return
@@ -349,5 +339,5 @@ class DivergenceDetector:
             self.parted = number - self._second + 1
 
 
-def _thumbnail(image: Image) -> NDArray[np.float32]:
+def _thumbnail(image: Images) -> Float32s:
     return resize(image[None], SIDE, "stretch")[0].astype(np.float32)

@@ -16,15 +16,16 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hma_data.errors import HMAError, UsageError
-from hma_model.play.session import FrameSampling, Session, Viewer
-from hma_model.worlds.scenes import Drivable, Float32s
-
-if TYPE_CHECKING:
-    from hma_model.worlds.world import World
+from hma_model.arrays import Float32s
+from hma_model.generation.unmask import Decoding
+from hma_model.play.session import Session, Viewer
+from hma_model.worlds.scenes import Drivable
+from hma_model.worlds.world import World
 
 MAX_SESSIONS, IDLE_S = 8, 300.0
 SLEEP_S = 1.0  # longest sleep between looks at idle sessions
@@ -45,7 +46,7 @@ class Stepper:
 
     def __init__(
         self,
-        world: "World",
+        world: World,
         robots: Mapping[str, Drivable],
         *,
         orders: Sequence[str] = ("random", "confidence"),
@@ -57,7 +58,7 @@ class Stepper:
         self.most = most
         self.idle_s = idle_s
         self._world = world
-        self._sampling = FrameSampling(world.unmask_steps, world.temperature, world.order)
+        self._sampling = world.decoding
         self.sessions: dict[str, Session] = {}
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="stepper", daemon=True)
@@ -71,7 +72,7 @@ class Stepper:
         self._jobs.put(None)
         self._thread.join()
 
-    def call[T](self, function: Callable[[], T]) -> "Future[T]":
+    def call[T](self, function: Callable[[], T]) -> Future[T]:
         """Run a function in the thread, between two steps."""
         future: Future[T] = Future()
 
@@ -136,7 +137,7 @@ class Stepper:
         if session and session.viewer is viewer:
             session.viewer = None
 
-    def change(self, session: Session, sampling: FrameSampling) -> None:
+    def change(self, session: Session, sampling: Decoding) -> None:
         """Go on with another sampling.
 
         Raises:
@@ -184,7 +185,7 @@ class Stepper:
                 text = f"Paused after {self.idle_s / 60:.0f} minutes without input."
                 session.viewer.tell({"kind": "error", "text": text})
         due = [session for session in self.sessions.values() if session.ready(now)]
-        together: dict[FrameSampling, list[Session]] = {}
+        together: dict[Decoding, list[Session]] = {}
         for session in due:
             together.setdefault(session.sampling, []).append(session)
         for sampling, group in together.items():
@@ -194,10 +195,9 @@ class Stepper:
         waiting = [s.due - now for s in self.sessions.values() if s.viewer and (s.steps or not s.paused)]
         return min([SLEEP_S, *(wait for wait in waiting if wait > 0)])
 
-    def _step_together(self, sampling: FrameSampling, sessions: list[Session]) -> None:
+    def _step_together(self, sampling: Decoding, sessions: list[Session]) -> None:
         world = self._world
-        world.unmask_steps, world.temperature, world.order = vars(sampling).values()
-        world.measure = any(session.meter is not None for session in sessions)
+        world.decoding = replace(sampling, measure=any(session.meter is not None for session in sessions))
         begun = time.monotonic()
         chunks: dict[int, Float32s] = {}
         rows: dict[int, Session] = {}

@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 
 from hma_data.errors import HMAError, UsageError
-from hma_model.policies.arenas import Arena, Float32s, Scenes
+from hma_model.arrays import Float32s
+from hma_model.config import POLICY
+from hma_model.policies.arenas import Arena, Scenes
 from hma_model.policies.base import split_options
 from hma_model.worlds.images import Prompt
-from hma_model.worlds.world import World, load_world, require_actor
+from hma_model.worlds.world import World, load_world
 
 OPTIONS: dict[str, type] = {"horizon": int, "memory": int, "temperature": float, "unmask_steps": int}
 
@@ -120,7 +122,7 @@ class Acting:
         memory: int | None = None,
     ) -> None:
         config = world.model.config
-        require_actor(config, where)
+        world.model.require_readout(POLICY, where)
         if horizon > 1 and not config.predicts_video:
             raise UsageError(where, "predicts no video to look ahead in", "give horizon=1")
         for name, value in {"horizon": horizon, "memory": memory}.items():

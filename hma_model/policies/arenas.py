@@ -11,7 +11,7 @@ import copy
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,18 +21,13 @@ from hma_data.errors import HMAError
 from hma_data.lab import FAMILY, truth
 from hma_data.lab.scripted import PUSHER, SceneState, SeenState, seen_state, state_of, steerable
 from hma_data.lab.simulator import LabSimulator, simulated
+from hma_model.arrays import Float32s, Floats, Images
+from hma_model.evaluation.probe import Probe
 from hma_model.generation.commands import OutsideRangeWarning, described
 from hma_model.worlds.env import WorldModelVectorEnv
 from hma_model.worlds.images import Prompt
 from hma_model.worlds.scenes import Dimension, LabRobot, LabScene
-
-if TYPE_CHECKING:
-    from hma_model.evaluation.probe import Probe
-    from hma_model.worlds.world import World
-
-Float32s = NDArray[np.float32]
-Places = NDArray[np.float64]
-Image = NDArray[np.uint8]
+from hma_model.worlds.world import World
 
 SCENES_PER_SEED = 100_000  # scenes of a seed; those of the next seed are others
 
@@ -52,9 +47,7 @@ class Scenes:
     seed: int
 
     @classmethod
-    def of(
-        cls, world: "World", embodiment: str, count: int, seed: int, *, simulator: bool = True
-    ) -> "Scenes":
+    def of(cls, world: World, embodiment: str, count: int, seed: int, *, simulator: bool = True) -> "Scenes":
         """Return the first scenes of a seed.
 
         Args:
@@ -116,7 +109,7 @@ class Arena(Protocol):
 
     scenes: Scenes
     prompts: Sequence[Prompt]  # of the scenes, at the rate of the model's frames
-    images: Image  # (N, S, S, 3), the newest ones
+    images: Images  # (N, S, S, 3), the newest ones
     held: Float32s  # (N, A), the actions that leave the robot as it is after the prompt
 
     @property
@@ -160,7 +153,7 @@ class TrueArena:
         self._begun = scenes.begin()
         self.prompts: Sequence[Prompt] = [scene.prompt for scene in self._begun]
         self.held = np.stack([scene.action for scene in self._begun])
-        self.parts: list[Places] = []
+        self.parts: list[Floats] = []
         self.told: list[Float32s] = []
         self._look()
         self.first_images = self.images
@@ -199,24 +192,27 @@ class TrueArena:
     def _look(self) -> None:
         if self._drawn or not self.parts:
             shown = np.stack([scene.simulator.picture() for scene in self._begun])
-            self.images: Image = shown if shown.shape[1] == self._size else resize(shown, self._size)
+            self.images: Images = shown if shown.shape[1] == self._size else resize(shown, self._size)
         self.parts.append(np.stack([truth.parts_of(s.simulator.simulation)[1] for s in self._begun]))
 
 
-class Beginning(Protocol):
-    """The first frames of episodes in the model, and the actions of the true ones.
+@dataclass(frozen=True)
+class Beginning:
+    """The first frames of real episodes, and the actions that followed.
 
     Attributes:
         scenes: N of them.
         prompts: of each.
         held: (N, A) the actions that leave the robots as they are.
-        told: (N, A) the actions of each step by the recorder's driver.
+        told: (N, A) the actions of each step by the recorder's driver; none if no policy asks for them.
+        groups: (N,) ids of the real episodes; none if nobody asks for them.
     """
 
     scenes: Scenes
     prompts: Sequence[Prompt]
     held: Float32s
-    told: list[Float32s]
+    told: Sequence[Float32s] = ()
+    groups: Sequence[str] = ()
 
 
 class ModelArena:
@@ -224,7 +220,7 @@ class ModelArena:
 
     Args:
         world: with the robot.
-        true: the simulators that acted in the same scenes, or other beginnings.
+        true: the simulators that acted in the same scenes, or other real episodes.
         probe: reads places for policies that ask for a state.
 
     Attributes:
@@ -232,7 +228,7 @@ class ModelArena:
         made: the newest images of the model; at the start, the last one of the prompt as it decodes it.
     """
 
-    def __init__(self, world: "World", true: Beginning, probe: "Probe | None") -> None:
+    def __init__(self, world: World, true: Beginning | TrueArena, probe: Probe | None) -> None:
         self.scenes = true.scenes
         self.held = true.held
         self._world = world
@@ -244,7 +240,7 @@ class ModelArena:
         )
         for env, number, prompt in zip(self._envs.envs, self.scenes.numbers, true.prompts, strict=True):
             env.reset(seed=self.scenes.seed + number, options={"prompt": prompt._asdict()})
-        self.made: Image = np.stack([env.image for env in self._envs.envs])
+        self.made: Images = np.stack([env.image for env in self._envs.envs])
         self.images = self.made
         self._first_states: list[tuple[list[SceneState], Float32s | None]] = []
         if isinstance(true, TrueArena):
@@ -309,7 +305,7 @@ class ModelArena:
         """Return the newest frames (N, …) as shards store them."""
         return np.stack([self._world.stored(session) for session in self._sessions])
 
-    def uncertainty(self) -> NDArray[np.float64]:
+    def uncertainty(self) -> Floats:
         """Return how unsure the model was of the newest frames (N,); NaN where it is not measured."""
         return np.array([self._world.uncertainty.get(session, np.nan) for session in self._sessions])
 

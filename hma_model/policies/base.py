@@ -8,16 +8,15 @@ N scenes, A action dims.
 import random
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
 from hma_data.errors import HMAError, UsageError
-from hma_model.policies.arenas import Arena, Float32s
-
-if TYPE_CHECKING:
-    from hma_model.policies.judge import StateJudge
+from hma_model.arrays import Float32s
+from hma_model.policies.arenas import Arena
+from hma_model.policies.judge import StateJudge
 
 
 class Policy(Protocol):
@@ -34,7 +33,7 @@ class Policy(Protocol):
 class Judged(Protocol):
     """A policy that needs the judge of its success, and gets it before it begins."""
 
-    def judged(self, judge: "StateJudge") -> None:
+    def judged(self, judge: StateJudge) -> None:
         """Take the judge."""
 
 

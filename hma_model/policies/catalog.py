@@ -4,7 +4,7 @@ import importlib
 import re
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,7 @@ from hma_data.lab import FAMILY
 from hma_model.policies.arenas import Scenes
 from hma_model.policies.base import Policy
 from hma_model.policies.scripted import Called, Random, Scripted, Still
-
-if TYPE_CHECKING:
-    from hma_model.worlds.world import World
+from hma_model.worlds.world import World
 
 POLICY_FORMS = (
     "give scripted, scripted:noise=0.5, reach, random, still, hma:CHECKPOINT, plan:cem, "
@@ -23,7 +21,7 @@ POLICY_FORMS = (
 )
 
 
-def read_policy(words: str, scenes: Scenes, world: "World | None" = None) -> Policy:
+def read_policy(words: str, scenes: Scenes, world: World | None = None) -> Policy:
     """Return the policy of words such as `scripted:noise=0.5`, for the robot of scenes.
 
     Args:

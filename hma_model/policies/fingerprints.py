@@ -10,19 +10,17 @@ import sys
 import uuid
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from hma_data.errors import HMAError
 from hma_data.storage.files import file_sha256
 from hma_model.checkpoint.folder import HEAD, STATS, STEM, YAML, Checkpoint
+from hma_model.network.model import HMA
 from hma_model.policies.acting import OPTIONS
 from hma_model.policies.base import split_options
-
-if TYPE_CHECKING:
-    from hma_model.network.model import HMA
-    from hma_model.worlds.world import World
+from hma_model.worlds.world import World
 
 
 def policy_facts(words: str, embodiment: str) -> dict[str, str]:
@@ -50,9 +48,10 @@ def policy_facts(words: str, embodiment: str) -> dict[str, str]:
     return {"module": file_sha256(Path(source))} if source else {}
 
 
-def world_facts(world: "World") -> dict[str, Any]:
+def world_facts(world: World) -> dict[str, Any]:
     """Return what changes the frames of a world, beside its checkpoint, unmask steps and temperature."""
-    facts = {"order": world.order, "sample_steps": world.sample_steps, "precision": world.precision}
+    way = world.decoding
+    facts = {"order": way.order, "sample_steps": way.sample_steps, "precision": world.precision}
     if world.model.source is None:
         facts["weights"] = _weights_sha256(world.model)
     return facts
@@ -66,7 +65,7 @@ def object_sha256(value: Any) -> str:
         return uuid.uuid4().hex
 
 
-def _weights_sha256(model: "HMA") -> str:
+def _weights_sha256(model: HMA) -> str:
     digest = hashlib.sha256()
     for name, tensor in model.state_dict().items():
         values = tensor.detach().cpu().contiguous()
@@ -75,7 +74,7 @@ def _weights_sha256(model: "HMA") -> str:
     return digest.hexdigest()
 
 
-def world_digests(world: "World", embodiment: str) -> dict[str, str]:
+def world_digests(world: World, embodiment: str) -> dict[str, str]:
     """Return what tells the checkpoint of a world from others."""
     kept = world.model.source
     if kept is None:
@@ -83,6 +82,6 @@ def world_digests(world: "World", embodiment: str) -> dict[str, str]:
     return {"checkpoint_sha256": kept.trunk_sha256, "stem_sha256": file_sha256(kept.path(embodiment, STEM))}
 
 
-def device_facts(model: "HMA") -> dict[str, str]:
+def device_facts(model: HMA) -> dict[str, str]:
     """Return the device of a model, on which its numbers depend; nothing for a CPU."""
     return {} if model.device.type == "cpu" else {"device": model.device.type}

@@ -11,21 +11,18 @@ N episodes, T frames, S pixels a side, P parts. Places are px of an image of 128
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import truth
-from hma_model.evaluation.agreement import Accuracy, Bools, accuracy
+from hma_data.tokenizers.base import Tokenizer
+from hma_model.arrays import Bools, Floats, Images
+from hma_model.evaluation.agreement import Accuracy, accuracy
 from hma_model.evaluation.probe import EPISODES, FIRST_EPISODE, Probe, as_seen, as_shown, train_probe
+from hma_model.worlds.env import Judge
 
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-
-Floats = NDArray[np.float64]
-Images = NDArray[np.uint8]
 Score = Callable[[Floats, int], Floats]
 
 END_FRAMES = 3  # last frames over which a place is the median
@@ -120,7 +117,7 @@ def task_of(robot: str, words: str = "moved") -> Task:
 class StateJudge:
     """A judge of one robot and one task, for images as its tokenizer shows them.
 
-    It is also a `Judge` of `WorldModelEnv`: the reward is the score so far, and it never ends an episode.
+    It is also an `EpisodeJudge` of `WorldModelEnv`: the reward is the score so far; it never ends an episode.
 
     Attributes:
         probe: reads the places.
@@ -154,34 +151,23 @@ class StateJudge:
         judged: Bools = scores >= self.limit
         return judged
 
-    def __call__(self, images: Images, actions: Any) -> tuple[float, bool]:
-        return self.begun()(images, actions)
-
-    def begun(self) -> "EpisodeScore":
+    def begun(self) -> Judge:
         """Return the judge of one episode, which reads each of its images once."""
-        return EpisodeScore(self)
+        places: list[Floats] = []
+        areas: list[Floats] = []
 
+        def judge(images: Images, actions: Any) -> tuple[float, bool]:
+            if len(new := images[len(places) :]):
+                places.extend(self.probe.read(new))
+                areas.extend(self.probe.areas(new))
+            return float(self.read_score(np.stack(places)[None], np.stack(areas)[None])[0]), False
 
-class EpisodeScore:
-    """A `StateJudge` in one episode: it keeps what it read of the earlier images."""
-
-    def __init__(self, judge: StateJudge) -> None:
-        self._judge = judge
-        self._places: list[Floats] = []
-        self._areas: list[Floats] = []
-
-    def __call__(self, images: Images, actions: Any) -> tuple[float, bool]:
-        new = images[len(self._places) :]
-        if len(new):
-            self._places += list(self._judge.probe.read(new))
-            self._areas += list(self._judge.probe.areas(new))
-        score = self._judge.read_score(np.stack(self._places)[None], np.stack(self._areas)[None])
-        return float(score[0]), False
+        return judge
 
 
 def train_judge(
     robot: str,
-    tokenizer: "Tokenizer",
+    tokenizer: Tokenizer,
     stride: int,
     frames: int,
     task: Task | None = None,

@@ -14,7 +14,8 @@ from hma_data.errors import HMAError
 from hma_data.hub.repository import Repository
 from hma_data.lab import imported
 from hma_data.storage.paths import REPOSITORY
-from hma_model.policies.arenas import Arena, Float32s, Scenes
+from hma_model.arrays import Float32s
+from hma_model.policies.arenas import Arena, Scenes
 
 STATE, TASK = "observation.state", "task"
 

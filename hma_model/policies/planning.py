@@ -14,7 +14,7 @@ import contextlib
 import io
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -23,13 +23,12 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, MissingDependencyError, UsageError, install_command
+from hma_model.arrays import Float32s, Floats, Images
 from hma_model.policies.acting import Follower
-from hma_model.policies.arenas import Arena, Float32s, Image, Scenes
+from hma_model.policies.arenas import Arena, Scenes
 from hma_model.policies.base import split_options
+from hma_model.policies.judge import StateJudge
 from hma_model.worlds.world import World
-
-if TYPE_CHECKING:
-    from hma_model.policies.judge import StateJudge
 
 SOLVERS = {"cem": "CEMSolver", "icem": "ICEMSolver", "mppi": "MPPISolver"}
 OPTIONS: dict[str, type] = {
@@ -52,7 +51,7 @@ class Cost:
         HMAError: the model lacks the robot.
     """
 
-    def __init__(self, world: World, embodiment: str, judge: "StateJudge | None" = None) -> None:
+    def __init__(self, world: World, embodiment: str, judge: StateJudge | None = None) -> None:
         self.world = world
         self.embodiment = embodiment
         self.judge = judge
@@ -62,7 +61,7 @@ class Cost:
         self._mean = np.array(space.mean, np.float32)
         self._std = np.array(space.std, np.float32)
         self.sessions: list[int] = []
-        self.first: Image | None = None  # (N, S, S, 3) in which the judged episodes began
+        self.first: Images | None = None  # (N, S, S, 3) in which the judged episodes began
 
     @property
     def space(self) -> gymnasium.spaces.Box:
@@ -81,7 +80,7 @@ class Cost:
         actions = self._own.clip(self._mean + self._std * rows).astype(np.float32)
         return actions.repeat(stride, axis=-2) if held and stride > 1 else actions
 
-    def imagine(self, sessions: Sequence[int], candidates: NDArray[Any], *, ends: bool = False) -> Image:
+    def imagine(self, sessions: Sequence[int], candidates: NDArray[Any], *, ends: bool = False) -> Images:
         """Return the images (N, C, H, S, S, 3) that candidates (N, C, H, A or K) lead to from sessions.
 
         With `ends` it is the last one alone, (N, C, 1, S, S, 3), which saves decoding the others.
@@ -138,7 +137,7 @@ class Cost:
         self.first = np.stack([self.world.image(session) for session in made])
 
 
-def goal_distance(images: Image, goals: Image) -> NDArray[np.float64]:
+def goal_distance(images: Images, goals: Images) -> Floats:
     """Return the mean squared distances (N, C) of images (N, C, S, S, 3) from goals (N, …, S', S', 3)."""
     shape = images.shape[:2]
     coarse = resize(images.reshape(-1, *images.shape[2:]), COARSE_SIZE).astype(np.float64)
@@ -185,7 +184,7 @@ class Planning:
         self._seed = scenes.seed
         self._sizes = horizon, samples, steps, receding
 
-    def judged(self, judge: "StateJudge") -> None:
+    def judged(self, judge: StateJudge) -> None:
         """Take the judge whose success is planned for."""
         self.cost.judge = judge
 

@@ -10,10 +10,8 @@ N episodes, T frames after the prompt, A action dims.
 """
 
 import hashlib
-import json
-import shutil
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,30 +25,31 @@ from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.errors import UsageError
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.windows import episode_pieces
-from hma_data.storage.files import write_atomic
-from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.evaluation.agreement import Bools, alike_pairs, share_interval
+from hma_model.arrays import Bools, Floats, Images
+from hma_model.evaluation.agreement import alike_pairs, share_interval
 from hma_model.evaluation.pages import Page
 from hma_model.generation.decode import cameras_for
-from hma_model.policies.arenas import Float32s, Image, ModelArena, Scenes
+from hma_model.policies.arenas import Beginning, ModelArena, Scenes
 from hma_model.policies.base import Judged, Policy, begin, checked
 from hma_model.policies.catalog import read_policy
-from hma_model.policies.fingerprints import device_facts, policy_facts, world_digests
+from hma_model.policies.fingerprints import policy_facts
+from hma_model.policies.report import write_files
 from hma_model.policies.rewards import RewardJudge, labelled_shards, measured_judge
 from hma_model.policies.scores import (
     EPISODES,
     FRAMES,
     SHOWN_FRAMES,
-    WORK,
     Progress,
+    kept_policies,
     names_of,
     part_keys,
+    play_all,
     run,
     sampling_of,
 )
-from hma_model.worlds.images import Prompt, seen_cameras
+from hma_model.worlds.images import seen_cameras
 from hma_model.worlds.prompts import default_frames, shard_window
 from hma_model.worlds.scenes import at_rest
 from hma_model.worlds.world import World, load_world
@@ -58,16 +57,6 @@ from hma_model.worlds.world import World, load_world
 COLUMNS = ("policy", "success in the model", "mean reward")
 SHOWN_EPISODES = 2  # of each policy and outcome on the page
 UNKNOWN = "the judge's accuracy on generated frames is unknown: compare policies, not rates"
-
-
-@dataclass
-class RecordedBeginnings:
-    """The first frames of recorded episodes; a `Beginning`."""
-
-    scenes: Scenes
-    prompts: Sequence[Prompt]
-    held: Float32s
-    told: list[Float32s]
 
 
 @dataclass(frozen=True)
@@ -80,9 +69,9 @@ class Played:
     """
 
     policy: str
-    scores: NDArray[np.float64]
+    scores: Floats
     success: Bools
-    images: Image
+    images: Images
 
 
 @dataclass(frozen=True)
@@ -189,31 +178,20 @@ def evaluate_recorded(
         begun, beginnings = recorded_beginnings(world, scenes, labelled)
         for name, policy in zip(names, made, strict=True):
             _try(name, policy, world, begun)
-        kept = None
-        keys = [""] * len(made)
-        if folder:
-            digest = hashlib.sha256(labelled.manifest.to_text().encode()).hexdigest()
-            facts: dict[str, Any] = {"embodiment": embodiment, "episodes": episodes, "frames": frames}
-            facts |= {"seed": seed, "sampling": sampling_of(world), "shards_sha256": digest, "judge": judge}
-            facts |= {"judge_sha256": policy_facts(f"lerobot:{judge}", embodiment)}
-            facts |= world_digests(world, embodiment) | device_facts(world.model)
-            kept = KeptParts(folder / WORK, facts)
-            keys = part_keys(policies, world, embodiment, judge)
-        on_progress(0, "episodes")  # the clock of the time left starts here
-        played = []
-        for number, (name, policy, key) in enumerate(zip(names, made, keys, strict=True)):
-
-            def tell(done: float, number: int = number, name: str = name) -> None:
-                on_progress(number * frames * episodes + done, name)
-
-            play = partial(_play, name, policy, world, begun, measured, frames, tell)
-            played.append(Played(name, **(play() if kept is None else kept.part(key, play))))
+        digest = hashlib.sha256(labelled.manifest.to_text().encode()).hexdigest()
+        judged_by: dict[str, Any] = {"shards_sha256": digest, "judge": judge}
+        judged_by |= {"judge_sha256": policy_facts(f"lerobot:{judge}", embodiment)}
+        kept = kept_policies(folder, world, scenes, frames, judged_by)
+        keys = part_keys(policies, world, embodiment, judge) if folder else names
+        play = partial(_play, world=world, begun=begun, judge=measured, frames=frames)
+        each = play_all(names, made, keys, kept, frames * episodes, on_progress, play)
+        played = [Played(name, **arrays) for name, arrays in zip(names, each, strict=True)]
     return ModelEvaluation(
         embodiment, str(checkpoint), sampling_of(world), seed, frames, beginnings, measured, tuple(played)
     )
 
 
-def recorded_beginnings(world: World, scenes: Scenes, shards: ShardSet) -> tuple[RecordedBeginnings, int]:
+def recorded_beginnings(world: World, scenes: Scenes, shards: ShardSet) -> tuple[Beginning, int]:
     """Return the first frames of held-out episodes in turn, one for each scene, and how many there are.
 
     Raises:
@@ -237,35 +215,23 @@ def recorded_beginnings(world: World, scenes: Scenes, shards: ShardSet) -> tuple
     # the action in force at the last frame of the prompt; without one, a target is zero
     last = [prompt.chunks[-1, -dims:] if len(prompt.chunks) else np.zeros(dims) for prompt in prompts]
     held = at_rest(scenes.dimensions, np.nan_to_num(np.stack(last)))
-    return RecordedBeginnings(scenes, prompts, held, []), len(kept)
+    return Beginning(scenes, prompts, held), len(kept)
 
 
-def _try(name: str, policy: Policy, world: World, begun: RecordedBeginnings) -> None:
+def _try(name: str, policy: Policy, world: World, begun: Beginning) -> None:
     """Refuse what a policy returns before minutes of work."""
-    one = RecordedBeginnings(begun.scenes.take(range(1)), begun.prompts[:1], begun.held[:1], [])
-    arena = ModelArena(world, one, None)
-    try:
+    one = Beginning(begun.scenes.take(range(1)), begun.prompts[:1], begun.held[:1])
+    with closing(ModelArena(world, one, None)) as arena:
         begin(name, policy, arena)
         checked(name, policy, arena)
-    finally:
-        arena.close()
 
 
 def _play(
-    name: str,
-    policy: Policy,
-    world: World,
-    begun: RecordedBeginnings,
-    judge: RewardJudge,
-    frames: int,
-    tell: Any,
+    name: str, policy: Policy, tell: Any, world: World, begun: Beginning, judge: RewardJudge, frames: int
 ) -> dict[str, NDArray[Any]]:
     """Return what comes of one policy in the model: the arrays of `Played`."""
-    arena = ModelArena(world, begun, None)
-    try:
+    with closing(ModelArena(world, begun, None)) as arena:
         images, _ = run(name, policy, arena, frames, tell)
-    finally:
-        arena.close()
     shown = np.unique(np.linspace(0, frames, SHOWN_FRAMES).round().astype(int))
     # the frames of an episode are scored together, so that memory does not grow with N
     scores = np.concatenate([judge.model.score(np.stack(one)[None]) for one in zip(*images, strict=True)])
@@ -285,11 +251,7 @@ def show(found: ModelEvaluation) -> None:
 
 def write_report(found: ModelEvaluation, folder: Path) -> Path:
     """Write results.json and report.html; return the path of the page. Finished policies are then removed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_atomic(folder / "results.json", json.dumps(found.to_json(), indent=1))
-    write_atomic(folder / "report.html", html(found))
-    shutil.rmtree(folder / WORK, ignore_errors=True)
-    return folder / "report.html"
+    return write_files(folder, found.to_json(), html(found))
 
 
 def html(found: ModelEvaluation) -> str:

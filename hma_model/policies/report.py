@@ -11,7 +11,7 @@ import numpy as np
 
 from hma_data.console import print_lines, print_table, short_paths
 from hma_data.episodes.sheets import grid, png_bytes
-from hma_data.storage.files import atomic_path
+from hma_data.storage.files import write_atomic
 from hma_model.evaluation.agreement import Estimate
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
@@ -138,13 +138,16 @@ def show(found: PolicyEvaluation) -> None:
 
 def write_report(found: PolicyEvaluation, folder: Path) -> Path:
     """Write results.json and report.html; return the path of the page. Finished policies are then removed."""
+    return write_files(folder, found.to_json(), html(found))
+
+
+def write_files(folder: Path, results: dict[str, Any], page: str) -> Path:
+    """Write the results and the page of policies, and remove what was kept to continue; return the page."""
     folder.mkdir(parents=True, exist_ok=True)
-    page = folder / "report.html"
-    for path, text in ((folder / "results.json", json.dumps(found.to_json(), indent=1)), (page, html(found))):
-        with atomic_path(path) as part:
-            part.write_text(text, encoding="utf-8")
+    write_atomic(folder / "results.json", json.dumps(results, indent=1))
+    write_atomic(folder / "report.html", page)
     shutil.rmtree(folder / WORK, ignore_errors=True)
-    return page
+    return folder / "report.html"
 
 
 def html(found: PolicyEvaluation) -> str:

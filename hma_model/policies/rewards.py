@@ -15,28 +15,24 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hma_data.errors import HMAError, MissingDependencyError, UsageError
 from hma_data.hub.repository import Repository
 from hma_data.lab import imported
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.storage.paths import REPOSITORY
-from hma_model.evaluation.agreement import Accuracy, Bools, accuracy, share_interval
+from hma_model.arrays import Bools, Floats, Images
+from hma_model.evaluation.agreement import Accuracy, accuracy, share_interval
 from hma_model.generation.decode import cameras_for
 from hma_model.policies.lerobot import TASK
+from hma_model.worlds.env import Judge
 from hma_model.worlds.images import seen_cameras
 from hma_model.worlds.prompts import require_fit, seen_frames
-
-if TYPE_CHECKING:
-    from hma_model.worlds.world import World
-
-Floats = NDArray[np.float64]
-Images = NDArray[np.uint8]
+from hma_model.worlds.world import World
 
 LIMIT = 0.5  # least reward of a success, as lerobot's
 FRAMES_AT_ONCE = 64
@@ -149,27 +145,18 @@ class RewardModel:
         judged: Bools = scores > LIMIT
         return judged
 
-    def __call__(self, images: Images, actions: Any) -> tuple[float, bool]:
-        return self.begun()(images, actions)
+    def begun(self) -> Judge:
+        """Return the judge of one episode: its highest reward so far; it never ends the episode."""
+        seen, highest = 0, -np.inf
 
-    def begun(self) -> "HighestReward":
-        """Return the judge of one episode, as a `WorldModelEnv` takes it."""
-        return HighestReward(self)
+        def judge(images: Images, actions: Any) -> tuple[float, bool]:
+            nonlocal seen, highest
+            if len(new := images[seen:]):
+                highest = max(highest, float(self.score(new[None])[0]))
+                seen = len(images)
+            return highest, False
 
-
-class HighestReward:
-    """A `RewardModel` in one episode: the highest reward of its frames so far; it never ends the episode."""
-
-    def __init__(self, model: RewardModel) -> None:
-        self._model = model
-        self._seen = 0
-        self._highest = -np.inf
-
-    def __call__(self, images: Images, actions: Any) -> tuple[float, bool]:
-        if len(new := images[self._seen :]):
-            self._highest = max(self._highest, float(self._model.score(new[None])[0]))
-            self._seen = len(images)
-        return self._highest, False
+        return judge
 
 
 @dataclass(frozen=True)
@@ -215,7 +202,7 @@ def _of(part: int, whole: int) -> str:
 
 def measured_judge(
     source: str,
-    world: "World",
+    world: World,
     embodiment: str,
     shards: ShardSet,
     tell: Callable[[str], None] = lambda words: None,
@@ -262,7 +249,7 @@ def measured_judge(
     return judge
 
 
-def labelled_shards(world: "World", embodiment: str, given: Any, judge: str) -> ShardSet:
+def labelled_shards(world: World, embodiment: str, given: Any, judge: str) -> ShardSet:
     """Return the shard set that is given, or that of the run that the world was loaded from.
 
     Raises:

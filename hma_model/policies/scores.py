@@ -20,9 +20,10 @@ import hashlib
 import json
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,9 +33,9 @@ from hma_data.errors import HMAError, UsageError
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
+from hma_model.arrays import Bools, Float32s, Floats, Images, Ints
 from hma_model.evaluation.agreement import (
     Accuracy,
-    Bools,
     Estimate,
     accuracy,
     alike_pairs,
@@ -48,7 +49,7 @@ from hma_model.evaluation.agreement import (
 from hma_model.evaluation.calibration import Meter, accumulated
 from hma_model.evaluation.intervals import rounded
 from hma_model.generation.commands import OutsideRangeWarning
-from hma_model.policies.arenas import Arena, Float32s, Image, ModelArena, Scenes, TrueArena
+from hma_model.policies.arenas import Arena, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy, begin, checked, kept_randomness, seed_samplers
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import (
@@ -61,7 +62,6 @@ from hma_model.policies.fingerprints import (
 from hma_model.policies.judge import StateJudge, task_of, train_judge
 from hma_model.worlds.world import World, load_world
 
-Scores = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 EPISODES, FRAMES = 32, 40
 WORK = ".policies"  # folder of finished policies in an output
@@ -85,12 +85,12 @@ class Scored:
     """
 
     policy: str
-    scores: Scores
+    scores: Floats
     success: Bools
-    shown: NDArray[np.int64]
-    true_images: Image
-    model_images: Image
-    stated: Scores
+    shown: Ints
+    true_images: Images
+    model_images: Images
+    stated: Floats
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ def evaluate_policies(
         scenes = Scenes.of(world, embodiment, episodes, seed)
         meter = None if max_error is None else choosing_meter(world, embodiment)
         made = [read_policy(one, scenes, world) if isinstance(one, str) else one[1] for one in policies]
-        keys = [""] * len(made) if folder is None else part_keys(policies, world, embodiment, judge)
+        keys = part_keys(policies, world, embodiment, judge) if folder else names
         for name, policy in zip(names, made, strict=True):
             if not isinstance(policy, Judged):
                 # What it returns is refused here, before minutes of work.
@@ -288,24 +288,13 @@ def evaluate_policies(
             judge = train_judge(
                 embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed, tell=told
             )  # fmt: skip
-        kept = None
-        if folder:
-            facts = {"embodiment": embodiment, "episodes": episodes, "frames": frames, "seed": seed}
-            facts |= {"judge": asdict(judge.task), "sampling": sampling}
-            facts |= world_digests(world, embodiment) | device_facts(world.model)
-            kept = KeptParts(folder / WORK, facts)
-        on_progress(0, "episodes")  # the clock of the time left starts here
-        scored: list[Scored] = []
-        for number, (name, policy, key) in enumerate(zip(names, made, keys, strict=True)):
+        for policy in made:
             if isinstance(policy, Judged):
                 policy.judged(judge)
-
-            def tell(done: float, where: str, number: int = number, name: str = name) -> None:
-                on_progress(number * frames * episodes + done, f"{name}, {where}")
-
-            score = partial(score_policy, policy=policy, world=world, scenes=scenes, judge=judge)
-            score = partial(score, name, frames=frames, tell=tell)
-            scored.append(Scored(name, **(score() if kept is None else kept.part(key, score))))
+        kept = kept_policies(folder, world, scenes, frames, {"judge": asdict(judge.task)})
+        score = partial(score_policy, world=world, scenes=scenes, judge=judge, frames=frames)
+        each = play_all(names, made, keys, kept, frames * episodes, on_progress, score)
+        scored = [Scored(name, **arrays) for name, arrays in zip(names, each, strict=True)]
     success = np.stack([one.success for one in scored], axis=1)  # (3, M, N)
     rates = success.astype(float)
     scores = np.stack([one.scores for one in scored], axis=1)
@@ -358,7 +347,7 @@ def names_of(policies: Sequence[str | tuple[str, Policy]]) -> list[str]:
 
 def sampling_of(world: World) -> str:
     """Return in words how a world draws its frames."""
-    sampling = f"unmask_steps={world.unmask_steps},temperature={world.temperature:g}"
+    sampling = f"unmask_steps={world.decoding.unmask_steps},temperature={world.decoding.temperature:g}"
     return sampling if world.precision == "float32" else f"{sampling},precision={world.precision}"
 
 
@@ -375,6 +364,45 @@ def part_keys(
         for one in policies
     ]
     return [hashlib.sha256(json.dumps([one, shared]).encode()).hexdigest()[:32] for one in own]
+
+
+def kept_policies(
+    folder: Path | None, world: World, scenes: Scenes, frames: int, judge: dict[str, Any]
+) -> KeptParts | None:
+    """Return where finished policies are kept in an output; None without one."""
+    if folder is None:
+        return None
+    facts = {"embodiment": scenes.name, "episodes": len(scenes.numbers), "frames": frames}
+    facts |= judge | {"seed": scenes.seed, "sampling": sampling_of(world)}
+    return KeptParts(folder / WORK, facts | world_digests(world, scenes.name) | device_facts(world.model))
+
+
+def play_all(
+    names: Sequence[str],
+    policies: Sequence[Policy],
+    keys: Sequence[str],
+    kept: KeptParts | None,
+    frames: int,
+    on_progress: Progress,
+    play: Callable[..., dict[str, NDArray[Any]]],
+) -> list[dict[str, NDArray[Any]]]:
+    """Return what `play` makes of each policy, called with its name, itself and what tells how far it is.
+
+    Args:
+        names, keys: of the policies, and those under which their results are kept.
+        kept: where finished policies are; None keeps nothing.
+        frames: of all episodes of a policy.
+    """
+    on_progress(0, "episodes")  # the clock of the time left starts here
+    found = []
+    for number, (name, policy, key) in enumerate(zip(names, policies, keys, strict=True)):
+
+        def tell(done: float, where: str = "", number: int = number, name: str = name) -> None:
+            on_progress(number * frames + done, f"{name}, {where}" if where else name)
+
+        make = partial(play, name, policy=policy, tell=tell)
+        found.append(make() if kept is None else kept.part(key, make))
+    return found
 
 
 def score_policy(
@@ -403,12 +431,8 @@ def score_policy(
         unsure.append(model.uncertainty())
         tell(done, "in the model")
 
-    world.measure = True
-    try:
+    with closing(model), world.drawing(measure=True):
         model_images, actions = run(name, policy, model, frames, look)
-    finally:
-        world.measure = False
-        model.close()
     _require_paired(name, acted[: scenes.stride], actions[: scenes.stride])
     again = TrueArena(scenes, size, drawn=False)
     for action in actions:
@@ -440,7 +464,7 @@ def _require_paired(name: str, true: list[Float32s], model: list[Float32s]) -> N
 
 def run(
     name: str, policy: Policy, arena: Arena, frames: int, tell: Callable[[float], None] = lambda done: None
-) -> tuple[list[Image], list[Float32s]]:
+) -> tuple[list[Images], list[Float32s]]:
     """Let a policy act for so many frames, with global random numbers that are seeded at each step.
 
     Returns:

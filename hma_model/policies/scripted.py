@@ -11,7 +11,8 @@ import numpy as np
 
 from hma_data.errors import UsageError
 from hma_data.lab.scripted import driver, reacher, steerable
-from hma_model.policies.arenas import Arena, Float32s
+from hma_model.arrays import Float32s
+from hma_model.policies.arenas import Arena
 
 
 class Still:

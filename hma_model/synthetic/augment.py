@@ -11,7 +11,7 @@ N episodes, P frames of a prompt, T generated frames, A action dims, K = stride 
 import hashlib
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -29,11 +29,12 @@ from hma_data.shards.windows import episode_pieces
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
+from hma_model.arrays import Bools, Float32s, Floats
 from hma_model.evaluation.calibration import Meter, accumulated
 from hma_model.evaluation.probe import Probe, train_probe
 from hma_model.evaluation.recorded_state import EPISODES_NEEDED, Reader, recorded_reader, simulated_reader
 from hma_model.generation.decode import cameras_for
-from hma_model.policies.arenas import Arena, Float32s, ModelArena, Scenes, TrueArena
+from hma_model.policies.arenas import Arena, Beginning, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import device_facts, world_digests
@@ -130,20 +131,9 @@ class SyntheticBatch:
 
     stored: NDArray[Any]
     chunks: Float32s
-    uncertainty: NDArray[np.float64]
-    success: NDArray[np.bool_]
+    uncertainty: Floats
+    success: Bools
     groups: NDArray[np.str_]
-
-
-@dataclass
-class RealBeginnings:
-    """Real beginnings from shards; a `Beginning`."""
-
-    scenes: Scenes
-    prompts: Sequence[Prompt]
-    held: Float32s
-    told: list[Float32s]
-    groups: Sequence[str]
 
 
 class ReplayPolicy:
@@ -386,13 +376,9 @@ class _Maker:
             uncertainty.append(arena.uncertainty())
             tell(done)
 
-        self.world.measure = True
-        try:
+        with closing(arena), self.world.drawing(measure=True):
             images, actions = run(self.settings.commands, self.policy, arena, self.settings.frames, look)
-        finally:
-            self.world.measure = False
-            arena.close()
-        success: NDArray[np.bool_] = np.ones(len(numbers), np.bool_)
+        success: Bools = np.ones(len(numbers), np.bool_)
         if self.judge is not None:
             success = self.judge.success(self.judge.score(np.stack(images, axis=1)))
         generated = np.stack(kept, axis=1)
@@ -411,16 +397,16 @@ class _Maker:
             np.array(begun.groups),
         )
 
-    def _simulated(self, numbers: range) -> RealBeginnings:
+    def _simulated(self, numbers: range) -> Beginning:
         """Return beginnings from the simulator, with the actions of its driver."""
         scenes = self.scenes.take(numbers)
         true = TrueArena(scenes, self.world.image_shape[0], drawn=False)
         for _ in range(self.settings.frames * scenes.stride):
             true.step(true.recorded())
         groups = [f"{scenes.name}/{number}" for number in scenes.numbers]
-        return RealBeginnings(scenes, true.prompts, true.held, true.told, groups)
+        return Beginning(scenes, true.prompts, true.held, true.told, groups)
 
-    def _recorded(self, shards: ShardSet, numbers: range) -> RealBeginnings:
+    def _recorded(self, shards: ShardSet, numbers: range) -> Beginning:
         """Return beginnings from episodes of shards, with their actions."""
         scenes = self.scenes.take(numbers)
         known = self.prompt_frames
@@ -433,7 +419,7 @@ class _Maker:
             told.append(np.nan_to_num(chunks[known - 1 :]).reshape(-1, len(scenes.dimensions)))
             groups.append(str(row["group"] or row["id"]))
         steps = list(np.stack(told, axis=1).astype(np.float32))
-        return RealBeginnings(scenes, prompts, at_rest(scenes.dimensions, steps[0]), steps, groups)
+        return Beginning(scenes, prompts, at_rest(scenes.dimensions, steps[0]), steps, groups)
 
     def _window(self, shards: ShardSet, number: int) -> tuple[dict[str, Any], Prompt]:
         """Return a row of an episode, and a window of it: frames (P + T, …) and chunks (P + T - 1, K).

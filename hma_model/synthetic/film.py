@@ -26,8 +26,9 @@ from hma_data.shards.windows import episode_pieces
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.storage.files import file_sha256
 from hma_data.storage.paths import StrPath, as_path
+from hma_model.arrays import Bools, Float32s
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.generation.commands import Float32s, card, described
+from hma_model.generation.commands import card, described
 from hma_model.worlds.images import fitted, recorded_cameras, seen_cameras, trained_cameras
 from hma_model.worlds.prompts import seen_frames
 from hma_model.worlds.world import World
@@ -154,7 +155,7 @@ class ShardFilm:
         """Return the frames (T, …) of an episode."""
         return self.labelled(number)[0]
 
-    def labelled(self, number: int) -> tuple[NDArray[Any], Float32s, NDArray[np.bool_]]:
+    def labelled(self, number: int) -> tuple[NDArray[Any], Float32s, Bools]:
         """Return the frames (T, …), the chunks (T, K) that follow them, and which are known (T,)."""
         row, part = self._parts[number]
         stored, columns = seen_frames(self._shards, self._reader, row, self.cameras)

@@ -13,7 +13,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,17 +26,16 @@ from hma_data.shards.schema import Refused
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
+from hma_model.arrays import Float32s
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import INVERSE
-from hma_model.generation.commands import Commands, Float32s, card, described
+from hma_model.generation.commands import Commands, card, described
+from hma_model.network.model import HMA
 from hma_model.policies.fingerprints import device_facts, world_digests
 from hma_model.synthetic.film import FilmEpisode, ShardFilm, find_film, read_film
 from hma_model.synthetic.recorder import SyntheticEpisode, finished, write_shards
 from hma_model.worlds.images import recorded_cameras, seen_cameras, trained_cameras
 from hma_model.worlds.world import World, load_world
-
-if TYPE_CHECKING:
-    from hma_model.network.model import HMA
 
 WORK = ".label"
 ORIGIN = "inferred: the actions are a model's, by inverse dynamics from the frames"
@@ -117,9 +116,7 @@ def label_actions(
         raise OutputError(folder, "is a file", "name a folder")
     world = world or load_world(checkpoint, device=device)
     model = world.model
-    if INVERSE not in model.config.trained_readouts:
-        fault = f"was not trained to infer actions, but for {', '.join(model.config.objectives)}"
-        raise HMAError(checkpoint, fault, "train one with objectives={inverse: 1.0}")
+    model.require_readout(INVERSE, checkpoint)
     spec = world.action_spec(embodiment)
     robot = described(model, embodiment)
     if robot is None:
@@ -155,7 +152,7 @@ def label_actions(
 # -- inference
 
 
-def infer(model: "HMA", spec: Commands, stored: NDArray[Any]) -> Float32s:
+def infer(model: HMA, spec: Commands, stored: NDArray[Any]) -> Float32s:
     """Return the chunks (T - 1, K) that led from each stored frame (T, …) to the next.
 
     A chunk is read off a window in whose later half it lies, except those of the first window.
@@ -220,7 +217,7 @@ def measure(
     return found
 
 
-def _check_set(model: "HMA", embodiment: str, check: StrPath | None) -> ShardSet:
+def _check_set(model: HMA, embodiment: str, check: StrPath | None) -> ShardSet:
     """Return the labelled shards to check on: those given, else those that the model was trained on."""
     if check is not None:
         sets = [ShardSet(check)]
@@ -237,7 +234,7 @@ def _check_set(model: "HMA", embodiment: str, check: StrPath | None) -> ShardSet
 
 
 def _label(
-    model: "HMA",
+    model: HMA,
     spec: Commands,
     film: Sequence[FilmEpisode],
     kept: KeptParts,
@@ -262,7 +259,7 @@ def _part(episode: FilmEpisode) -> str:
     return episode.key[:32]
 
 
-def _labels_of(model: "HMA", spec: Commands, episode: FilmEpisode) -> dict[str, NDArray[Any]]:
+def _labels_of(model: HMA, spec: Commands, episode: FilmEpisode) -> dict[str, NDArray[Any]]:
     """Return the frames and the inferred chunks of an episode, or why it cannot be used."""
     try:
         stored = episode.frames()

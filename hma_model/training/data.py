@@ -7,22 +7,20 @@ Otherwise there are W passes.
 """
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hma_data.errors import RecipeError, UsageError
 from hma_data.loading.dataset import Batch, MixtureDataset
 from hma_data.loading.mixture import Mixture
 from hma_data.shards.reader import ShardSet
 from hma_model.training.parallel import Ranks
+from hma_model.training.recipe import Recipe
 from hma_model.training.resume import seed_for
-
-if TYPE_CHECKING:
-    from hma_model.training.recipe import Recipe
 
 MEMORY_MIB = 2048  # of decoded rows; all passes share it, so it does not depend on the number of ranks
 
 
-def share(recipe: "Recipe", ranks: int) -> tuple[int, int]:
+def share(recipe: Recipe, ranks: int) -> tuple[int, int]:
     """Return (passes of all ranks together, windows a pass) of a step.
 
     Raises:
@@ -56,7 +54,7 @@ class TrainData:
         ShardError: a set has no window.
     """
 
-    def __init__(self, recipe: "Recipe", sets: Mapping[str, ShardSet], ranks: Ranks) -> None:
+    def __init__(self, recipe: Recipe, sets: Mapping[str, ShardSet], ranks: Ranks) -> None:
         self.passes, size = share(recipe, ranks.size)
         self.own = range(ranks.rank, self.passes, ranks.size)
         self._workers = -(-recipe.workers // len(self.own))
@@ -69,7 +67,7 @@ class TrainData:
         self._data += [self._dataset(recipe, sets, size, number) for number in self.own[1:]]
 
     def _dataset(
-        self, recipe: "Recipe", sets: Mapping[str, ShardSet], size: int, number: int
+        self, recipe: Recipe, sets: Mapping[str, ShardSet], size: int, number: int
     ) -> MixtureDataset:
         given: dict[str, Any] = {key: value or None for key, value in recipe.mixture}
         try:

@@ -4,7 +4,7 @@ import math
 import resource
 import sys
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pyarrow.compute as pc
 import torch
@@ -13,10 +13,8 @@ from torch import Tensor
 from hma_data.loading.dataset import Batch
 from hma_data.shards.reader import ShardSet
 from hma_model.config import OBJECTIVES
+from hma_model.network.objectives import Output
 from hma_model.training.parallel import Ranks
-
-if TYPE_CHECKING:
-    from hma_model.network.objectives import Output
 
 NAMED = 4  # windows named in an error
 
@@ -38,7 +36,7 @@ class StepMetrics:
         self._sums = torch.zeros(2, len(names), device=device)
         self._objectives = torch.zeros(2, len(OBJECTIVES), device=device)
 
-    def add(self, embodiment: list[str], output: "Output") -> None:
+    def add(self, embodiment: list[str], output: Output) -> None:
         """Add the loss of a pass, the loss of each sample, and the objective."""
         index = torch.tensor([self._names.index(name) for name in embodiment], device=self._sums.device)
         losses = output.per_sample.to(self._sums)

@@ -1,7 +1,7 @@
 """Write the metrics of a training run, show its progress, and pass the figures to trackers.
 
 `metrics.jsonl` has one line a step (`"kind": "train"`) and one line an evaluation (`"kind": "eval"`). A
-terminal shows a live table; any other output gets a plain line every few seconds. The recipe may name
+terminal shows one line that changes; any other output gets a line every few seconds. The recipe may name
 trackers: TensorBoard's event files in `tensorboard/` of the run's folder (`tensorboard --logdir RUN` shows
 them), trackio or wandb. An OSError is converted by the caller, see `hma_model.training.runtime.run_errors`.
 """
@@ -22,12 +22,10 @@ from hma_data.console import human_times
 from hma_data.errors import MissingDependencyError, install_command
 from hma_data.storage.files import finite, write_atomic
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.evaluation.metrics import perplexity
 from hma_model.evaluation.rollout_video import SHEETS
 from hma_model.training.recipe import Recipe
 
 if TYPE_CHECKING:
-    from rich.console import Group
     from rich.live import Live
 
 METRICS, KINDS, EVENTS = "metrics.jsonl", ("train", "eval"), "tensorboard"
@@ -153,15 +151,14 @@ class RunLog:
         show: print progress to standard error.
         write: write metrics.jsonl; only the first rank does.
         trackers: the trackers that get the same figures.
-        nats: losses are nats a token, so a perplexity can be shown.
     """
 
     def __init__(
         self, out: Path, steps: int, begin: int, show: bool = True, write: bool = True,
-        trackers: Sequence[Tracker] = (), nats: bool = True,
+        trackers: Sequence[Tracker] = (),
     ) -> None:  # fmt: skip
         self._steps, self._begin, self._show, self._write_it = steps, begin, show, write
-        self._trackers, self._nats = trackers, nats
+        self._trackers = trackers
         self._path = out / METRICS
         kept = [line for line in read_metrics(out) if line["step"] <= begin]
         if write:
@@ -181,7 +178,7 @@ class RunLog:
             from rich.console import Console
             from rich.live import Live
 
-            first = f"step {self._begin:,}/{self._steps:,}   waiting for the first step"
+            first = f"step {self._begin}/{self._steps}: waiting for the first step"
             self._live = Live(first, console=Console(stderr=True), refresh_per_second=4)
             self._live.__enter__()
         return self
@@ -255,7 +252,7 @@ class RunLog:
         if not self._last or not self._show:
             return
         if self._live:
-            self._live.update(self._table())
+            self._live.update(self._text())
         elif force or time.monotonic() - self._shown >= PLAIN_SECONDS:
             self._shown = time.monotonic()
             news = self._last["step"], self._evaluation.get("step", -1)
@@ -276,34 +273,14 @@ class RunLog:
         done = self._last.get("done")
         return min(self._steps, round(self._last["step"] / min(done, 1))) if done else self._steps
 
-    def _smooth(self) -> dict[str, float]:
-        return {n: sum(v) / len(v) if v else math.nan for n, v in sorted(self._recent.items())}
-
     def _text(self) -> str:
         rate, times = self._pace()
-        losses = _listed(self._smooth())
-        held = f", validation {_number(self._evaluation.get('loss'))}" if self._evaluation else ""
+        losses = _listed({n: sum(v) / len(v) if v else math.nan for n, v in sorted(self._recent.items())})
+        found = self._evaluation.get("loss")
+        held = "" if not self._evaluation else f", validation {'-' if found is None else f'{found:.3f}'}"
         skipped = f", {self._last['skipped']} steps skipped" if self._last.get("skipped") else ""
         where = f"step {self._last['step']}/{self._expected()}"
         return f"{where}: loss {losses}{held}, {rate:.1f} windows/s, {times}{skipped}"
-
-    def _table(self) -> "Group":
-        from rich.box import SIMPLE
-        from rich.console import Group
-        from rich.table import Table
-
-        rate, times = self._pace()
-        table = Table("embodiment", "loss", "perplexity", "validation", "baseline", box=SIMPLE)
-        held = self._evaluation.get("loss_by_embodiment", {})
-        ignoring = self._evaluation.get("baseline_by_embodiment", {})
-        for name, loss in self._smooth().items():
-            known = [_number(values.get(name)) for values in (held, ignoring)]
-            table.add_row(name, f"{loss:.3f}", f"{perplexity(loss):,.1f}" if self._nats else "-", *known)
-        last = self._last
-        head = f"step {last['step']:,}/{self._expected():,}   {rate:.1f} windows/s   {times}"
-        rest = f"lr {last['lr']:.2e}   {last.get('memory_mib', 0):,.0f} MiB"
-        skipped = f"   {last['skipped']} steps skipped" if last.get("skipped") else ""
-        return Group(f"{head}   {rest}{skipped}", table)
 
 
 def _listed(losses: dict[str, float]) -> str:
@@ -316,10 +293,6 @@ def _listed(losses: dict[str, float]) -> str:
     ]
     mean = sum(losses.values()) / len(losses)
     return f"{mean:.3f} over {len(losses)} robots ({ends[0]} to {ends[1]})"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
 
 
 def _line(values: dict[str, Any]) -> str:

@@ -94,7 +94,7 @@ def train(
         run.note_settings()
         trackers: list[Tracker] = []
         ranks.once(lambda: trackers.extend(open_trackers(recipe, run.out, run.step)))
-        log = RunLog(run.out, recipe.steps, run.step, show and ranks.main, ranks.main, trackers, run.nats)
+        log = RunLog(run.out, recipe.steps, run.step, show and ranks.main, ranks.main, trackers)
         with log, stop_on_signals() as stop:
             _loop(run, log, stop, on_progress)
         result = _result(run)

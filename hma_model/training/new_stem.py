@@ -12,28 +12,25 @@ A action dims, D width.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from hma_data.loading.views import Cameras
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.evaluation.losses import validation_losses, windows
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from hma_data.registry.embodiment import Embodiment
-    from hma_model.network.model import HMA
+from hma_model.network.model import HMA
 
 FETCHED = 4  # robots of a hub that are fetched for a new one; of a folder all are tried
 WINDOWS, FRAMES = 8, 4  # on which they are tried
 STATISTICS = "normalizer."  # the statistics, which stay those of the new robot
 INPUT, WAVES = "input.weight", "waves.weight"
 
-type State = Mapping[str, "Tensor"]
+type State = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ class ChosenStem:
     fresh_loss: float  # of the same windows with a fresh stem
 
 
-def candidates(cards: Mapping[str, Mapping[str, Any]], robot: "Embodiment") -> list[str]:
+def candidates(cards: Mapping[str, Mapping[str, Any]], robot: Embodiment) -> list[str]:
     """Return the ids of the robots with as many action dims, those of the nearest rate first.
 
     Args:
@@ -62,7 +59,7 @@ def candidates(cards: Mapping[str, Mapping[str, Any]], robot: "Embodiment") -> l
 
 @torch.no_grad()
 def choose(
-    model: "HMA", name: str, checkpoint: Checkpoint, shards: ShardSet, cameras: Cameras, objective: str
+    model: HMA, name: str, checkpoint: Checkpoint, shards: ShardSet, cameras: Cameras, objective: str
 ) -> ChosenStem | None:
     """Find the robot whose stem gives a new robot's training windows the lowest loss; None: a fresh one does.
 
@@ -97,7 +94,7 @@ def choose(
     return ChosenStem(chosen, lowest, fresh) if chosen else None
 
 
-def copy_stem(model: "HMA", name: str, checkpoint: Checkpoint, like: str) -> None:
+def copy_stem(model: HMA, name: str, checkpoint: Checkpoint, like: str) -> None:
     """Give a robot of the model another one's stem, and its head if it fits; the statistics stay."""
     own_stem, own_head = _states(model, name)
     space, stem, head = checkpoints.read_embodiment(checkpoint, like)
@@ -106,7 +103,7 @@ def copy_stem(model: "HMA", name: str, checkpoint: Checkpoint, like: str) -> Non
     _load(model, name, stem, head if fits else own_head)
 
 
-def _fitted(stem: State, own: State, steps: int, own_steps: int) -> "dict[str, Tensor]":
+def _fitted(stem: State, own: State, steps: int, own_steps: int) -> dict[str, Tensor]:
     """Return a stem's tensors for chunks of another number of steps, with the statistics of `own`."""
     kept = {key: value for key, value in own.items() if key.startswith(STATISTICS)}
     fitted = {**stem, **kept, INPUT: _resampled(stem[INPUT].unsqueeze(-1), steps, own_steps).flatten(1)}
@@ -121,7 +118,7 @@ def _fitted(stem: State, own: State, steps: int, own_steps: int) -> "dict[str, T
     return {key: fitted[key] for key in own}
 
 
-def _resampled(weight: "Tensor", steps: int, own_steps: int) -> "Tensor":
+def _resampled(weight: Tensor, steps: int, own_steps: int) -> Tensor:
     """Return weights (D, steps · A, V) for chunks of `own_steps`.
 
     Each command of the old chunk becomes the new chunk's command of the nearest time.
@@ -132,11 +129,11 @@ def _resampled(weight: "Tensor", steps: int, own_steps: int) -> "Tensor":
     return resampled.index_add(1, nearest.to(weight.device), by_step).flatten(1, 2)
 
 
-def _states(model: "HMA", name: str) -> "tuple[dict[str, Tensor], dict[str, Tensor]]":
+def _states(model: HMA, name: str) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     stem, head = model.stem_state(name), model.head_state(name)
     return {key: value.clone() for key, value in stem.items()}, {k: v.clone() for k, v in head.items()}
 
 
-def _load(model: "HMA", name: str, stem: State, head: State) -> None:
+def _load(model: HMA, name: str, stem: State, head: State) -> None:
     model.stem(name).load_state_dict(stem)
     model.head(name).load_state_dict(head)

@@ -7,19 +7,17 @@ by width / base_width, so that lr and decay found at one width suit another (Yan
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
 from hma_data.tokenizers.training.muon import muon_step
+from hma_model.network.model import HMA
 from hma_model.network.stem import waves_of_stem
 from hma_model.training.parallel import gathered, like, local, whole
-
-if TYPE_CHECKING:
-    from hma_model.network.model import HMA
-    from hma_model.training.recipe import Recipe
+from hma_model.training.recipe import Recipe
 
 _MOMENTS = ("exp_avg", "exp_avg_sq", "step")
 MUON_MOMENTUM = 0.95
@@ -43,7 +41,7 @@ class AdamWAndMuon(torch.optim.AdamW):
                 muon_step(group["params"], self.state, group["lr"], MUON_MOMENTUM, group["weight_decay"])
 
 
-def make_optimizer(model: "HMA", recipe: "Recipe") -> AdamWAndMuon:
+def make_optimizer(model: HMA, recipe: Recipe) -> AdamWAndMuon:
     """Return the optimizer of the trained parameters."""
     fused = model.device.type == "cuda"
     lr, muon_lr = learning_rate(recipe), recipe.muon_lr if recipe.optimizer == "muon" else None
@@ -51,14 +49,14 @@ def make_optimizer(model: "HMA", recipe: "Recipe") -> AdamWAndMuon:
     return AdamWAndMuon(groups, lr=lr, betas=recipe.betas, eps=recipe.eps, fused=fused)
 
 
-def learning_rate(recipe: "Recipe") -> float:
+def learning_rate(recipe: Recipe) -> float:
     """Return the schedule's peak; the paper's rule scales lr by windows a step / 64, limited to 1 to 8."""
     if recipe.lr_rule == "paper":
         return recipe.lr * min(max(recipe.windows_per_step / 64, 1.0), 8.0)
     return recipe.lr
 
 
-def lr_scale(step: int, recipe: "Recipe", done: float = 0.0) -> float:
+def lr_scale(step: int, recipe: Recipe, done: float = 0.0) -> float:
     """Return the factor of the peak in step `step`, counted from 0.
 
     With `cpu_seconds`, a cosine falls by `done`, the share of the run that is done.
@@ -79,7 +77,7 @@ def set_lr(optimizer: torch.optim.Optimizer, scale: float) -> float:
 
 
 def parameter_groups(
-    model: "HMA", lr: float, weight_decay: float, muon_lr: float | None = None
+    model: HMA, lr: float, weight_decay: float, muon_lr: float | None = None
 ) -> list[dict[str, Any]]:
     """Return the groups of parameters, by weight decay, muP's scaling, sharding and optimizer.
 
@@ -117,7 +115,7 @@ def _undecayed(model: nn.Module) -> set[str]:
     return names
 
 
-def _growing_matrices(model: "HMA") -> set[str]:
+def _growing_matrices(model: HMA) -> set[str]:
     """Return the parameters with two sides that grow with the width, by comparison with a wider model."""
     with torch.device("meta"):
         wider = type(model)(model.config.replace(width=2 * model.config.width))

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -29,17 +29,15 @@ from torch.distributed.tensor import DTensor, distribute_tensor
 
 from hma_data.errors import HMAError, RecipeError, TrainingError
 from hma_model.config import OBJECTIVES, HMAConfig
-
-if TYPE_CHECKING:
-    from hma_model.network.model import HMA
-    from hma_model.training.recipe import Recipe
+from hma_model.network.model import HMA
+from hma_model.training.recipe import Recipe
 
 PATIENCE = timedelta(hours=2)  # rank 0 evaluates and writes while the others wait
 ANSWER = timedelta(seconds=30)  # the time limit for an answer of torchrun's store
 PREFIX, ERROR, REPORTS = "errors", "error", "reports"  # of the keys in the store
 
 
-def require_shardable(recipe: "Recipe", config: HMAConfig) -> None:
+def require_shardable(recipe: Recipe, config: HMAConfig) -> None:
     """Raise if several ranks cannot train a network so with `parallel=fsdp`.
 
     Raises:
@@ -226,7 +224,7 @@ class _DDP(nn.parallel.DistributedDataParallel):
 class ParallelModel:
     """A model, the same on every rank, that is distributed over the ranks; `mode` fsdp shards it in place."""
 
-    def __init__(self, model: "HMA", ranks: Ranks, mode: str) -> None:
+    def __init__(self, model: HMA, ranks: Ranks, mode: str) -> None:
         self.model, self.ranks = model, ranks
         self.sharded = mode == "fsdp" and ranks.size > 1
         self._call: nn.Module = model
@@ -286,7 +284,7 @@ class ParallelModel:
         return norm
 
 
-def _shard(model: "HMA", ranks: Ranks) -> None:
+def _shard(model: HMA, ranks: Ranks) -> None:
     from torch.distributed.device_mesh import init_device_mesh
     from torch.distributed.fsdp import fully_shard
 

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 from pydantic import (
     AfterValidator,
@@ -30,11 +30,9 @@ from hma_data.errors import RecipeError, UsageError
 from hma_data.loading.views import view_count
 from hma_data.storage.paths import StrPath, as_text, shipped
 from hma_data.storage.yaml_io import parse_yaml, plain_fault, read_yaml
+from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint.folder import EMBEDDED_NAME
 from hma_model.config import MOST_IDS, HMAConfig
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import TokenizerSpec
 
 # keys that may change when a run is resumed: places and intervals, but nothing that changes the weights
 _FREE = {
@@ -192,7 +190,7 @@ class Recipe(_Settings):
         """Return the settings that must be the same when a run is resumed."""
         return {key: value for key, value in self.values().items() if key not in _FREE}
 
-    def factored(self, spec: "TokenizerSpec") -> tuple[int, ...]:
+    def factored(self, spec: TokenizerSpec) -> tuple[int, ...]:
         """Return the values of each digit of a token of this tokenizer, low digit first.
 
         With `digits`, each of the tokenizer's digits is split into as many of that many values as divide it,
@@ -215,7 +213,7 @@ class Recipe(_Settings):
                 joined.append(values)
         return tuple(joined)
 
-    def network(self, spec: "TokenizerSpec") -> HMAConfig:
+    def network(self, spec: TokenizerSpec) -> HMAConfig:
         """Return the network's config for tokens of this tokenizer.
 
         Raises:
@@ -230,7 +228,7 @@ class Recipe(_Settings):
         derived.update(frames=self.frames, objectives=self.objectives, views=view_count(self.cameras))
         return HMAConfig(**{**self.model, **derived})
 
-    def _side(self, spec: "TokenizerSpec") -> dict[str, int]:
+    def _side(self, spec: TokenizerSpec) -> dict[str, int]:
         """Return the side of the squares or patches for `places`; nothing if the recipe gives it."""
         name = "merge" if spec.kind == "discrete" else "patch"
         if not self.places or name in self.model:

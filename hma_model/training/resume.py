@@ -17,7 +17,9 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from torch import Tensor
 
 from hma_data.errors import CheckpointError, RecipeError
 from hma_data.shards.reader import ShardSet
@@ -28,9 +30,6 @@ from hma_model.config import HMAConfig
 from hma_model.network.model import HMA
 from hma_model.network.states import check_fit, module_key
 from hma_model.training.recipe import differences
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 STATE, OPTIMIZER, WEIGHTS = "state.json", "optimizer.safetensors", "weights.safetensors"
 VERSION = 1  # of `training/`; any change in the meaning of its files raises it
@@ -96,7 +95,7 @@ def data_digests(sets: Mapping[str, ShardSet]) -> dict[str, str]:
 
 
 def write_state(
-    folder: Path, state: RunState, moments: Mapping[str, "Tensor"], weights: Mapping[str, "Tensor"]
+    folder: Path, state: RunState, moments: Mapping[str, Tensor], weights: Mapping[str, Tensor]
 ) -> None:
     """Write the files of `training/`; without `weights` the checkpoint's weights are those of training."""
     write_tensors(folder / OPTIMIZER, moments, {"format": "pt"})
@@ -128,10 +127,10 @@ class TrainingState:
     """The content of a checkpoint for a run, read completely before the model changes."""
 
     state: RunState
-    shown: dict[str, tuple[dict[str, "Tensor"], ...]]  # published tensors: trunk (""), each stem and head
-    weights: dict[str, "Tensor"]  # the weights of training, if they differ from the published ones
-    moments: dict[str, "Tensor"]  # of the optimizer
-    averages: dict[str, "Tensor"] = field(default_factory=dict)  # parameters by name; `fill` collects them
+    shown: dict[str, tuple[dict[str, Tensor], ...]]  # published tensors: trunk (""), each stem and head
+    weights: dict[str, Tensor]  # the weights of training, if they differ from the published ones
+    moments: dict[str, Tensor]  # of the optimizer
+    averages: dict[str, Tensor] = field(default_factory=dict)  # parameters by name; `fill` collects them
 
     def fill(self, model: HMA) -> None:
         """Load the weights of training into an unsharded model.
@@ -177,7 +176,7 @@ def read_training_state(checkpoint: Checkpoint, embodiments: Iterable[str]) -> T
     return TrainingState(state, shown, weights, _own_file(checkpoint, OPTIMIZER, files))
 
 
-def _own_file(checkpoint: Checkpoint, name: str, hashes: Mapping[str, str]) -> "dict[str, Tensor]":
+def _own_file(checkpoint: Checkpoint, name: str, hashes: Mapping[str, str]) -> dict[str, Tensor]:
     path = inside(checkpoint.folder, f"{TRAINING}/{name}")
     if hashes.get(name) != file_sha256(path):
         raise CheckpointError(path, f"is not the file that {STATE} names", "delete this checkpoint")

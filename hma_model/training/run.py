@@ -49,7 +49,6 @@ from hma_model.training.resume import (
 from hma_model.training.runtime import (
     ENVIRONMENT,
     RECIPE,
-    attention_form,
     choose_precision,
     environment,
 )
@@ -151,9 +150,8 @@ class Run:
             return choose_precision(recipe, config, self.device, begun)
 
         precision, reason = self.ranks.once(choose)
-        chosen = recipe.model_copy(update={"precision": precision})
-        self.arithmetic = f"precision {precision}: {reason}; {attention_form(chosen, config, self.device)}"
-        return chosen
+        self.arithmetic = f"precision {precision}: {reason}"
+        return recipe.model_copy(update={"precision": precision})
 
     def _config(self, recipe: Recipe) -> HMAConfig:
         if self.start:
@@ -186,11 +184,6 @@ class Run:
         """Return the share of the run that is done: of its steps or its CPU seconds, whichever is larger."""
         limit = self.recipe.cpu_seconds
         return max(self.step / self.recipe.steps, self.cpu_seconds / limit if limit else 0.0)
-
-    @property
-    def nats(self) -> bool:
-        """Check whether the losses are nats a token."""
-        return self.model.config.kind == "discrete" and self.objective.predicts_video
 
     def note_settings(self) -> None:
         """Note what the user may not expect of the recipe and the data."""

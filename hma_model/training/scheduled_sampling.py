@@ -9,7 +9,6 @@ B batch, T frames of a window, h,w token grid, c,H,W latents, D frames replaced.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -18,21 +17,18 @@ from hma_data.loading.dataset import Batch
 from hma_model.config import OBJECTIVES
 from hma_model.network.conditioning import Groups, align
 from hma_model.network.head import uniform
+from hma_model.network.model import HMA
 from hma_model.network.objectives import Layout
 from hma_model.network.stem import from_digits, split_tokens, unpatchify
-from hma_model.network.trunks.contract import Conditioning, TimePositions
 
-if TYPE_CHECKING:
-    from hma_model.network.model import HMA
-
-type Under = tuple[Conditioning, Groups, TimePositions]
+type Given = tuple[Tensor | None, Tensor, list[str]]  # chunks, which are known, the robot of each window
 
 SAMPLE_STEPS = 8  # of the diffusion head; enough for a past to learn from
 
 
 @torch.no_grad()
 def forwarded(
-    model: "HMA", batch: Batch, share: float, depth: int, generator: torch.Generator | None = None
+    model: HMA, batch: Batch, share: float, depth: int, generator: torch.Generator | None = None
 ) -> Batch:
     """Return the batch, with past frames predicted by the model in some windows.
 
@@ -60,18 +56,16 @@ def forwarded(
     names = [name for name, taken in zip(batch.embodiment, chosen.tolist()) if taken]
     training = model.training
     model.eval()
-    groups, times = Groups.of(names, len(rows)), model.time_positions(frames)
-    actions = batch.actions[chosen] if model.config.sees_actions else None
-    conditioning = model.condition_window(actions, batch.action_mask[chosen], groups, times)
+    given = batch.actions[chosen] if model.config.sees_actions else None, batch.action_mask[chosen], names
     if model.config.whole_frames and model.config.kind == "continuous":
         known = torch.arange(frames, device=true.device) < first[chosen].unsqueeze(1)
         for _ in range(depth):
-            made = _all_predicted(model, context, (actions, batch.action_mask[chosen], groups), generator)
+            made = _all_predicted(model, context, given, generator)
             context = torch.where(known.view(*known.shape, 1, 1, 1), context, made.to(context.dtype))
     else:
         for offset in range(depth):
             at = first[chosen] + offset
-            context[rows, at] = _predicted(model, context, at, (conditioning, groups, times), generator)
+            context[rows, at] = _predicted(model, context, at, given, generator)
     model.train(training)
     seen = true.clone()
     seen[chosen] = context
@@ -79,26 +73,27 @@ def forwarded(
 
 
 def _all_predicted(
-    model: "HMA",
+    model: HMA,
     context: Tensor,
-    under: tuple[Tensor | None, Tensor, Groups],
+    given: Given,
     generator: torch.Generator | None,
 ) -> Tensor:
     """Predict every frame from the frames before it in one pass; the first stays.
 
     Each pass makes one more frame of a window what a rollout from its true frames would have.
     """
-    config, (actions, known, groups) = model.config, under
+    config, (actions, known, names) = model.config, given
+    groups = Groups.of(names, len(context))
     layout = Layout.of(model, context.shape[1], OBJECTIVES["forward" if config.sees_actions else "passive"])
-    given = None
+    chunks = None
     if actions is not None:
-        given = align(config, actions, known, context.shape[1]).frames(layout.frames)
+        chunks = align(config, actions, known, context.shape[1]).frames(layout.frames)
     frames = model.frame_values(context)
     values = torch.cat([frames[:, : layout.past], frames[:, 1:]], dim=1)
     masked = torch.zeros_like(values[..., :1], dtype=torch.bool)
     masked[:, layout.past :] = True
     x = model.embed(groups.sort(values), masked, layout.previous)
-    features = model.trunk(x, model.condition(given, groups, layout.times.positions), layout.times)
+    features = model.trunk(x, model.condition(chunks, groups, layout.times.positions), layout.times)
     conditions = model.latent_readout(
         features[:, layout.predicted], layout.times.positions[layout.predicted], groups.sort(frames[:, :-1])
     )
@@ -109,25 +104,25 @@ def _all_predicted(
 
 
 def _predicted(
-    model: "HMA",
+    model: HMA,
     context: Tensor,
     at: Tensor,
-    under: Under,
+    given: Given,
     generator: torch.Generator | None,
 ) -> Tensor:
     """Predict frame `at` (n,) of each window, wholly masked, from the frames before it."""
-    config, (conditioning, groups, times) = model.config, under
+    config, (actions, known, names) = model.config, given
     rows = torch.arange(len(at), device=at.device)
     if config.kind == "discrete":
         hidden = context.clone()
         hidden[rows, at] = config.vocab_size
-        scores = model.logits_under(conditioning, hidden, groups, times, frame=at)
+        scores = model.video_logits(hidden, actions, names, known, frame=at)
         tokens = from_digits(scores[:, 0].argmax(-1), config.digits).flatten(1)
         return split_tokens(tokens, config.merge, config.vocab_size, config.token_grid)
     scaled = context.float() * config.latent_scale
     mask = torch.zeros(context.shape[:2] + context.shape[3:], dtype=torch.bool, device=context.device)
     mask[rows, at] = True
-    conditions = model.conditions_under(conditioning, scaled, mask, groups, times)[rows, at]
+    conditions = model.video_conditions(scaled, mask, actions, names, known)[rows, at]
     patches = model.latent_readout.sample(conditions.flatten(0, 2), SAMPLE_STEPS, generator=generator)
     whole = patches.view(len(at), 1, -1, config.patch_dim)
     latents = unpatchify(whole, config.patch, config.token_grid)

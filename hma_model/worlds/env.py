@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, UsageError
 from hma_data.storage.paths import StrPath
-from hma_model.generation.commands import Float32s, OutsideRangeWarning
+from hma_model.arrays import Bools, Float32s, Images, Ints
+from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.worlds.images import Prompt
 from hma_model.worlds.prompts import read_prompt
-from hma_model.worlds.world import Image, World, load_world
+from hma_model.worlds.world import World, load_world
 
 # An OpenMP pool does not survive a fork, as in gymnasium's "async" vectors; one thread needs none.
 os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
@@ -38,7 +39,7 @@ CONTROLS = ("frame", "chunk")
 class Judge(Protocol):
     """A function that scores an episode after each new image."""
 
-    def __call__(self, images: Image, actions: Float32s) -> tuple[float, bool]:
+    def __call__(self, images: Images, actions: Float32s) -> tuple[float, bool]:
         """Return the reward of the newest image, and whether the episode ends there.
 
         Args:
@@ -65,7 +66,7 @@ def _known(options: dict[str, Any] | None, *keys: str) -> dict[str, Any]:
     return options
 
 
-class WorldModelEnv(gymnasium.Env[Image, Float32s]):
+class WorldModelEnv(gymnasium.Env[Images, Float32s]):
     """One robot in a world model, as a gymnasium environment.
 
     An observation is the newest image (S, V·S, 3) uint8. Actions outside the range seen in training cause
@@ -101,7 +102,7 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
         prompt: Any = None,
         control: str = "frame",
         horizon: int | None = 300,
-        judge: Judge | None = None,
+        judge: Judge | EpisodeJudge | None = None,
         render_mode: str | None = None,
         *,
         clip: bool = False,
@@ -145,11 +146,11 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
         self._read: dict[int | None, Prompt] = {}
         self._warned: set[str] = set()  # of what; a vector's environments share it, and the prompts
         self.session: int | None = None
-        self.image: Image = np.zeros(world.image_shape, np.uint8)
+        self.image: Images = np.zeros(world.image_shape, np.uint8)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Image, dict[str, Any]]:
+    ) -> tuple[Images, dict[str, Any]]:
         """Start an episode; `options["prompt"]` is what it starts from, as `read_prompt` takes it."""
         given = _known(options, "prompt")
         super().reset(seed=seed)
@@ -168,7 +169,7 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
         self._chunks: list[Float32s] = []
         return self._seen(self.image), {"frames": 0}
 
-    def step(self, action: Float32s) -> tuple[Image, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Float32s) -> tuple[Images, float, bool, bool, dict[str, Any]]:
         """Send an action, or a chunk; between chunks the last image is shown."""
         return self.finish(self.world.step(self.take(action)))
 
@@ -188,7 +189,7 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
             self._chunks.append(chunk)
         return {self.session: chunk}
 
-    def finish(self, made: dict[int, Image]) -> tuple[Image, float, bool, bool, dict[str, Any]]:
+    def finish(self, made: dict[int, Images]) -> tuple[Images, float, bool, bool, dict[str, Any]]:
         """End a step with the images that a pass of the world made, perhaps none of this session."""
         assert self.session is not None
         self._steps += 1
@@ -204,7 +205,7 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
         facts = {"frames": self._frames}
         return self._seen(self.image), float(reward), bool(terminated), truncated, facts
 
-    def render(self) -> Image | None:
+    def render(self) -> Images | None:
         """Return the newest image (S, V·S, 3) as the model makes it."""
         return self.image if self.render_mode == "rgb_array" else None
 
@@ -242,12 +243,12 @@ class WorldModelEnv(gymnasium.Env[Image, Float32s]):
             warnings.warn(f"{said}. Shown only once", OutsideRangeWarning, stacklevel=4)
         return values
 
-    def _seen(self, image: Image) -> Image:
+    def _seen(self, image: Images) -> Images:
         """Return an image as it is observed; a copy, which its receiver may change."""
         return image.copy() if self.size is None else resize(image[None], self.size)[0]
 
 
-class WorldModelVectorEnv(VectorEnv[Image, Float32s, NDArray[Any]]):
+class WorldModelVectorEnv(VectorEnv[Images, Float32s, NDArray[Any]]):
     """N robots in a world model, whose sessions step in one pass and begin and end independently.
 
     Args:
@@ -277,11 +278,11 @@ class WorldModelVectorEnv(VectorEnv[Image, Float32s, NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.observations = np.zeros(self.observation_space.shape or (), np.uint8)
-        self.ended: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
+        self.ended: Bools = np.zeros(num_envs, np.bool_)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Image, dict[str, Any]]:
+    ) -> tuple[Images, dict[str, Any]]:
         """Start episodes.
 
         Args:
@@ -300,7 +301,7 @@ class WorldModelVectorEnv(VectorEnv[Image, Float32s, NDArray[Any]]):
 
     def step(
         self, actions: Float32s
-    ) -> tuple[Image, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+    ) -> tuple[Images, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Send an action, or a chunk, to each environment; those that get an image get it in one pass."""
         again = self.ended & (self.autoreset_mode == AutoresetMode.NEXT_STEP)
         if self.autoreset_mode == AutoresetMode.DISABLED and self.ended.any():
@@ -322,14 +323,14 @@ class WorldModelVectorEnv(VectorEnv[Image, Float32s, NDArray[Any]]):
         self.ended = np.logical_or(terminated, truncated)
         return self.observations.copy(), rewards, terminated, truncated, infos
 
-    def advance(self, chosen: NDArray[np.int64], actions: Float32s) -> list[tuple[int, Any]]:
+    def advance(self, chosen: Ints, actions: Float32s) -> list[tuple[int, Any]]:
         """Send actions (N, …) to the chosen environments in one pass; return their numbers and steps."""
         checked = [self.envs[i].checked(actions[i]) for i in chosen]  # all, before any is queued
         chunks = [self.envs[i].queue(values) for i, values in zip(chosen, checked, strict=True)]
         made = self.world.step({session: chunk for part in chunks for session, chunk in part.items()})
         return [(i, self.envs[i].finish(made)) for i in chosen]
 
-    def render(self) -> tuple[Image, ...] | None:
+    def render(self) -> tuple[Images, ...] | None:
         """Return the newest image of each environment."""
         return tuple(env.image for env in self.envs) if self.render_mode == "rgb_array" else None
 

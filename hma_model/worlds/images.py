@@ -4,7 +4,7 @@ P images, H×W pixels, S pixels a side of the tokenizer's images, V views side b
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +13,13 @@ from hma_data.episodes.images import decode_image, resize
 from hma_data.episodes.sheets import first_of_grid
 from hma_data.errors import EpisodeError, HMAError, UsageError
 from hma_data.loading.views import FIRST_CAMERA, Cameras
+from hma_data.registry.embodiment import Embodiment
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.arrays import Float32s, Images
 from hma_model.checkpoint.folder import SAMPLE, Checkpoint
 from hma_model.config import HMAConfig
-
-if TYPE_CHECKING:
-    from hma_data.registry.embodiment import Embodiment
-
-Image = NDArray[np.uint8]
 
 
 class Prompt(NamedTuple):
@@ -34,13 +31,13 @@ class Prompt(NamedTuple):
     """
 
     frames: NDArray[Any]
-    chunks: NDArray[np.float32]
+    chunks: Float32s
 
 
 REMEDY = "give a PNG, a JPEG or another still image"
 
 
-def read_image(path: StrPath, remedy: str = REMEDY) -> Image:
+def read_image(path: StrPath, remedy: str = REMEDY) -> Images:
     """Return the image (H, W, 3) RGB of a file.
 
     Args:
@@ -82,13 +79,13 @@ def seen_cameras(cameras: Cameras, stored: Sequence[str]) -> list[str]:
     return [name if name in stored else stored[0] for name in names]
 
 
-def recorded_cameras(robot: "Embodiment") -> list[str]:
+def recorded_cameras(robot: Embodiment) -> list[str]:
     """Return the names of a robot's cameras, the primary one first."""
     primary = robot.primary_camera.name
     return [primary, *(camera.name for camera in robot.cameras if camera.name != primary)]
 
 
-def fitted(images: NDArray[Any], config: HMAConfig, robot: "Embodiment | None") -> Image:
+def fitted(images: NDArray[Any], config: HMAConfig, robot: Embodiment | None) -> Images:
     """Return images (P, H, W, 3) uint8 as (P, S, V·S, 3), resized as in a conversion.
 
     Args:
@@ -111,7 +108,7 @@ def fitted(images: NDArray[Any], config: HMAConfig, robot: "Embodiment | None") 
     return resize(images, spec.image_size, rule, spec.resize_filter)
 
 
-def sample_image(checkpoint: Checkpoint, embodiment: str) -> Image | None:
+def sample_image(checkpoint: Checkpoint, embodiment: str) -> Images | None:
     """Return the first true image (S, V·S, 3) of an embodiment's sample sheet; None without a sheet."""
     path = checkpoint.folder / "embodiments" / embodiment / SAMPLE
     if not path.is_file():

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,13 +25,12 @@ from hma_data.shards.windows import episode_pieces, pieces
 from hma_data.sources.base import open_source
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.arrays import Bools, Float32s, Ints
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.generation.commands import card, described
 from hma_model.generation.decode import cameras_for
+from hma_model.network.model import HMA
 from hma_model.worlds.images import Prompt, read_image, recorded_cameras, seen_cameras, trained_cameras
-
-if TYPE_CHECKING:
-    from hma_model.network.model import HMA
 
 PROMPT_FORMS = (
     "give an image or images, an image's file, a folder of shards or of a LeRobotDataset, an environment "
@@ -62,9 +61,7 @@ class EpisodePart:
             raise UsageError(where, f"has no episode {self.episode!r}", remedy)
         return found
 
-    def rows(
-        self, model: "HMA", parts: Sequence[range], stride: int, frame_stride: int = 1
-    ) -> NDArray[np.int64]:
+    def rows(self, model: HMA, parts: Sequence[range], stride: int, frame_stride: int = 1) -> Ints:
         """Return the rows (P,) of the frames, `stride` apart, in one of the pieces of an episode.
 
         Raises:
@@ -88,12 +85,12 @@ class EpisodePart:
         return np.arange(start, start + span + 1, stride)
 
 
-def default_frames(model: "HMA") -> int:
+def default_frames(model: HMA) -> int:
     """Return P of a prompt from a recording: half the model's window, at least one."""
     return max(1, model.config.frames // 2)
 
 
-def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int = 0) -> Prompt:
+def read_prompt(model: HMA, embodiment: str, prompt: Any = None, *, seed: int = 0) -> Prompt:
     """Return the frames and chunks of a prompt.
 
     Args:
@@ -135,7 +132,7 @@ def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int 
     return _of_frames(model, embodiment, images[None] if images.ndim in (2, 3) else images)
 
 
-def starting_window(model: "HMA", embodiment: str, seed: int = 0) -> Prompt:
+def starting_window(model: HMA, embodiment: str, seed: int = 0) -> Prompt:
     """Return a prompt that comes along: the first frames of an episode of a laboratory robot.
 
     The robot is simulated: episode 0 of `hma_data.lab.record` with this seed.
@@ -154,7 +151,7 @@ def starting_window(model: "HMA", embodiment: str, seed: int = 0) -> Prompt:
         return _of_recording(model, robot, record(embodiment, folder, 1, seed), EpisodePart())
 
 
-def _of_mapping(model: "HMA", embodiment: str, prompt: Mapping[str, Any]) -> Prompt:
+def _of_mapping(model: HMA, embodiment: str, prompt: Mapping[str, Any]) -> Prompt:
     given = dict(prompt)
     for key, read in (("shards", _of_shards), ("lerobot", _of_lerobot)):
         if key in given and not given.keys() - {key, *vars(EpisodePart())}:
@@ -167,9 +164,7 @@ def _of_mapping(model: "HMA", embodiment: str, prompt: Mapping[str, Any]) -> Pro
     return _of_frames(model, embodiment, frames, given.get("chunks"))
 
 
-def _of_frames(
-    model: "HMA", embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None = None
-) -> Prompt:
+def _of_frames(model: HMA, embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None = None) -> Prompt:
     if chunks is None:
         described(model, embodiment)  # raises if the model lacks it
         width = model.embodiments[embodiment].chunk_dim
@@ -177,7 +172,7 @@ def _of_frames(
     return Prompt(frames, np.asarray(chunks, np.float32))
 
 
-def _strided(model: "HMA", embodiment: str, frames: NDArray[Any], actions: ArrayLike) -> Prompt:
+def _strided(model: HMA, embodiment: str, frames: NDArray[Any], actions: ArrayLike) -> Prompt:
     """Return every stride-th frame, the last one included, and the chunks between them."""
     described(model, embodiment)
     space = model.embodiments[embodiment]
@@ -193,7 +188,7 @@ def _strided(model: "HMA", embodiment: str, frames: NDArray[Any], actions: Array
 # -- episodes
 
 
-def _of_shards(model: "HMA", embodiment: str, folder: StrPath, part: EpisodePart) -> Prompt:
+def _of_shards(model: HMA, embodiment: str, folder: StrPath, part: EpisodePart) -> Prompt:
     shards = ShardSet(folder)
     require_fit(model, embodiment, shards)
     rows = shards.episodes.to_pylist()
@@ -204,7 +199,7 @@ def _of_shards(model: "HMA", embodiment: str, folder: StrPath, part: EpisodePart
     return shard_window(shards, EpisodeReader(shards, shards.columns(names)), chosen, names, at)
 
 
-def require_fit(model: "HMA", embodiment: str, shards: ShardSet) -> None:
+def require_fit(model: HMA, embodiment: str, shards: ShardSet) -> None:
     """Check that an embodiment of a model can go on from the frames of shards; raise HMAError if not."""
     require_tokenizer(model.config, shards.spec, shards.folder)
     described(model, embodiment)
@@ -220,7 +215,7 @@ def shard_window(
     reader: EpisodeReader,
     row: Mapping[str, Any],
     cameras: Sequence[str],
-    at: NDArray[np.int64],
+    at: Ints,
 ) -> Prompt:
     """Return the frames at some rows (P,) of an episode, as of `seen_frames`, and the chunks between them."""
     frames, columns = seen_frames(shards, reader, row, cameras)
@@ -247,7 +242,7 @@ def seen_frames(
     return np.concatenate(views, axis=-2), columns
 
 
-def _of_lerobot(model: "HMA", embodiment: str, folder: StrPath, part: EpisodePart) -> Prompt:
+def _of_lerobot(model: HMA, embodiment: str, folder: StrPath, part: EpisodePart) -> Prompt:
     robot = described(model, embodiment)
     if robot is None:
         raise HMAError(embodiment, "has no YAML, which says how its recordings are read", "load a checkpoint")
@@ -276,7 +271,7 @@ def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
     return Embodiment.from_values({**kept, **changed}, f"{folder}, as {robot.id}")
 
 
-def _of_recording(model: "HMA", robot: Embodiment, recording: Path, part: EpisodePart) -> Prompt:
+def _of_recording(model: HMA, robot: Embodiment, recording: Path, part: EpisodePart) -> Prompt:
     """Return frames of an episode of a recording, in the format that the robot's YAML names."""
     source = open_source(robot.source.format)
     ids = source.episode_ids(recording)
@@ -297,9 +292,7 @@ def _of_recording(model: "HMA", robot: Embodiment, recording: Path, part: Episod
     return Prompt(np.concatenate(views, axis=2), chunks)
 
 
-def _chunks(
-    actions: NDArray[Any], known: NDArray[np.bool_] | None, at: NDArray[np.int64], stride: int
-) -> NDArray[np.float32]:
+def _chunks(actions: NDArray[Any], known: Bools | None, at: Ints, stride: int) -> Float32s:
     """Return the chunks (P - 1, K) between the rows (P,) of an episode's actions (T, ...)."""
     spans = at[:-1, None] + np.arange(stride)
     chunks = actions[spans].reshape(len(at) - 1, int(np.prod(actions.shape[1:])) * stride)

@@ -24,9 +24,9 @@ from hma_data.registry.components import Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
+from hma_model.arrays import Float32s, Floats, Images
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.worlds.images import (
-    Image,
     Prompt,
     fitted,
     image_shape,
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from hma_data.loading.dataset import WindowDataset
     from hma_data.tokenizers.base import Tokenizer
 
-Float32s = NDArray[np.float32]
-Array = NDArray[np.float64]
 
 PROMPT_FRAMES = 4  # frames; two would show velocities, more also show what stands still
 LONGEST_WINDOW = 64  # frames of a window of a recording
@@ -76,7 +74,7 @@ class DrivenScene(Protocol):
     prompt: Prompt
     action: Float32s
 
-    def advance(self, chunk: Float32s | None) -> tuple[Float32s, Image | None] | None:
+    def advance(self, chunk: Float32s | None) -> tuple[Float32s, Images | None] | None:
         """Take the next chunk.
 
         Args:
@@ -146,7 +144,7 @@ class LabScene:
         self.prompt = Prompt(np.stack(frames), np.stack(chunks))
         self.action = at_rest(dims, self.prompt.chunks[-1][-self.width :])
 
-    def advance(self, chunk: Float32s | None) -> tuple[Float32s, Image]:
+    def advance(self, chunk: Float32s | None) -> tuple[Float32s, Images]:
         taken = []
         for step in range(self.stride):
             action = (
@@ -158,7 +156,7 @@ class LabScene:
             taken.append(action)
         return np.concatenate(taken).astype(np.float32), self._fitted(self.simulator.picture())
 
-    def _fitted(self, image: Image) -> Image:
+    def _fitted(self, image: Images) -> Images:
         return image if len(image) == self.size else resize(image[None], self.size)[0]
 
 
@@ -240,7 +238,7 @@ class RecordedScene:
         self,
         prompt: Prompt,
         action: Float32s,
-        frames: Image | tuple[()] = (),
+        frames: Images | tuple[()] = (),
         chunks: Float32s | tuple[()] = (),
     ) -> None:
         self.prompt = prompt
@@ -248,7 +246,7 @@ class RecordedScene:
         self._rest = iter(zip(chunks, frames, strict=True))
         self._followed = True  # whether all actions were the recorded ones
 
-    def advance(self, chunk: Float32s | None) -> tuple[Float32s, Image | None] | None:
+    def advance(self, chunk: Float32s | None) -> tuple[Float32s, Images | None] | None:
         if chunk is not None:
             self._followed = False
             return chunk, None
@@ -271,7 +269,7 @@ class ImageRobot:
         self,
         embodiment: Embodiment,
         stats: Mapping[str, Any],
-        images: Image,
+        images: Images,
         cameras: Cameras = FIRST_CAMERA,
     ) -> None:
         self.embodiment = embodiment
@@ -300,7 +298,7 @@ def drivable(
     checkpoint: Checkpoint,
     sets: Iterable[ShardSet],
     tokenizer: Callable[[], "Tokenizer"],
-    images: Sequence[Image] = (),
+    images: Sequence[Images] = (),
 ) -> dict[str, Drivable]:
     """Return the robots of a checkpoint that can be driven, by key.
 
@@ -377,7 +375,7 @@ def trained_on(checkpoint: Checkpoint) -> list[ShardSet]:
     return [one for one in checkpoint.shards() if not simulated(one.embodiment.id)]
 
 
-def seen_range(stats: Mapping[str, Any]) -> tuple[Array, Array]:
+def seen_range(stats: Mapping[str, Any]) -> tuple[Floats, Floats]:
     """Return the least and the greatest action (A,) seen in training; about them where nobody knows."""
     action = stats["action"]
     mean = np.array(action["mean"])

@@ -11,9 +11,10 @@ P frames of a prompt, H×W pixels, S pixels a side of the tokenizer's images, V 
 dims, K = stride · A, n sessions of a step.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,24 +22,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from hma_data.errors import HMAError
 from hma_data.storage.paths import StrPath
-from hma_data.tokenizers.base import full_name, get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, full_name, get_tokenizer
+from hma_model.arrays import Float32s, Images
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.config import POLICY
 from hma_model.evaluation.calibration import Meter, meter_of
 from hma_model.generation.commands import Commands, described
 from hma_model.generation.decode import decode
 from hma_model.generation.engine import products_in
 from hma_model.generation.rollout import Rollout
 from hma_model.generation.state import Snapshot as Snapshot
-from hma_model.generation.unmask import Decoding, check, default_temperature
-from hma_model.worlds.images import Image, fitted, image_shape
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-    from hma_model.config import HMAConfig
-    from hma_model.network.model import HMA
-
-Float32s = NDArray[np.float32]
+from hma_model.generation.unmask import Decoding, check
+from hma_model.network.model import HMA
+from hma_model.worlds.images import fitted, image_shape
 
 
 @dataclass(frozen=True)
@@ -58,16 +53,16 @@ class World:
         compile, precision: as in `Rollout`; compile is for a GPU.
 
     Attributes:
-        unmask_steps, temperature, order, sample_steps: may be set between steps; they count for all sessions.
-        measure: set it to know how unsure the model is, see `uncertainty`; latents are then drawn twice.
+        decoding: how frames are drawn; it may be replaced between steps, and counts for all sessions. With
+            `measure` one knows how unsure the model is, see `uncertainty`; latents are then drawn twice.
         uncertainty: session → that of the newest frame as of `Rollout`, if it is measured.
         image_shape: (S, V·S, 3) of every image.
     """
 
     def __init__(
         self,
-        model: "HMA",
-        tokenizer: "Tokenizer",
+        model: HMA,
+        tokenizer: Tokenizer,
         *,
         unmask_steps: int = 2,
         temperature: float | None = None,
@@ -81,32 +76,36 @@ class World:
         self.tokenizer = tokenizer
         self.compile = compile
         self.precision = precision
-        self.unmask_steps = unmask_steps
-        self.temperature = default_temperature(model.config) if temperature is None else temperature
-        self.order = order
-        self.sample_steps = sample_steps
-        self.measure = False
+        self.decoding = Decoding.of(model.config, unmask_steps, temperature, order, sample_steps)
         self.uncertainty = dict[int, float]()
         products_in(precision, model.device, compile)  # checks that the device has them
-        self._decoding()
         self.image_shape = image_shape(model.config)
         self._rollout: Rollout | None = None
         self._sessions: dict[int, _Session] = {}
         self._opened = 0
         self._specs: dict[str, Commands] = {}
 
-    def meter(self, embodiment: str, **sampling: Any) -> tuple[Meter | None, str]:
+    @contextmanager
+    def drawing(self, **changes: Any) -> Iterator[None]:
+        """Draw frames in another way while the block runs; the changes are of fields of `decoding`."""
+        before = self.decoding
+        self.decoding = replace(before, **changes)
+        try:
+            yield
+        finally:
+            self.decoding = before
+
+    def meter(self, embodiment: str, **changes: Any) -> tuple[Meter | None, str]:
         """Return the calibrated uncertainty of a robot's frames, or None and why there is none.
 
         Args:
             embodiment: an id.
-            sampling: unmask_steps, temperature and order of the frames; by default those of the world.
+            changes: of the frames' way from `decoding`, by field.
         """
         source = self.model.source
         card = source.card(embodiment) if source and embodiment in source.embodiments else {}
-        own: dict[str, Any] = {"unmask_steps": self.unmask_steps, "temperature": self.temperature}
-        own["order"] = self.order
-        return meter_of(self.model.config, card, **own | sampling)
+        way = replace(self.decoding, **changes)
+        return meter_of(self.model.config, card, way.unmask_steps, way.temperature, way.order)
 
     @property
     def sessions(self) -> dict[int, str]:
@@ -159,7 +158,7 @@ class World:
         self._at(session)
         del self._sessions[session]
 
-    def step(self, actions: Mapping[int, ArrayLike], *, decoded: bool = True) -> dict[int, Image]:
+    def step(self, actions: Mapping[int, ArrayLike], *, decoded: bool = True) -> dict[int, Images]:
         """Generate the next image of some sessions, in one pass.
 
         Args:
@@ -175,9 +174,10 @@ class World:
         order, rows = self._ordered(actions)
         chunks, known = self._chunks(order, actions)
         rollout = self._running()
-        rollout.decoding = self._decoding()
+        check(self.decoding, self.model.config)
+        rollout.decoding = self.decoding
         frames = rollout.step(chunks, known=known, rows=rows)
-        if self.measure:
+        if self.decoding.measure:
             self.uncertainty |= dict(zip(order, rollout.uncertainty.tolist()))
         return dict(zip(order, decode(self.tokenizer, frames.unsqueeze(1))[:, 0])) if decoded else {}
 
@@ -187,7 +187,6 @@ class World:
         Raises:
             HMAError: the model was not trained to act.
         """
-        require_actor(self.model.config, "the model")
         order, rows = self._ordered(sessions)
         made = self._running().act(rows).numpy(force=True)
         spaces = [self.model.embodiments[self._at(session).embodiment] for session in order]
@@ -196,7 +195,7 @@ class World:
             for session, chunk, space in zip(order, made, spaces)
         }
 
-    def observe(self, images: Mapping[int, Image], actions: Mapping[int, ArrayLike]) -> None:
+    def observe(self, images: Mapping[int, Images], actions: Mapping[int, ArrayLike]) -> None:
         """Add the images that truly came next to sessions, in one pass.
 
         Args:
@@ -208,11 +207,11 @@ class World:
         stored = self._encoded(self._at(order[0]).embodiment, np.stack([images[one] for one in order]))
         self._running().observe(torch.from_numpy(stored), chunks, known=known, rows=rows)
 
-    def image(self, session: int) -> Image:
+    def image(self, session: int) -> Images:
         """Return the newest image of a session; after `open`, the last of its prompt."""
         return decode(self.tokenizer, self._newest(session).unsqueeze(1))[0, 0]
 
-    def shown(self, frames: NDArray[Any]) -> Image:
+    def shown(self, frames: NDArray[Any]) -> Images:
         """Return the images (P, S, V·S, 3) of frames as a prompt takes them; images stay as they are."""
         stored = frames.shape[1:] == self.model.config.frame_shape  # of pixels in uint8 too
         if frames.ndim == 4 and frames.dtype == np.uint8 and not stored:
@@ -243,18 +242,10 @@ class World:
 
         Its sessions are numbered from 0, those of one side by side.
         """
-        rows = [self._at(session).row for session in sessions for _ in range(n)]
-        ones = [replace(self._at(session), row=0) for session in sessions for _ in range(n)]
-        other = World(
-            self.model, self.tokenizer, unmask_steps=self.unmask_steps, temperature=self.temperature,
-            order=self.order, sample_steps=self.sample_steps, compile=self.compile, precision=self.precision,
-        )  # fmt: skip
-        names = [one.embodiment for one in ones]
-        running = Rollout(self.model, names, len(ones), compile=self.compile, precision=self.precision)
-        kept = sorted(set(rows))
-        place = {row: i for i, row in enumerate(sorted(set(rows)))}
-        running.restore(range(len(rows)), self._running().snapshot(kept).take([place[row] for row in rows]))
-        other._rollout = running
+        ones = [self._at(session) for session in sessions for _ in range(n)]
+        other = World(self.model, self.tokenizer, compile=self.compile, precision=self.precision)
+        other.decoding = self.decoding
+        other._rollout = self._running().fork(n, [self._at(session).row for session in sessions])
         other._opened = len(ones)
         other._sessions = {number: replace(one, row=number) for number, one in enumerate(ones)}
         return other
@@ -294,13 +285,6 @@ class World:
     def _running(self) -> Rollout:
         assert self._rollout is not None
         return self._rollout
-
-    def _decoding(self) -> Decoding:
-        decoding = Decoding(
-            self.unmask_steps, self.temperature, self.order, self.sample_steps, measure=self.measure
-        )
-        check(decoding, self.model.config)
-        return decoding
 
     def _reserve(self, row: int, embodiment: str) -> None:
         """Make sure that the rollout has a row; rows double."""
@@ -344,14 +328,6 @@ class World:
         frames = fitted(frames, config, described(self.model, embodiment))
         views = [self.tokenizer.encode(view) for view in np.split(frames, config.views, axis=2)]
         return np.concatenate(views, axis=-2).astype(np.int64 if config.kind == "discrete" else np.float32)
-
-
-def require_actor(config: "HMAConfig", where: str) -> None:
-    """Check that a model was trained to act; an HMAError says how that is done."""
-    if POLICY not in config.trained_readouts:
-        objectives = ", ".join(name for name, weight in config.objectives.items() if weight)
-        fault = f"was not trained to act, but for {objectives}"
-        raise HMAError(where, fault, "train one with objectives={policy: 1.0} or {full: 1.0}")
 
 
 def load_world(checkpoint: StrPath = "embedded", *, device: str = "cpu", **settings: Any) -> World:

@@ -15,7 +15,7 @@ import hma_model.play
 from hma_data.storage.files import write_atomic
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.play.holding import MEASURED
-from hma_model.play.session import FrameSampling, Session
+from hma_model.play.session import Session
 from hma_model.worlds.scenes import drivable
 from hma_model.worlds.world import load_world
 
@@ -31,11 +31,12 @@ def main() -> None:
     checkpoint = Checkpoint.open(given.checkpoint)
     world = load_world(given.checkpoint, device=given.device)
     robots = drivable(checkpoint, (), lambda: world.tokenizer)
-    sampling = FrameSampling(world.unmask_steps, world.temperature, world.order)
     sessions: dict[str, list[Session]] = {}
     for name, robot in robots.items():
         if robot.source == "simulator":
-            sessions[name] = [Session(name, robot, n, world, sampling, 0.0) for n in range(given.scenes)]
+            sessions[name] = [
+                Session(name, robot, n, world, world.decoding, 0.0) for n in range(given.scenes)
+            ]
     every = [session for some in sessions.values() for session in some]
     for session in every:
         session.replays = True

@@ -34,7 +34,6 @@ from hma_model.evaluation.wholeness import (
     centre,
     continued,
     masks_of,
-    mean_of,
     overlap,
     palettes,
     shares,
@@ -192,3 +191,10 @@ BENCH = Bench(
     run,
     choices={"driver": ("own", "wander", "contact")},
 )
+
+
+def mean_of(values: Any) -> float | None:
+    """Return the mean of the finite values, None if there are none."""
+    kept = np.asarray(values, dtype=np.float64)
+    kept = kept[np.isfinite(kept)]
+    return round(float(kept.mean()), 3) if kept.size else None

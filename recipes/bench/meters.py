@@ -37,7 +37,7 @@ def main() -> None:
         arrays = frame_errors(choose(world, scenes, probe, Scripted(NOISE), FRAMES, given.sequences))
         found = calibration(
             arrays["uncertainty"], arrays["error_px"], arrays["pixel_rmse"],
-            unmask_steps=world.unmask_steps, temperature=world.temperature, seed=given.seed,
+            unmask_steps=world.decoding.unmask_steps, temperature=world.decoding.temperature, seed=given.seed,
         )  # fmt: skip
         record_evaluation(bundled, robot, found["meter"], "meter")
         print(f"{robot}: {found['meter']['verdict']}", flush=True)

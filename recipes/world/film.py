@@ -14,7 +14,7 @@ from hma_data.episodes.sheets import webp_bytes
 from hma_data.storage.files import write_atomic
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.play.save import panels
-from hma_model.play.session import FrameSampling, Session
+from hma_model.play.session import Session
 from hma_model.worlds.scenes import drivable
 from hma_model.worlds.world import load_world
 
@@ -31,8 +31,7 @@ def main() -> None:
     given = parser.parse_args()
     world = load_world(given.checkpoint)
     robot = drivable(Checkpoint.open(given.checkpoint), (), lambda: world.tokenizer)[given.robot]
-    sampling = FrameSampling(world.unmask_steps, world.temperature, world.order)
-    session = Session(given.robot, robot, given.scene, world, sampling, 0.0)
+    session = Session(given.robot, robot, given.scene, world, world.decoding, 0.0)
     session.replays = True
     hz = robot.embodiment.effective_hz
     for _ in range(round(given.seconds * hz)):

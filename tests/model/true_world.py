@@ -18,9 +18,11 @@ from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint, action_stats
 from hma_model.config import ActionSpace, HMAConfig
+from hma_model.generation.unmask import Decoding
 from hma_model.network.model import HMA
 from hma_model.play.session import Frame
 from hma_model.worlds.scenes import PROMPT_FRAMES, SCENE_SEED, Drivable, LabRobot
+from hma_model.worlds.world import World
 from tests.conftest import BlockTokenizer
 from tests.model.robots import stats
 
@@ -38,11 +40,11 @@ class TrueWorld:
     def __init__(self) -> None:
         self.rows: dict[int, LabSimulator] = {}
         self.steps: list[dict[int, NDArray[np.float32]]] = []
-        self.measure, self.uncertainty = False, dict[int, float]()
+        self.uncertainty = dict[int, float]()
         self.begun: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
         self.blind: set[int] = set()
         self.sampling: list[tuple[int, float, str]] = []
-        self.unmask_steps, self.temperature, self.order = 2, 0.0, "random"
+        self.decoding = Decoding(2, 0.0)
         self._count = 0
 
     def open(self, embodiment: str, frames: Any, chunks: Any = None, *, seed: int = 0) -> int:
@@ -62,7 +64,9 @@ class TrueWorld:
                     self._advance(first, chunk)
                 self.rows[session] = first
 
-    def meter(self, embodiment: str, **sampling: Any) -> tuple[None, str]:
+    drawing = World.drawing
+
+    def meter(self, embodiment: str, **changes: Any) -> tuple[None, str]:
         return None, "it is never unsure"
 
     def fork(self, sessions: Sequence[int], n: int) -> "TrueWorld":
@@ -75,7 +79,7 @@ class TrueWorld:
         self, actions: Mapping[int, NDArray[np.float32]], *, decoded: bool = True
     ) -> dict[int, NDArray[np.uint8]]:
         self.steps.append(dict(actions))
-        self.sampling.append((self.unmask_steps, self.temperature, self.order))
+        self.sampling.append((self.decoding.unmask_steps, self.decoding.temperature, self.decoding.order))
         for row, chunk in actions.items():
             self._advance(self.rows[row], chunk)
         images = {row: self.rows[row].picture() for row in actions}

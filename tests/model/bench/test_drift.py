@@ -107,9 +107,9 @@ def test_a_wrong_setting_is_named(change, message):
 
 
 def test_ways_of_sampling_are_told_apart_by_the_words_that_differ() -> None:
-    ways = drift._samplings("unmask_steps=2,temperature=0.5/unmask_steps=2, temperature=0.5, noise_level=0.1")
-    assert list(ways) == ["unmask_steps=2,temperature=0.5", "noise_level=0.1"]
-    assert ways["noise_level=0.1"] == {"unmask_steps": 2, "temperature": 0.5, "noise_level": 0.1}
+    ways = drift._samplings("unmask_steps=2,temperature=0.5/unmask_steps=2, temperature=0.5, sample_steps=4")
+    assert list(ways) == ["unmask_steps=2,temperature=0.5", "sample_steps=4"]
+    assert ways["sample_steps=4"] == {"unmask_steps": 2, "temperature": 0.5, "sample_steps": 4}
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from hma_model.benchmark.measures import REACHED_PX, decisions, no_inverse
 from hma_model.benchmark.planning import difference, plan, verdict
 from hma_model.benchmark.report import compared, read_results, rows, write_report
 from hma_model.benchmark.run import QUICK, RESULTS, WORK, benchmark
+from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.cli import main
 from hma_model.evaluation.agreement import Accuracy
@@ -48,9 +49,7 @@ class FrozenWorld(FlawlessWorld):
 
 
 def world_of(kind: type[FlawlessWorld]) -> Any:
-    made: Any = kind(World(tiny_model(ROBOT), get_tokenizer("fsq-8")))
-    made.sample_steps = None
-    return made
+    return kind(World(tiny_model(ROBOT), get_tokenizer("fsq-8")))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -123,11 +122,10 @@ def test_meters_are_recorded_in_the_cards_of_a_checkpoint_of_this_machine(tmp_pa
     folder = tmp_path / "model"
     shutil.copytree(EMBEDDED, folder)
     source = Checkpoint.open(folder)
-    world: Any = SimpleNamespace(model=SimpleNamespace(source=source))
     meter = {"verdict": "uncertainty warns of a state error of 1.7 px", "limit": 2.0}
-    made = {"mover_04": {"calibration": {"meter": meter}}, "rails_03": {"calibration": {"missing": "why"}}}
-    running._record_meters("org/name", world, made)  # a copy of what is on the hub
-    running._record_meters(folder, world, made)
+    checkpoints.record_locally("org/name", source, "mover_04", meter, "meter")  # a copy of what is on the hub
+    assert source.card("mover_04").get("meter") != meter
+    checkpoints.record_locally(folder, source, "mover_04", meter, "meter")
     assert source.card("mover_04")["meter"] == meter
     assert "uncertainty warns of a state error of 1.7 px" in (folder / "README.md").read_text()
 
@@ -276,9 +274,13 @@ def test_finished_results_of_a_killed_job_still_record_meters_and_remove_its_par
     shutil.copytree(folders[0], tmp_path / "out")
     (tmp_path / "out" / WORK).mkdir()
     recorded: list[Any] = []
-    monkeypatch.setattr(running, "_record_meters", lambda *given: recorded.append(given[2]))
+    monkeypatch.setattr(running, "record_locally", lambda *given: recorded.append(given[2:]))
     found = benchmark("it", tmp_path / "out", TINY, world=world_of(FlawlessWorld))
-    assert recorded == [found["measures"]] and not (tmp_path / "out" / WORK).exists()
+    meters = {robot: one["calibration"].get("meter") for robot, one in found["measures"].items()}
+    assert (
+        recorded == [(robot, meter, "meter") for robot, meter in meters.items() if meter]
+        and not (tmp_path / "out" / WORK).exists()
+    )
 
 
 def test_a_checkpoint_that_may_only_be_read_gets_no_meter_and_no_error(
@@ -287,6 +289,6 @@ def test_a_checkpoint_that_may_only_be_read_gets_no_meter_and_no_error(
     def refused(*given: Any) -> None:
         raise OutputError(tmp_path, "cannot be written: Permission denied")
 
-    monkeypatch.setattr(running, "record_evaluation", refused)
-    world: Any = SimpleNamespace(model=SimpleNamespace(source=SimpleNamespace(folder=tmp_path)))
-    running._record_meters(tmp_path, world, {"mover_04": {"calibration": {"meter": {}}}})
+    monkeypatch.setattr(checkpoints, "record_evaluation", refused)
+    source: Any = SimpleNamespace(folder=tmp_path)
+    checkpoints.record_locally(tmp_path, source, "mover_04", {}, "meter")

@@ -8,6 +8,7 @@ import pytest
 
 from hma_data.lab.family.look import SIZE
 from hma_model.evaluation.probe import Probe, fit, state_errors
+from recipes.bench.drift import wholeness
 
 RED, BLUE, PAPER = (200, 30, 40), (40, 60, 200), (225, 225, 215)
 
@@ -59,7 +60,7 @@ def test_what_does_not_move_or_cannot_be_read_is_no_part_of_the_state():
 def test_wholeness_falls_with_what_is_lost_and_not_with_what_moves(probe):
     here, there = np.array([[30.0, 30], [90, 90]]), np.array([[90.0, 40], [30, 100]])
     truth = np.stack([scene(here)] * 3)
-    found = probe.wholeness(np.stack([scene(here), scene(there), scene(here[:1])]), truth)
+    found = wholeness(probe, np.stack([scene(here), scene(there), scene(here[:1])]), truth)
     np.testing.assert_allclose(found, [1.0, 1.0, 0.5], atol=0.07)
 
 

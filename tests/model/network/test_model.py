@@ -9,7 +9,6 @@ import torch
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_model.config import CONDITIONINGS, OBJECTIVES, ActionSpace
-from hma_model.network.conditioning import Groups
 from hma_model.network.masking import draw_video_mask, drop_chunks
 from hma_model.network.model import HMA
 from hma_model.network.stem import from_digits, patchify, to_digits, unpatchify
@@ -179,11 +178,9 @@ def test_the_scores_of_one_frame_of_each_window_are_those_of_all_at_these_frames
     model = small_model(**changes)
     batch = small_batch(model.config, ["arm", "hand.v1", "arm"])
     frame = torch.tensor([4, 1, 0])
-    groups, times = Groups.of(batch.embodiment, 3), model.time_positions(5)
-    conditioning = model.condition_window(batch.actions, None, groups, times)
     for true in (None, batch.tokens):
-        whole = model.video_logits(batch.tokens, batch.actions, batch.embodiment, None, true)
-        one = model.logits_under(conditioning, batch.tokens, groups, times, true, frame=frame)
+        given = batch.tokens, batch.actions, batch.embodiment, None, true
+        whole, one = model.video_logits(*given), model.video_logits(*given, frame=frame)
         assert torch.allclose(one[:, 0], whole[torch.arange(3), frame], atol=1e-5)
 
 
@@ -201,11 +198,11 @@ def test_predicted_actions_are_raw_and_padded() -> None:
 @pytest.mark.parametrize(
     ("objectives", "readout", "says"),
     [
-        ({"forward": 1.0}, "policy", "'policy', but for forward.*objective policy or full"),
-        ({"passive": 1.0, "policy": 0.0}, "policy", "'policy', but for passive"),
-        ({"policy": 1.0}, "inverse", "'inverse', but for policy.*objective inverse"),
-        ({"full": 1.0}, "inverse", "'inverse', but for full"),
-        ({"inverse": 1.0}, "policy", "'policy', but for inverse"),
+        ({"forward": 1.0}, "policy", "act, but for forward.*objectives={policy: 1.0} or {full: 1.0}"),
+        ({"passive": 1.0, "policy": 0.0}, "policy", "act, but for passive"),
+        ({"policy": 1.0}, "inverse", "infer actions, but for policy.*objectives={inverse: 1.0}"),
+        ({"full": 1.0}, "inverse", "infer actions, but for full"),
+        ({"inverse": 1.0}, "policy", "act, but for inverse"),
     ],
 )
 def test_readouts_that_nothing_trained_are_refused(

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from hma_data.errors import HMAError
 from hma_model.network.stem import NoiseEmbedding
 from tests.model.network_parts import seeded, small_batch, small_model
 
@@ -57,28 +56,3 @@ def test_the_embedding_learns_from_noise_in_the_past(kind):
     model = small_model(kind=kind, told_noise=True, latent_noise=0.5, training_pass="pairs").train()
     model(small_batch(model.config, NAMES), "forward", seeded()).loss.backward()
     assert model.trunk.noise.weight.grad.abs().sum() > 0
-
-
-@pytest.mark.parametrize("changes", [{}, {"masked_input": "previous"}, {"layout": "released"}], ids=str)
-def test_a_rollout_tells_the_level_of_its_own_frames_only(changes, monkeypatch):
-    model = small_model(told_noise=True, frames=4, **changes)
-    batch = small_batch(model.config, NAMES, frames=7)
-
-    def made(frames, **how):
-        return model.generate(batch.tokens[:, :3], batch.actions, NAMES, frames, generator=seeded(), **how)
-
-    plain, told = made(4), []
-    noise = NoiseEmbedding.forward
-    monkeypatch.setattr(NoiseEmbedding, "forward", lambda self, x: told.append(x) or noise(self, x))
-    first = made(1, noise_level=0.3)
-    assert not any(level.any() for level in told) and torch.equal(first[:, 0], plain[:, 0])
-    cached = made(4, noise_level=0.3)
-    assert told[-1][0].tolist()[-2:] == [pytest.approx(0.3), 0.0]
-    assert torch.equal(cached, made(4, noise_level=0.3, cache=False)) and not torch.equal(cached, plain)
-
-
-def test_a_model_that_is_not_told_refuses_a_level():
-    model = small_model()
-    batch = small_batch(model.config, NAMES)
-    with pytest.raises(HMAError, match="noise_level: 0.3 is not allowed .*told_noise"):
-        model.generate(batch.tokens[:, :2], batch.actions, NAMES, 1, noise_level=0.3)

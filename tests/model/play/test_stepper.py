@@ -9,7 +9,8 @@ import pytest
 from hma_data.errors import UsageError
 from hma_data.lab.simulator import LabSimulator
 from hma_model.evaluation.calibration import Meter
-from hma_model.play.session import FrameSampling, Session
+from hma_model.generation.unmask import Decoding
+from hma_model.play.session import Session
 from hma_model.play.stepper import Stepper
 from hma_model.worlds.scenes import PROMPT_FRAMES, SCENE_SEED
 from tests.model.true_world import TrueWorld, Watcher, lab_robots
@@ -140,15 +141,15 @@ def test_the_meter_of_uncertainty_warns_until_a_sync_and_is_refused_if_no_better
     for _ in range(4):
         bench.step()
         found.append(session.metered)
-    assert bench.world.measure
+    assert bench.world.decoding.measure
     roots = [1.5 * count**0.25 for count in (1, 2, 3, 4)]
     assert found == [{"px": round(1 + 2 * root, 1), "warns": root >= 2} for root in roots]
     session.sync()
     assert session.metered == {"px": 1.0, "warns": False}
-    session.sample(replace(session.sampling, passes=3))
+    session.sample(replace(session.sampling, unmask_steps=3))
     assert session.metered is None and "no better than a clock" in session.status()["unmetered"]
     bench.step()
-    session.sample(replace(session.sampling, passes=2))
+    session.sample(replace(session.sampling, unmask_steps=2))
     assert session.metered is None  # a frame was not measured
     session.begin(0)
     assert session.metered == {"px": 1.0, "warns": False}
@@ -170,12 +171,12 @@ def test_sync_restarts_the_model_from_the_true_frames_and_their_actions() -> Non
 def test_sessions_of_another_sampling_have_a_pass_of_their_own() -> None:
     bench = Bench(orders=("random",))
     one, other, third = (bench.open()[0] for _ in range(3))
-    bench.stepper.change(other, FrameSampling(4, 0.5, "random"))
+    bench.stepper.change(other, Decoding(4, 0.5, "random"))
     bench.step()
     assert bench.world.sampling == [(2, 0.0, "random"), (4, 0.5, "random")]
     assert [set(step) for step in bench.world.steps] == [{one.row, third.row}, {other.row}]
     with pytest.raises(UsageError, match="no 'confidence'"):
-        bench.stepper.change(one, FrameSampling(2, 0.0, "confidence"))
+        bench.stepper.change(one, Decoding(2, 0.0, "confidence"))
 
 
 def test_a_new_scene_begins_anew_and_the_same_scene_is_the_same() -> None:

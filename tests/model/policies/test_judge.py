@@ -119,7 +119,7 @@ def test_a_judge_tells_its_accuracy_on_episodes_that_it_was_not_fitted_to(episod
     assert made.held_out.balanced == 1 and made.held_out.count == 20
     assert told == [f"training the judge: episode {count} of 40" for count in range(1, 41)]
     parts = np.full((12, 3, 2), 40.0)
-    reward, ended = made(written(parts), None)
+    reward, ended = made.begun()(written(parts), None)
     assert reward == 0 and not ended
     parts[5:, 2] += 9
     assert made.success(made.score(written(parts)[None])).tolist() == [True]

@@ -206,40 +206,6 @@ def test_the_run_folder_has_its_recipe_and_ground(run):
 # -- the console
 
 
-@pytest.fixture
-def terminal(monkeypatch):
-    """Standard error as a terminal that keeps what is shown."""
-    from rich import console, live
-
-    shown = []
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    monkeypatch.setattr(live.Live, "__enter__", lambda self: self)
-    monkeypatch.setattr(live.Live, "__exit__", lambda *given: None)
-
-    def update(self, group, refresh=False):
-        page = console.Console(width=120, record=True, file=io.StringIO())
-        page.print(group)
-        shown.append(page.export_text())
-
-    monkeypatch.setattr(live.Live, "update", update)
-    return shown
-
-
-def test_the_live_table_has_losses_by_robot_perplexity_speed_and_time_left(data, tmp_path, terminal):
-    train(make_recipe({**TINY, "data": data}), out=tmp_path / "run")
-    last = terminal[-1]
-    for text in ("step 6/6", "windows/s", "left", "MiB", "arm", "hand", "perplexity", "baseline"):
-        assert text in last
-    lines = read_metrics(tmp_path / "run")
-    assert f"{lines[-1]['loss_by_embodiment']['arm']:.3f}" in last
-
-
-def test_action_losses_have_no_perplexity(data, tmp_path, terminal):
-    train(make_recipe({**TINY, "data": data, "objectives": {"policy": 1}}), out=tmp_path / "run")
-    (row,) = [line for line in terminal[0].splitlines() if line.strip().startswith("arm")]
-    assert row.split()[2] == "-"
-
-
 def facts(step: int, seconds: float = 0.5, loss: float = 2.0, **given) -> dict:
     own = {"loss": loss, "loss_by_embodiment": {"arm": loss}, "windows": 8, "lr": 1e-3, "skipped": 0}
     return {"step": step, "step_seconds": seconds, **own, **given}
@@ -287,13 +253,15 @@ def test_a_loss_that_is_no_number_leaves_the_shown_mean_one(tmp_path, capsys):
     assert "loss arm 2.000" in last and "1 steps skipped" in last
 
 
-def test_a_terminal_shows_where_the_run_stands_before_the_first_step(tmp_path, monkeypatch):
+def test_a_terminal_shows_in_one_line_where_the_run_stands(tmp_path, monkeypatch):
     from rich import live
 
     shown = []
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     monkeypatch.setattr(live.Live, "__enter__", lambda self: shown.append(self.renderable))
     monkeypatch.setattr(live.Live, "__exit__", lambda *given: None)
-    with RunLog(tmp_path, 2000, 1000):
-        pass
-    assert str(shown[0]).startswith("step 1,000/2,000")
+    monkeypatch.setattr(live.Live, "update", lambda self, text: shown.append(text))
+    with RunLog(tmp_path, 2000, 1000) as log:
+        log.step(facts(1001))
+    assert str(shown[0]) == "step 1000/2000: waiting for the first step"
+    assert str(shown[1]).startswith("step 1001/2000: loss arm 2.000, 16.0 windows/s")

@@ -198,7 +198,7 @@ def test_one_that_knows_the_frames_already_gives_the_very_batch(model, monkeypat
     def known(*given, frame, **more):
         return scores[torch.arange(len(frame)), frame].unsqueeze(1)
 
-    monkeypatch.setattr(model, "logits_under", known)
+    monkeypatch.setattr(model, "video_logits", known)
     given = forwarded(model, true, 1.0, 3, torch.Generator().manual_seed(3))
     assert torch.equal(given.context, true.tokens)
 

@@ -22,9 +22,10 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.generation.unmask import Decoding
 from hma_model.play.pads import Pad, describe, hint, labels, pads
 from hma_model.play.save import film, lerobot_episode
-from hma_model.play.session import Frame, FrameSampling, Session, jpeg
+from hma_model.play.session import Frame, Session, jpeg
 from hma_model.worlds.scenes import PROMPT_FRAMES, LabRobot, RecordedRobot, apart, drivable
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
@@ -144,7 +145,7 @@ def test_what_truly_happens_is_shown_in_the_size_of_the_models_images(size: int)
     scene = robot.scene(0)
     found = scene.advance(None)
     assert scene.prompt.frames.shape == (PROMPT_FRAMES, size, size, 3) and found[1].shape == (size, size, 3)
-    session = Session("s", robot, 0, Scaled(), FrameSampling(2, 0.0, "random"), 0.0)
+    session = Session("s", robot, 0, Scaled(), Decoding(2, 0.0), 0.0)
     assert session.start.psnr is not None
 
 
@@ -153,7 +154,7 @@ def test_a_session_that_cannot_begin_leaves_its_place(monkeypatch: pytest.Monkey
     world = TrueWorld()
     monkeypatch.setattr(world, "image", lambda row: np.zeros((3, 3, 3), np.uint8))
     with pytest.raises(ValueError, match="broadcast"):
-        Session("s", robot, 0, world, FrameSampling(2, 0.0, "random"), 0.0)
+        Session("s", robot, 0, world, Decoding(2, 0.0), 0.0)
     assert not world.rows
 
 
@@ -263,7 +264,7 @@ def test_a_saved_dataset_reads_as_what_was_driven(name: str, tmp_path: Path) -> 
     (robot,) = lab_robots(name).values()
     world = TrueWorld()
     session, rng = (
-        Session("s", robot, 0, world, FrameSampling(2, 0.0, "random"), 0.0),
+        Session("s", robot, 0, world, Decoding(2, 0.0), 0.0),
         np.random.default_rng(0),
     )
     low, high = (np.array([getattr(dim, end) for dim in robot.dimensions]) for end in ("low", "high"))

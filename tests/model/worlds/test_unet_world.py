@@ -51,8 +51,8 @@ def test_stored_pixels_of_a_prompt_are_shown_as_images(world: World) -> None:
 def test_how_unsure_it_is_is_not_measured_rather_than_nothing(world: World) -> None:
     arena = TrueArena(Scenes.of(world, ROBOT, 1, 0), 64)
     session = world.open(ROBOT, arena.prompts[0].frames, arena.prompts[0].chunks)
-    world.measure = True
-    world.step({session: np.zeros(world.model.embodiments[ROBOT].chunk_dim, np.float32)})
+    with world.drawing(measure=True):
+        world.step({session: np.zeros(world.model.embodiments[ROBOT].chunk_dim, np.float32)})
     assert np.isnan(world.uncertainty[session])
 
 

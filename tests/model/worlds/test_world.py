@@ -1,5 +1,6 @@
 """Sessions in images: side by side as alone, and as `HMA.generate` makes them."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -98,10 +99,10 @@ def test_a_reset_gives_the_same_images_again_and_settings_count_at_once(model, w
     first = world.step({session: chunk})[session]
     world.reset(session, *windows[ARM])
     assert np.array_equal(world.step({session: chunk})[session], first)
-    world.temperature = 3.0
+    world.decoding = replace(world.decoding, temperature=3.0)
     world.reset(session, *windows[ARM])
     assert not np.array_equal(world.step({session: chunk})[session], first)
-    world.order = "spiral"
+    world.decoding = replace(world.decoding, order="spiral")
     with pytest.raises(HMAError, match="order"):
         world.step({session: chunk})
 
@@ -178,4 +179,4 @@ def test_the_embedded_world_opens_without_arguments() -> None:
     assert actions.names == ("x", "y") and actions.stride == 4 and actions.rate_hz == 10
     assert actions.low.tolist() == [0, 0] and actions.high.tolist() == [512, 512]
     assert actions.seen is not None and (actions.seen[0] >= 15).all() and (actions.seen[1] <= 497).all()
-    assert world.unmask_steps == 3 and len(world.model.embodiments) > 10
+    assert world.decoding.unmask_steps == 3 and len(world.model.embodiments) > 10

@@ -1,0 +1,10 @@
+"""Name the arrays that several packages take and give."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Float32s = NDArray[np.float32]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Images = NDArray[np.uint8]  # one or many, (…, H, W, 3) RGB
