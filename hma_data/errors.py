@@ -84,6 +84,10 @@ class OutputError(HMAError):
     """An output folder cannot be used: it holds something else than this job would write, for example."""
 
 
+class OtherPlanError(OutputError):
+    """An output folder holds what another conversion makes."""
+
+
 class RecipeError(HMAError):
     """A recipe or an override of it is not valid."""
 

@@ -13,9 +13,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (663, 3_750, 7),
+    "hma_data": (667, 3_755, 7),
     "hma_data/cli": (1_545, 11_038, 8),
-    "hma_data/conversion": (4_191, 31_210, 14),
+    "hma_data/conversion": (4_210, 31_270, 14),
     "hma_data/episodes": (1_671, 14_646, 9),
     "hma_data/hub": (512, 3_787, 3),
     "hma_data/inspection": (2_153, 20_120, 9),
@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_285, 10_976, 6),
     "hma_data/registry": (1_278, 8_202, 6),
     "hma_data/shards": (2_533, 19_482, 11),
-    "hma_data/sources": (12_577, 104_916, 52),
+    "hma_data/sources": (12_585, 105_010, 52),
     "hma_data/storage": (1_655, 10_881, 11),
     "hma_data/tokenizers": (3_274, 23_686, 17),
     "hma_model": (530, 3_100, 4),
@@ -35,7 +35,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/export": (990, 7_660, 7),
     "hma_model/generation": (1_670, 13_500, 10),
     "hma_model/hub": (1_060, 8_250, 6),
-    "hma_model/lerobot_env": (585, 4_550, 3),
+    "hma_model/lerobot_env": (615, 4_680, 3),
     "hma_model/network": (3_290, 28_300, 16),
     "hma_model/play": (1_655, 11_950, 8),
     "hma_model/policies": (2_840, 20_200, 14),
@@ -44,9 +44,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_560, 29_400, 18),
     "hma_model/worlds": (1_520, 11_250, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_800, 512_500
-TEST_LINES = 47_950
-DOC_WORDS = 40_330
+PRODUCT_LINES, PRODUCT_NODES = 64_860, 512_600
+TEST_LINES = 47_980
+DOC_WORDS = 40_340
 
 
 @cache

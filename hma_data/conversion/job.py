@@ -8,7 +8,7 @@ the job goes on.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -37,7 +37,14 @@ from hma_data.conversion.report import (
 )
 from hma_data.conversion.worker import MakeWork
 from hma_data.episodes.align import OFF_RATE
-from hma_data.errors import OutputError, RegistryError, SourceError, StorageAwayError, UsageError
+from hma_data.errors import (
+    OtherPlanError,
+    OutputError,
+    RegistryError,
+    SourceError,
+    StorageAwayError,
+    UsageError,
+)
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest, shard_sizes
 from hma_data.shards.schema import RowLayout, to_numpy
@@ -53,6 +60,7 @@ from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.shapes import get_spec
 
 MERGE = "convert some episodes (--only) into a dataset of their own; lerobot-edit-dataset merges datasets"
+BOTH_ANEW = "choose another --out and another --lerobot, or --overwrite to start both over"
 OnProgress = Callable[[Progress], None]
 Target = Literal["shards", "lerobot"]
 
@@ -185,6 +193,8 @@ class Conversion:
         run = _Run(self)
         runs = [run] if run.beside is None else [run, run.beside]
         with ExitStack() as held:
+            if run.beside:
+                held.enter_context(_advice_for_both())
             for one in runs:
                 held.enter_context(locked(one.folder))
             for one in runs:
@@ -226,6 +236,15 @@ class Conversion:
                     # A journal shows that some share has made shards since the manifest was written.
                     return run.finish(plan, base, bool(run.made or known_hashes(run.out)))
         return UnfinishedShare(run.out, run.kept, run.made, missing, time.monotonic() - run.begun)
+
+
+@contextmanager
+def _advice_for_both() -> Iterator[None]:
+    """Give the remedy for shards and a dataset that are made together: --extend is for shards alone."""
+    try:
+        yield
+    except OtherPlanError as fault:
+        raise OtherPlanError(fault.where, fault.fault, BOTH_ANEW) from fault
 
 
 class _Run:
@@ -292,7 +311,7 @@ class _Run:
         plan = extended(self.folder, base, self.whole, given.settings.shard_frames, content)
         if plan.units and not given.extend:
             fault = f"lacks {plan.episodes:,} episodes that the recording has now"
-            raise OutputError(self.folder, fault, "--extend adds them")
+            raise OtherPlanError(self.folder, fault, "--extend adds them")
         return plan, base
 
     def _check_stride(self, base: Manifest) -> None:

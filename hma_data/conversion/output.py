@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from hma_data.conversion.extend import ways
 from hma_data.conversion.plan import Plan, differences
-from hma_data.errors import HMAError, OutputError, RegistryError, StorageAwayError
+from hma_data.errors import HMAError, OtherPlanError, OutputError, RegistryError, StorageAwayError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import (
     EMBODIMENT,
@@ -277,13 +277,13 @@ def _metadata(out: Path, names: list[str]) -> Iterator[tuple[str, dict[bytes, by
             yield from zip(some, pool.map(lambda name: read_metadata(out / name).metadata or {}, some))
 
 
-def other_plan(out: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> OutputError:
+def other_plan(out: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> OtherPlanError:
     """Return the error for a folder that holds the set of another plan."""
     remedy = "choose another --out, or --overwrite to start over"
     if ways(ours) == ways(theirs) and "to" not in ours:
         remedy = "--extend adds the episodes that are new, --overwrite starts over"
     fault = f"belongs to another conversion; different: {differences(ours, theirs)}"
-    return OutputError(out, fault, remedy)
+    return OtherPlanError(out, fault, remedy)
 
 
 # -- the journal

@@ -9,6 +9,7 @@
 lerobot imports this package and finds the environment registered. S pixels a side.
 """
 
+import logging
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -22,13 +23,15 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
 from hma_data.errors import HMAError, UsageError
+from hma_data.sources.lerobot.writer import SYNTHETIC
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.hub.publish import located
-from hma_model.lerobot_env.vector import SYNTHETIC, LeRobotVectorEnv, camera_names, judged_task, state_source
+from hma_model.lerobot_env.vector import LeRobotVectorEnv, camera_names, judged_task, state_source
 from hma_model.worlds.images import image_shape
 from hma_model.worlds.world import World, load_world
 
 Envs = dict[str, dict[int, LeRobotVectorEnv]]
+log = logging.getLogger(__name__)
 
 
 @EnvConfig.register_subclass("hma")
@@ -78,6 +81,8 @@ class HMAEnvConfig(EnvConfig):
         """Return the environments; they step in one pass in any case."""
         with in_one_line():
             require_fit(self)
+            if self.judge is None:
+                log.warning("no judge is given, so pc_success will be 0; name one by --env.judge")
             world = load_world(
                 self.checkpoint, device=self.device, unmask_steps=self.unmask_steps,
                 temperature=self.temperature,

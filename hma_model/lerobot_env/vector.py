@@ -4,6 +4,7 @@ N environments, S pixels a side, S' values of a state, A action dims.
 """
 
 import logging
+import time
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import Any
@@ -16,9 +17,16 @@ from numpy.typing import NDArray
 from hma_data.errors import UsageError
 from hma_data.lab.simulator import simulated
 from hma_data.shards.reader import ShardSet
+from hma_data.sources.lerobot.writer import SYNTHETIC
 from hma_model.arrays import Float32s, Ints
 from hma_model.checkpoint.folder import Checkpoint
-from hma_model.evaluation.recorded_state import EPISODES_NEEDED, Reader, recorded_reader, simulated_reader
+from hma_model.evaluation.recorded_state import (
+    EPISODES_NEEDED,
+    Reader,
+    Tell,
+    recorded_reader,
+    simulated_reader,
+)
 from hma_model.policies.judge import StateJudge, Task, task_of, train_judge
 from hma_model.policies.rewards import RewardModel, labelled_shards, measured_judge, names_reward_model
 from hma_model.worlds.env import WorldModelVectorEnv
@@ -27,7 +35,7 @@ from hma_model.worlds.world import World
 
 Observations = dict[str, Any]
 NEW_ROLLOUT = "lerobot_new_rollout"  # an option with which lerobot's evaluation begins each batch
-SYNTHETIC = "synthetic"  # an observation of 1; in lerobot's recordings it tells that no robot did this
+TOLD_EVERY_S = 20.0  # while a reader or a judge is trained
 log = logging.getLogger(__name__)
 
 
@@ -37,13 +45,13 @@ def camera_names(checkpoint: Checkpoint, embodiment: str) -> list[str]:
     return seen_cameras(trained_cameras(checkpoint.card(embodiment)), stored)
 
 
-def state_source(checkpoint: Checkpoint, embodiment: str) -> Callable[[World], Reader | None] | None:
+def state_source(checkpoint: Checkpoint, embodiment: str) -> Callable[[World, Tell], Reader | None] | None:
     """Return what trains a reader of a robot's state; None if it has no state, or no episodes tell it."""
     robot = checkpoint.embodiment(embodiment)
     if robot.state is None:
         return None
     if simulated(embodiment):
-        return lambda world: simulated_reader(embodiment, world.tokenizer, robot.stride, 0)
+        return lambda world, tell: simulated_reader(embodiment, world.tokenizer, robot.stride, 0, tell)
     for shards in checkpoint.shards():
         known = shards.embodiment.id == embodiment and shards.embodiment.state is not None
         if known and shards.manifest.splits["train"]["episodes"] >= EPISODES_NEEDED:
@@ -51,8 +59,21 @@ def state_source(checkpoint: Checkpoint, embodiment: str) -> Callable[[World], R
     return None
 
 
-def _recorded(shards: ShardSet, cameras: tuple[str, ...], world: World) -> Reader | None:
-    return recorded_reader(world.tokenizer, shards, cameras, 0)
+def _recorded(shards: ShardSet, cameras: tuple[str, ...], world: World, tell: Tell) -> Reader | None:
+    return recorded_reader(world.tokenizer, shards, cameras, 0, tell)
+
+
+def progress_log(embodiment: str) -> Tell:
+    """Return a function that logs how far a training is, but not more often than TOLD_EVERY_S."""
+    told = time.monotonic()
+
+    def tell(words: str) -> None:
+        nonlocal told
+        if time.monotonic() - told >= TOLD_EVERY_S:
+            told = time.monotonic()
+            log.warning("%s: %s", embodiment, words)
+
+    return tell
 
 
 class LeRobotVectorEnv(WorldModelVectorEnv):
@@ -128,7 +149,7 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         if self._train_reader is None:
             return None
         log.warning("%s: training a reader of the state; this takes minutes", self.embodiment)
-        reader = self._train_reader(self.world)
+        reader = self._train_reader(self.world, progress_log(self.embodiment))
         if reader is None:
             raise UsageError(self.embodiment, "has no episode whose states are all known", "give state=false")
         own = reader.readable
@@ -144,13 +165,17 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
             return None
         if self._task is None:
             shards = labelled_shards(self.world, self.embodiment, self._judge_from, self._judged_by)
-            found = measured_judge(self._judged_by, self.world, self.embodiment, shards)
+            tell = progress_log(self.embodiment)
+            found = measured_judge(self._judged_by, self.world, self.embodiment, shards, tell)
             log.warning("%s: success is what %s says; %s", self.embodiment, found.source, found.sentence)
             return found.model
         log.warning("%s: training the judge; this takes minutes", self.embodiment)
         spec = self.envs[0].action_spec
         frames = self._max_episode_steps // spec.stride + 1
-        judge = train_judge(self.embodiment, self.world.tokenizer, spec.stride, frames, self._task)
+        judge = train_judge(
+            self.embodiment, self.world.tokenizer, spec.stride, frames, self._task,
+            tell=progress_log(self.embodiment),
+        )  # fmt: skip
         log.warning("%s: success is that %s; the judge: %s", self.embodiment, self._task.text, judge.held_out)
         return judge
 

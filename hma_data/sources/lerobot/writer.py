@@ -26,12 +26,18 @@ from hma_data.registry.export import lerobot_features
 from hma_data.storage.files import read_json
 
 ORIGIN = "synthetic.json"  # beside a dataset whose episodes no robot recorded: what made them
+SYNTHETIC = "synthetic"  # a column of 1 in lerobot's own recordings of an evaluation in a model
 
 
 def origin_of(folder: Path) -> dict[str, Any]:
     """Return what made the episodes of a dataset: `made_by` of the plan of shards; empty for a recording."""
-    path = folder / ORIGIN
-    return read_json(path, SourceError) if path.is_file() else {}
+    path, info = folder / ORIGIN, folder / "meta" / "info.json"
+    if path.is_file():
+        return read_json(path, SourceError)
+    if not info.is_file() or SYNTHETIC not in read_json(info, SourceError).get("features", {}):
+        return {}
+    ranges = read_json(folder / "meta" / "stats.json", SourceError).get(SYNTHETIC, {})
+    return {"by": "lerobot-eval", "synthetic": True} if ranges.get("max") == [1.0] else {}
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,8 @@ def test_a_dataset_is_added_to_shards_that_are_there_and_kept(tmp_path: Path) ->
     convert(robot, str(data), "fsq-8", tmp_path / "one" / "shards", settings=BOTH)
     one_run(robot, data, tmp_path / "one")
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
-    with pytest.raises(OutputError, match="belongs to another conversion"):
+    own = "belongs to another conversion.* — choose another --out and another --lerobot, or --overwrite"
+    with pytest.raises(OutputError, match=own):  # --extend, which adds episodes to shards, would be refused
         one_run(robot, data, tmp_path / "one", replace(BOTH, limit=1))
     one_run(robot, data, tmp_path / "one", replace(BOTH, limit=1), overwrite=True)
     assert len(list(tmp_path.glob("one/shards/*/*.parquet"))) == 1

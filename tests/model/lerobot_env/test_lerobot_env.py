@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 
 from hma_data.errors import HMAError
+from hma_data.sources.lerobot.writer import origin_of
 from hma_model import lerobot_env
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.hub import push
 from hma_model.lerobot_env import HMAEnvConfig, vector
 from hma_model.worlds.world import World
+from tests.hub_server import Hub
+from tests.hub_state import REPO
 from tests.model.policies.test_lerobot_policy import CAMERA, saved
 
 pytestmark = pytest.mark.slow  # of the import of lerobot
+pytest_plugins = ["tests.hub_fixtures"]
 ROBOT = "rails_03"
 RENAME = "--rename_map=" + json.dumps({"observation.image": CAMERA})
 IMAGE = np.full((64, 64, 3), 90, np.uint8)
@@ -40,7 +44,7 @@ class Certain:
 
 @pytest.fixture
 def env(monkeypatch: pytest.MonkeyPatch, world: World) -> vector.LeRobotVectorEnv:
-    monkeypatch.setattr(vector, "state_source", lambda *_: lambda world: Certain())
+    monkeypatch.setattr(vector, "state_source", lambda *_: lambda world, tell: Certain())
     monkeypatch.setattr(vector.LeRobotVectorEnv, "reader", Certain())
     monkeypatch.setattr(vector.LeRobotVectorEnv, "judge", Certain())
     return vector.LeRobotVectorEnv(
@@ -144,12 +148,11 @@ def test_a_policy_that_does_not_fit(
     assert said in str(fault.value) and "\n" not in str(fault.value)
 
 
-def test_a_published_checkpoint_makes_environments(tmp_path: Path) -> None:
-    from lerobot.envs.utils import _call_make_env, _import_hub_module
+def test_a_published_checkpoint_makes_environments(server: Hub) -> None:
+    from lerobot.envs.factory import make_env
 
-    push("embedded", tmp_path / "hub", [ROBOT])
-    module = _import_hub_module(str(tmp_path / "hub" / "env.py"), "org/model")
-    envs = _call_make_env(module, n_envs=2, use_async_envs=True, cfg=None)
+    push("embedded", REPO, [ROBOT])
+    envs = make_env(REPO, n_envs=2, use_async_envs=True, trust_remote_code=True)
     assert list(envs) == [ROBOT] and envs[ROBOT][0].num_envs == 2
 
 
@@ -164,6 +167,17 @@ def test_a_repository_is_loaded_in_the_revision_of_its_file(monkeypatch: pytest.
     with pytest.raises(HMAError):
         lerobot_env.published_envs("/cache/models--org--m/snapshots/abc/env.py", "org/m", 1)
     assert asked == ["org/m@abc"]
+
+
+def test_how_far_a_training_is_is_logged_from_time_to_time(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock = iter([0.0, 5.0, 25.0, 25.0, 30.0])
+    monkeypatch.setattr(vector.time, "monotonic", lambda: next(clock))
+    tell = vector.progress_log(ROBOT)
+    for step in range(3):
+        tell(f"step {step + 1} of 3")
+    assert caplog.messages == [f"{ROBOT}: step 2 of 3"]
 
 
 def test_lerobot_eval_and_its_recording(tmp_path: Path) -> None:
@@ -186,3 +200,5 @@ def test_lerobot_eval_and_its_recording(tmp_path: Path) -> None:
     facts = json.loads((recorded / "meta" / "info.json").read_text())
     assert facts["total_frames"] == 10 and facts["fps"] == HMAEnvConfig(embodiment=ROBOT).fps
     assert {"pixels", "agent_pos", "action", "synthetic", "next.success"} <= facts["features"].keys()
+    assert origin_of(recorded) == {"by": "lerobot-eval", "synthetic": True}
+    assert "no judge is given, so pc_success will be 0" in found.stderr

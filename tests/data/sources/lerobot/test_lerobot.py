@@ -20,6 +20,7 @@ from hma_data.sources.base import open_source
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.detect import detect
 from hma_data.sources.lerobot.metadata import fill
+from hma_data.sources.lerobot.writer import origin_of
 from tests.data.hub_cache import as_snapshot
 from tests.data.videos import (
     CAMERA,
@@ -406,3 +407,15 @@ def test_the_real_g1_is_inspected(real_data: Path) -> None:
     assert keys["action"].names == tuple(find("g1_inspire").action.names())
     assert keys["observation.images.cam_high"].codec == "av1" and found.frames == 35_965
     assert "96 of 100 videos" in found.problems[0]
+
+
+@pytest.mark.parametrize(
+    ("highest", "made_by"), [(1.0, {"by": "lerobot-eval", "synthetic": True}), (0.0, {})]
+)
+def test_a_recording_of_an_evaluation_in_a_model_is_synthetic(
+    highest: float, made_by: dict[str, Any], tmp_path: Path
+) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text(json.dumps({"features": {"synthetic": {"shape": [1]}}}))
+    (tmp_path / "meta" / "stats.json").write_text(json.dumps({"synthetic": {"max": [highest]}}))
+    assert origin_of(tmp_path) == made_by
