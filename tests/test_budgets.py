@@ -15,17 +15,17 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (667, 3_755, 7),
     "hma_data/cli": (1_545, 11_038, 8),
-    "hma_data/conversion": (4_210, 31_270, 14),
-    "hma_data/episodes": (1_671, 14_646, 9),
+    "hma_data/conversion": (4_210, 31_264, 14),
+    "hma_data/episodes": (1_677, 14_704, 9),
     "hma_data/hub": (512, 3_787, 3),
-    "hma_data/inspection": (2_153, 20_120, 9),
+    "hma_data/inspection": (2_153, 20_106, 8),
     "hma_data/lab": (3_327, 30_626, 16),
     "hma_data/loading": (1_285, 10_976, 6),
-    "hma_data/registry": (1_278, 8_202, 6),
+    "hma_data/registry": (1_283, 8_240, 6),
     "hma_data/shards": (2_533, 19_482, 11),
-    "hma_data/sources": (12_585, 105_010, 52),
+    "hma_data/sources": (12_534, 104_664, 50),
     "hma_data/storage": (1_655, 10_881, 11),
-    "hma_data/tokenizers": (3_274, 23_686, 17),
+    "hma_data/tokenizers": (3_251, 23_456, 17),
     "hma_model": (530, 3_100, 4),
     "hma_model/benchmark": (855, 7_350, 5),
     "hma_model/checkpoint": (885, 6_600, 5),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_560, 29_400, 18),
     "hma_model/worlds": (1_520, 11_250, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_860, 512_600
+PRODUCT_LINES, PRODUCT_NODES = 64_795, 512_065
 TEST_LINES = 47_980
 DOC_WORDS = 40_340
 

@@ -188,7 +188,7 @@ def convert(
     if isinstance(summary, UnfinishedShare):
         _report_share(summary, share, json)
         return
-    from hma_data.inspection.kept import kept_findings
+    from hma_data.inspection.shard_findings import kept_findings
     from hma_data.shards.reader import ShardSet
 
     lasting: list[Finding] = []

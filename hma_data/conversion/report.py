@@ -11,7 +11,7 @@ from hma_data.console import human_count
 from hma_data.conversion.engines import Notice, Retry
 from hma_data.conversion.plan import HELD_OUT, VAL_FRACTION, Plan
 from hma_data.conversion.reading import Seen, Tick
-from hma_data.inspection.shard_flags import pause_finding, rate_finding, window_finding
+from hma_data.inspection.shard_findings import pause_finding, rate_finding, window_finding
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 

@@ -38,6 +38,12 @@ def opencv() -> Any:
     return cv2
 
 
+def image_codec(data: bytes | memoryview | NDArray[np.uint8]) -> str | None:
+    """Return jpeg or png by the first bytes of a still picture; None for anything else."""
+    start = bytes(data[:4])
+    return "png" if start == b"\x89PNG" else "jpeg" if start[:2] == b"\xff\xd8" else None
+
+
 def decode_image(data: bytes | NDArray[np.uint8], where: str, least: int = 0) -> Images:
     """Decode a JPEG, PNG or other still picture to (H, W, 3) RGB.
 

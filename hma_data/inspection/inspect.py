@@ -436,8 +436,13 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
 
 
 def _shard_set(folder: Path) -> Iterator[Finding]:
-    from hma_data.inspection.kept import kept_findings
-    from hma_data.inspection.shard_flags import pause_finding, picture_findings, rate_finding, window_finding
+    from hma_data.inspection.shard_findings import (
+        kept_findings,
+        pause_finding,
+        picture_findings,
+        rate_finding,
+        window_finding,
+    )
     from hma_data.shards.reader import ShardSet
     from hma_data.shards.verify import verify
 

@@ -153,6 +153,11 @@ class Embodiment(SpecModel):
         return self.action.dims
 
     @property
+    def components(self) -> tuple[Component, ...]:
+        """Return the components of the action, then those of the state."""
+        return self.action.components + (self.state.components if self.state else ())
+
+    @property
     def states_rate(self) -> bool:
         """Return whether the YAML states the rate of the grid."""
         return bool(self.sync.rate_hz) or isinstance(self.frequency_hz, float)

@@ -155,7 +155,7 @@ def _parts(key: str) -> Iterator[str | int]:
 def _write_page(folder: Path, shards: Path, film: Path, done: list[list[str]]) -> Path:
     """Write the page with the film, what was measured, and the commands."""
     from hma_data.episodes.sheets import webp_bytes
-    from hma_data.inspection.kept import kept_findings
+    from hma_data.inspection.shard_findings import kept_findings
     from hma_data.shards.reader import ShardSet
     from hma_data.storage.files import write_atomic
     from hma_model.evaluation.pages import Page

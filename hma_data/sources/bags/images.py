@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Floats, of_one_size, stacked
-from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images, decode_image, opencv
+from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images, decode_image, image_codec, opencv
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel
@@ -133,7 +133,7 @@ def picture(message: Any, kind: str, where: str, levels: Levels | None = None, l
         if kind == STILL_IMAGE and any(name in str(child(message, "format")).lower() for name in DEPTH):
             stated = str(child(message, "format"))
             raise EpisodeError(where, f"{stated!r} is depth, not colour", "name a colour topic as camera")
-        if encoding(message, kind) == MONO16 and (kind == RAW or _is_png(payload(message))):
+        if encoding(message, kind) == MONO16 and (kind == RAW or image_codec(payload(message)) == "png"):
             if levels is None:
                 remedy = "state the values of black and white in the YAML, such as levels: [0, 4095]"
                 raise EpisodeError(where, "images in mono16 have 16 bits of grey", remedy)
@@ -189,10 +189,6 @@ def wide_grey(message: Any, kind: str, where: str) -> NDArray[np.uint16]:
     if found is None or found.ndim != 2:
         raise EpisodeError(where, "an image in mono16 cannot be decoded")
     return found.astype(np.uint16)
-
-
-def _is_png(data: bytes) -> bool:
-    return data[:8] == b"\x89PNG\r\n\x1a\n"
 
 
 def _grey(values: NDArray[np.uint16], levels: Levels) -> Images:

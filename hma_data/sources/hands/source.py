@@ -168,9 +168,7 @@ def _needed(embodiment: Embodiment) -> tuple[str, ...]:
     for camera in embodiment.cameras:
         if camera.key != CAMERA:
             raise SourceError(where, f"camera key {camera.key!r} is not in hand videos", f"use {CAMERA!r}")
-    vectors = [embodiment.action, *([embodiment.state] if embodiment.state else [])]
-    keys = [part.key for vector in vectors for part in vector.components]
-    return tuple(dict.fromkeys(point_of(key, where) for key in keys))
+    return tuple(dict.fromkeys(point_of(part.key, where) for part in embodiment.components))
 
 
 def _whole(video: Video, digest: str) -> EpisodeRef:

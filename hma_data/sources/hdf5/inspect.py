@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hma_data.episodes.images import decode_image
+from hma_data.episodes.images import decode_image, image_codec
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import Hdf5Layout
 from hma_data.sources.common import checks
@@ -279,15 +279,9 @@ def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | N
         return "camera", (*shape[:2], 1) if _is_grey(item.shape) else shape, "raw"
     if images == "encoded":
         first = rows(item, [0])[0]
-        start = bytes(encoded(first)[:8])
-        codec = "jpeg" if start[:2] == b"\xff\xd8" else "png" if start[:4] == b"\x89PNG" else None
-        if codec:
+        if codec := image_codec(encoded(first)):
             shape = decode_image(encoded(first), where).shape
-            return (
-                "camera",
-                (*shape[:2], 1) if checks.one_channel(bytes(encoded(first))) else shape,
-                codec,
-            )
+            return "camera", (*shape[:2], 1) if checks.one_channel(bytes(encoded(first))) else shape, codec
     if item.dtype.kind in "OS":
         return "text", shape[1:], None
     if item.dtype.kind in "fiub" and 1 <= len(shape) <= 3:

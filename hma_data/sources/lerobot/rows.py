@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Floats, of_one_size, rate_times, stacked
-from hma_data.episodes.images import Images, decode_image
+from hma_data.episodes.images import Images, decode_image, image_codec
 from hma_data.errors import EpisodeError
 from hma_data.sources.lerobot.metadata import Folder, Metadata, parquet_explained
 
@@ -221,8 +221,7 @@ class StillImages:
 
     def codec(self) -> str | None:
         """Return png or jpeg, from the first image; None for anything else."""
-        start = self._bytes(0)[:4]
-        return "png" if start == b"\x89PNG" else "jpeg" if start[:2] == b"\xff\xd8" else None
+        return image_codec(self._bytes(0))
 
     def _where(self, index: int) -> str:
         return f"{self._rows.path} {self._key}[{index}]"

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from hma_data.episodes.episode import Episode, Floats, Pictures, Signal, rate_times
+from hma_data.episodes.images import image_codec
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Component, Vector
 from hma_data.registry.embodiment import Embodiment
@@ -195,7 +196,7 @@ def _check_keys(folder: RldsFolder, embodiment: Embodiment) -> None:
             images = [key for key, found in folder.step_features.items() if is_camera(found)]
             fault = f"{camera.key} is {_described(feature)} of {feature.dtype}, not a colour image"
             raise SourceError(folder.uri, fault, f"its images: {', '.join(images) or 'none'}")
-    for part in embodiment.action.components + (embodiment.state.components if embodiment.state else ()):
+    for part in embodiment.components:
         _check_component(folder, part)
     if embodiment.source.instruction:
         _text_feature(folder, embodiment.source.instruction)
@@ -413,7 +414,4 @@ def _codec(steps: Steps, key: str) -> str:
     """Return the codec of a key's first image; TFDS stores files as given, whatever is stated."""
     if steps.features[key].kind != "image":
         return "raw"
-    head = bytes(steps.blobs(key)[0][:8])
-    if head.startswith(b"\xff\xd8"):
-        return "jpeg"
-    return "png" if head.startswith(b"\x89PNG") else steps.features[key].codec or "unknown"
+    return image_codec(steps.blobs(key)[0]) or steps.features[key].codec or "unknown"

@@ -12,7 +12,7 @@ import pytest
 from hma_data.episodes.movement import Kept, MovingPart, framing
 from hma_data.inspection.infer import infer
 from hma_data.inspection.inspect import examine
-from hma_data.inspection.kept import kept_findings
+from hma_data.inspection.shard_findings import kept_findings
 from hma_data.registry.components import Camera
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.yaml_io import parse_yaml
