@@ -4,7 +4,8 @@ import gc
 import os
 import re
 import shutil
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,22 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     """Fail a run of CI in which a test was skipped for want of a package."""
     if os.environ.get("CI") and _unexplained() and session.exitstatus == pytest.ExitCode.OK:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.fixture(autouse=True, scope="session")
+def loaded_once() -> Iterator[None]:
+    """Load the weights of each embedded tokenizer once: no test changes them."""
+    from hma_data.tokenizers import embedded  # torch, which scripts that import this module may not need
+
+    load = embedded.load
+    kept = cache(load)
+
+    def once(name: str, **given: Any) -> Any:
+        return load(name, **given) if given["weights"] else kept(name, **given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(embedded, "load", once)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/episodes": (1_677, 14_704, 9),
     "hma_data/hub": (512, 3_787, 3),
     "hma_data/inspection": (2_153, 20_106, 8),
-    "hma_data/lab": (3_327, 30_626, 16),
+    "hma_data/lab": (3_327, 30_634, 16),
     "hma_data/loading": (1_285, 10_976, 6),
     "hma_data/registry": (1_283, 8_240, 6),
     "hma_data/shards": (2_533, 19_482, 11),
@@ -29,9 +29,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model": (530, 3_100, 4),
     "hma_model/benchmark": (855, 7_350, 5),
     "hma_model/checkpoint": (885, 6_600, 5),
-    "hma_model/cli": (1_715, 10_700, 12),
+    "hma_model/cli": (1_721, 10_700, 12),
     "hma_model/demo": (485, 4_100, 4),
-    "hma_model/evaluation": (4_480, 36_150, 23),
+    "hma_model/evaluation": (4_483, 36_150, 23),
     "hma_model/export": (990, 7_660, 7),
     "hma_model/generation": (1_670, 13_500, 10),
     "hma_model/hub": (1_060, 8_250, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_560, 29_400, 18),
     "hma_model/worlds": (1_520, 11_250, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_795, 512_065
-TEST_LINES = 47_980
+PRODUCT_LINES, PRODUCT_NODES = 64_806, 512_120
+TEST_LINES = 47_939
 DOC_WORDS = 40_340
 
 

@@ -107,8 +107,8 @@ class TeeTable:
             points = [(round(x), round(y)) for x, y in outline]
             game.draw.polygon(screen, game.Color("LightGreen"), points)
         self._space.debug_draw(_pencil(screen))
-        pixels = game.surfarray.array3d(screen).swapaxes(0, 1)
-        small: NDArray[np.uint8] = cv2.resize(np.ascontiguousarray(pixels), (size, size))
+        pixels = np.frombuffer(game.image.tobytes(screen, "RGB"), np.uint8).reshape(SIDE, SIDE, 3)
+        small: NDArray[np.uint8] = cv2.resize(pixels, (size, size))
         return small
 
 

@@ -8,6 +8,7 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -92,6 +93,14 @@ def _show_brackets(command: Any) -> None:
         _show_brackets(inner)
 
 
+@cache
+def _command() -> Any:
+    """Return the command of all verbs; it takes 0.1 s to make, and a process may run several."""
+    command = typer.main.get_command(app)
+    _show_brackets(command)
+    return command
+
+
 def _one_line(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
 ) -> str:
@@ -115,10 +124,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not debug:
         warnings.formatwarning = _one_line
     try:
-        command = typer.main.get_command(app)
-        _show_brackets(command)
         plain = [word for word in words if word != "--debug"]
-        code = command.main(plain, prog_name="hma", standalone_mode=False)
+        code = _command().main(plain, prog_name="hma", standalone_mode=False)
     except SystemExit as ended:  # a rank whose error another rank has reported
         return ended.code if isinstance(ended.code, int) else 1
     except HMAError as fault:

@@ -234,40 +234,41 @@ def _json_joints(item: Item) -> bytes:
     ).encode()
 
 
-def as_protobuf() -> dict[str, Encoded]:
-    """Protobuf, the pictures raw."""
+NUMBER, TEXT, UINT32, BLOB, MESSAGE = 1, 9, 7, 12, 11  # field types of descriptor.proto
+ONE, MANY = 1, 3  # and labels
+
+
+def protobuf_types(layout: dict[str, list[tuple[str, int, int]]]) -> tuple[bytes, dict[str, Any]]:
+    """Return a schema of messages with a stamp and these fields (name, type, label), and their types."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
     files = descriptor_pb2.FileDescriptorSet()
     timestamp_pb2.DESCRIPTOR.CopyToProto(files.file.add())
     own = files.file.add(name="robot.proto", package="foxglove", syntax="proto3")
     own.dependency.append("google/protobuf/timestamp.proto")
-    number, text, many, blob, message = 1, 9, 3, 12, 11  # field types and label of descriptor.proto
-    layout = {
-        "RawImage": [
-            ("width", 7, 1),
-            ("height", 7, 1),
-            ("step", 7, 1),
-            ("encoding", text, 1),
-            ("data", blob, 1),
-        ],
-        "Joints": [("name", text, many), ("position", number, many)],
-        "Command": [("data", number, many)],
-    }
+    stamp = {"type": MESSAGE, "type_name": ".google.protobuf.Timestamp"}
     for name, fields in layout.items():
         kind = own.message_type.add(name=name)
-        kind.field.add(
-            name="timestamp", number=1, type=message, label=1, type_name=".google.protobuf.Timestamp"
-        )
+        kind.field.add(name="timestamp", number=1, **stamp)
         for i, (field, field_type, label) in enumerate(fields):
             kind.field.add(name=field, number=i + 2, type=field_type, label=label)
     pool = descriptor_pool.DescriptorPool()
     for file in files.file:
         pool.Add(file)
-    types = {
-        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
-        for name in layout
+    found = {name: pool.FindMessageTypeByName(f"foxglove.{name}") for name in layout}
+    types = {name: message_factory.GetMessageClass(one) for name, one in found.items()}
+    return files.SerializeToString(), types
+
+
+def as_protobuf() -> dict[str, Encoded]:
+    """Protobuf, the pictures raw."""
+    sizes = [(name, UINT32, ONE) for name in ("width", "height", "step")]
+    layout = {
+        "RawImage": [*sizes, ("encoding", TEXT, ONE), ("data", BLOB, ONE)],
+        "Joints": [("name", TEXT, MANY), ("position", NUMBER, MANY)],
+        "Command": [("data", NUMBER, MANY)],
     }
+    schema, types = protobuf_types(layout)
 
     def encode(item: Item) -> bytes:
         if item.topic == COMMAND:
@@ -282,7 +283,6 @@ def as_protobuf() -> dict[str, Encoded]:
         made.timestamp.FromNanoseconds(item.stamp_ns)
         return made.SerializeToString()
 
-    schema = files.SerializeToString()
     names = {CAMERA: "RawImage", STATE: "Joints", COMMAND: "Command"}
     return {t: Encoded(f"foxglove.{n}", "protobuf", schema, "protobuf", encode) for t, n in names.items()}
 

@@ -5,14 +5,11 @@ What a session shares is read only. `folder` is a copy that a test may change.
 
 import shutil
 from collections.abc import Callable, Iterator
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
-from hma_data.tokenizers import embedded
 from hma_model.training.loop import TrainResult, train
 from hma_model.training.recipe import Recipe, make_recipe
 from tests.hub_state import ROBOTS
@@ -28,20 +25,6 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-@pytest.fixture(autouse=True, scope="session")
-def loaded_once() -> Iterator[None]:
-    """Load the weights of each embedded tokenizer once: no test changes them."""
-    load = embedded.load
-    kept = cache(load)
-
-    def once(name: str, **given: Any) -> Any:
-        return load(name, **given) if given["weights"] else kept(name, **given)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(embedded, "load", once)
-        yield
 
 
 @pytest.fixture(scope="session")

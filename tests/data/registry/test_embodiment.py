@@ -44,7 +44,7 @@ def arm(path: str = "id", value: Any = "arm") -> Embodiment:
 
 # -- strategies
 
-texts = st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs", "Zl", "Zp"]), max_size=20)
+texts = st.text(st.characters(exclude_categories=["Cc", "Cs", "Zl", "Zp"]), max_size=20)
 words = texts.map(str.strip).filter(lambda word: bool(word) and not word.startswith("TODO"))
 numbers = st.floats(-1e6, 1e6, allow_subnormal=False)
 names = st.from_regex(r"[A-Za-z0-9_.-]{1,12}", fullmatch=True)

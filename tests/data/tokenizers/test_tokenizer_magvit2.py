@@ -237,19 +237,11 @@ def test_a_trainers_checkpoint_is_stripped_to_the_network(tmp_path, tiny):
     assert other.spec.weights_sha256 != tiny.spec.weights_sha256
 
 
-def test_averaged_weights_are_preferred(tmp_path):
+def test_averaged_weights_are_preferred_and_the_plain_ones_beside_them_can_be_had(tmp_path):
     state, average = magvit2_state(seed=1), magvit2_state(seed=2)
     shadow = {"model_ema." + name.replace(".", ""): tensor for name, tensor in average.items()}
     counters = {"model_ema.decay": torch.tensor(0.999), "model_ema.num_updates": torch.tensor(4)}
     torch.save({"state_dict": {**state, **shadow, **counters}}, tmp_path / "a.ckpt")
-    network = read_network(tmp_path / "a.ckpt")
-    assert all(torch.equal(p, average[name]) for name, p in network.named_parameters())
-
-
-def test_the_plain_weights_beside_an_average_can_be_had(tmp_path):
-    state, average = magvit2_state(seed=1), magvit2_state(seed=2)
-    shadow = {"model_ema." + name.replace(".", ""): tensor for name, tensor in average.items()}
-    torch.save({"state_dict": {**state, **shadow}}, tmp_path / "a.ckpt")
     both = [get_tokenizer(name, weights=str(tmp_path / "a.ckpt")) for name in ("magvit2", "magvit2-plain")]
     for tokenizer, expected in zip(both, (average, state), strict=True):
         assert all(torch.equal(p, expected[name]) for name, p in tokenizer.network.named_parameters())

@@ -16,7 +16,7 @@ from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, full_name, get_to
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 from hma_data.tokenizers.checkpoints import read_weights, save_weights
 from hma_data.tokenizers.embedded import FsqAutoencoder, Quantizer
-from hma_data.tokenizers.shapes import FsqConfig, get_spec
+from hma_data.tokenizers.shapes import FsqConfig, VaeConfig, get_spec
 from hma_data.tokenizers.training.eval import CodebookUse, evaluate, psnr_db, ssim, to_markdown
 from hma_data.tokenizers.training.frames import read_films
 from hma_data.tokenizers.training.recipe import load_recipe
@@ -158,11 +158,12 @@ def test_a_frame_has_the_same_latents_to_the_last_bit_on_any_number_of_threads(n
     tokenizer = get_tokenizer(name)
     frames = scenes(4, tokenizer.spec.image_size)
     seen: list[torch.Tensor] = []
-    tokenizer.network.encoder.register_forward_hook(lambda *call: seen.append(call[-1].clone()))
+    hook = tokenizer.network.encoder.register_forward_hook(lambda *call: seen.append(call[-1].clone()))
     threads(1)
     alone = tokenizer.encode(frames)
     threads(count)
     assert np.array_equal(tokenizer.encode(frames), alone)
+    hook.remove()
     one, many = ({z.numpy().tobytes() for z in half} for half in (seen[:4], seen[4:]))
     assert len(one) == 4 and one == many
 
@@ -313,17 +314,20 @@ def test_a_file_of_other_than_whole_weights_is_refused(tmp_path, write, said):
         get_tokenizer("fsq-8", weights=str(tmp_path / "other.safetensors"))
 
 
+LIES = [{"width": [64, 256]}, {"levels": [[1]]}, {"levels": [[4096] * 9]}, {"hidden": "many"}, {"width": 3}]
+VAE_LIES = [{"width": 64}, {"decoder_blocks": [1]}, {"noise": float("nan")}, {"latent_scale": 0}]
+
+
 @pytest.mark.parametrize(
-    "change",
-    [{"width": [64, 256]}, {"levels": [[1]]}, {"levels": [[4096] * 9]}, {"hidden": "many"}, {"width": 3}],
+    ("kind", "change"), [*((FsqConfig, lie) for lie in LIES), *((VaeConfig, lie) for lie in VAE_LIES)]
 )
-def test_weights_whose_config_lies_are_refused(tmp_path, change):
-    path = tmp_path / "lying.safetensors"
-    config, tensors, _ = read_weights(WEIGHTS, FORMAT, FsqConfig)
+def test_weights_whose_config_lies_are_refused(tmp_path, kind, change):
+    path, name = tmp_path / "lying.safetensors", "fsq" if kind is FsqConfig else "vae"
+    config, tensors, _ = read_weights(EMBEDDED / f"{name}.safetensors", kind.format, kind)
     values = json.dumps(config.model_dump() | change)
-    save_file(tensors, path, {"format": "hma-fsq-1", "config": values})
+    save_file(tensors, path, {"format": kind.format, "config": values})
     with pytest.raises(TokenizerError, match="does not fit the network|does not describe the network"):
-        get_tokenizer("fsq-8", weights=str(path))
+        get_tokenizer(f"{name}-8", weights=str(path))
 
 
 def test_weights_that_are_not_finite_are_refused(tmp_path):

@@ -1,8 +1,10 @@
 """Several checkpoints on several sets: parts that are kept, results that repeat, the page, refusals."""
 
+import copy
 import json
 import re
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,11 +42,19 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(autouse=True)
-def blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (suite, report):
-        monkeypatch.setattr(module, "tokenizer_of", lambda shards, **_: Blocks())
-    suite._tokenizer.cache_clear()
+@pytest.fixture(autouse=True, scope="module")
+def blocks() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (suite, report):
+            patch.setattr(module, "tokenizer_of", lambda shards, **_: Blocks())
+        suite._tokenizer.cache_clear()
+        yield
+
+
+@pytest.fixture(scope="module")
+def evaluated(made: Path, blocks: None) -> list[suite.Part]:
+    """Both checkpoints on both sets; what a test changes is a copy."""
+    return run(made, checkpoints=BOTH)
 
 
 def run(
@@ -60,8 +70,10 @@ def run(
 BOTH, ROBOTS = ("one", "other"), ("arm", "hand")
 
 
-def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_once(made: Path) -> None:
-    parts = run(made, checkpoints=BOTH)
+def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_once(
+    evaluated: list[suite.Part],
+) -> None:
+    parts = evaluated
     assert [(Path(p.checkpoint).name, p.found["embodiment"]) for p in parts] == [
         ("one", "arm"), ("one", "hand"), ("other", "arm"), ("other", "hand"),
     ]  # fmt: skip
@@ -79,8 +91,8 @@ def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_onc
     )
 
 
-def test_a_verdict_reaches_the_cards_of_a_checkpoint(made: Path) -> None:
-    (arm, _) = run(made)
+def test_a_verdict_reaches_the_cards_of_a_checkpoint(made: Path, evaluated: list[suite.Part]) -> None:
+    arm = evaluated[0]
     found = Checkpoint.open(made / "one").card("arm")["evaluation"]
     assert found["verdict"] == verdict(arm.found) and found["episodes"] == 2
     assert found["follows"] is found["verdict"].startswith("follows")
@@ -88,8 +100,10 @@ def test_a_verdict_reaches_the_cards_of_a_checkpoint(made: Path) -> None:
     assert page.index("> **arm** ") < page.index("## Embodiments")
 
 
-def test_what_holds_for_every_part_is_said_of_all_and_the_rest_of_its_own(made: Path) -> None:
-    parts = run(made, checkpoints=BOTH)
+def test_what_holds_for_every_part_is_said_of_all_and_the_rest_of_its_own(
+    made: Path, evaluated: list[suite.Part]
+) -> None:
+    parts = copy.deepcopy(evaluated)
     for part in parts:
         part.found["notes"] = ["of each"]
     parts[1].found["notes"] = ["of each", "of one"]
@@ -145,22 +159,24 @@ def test_parts_that_are_done_are_not_computed_again(made, tmp_path, monkeypatch)
     assert len(calls) == 7
 
 
-def test_the_same_seed_gives_the_same_bytes(made: Path, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_results(run(made, tmp_path / name), tmp_path / name, "hma evaluate")
+def test_the_same_seed_gives_the_same_bytes(made: Path, evaluated: list[suite.Part], tmp_path: Path) -> None:
+    for name, parts in (("a", evaluated[:2]), ("b", run(made, tmp_path / "b"))):
+        write_results(parts, tmp_path / name, "hma evaluate")
     assert (tmp_path / "a/results.json").read_bytes() == (tmp_path / "b/results.json").read_bytes()
     assert (tmp_path / "a/report.html").read_bytes() == (tmp_path / "b/report.html").read_bytes()
 
 
-def test_the_page_is_one_file_that_shows_each_robot_and_checkpoint(made: Path, tmp_path: Path) -> None:
-    page = write_results(run(made, tmp_path, checkpoints=BOTH), tmp_path, "hma evaluate").read_text()
+def test_the_page_is_one_file_that_shows_each_robot_and_checkpoint(
+    made: Path, evaluated: list[suite.Part], tmp_path: Path
+) -> None:
+    page = write_results(evaluated, tmp_path, "hma evaluate").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     strips = re.findall(r'alt="(The \w+ window[^"]*)"', page)
     assert len(strips) == 2 * 3 * (1 + 2 * 3)  # robots, windows, and from the tokens and three a checkpoint
     assert "recorded images are not shown" in page and "--lpips FILE" in page
     table = (tmp_path / "results.md").read_text()
     assert table.count("mean over sets") == 2 and "ΔPSNR" in table
-    said = verdict(run(made)[0].found)
+    said = verdict(evaluated[0].found)
     assert said in page and f"- {made / 'one'} on arm {said}" in table
     shown = re.sub(r"<h2>The command.*", "", page, flags=re.DOTALL)
     assert shown.count(str(made / "one")) == 1  # a legend, then short names

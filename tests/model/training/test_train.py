@@ -68,8 +68,7 @@ def test_the_result_is_a_checkpoint_with_cards_and_the_statistics_of_the_shards(
 
 
 CUTS = {  # changes of the recipe, the step after which the run is killed, changes of the second part
-    "averages": ({"ema": 0.9}, 3, {}),
-    "a past of its own": ({"self_forward": 0.5, "self_forward_from": 2}, 5, {}),
+    "averages and a past of its own": ({"ema": 0.9, "self_forward": 0.5, "self_forward_from": 2}, 5, {}),
     "other workers": ({}, 1, {"workers": 1}),
 }
 

@@ -18,7 +18,21 @@ from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.training.frames import recording_films
 from tests.data import bag_parts
-from tests.data.bag_files import CAMERA, SOURCE, arm, as_cdr, make_recording, read, ros_message, write_mcap
+from tests.data.bag_files import (
+    BLOB,
+    CAMERA,
+    ONE,
+    SOURCE,
+    TEXT,
+    UINT32,
+    arm,
+    as_cdr,
+    make_recording,
+    protobuf_types,
+    read,
+    ros_message,
+    write_mcap,
+)
 from tests.data.sources.bags.test_bag_pictures import LOW_DELAY, VIDEO_YAML
 
 PICTURES = np.random.default_rng(3).integers(0, 256, (6, 10, 14, 3), np.uint8)
@@ -84,30 +98,16 @@ def ros_encoder(name: str, encoding: str) -> tuple[str, str, bytes, Callable[[in
 
 def protobuf_encoder(name: str) -> tuple[str, str, bytes, Callable[[int, dict[str, Any]], bytes]]:
     """The same of foxglove's protobuf schemas."""
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
-
-    files = descriptor_pb2.FileDescriptorSet()
-    timestamp_pb2.DESCRIPTOR.CopyToProto(files.file.add())
-    own = files.file.add(name=f"foxglove/{name}.proto", package="foxglove", syntax="proto3")
-    own.dependency.append("google/protobuf/timestamp.proto")
-    kind = own.message_type.add(name=name)
-    stamp = ".google.protobuf.Timestamp"
-    kind.field.add(name="timestamp", number=1, type=11, label=1, type_name=stamp)
-    numbers = {"string": 9, "uint32": 7, "uint8[]": 12}
-    for i, line in enumerate(FIELDS[name].splitlines()):
-        field_type, field = line.split()
-        kind.field.add(name=field, number=i + 2, type=numbers[field_type], label=1)
-    pool = descriptor_pool.DescriptorPool()
-    for file in files.file:
-        pool.Add(file)
-    made = message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
+    kinds = {"string": TEXT, "uint32": UINT32, "uint8[]": BLOB}
+    lines = [line.split() for line in FIELDS[name].splitlines()]
+    schema, types = protobuf_types({name: [(field, kinds[kind], ONE) for kind, field in lines]})
 
     def encode(i: int, fields: dict[str, Any]) -> bytes:
-        message = made(**(fields | {"data": fields["data"].tobytes(), "frame_id": "cam"}))
+        message = types[name](**(fields | {"data": fields["data"].tobytes(), "frame_id": "cam"}))
         message.timestamp.FromNanoseconds((1 + i) * 10**9 + 500)
         return bytes(message.SerializeToString())
 
-    return f"foxglove.{name}", "protobuf", files.SerializeToString(), encode
+    return f"foxglove.{name}", "protobuf", schema, encode
 
 
 def write(path: Path, name: str, encoding: str, pictures: np.ndarray) -> Path:
