@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_520, 11_250, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_806, 512_120
-TEST_LINES = 47_939
+TEST_LINES = 47_948
 DOC_WORDS = 40_340
 
 

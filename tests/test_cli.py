@@ -1,7 +1,6 @@
 """The command line: exit codes, one-line errors, JSON, and that light verbs stay light."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -96,7 +95,8 @@ assert not heavy, heavy
     assert done.returncode == 0, done.stderr
 
 
-def test_tab_completes_verbs_robots_tokenizers_and_recipes() -> None:
+def test_tab_completes_verbs_robots_tokenizers_and_recipes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("_HMA_COMPLETE", "complete_bash")
     for typed, offered in (
         ("hma reg", {"registry"}),
         ("hma convert -e pusht_", {"pusht_fast", "pusht_slow"}),
@@ -104,10 +104,9 @@ def test_tab_completes_verbs_robots_tokenizers_and_recipes() -> None:
         ("hma train discrete_t", {"discrete_tiny"}),
         ("hma policy-eval rails_", {"rails_03", "rails_09"}),
     ):
-        asked = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" ")), "_HMA_COMPLETE": "complete_bash"}
-        words = [sys.executable, "-c", "from hma_model.cli import main; main()"]
-        done = subprocess.run(words, env={**os.environ, **asked}, cwd=ROOT, capture_output=True, text=True)
-        assert set(done.stdout.split()) == offered, done.stderr
+        monkeypatch.setenv("COMP_WORDS", typed)
+        monkeypatch.setenv("COMP_CWORD", str(typed.count(" ")))
+        assert set(hma().stdout.split()) == offered
 
 
 @pytest.mark.slow

@@ -30,15 +30,16 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
-def hma(site: Path, where: Path, *arguments: str) -> str:
+def hma(site: Path, where: Path, *commands: str) -> str:
+    """Run commands of the unpacked wheel in one process."""
     code = """
 import sys, hma_data
 assert sys.argv.pop(1) in hma_data.__file__
 from hma_model.cli import main
-sys.exit(main())
+sys.exit(any(main(words.split()) for words in sys.argv[1:]))
 """
     done = subprocess.run(
-        [sys.executable, "-P", "-c", code, str(site), *arguments],
+        [sys.executable, "-P", "-c", code, str(site), *commands],
         cwd=where,
         env={**os.environ, "PYTHONPATH": str(site), "HMA_REGISTRY": ""},
         capture_output=True,
@@ -93,13 +94,11 @@ def test_it_says_which_revision_it_was_built_from(installed: Path, tmp_path: Pat
     subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)  # a user's repository around it
     shutil.copytree(installed, tmp_path / "site")
     code = "import torch, hma_model.training.runtime as r; print(r.environment(torch.device('cpu')))"
+    site = tmp_path / "site"
     done = subprocess.run(
-        [sys.executable, "-P", "-c", code],
-        env={**os.environ, "PYTHONPATH": str(tmp_path / "site")},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+        [sys.executable, "-P", "-c", code], env={**os.environ, "PYTHONPATH": str(site)},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
     assert f"'git_revision': '{built}'" in done.stdout
 
 
@@ -111,9 +110,6 @@ def test_every_extra_that_an_error_names_is_one(installed: Path) -> None:
     assert named == extras
 
 
-def test_the_registry_answers_from_another_folder(installed: Path, tmp_path: Path) -> None:
-    assert "pusht_fast" in hma(installed, tmp_path, "registry", "list")
-
-
-def test_the_tokenizer_works_from_another_folder(installed: Path, tmp_path: Path) -> None:
-    assert "fsq-16" in hma(installed, tmp_path, "tokenizer", "list", "--json")
+def test_the_registry_and_the_tokenizers_answer_from_another_folder(installed: Path, tmp_path: Path) -> None:
+    said = hma(installed, tmp_path, "registry list", "tokenizer list --json")
+    assert "pusht_fast" in said and "fsq-16" in said

@@ -59,6 +59,7 @@ def probe() -> Iterator[None]:
         sure = Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24)
         judge = StateJudge(ROBOT, task_of(ROBOT, "reached"), known, -12.0, sure)
         monkeypatch.setattr(planning, "ROUNDS", 1)
+        monkeypatch.setattr(planning, "CANDIDATES", 5)
         monkeypatch.setattr(running, "train_probe", lambda *given: known)
         monkeypatch.setattr(running, "train_judge", lambda *given, **named: judge)
         yield
@@ -172,6 +173,7 @@ def test_the_planner_finds_actions_near_a_target(monkeypatch: pytest.MonkeyPatch
         return np.square(candidates.sum(axis=2) / 5 - target).sum(axis=-1)
 
     monkeypatch.setattr(planning, "ROUNDS", 4)
+    monkeypatch.setattr(planning, "CANDIDATES", 16)
     found = plan(costs, low, high, 3, np.random.default_rng(0))
     assert found.shape == (3, 5, 2) and np.abs(found).max() <= 1
     assert np.linalg.norm(found.mean(axis=1) - target, axis=-1).max() < 0.2

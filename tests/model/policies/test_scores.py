@@ -75,10 +75,22 @@ class KnownPlaces:
         return KnownPlaces, ()  # what it has seen so far makes no other judge of it
 
 
+def made_judge(patch: pytest.MonkeyPatch) -> StateJudge:
+    known: Any = KnownPlaces(patch)
+    return StateJudge(ROBOT, task_of(ROBOT, "moved=2"), known, 2.0, Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24))
+
+
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> StateJudge:
-    sure = Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24)
-    return StateJudge(ROBOT, task_of(ROBOT, "moved=2"), KnownPlaces(monkeypatch), 2.0, sure)  # type: ignore[arg-type]
+    return made_judge(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def still(model: HMA) -> PolicyEvaluation:
+    """Eight episodes of the policy that stands still."""
+    with pytest.MonkeyPatch.context() as patch:
+        given: Any = {"world": World(model, get_tokenizer("fsq-8")), "judge": made_judge(patch)}
+        return evaluate_policies(ROBOT, ["still"], episodes=8, frames=4, **given)
 
 
 class FlawlessWorld(TrueWorld):
@@ -163,8 +175,8 @@ def test_an_interrupted_evaluation_continues_after_its_last_finished_policy(
     assert sorted(path.name for path in out.iterdir()) == ["report.html", "results.json"]
 
 
-def test_shares_have_exact_intervals_and_too_few_successes_are_said(world: World, judge: StateJudge) -> None:
-    found = evaluate_policies(ROBOT, ["still"], world=world, judge=judge, episodes=8, frames=4)
+def test_shares_have_exact_intervals_and_too_few_successes_are_said(still: PolicyEvaluation) -> None:
+    found = still
     (row,) = found.rows()
     assert row["true_success"] == 0 and row["true_success_interval"] == pytest.approx((0, 0.369), abs=1e-3)
     doubt = "there are too few successes to tell whether the judge is better"
@@ -511,11 +523,10 @@ def test_a_narrow_window_shows_the_last_columns(world: World, judge: StateJudge)
         browser.close()
 
 
-def test_policies_that_are_paths_go_by_short_names_with_a_legend(world: World, judge: StateJudge) -> None:
-    found = evaluate_policies(ROBOT, ["still"], world=world, judge=judge, episodes=8, frames=4)
+def test_policies_that_are_paths_go_by_short_names_with_a_legend(still: PolicyEvaluation) -> None:
     names = ("hma:build/runs/of/a/policy/few,memory=1", "hma:build/runs/of/a/policy/many,memory=1")
-    (still,) = found.policies
-    page = html(replace(found, policies=(*(replace(still, policy=name) for name in names), still)))
+    (own,) = still.policies
+    page = html(replace(still, policies=(*(replace(own, policy=name) for name in names), own)))
     for short, name in zip(("few,memory=1", "many,memory=1"), names, strict=True):
         assert f"<dt>{short}</dt><dd>{name}</dd>" in page and page.count(name) == 1
         assert page.index(name) < page.index("<table") < page.index(f">{short}<", page.index("<table"))
