@@ -125,8 +125,8 @@ def test_two_ranks_give_the_curve_and_the_weights_of_one(shards, tmp_path, mode)
     ],
 )
 def test_the_loss_of_each_objective_falls(shards, tmp_path, objective):
-    changes = {"objectives": {objective: 1}, "steps": 24, "lr": 1e-2, "schedule": "constant_with_warmup"}
-    done = train(recipe(shards[:1], checkpoint_every=24, **changes), out=tmp_path / "run", show=False)
+    changes = {"objectives": {objective: 1}, "steps": 40, "lr": 1e-2, "schedule": "constant_with_warmup"}
+    done = train(recipe(shards[:1], checkpoint_every=40, **changes), out=tmp_path / "run", show=False)
     losses = [loss for _, loss in done.losses]
     assert sum(losses[-8:]) < sum(losses[:8])
     model = HMA.from_pretrained(done.checkpoint).eval()
