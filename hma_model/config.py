@@ -13,7 +13,7 @@ This module is free of torch; `hma_model.network.objectives` computes the losses
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self
 
@@ -196,9 +196,10 @@ class HMAConfig:
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for name in ("objectives", "tokenizer"):
             object.__setattr__(self, name, dict(getattr(self, name)))
-        _check_scalars(self)
-        _check_shapes(self)
-        _check_sets(self)
+        for name, kept, allowed in _rules(self):
+            if not kept:
+                fault = f"{getattr(self, name)!r} is not allowed"
+                raise RecipeError(f"model.{name}", fault, f"give {allowed}")
 
     @property
     def released(self) -> bool:
@@ -313,85 +314,62 @@ def token_words(merge: int) -> str:
     return "token" if merge == 1 else f"square of {merge}×{merge} tokens"
 
 
-def _refuse(name: str, value: object, allowed: str) -> RecipeError:
-    return RecipeError(f"model.{name}", f"{value!r} is not allowed", f"give {allowed}")
-
-
-def _check_scalars(config: HMAConfig) -> None:
+def _rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
+    """Yield a field, whether its value keeps a rule, and what is allowed; a rule relies on earlier ones."""
     for name, choices in _CHOICES.items():
-        if getattr(config, name) not in choices:
-            raise _refuse(name, getattr(config, name), "one of " + ", ".join(choices))
+        yield name, getattr(config, name) in choices, f"one of {', '.join(choices)}"
     for name in _AT_LEAST_ONE:
-        if not getattr(config, name) >= 1:
-            raise _refuse(name, getattr(config, name), "a number of at least 1")
+        yield name, getattr(config, name) >= 1, "a number of at least 1"
     for name in _SHARES:
-        if not 0 <= getattr(config, name) <= 1:
-            raise _refuse(name, getattr(config, name), "a share from 0 to 1")
-    if not (math.isfinite(config.latent_noise) and config.latent_noise >= 0):
-        raise _refuse("latent_noise", config.latent_noise, "a number of at least 0")
-    if not (math.isfinite(config.motion_weight) and config.motion_weight >= 0):
-        raise _refuse("motion_weight", config.motion_weight, "a number of at least 0")
-    if not (math.isfinite(config.latent_scale) and config.latent_scale > 0):
-        raise _refuse("latent_scale", config.latent_scale, "a positive number")
-    if not 0 <= config.action_waves <= 16:
-        raise _refuse("action_waves", config.action_waves, "a number from 0 to 16")
+        yield name, 0 <= getattr(config, name) <= 1, "a share from 0 to 1"
+    for name in ("latent_noise", "motion_weight"):
+        yield name, 0 <= getattr(config, name) < math.inf, "a number of at least 0"
+    yield "latent_scale", 0 < config.latent_scale < math.inf, "a positive number"
+    yield "action_waves", 0 <= config.action_waves <= 16, "a number from 0 to 16"
 
+    grid, discrete = config.grid, config.kind == "discrete"
+    yield "grid", len(grid) == 2 and min(grid) >= 1, "(h, w), both at least 1"
+    fits = bool(config.factored) and min(config.factored) >= 2
+    yield "factored", fits, "at least one digit of at least two values"
+    yield "heads", not config.width % config.heads, f"a divisor of the width, {config.width}"
+    even = f"a width a head that is even, not {config.head_dim}, for rotary time"
+    yield "heads", config.released or not config.head_dim % 2, even
+    name = "merge" if discrete else "patch"
+    divides = not any(side % getattr(config, name) for side in grid)
+    yield name, divides, f"a divisor of both sides of the grid, {grid}"
+    fewer = "fewer tokens: their ids together must fit 62 bits"
+    yield "merge", not discrete or config.mask_id < MOST_IDS, fewer
 
-def _check_shapes(config: HMAConfig) -> None:
-    if len(config.grid) != 2 or min(config.grid) < 1:
-        raise _refuse("grid", config.grid, "(h, w), both at least 1")
-    if not config.factored or min(config.factored) < 2:
-        raise _refuse("factored", config.factored, "at least one digit of at least two values")
-    if config.width % config.heads:
-        raise _refuse("heads", config.heads, f"a divisor of the width, {config.width}")
-    if not config.released and config.head_dim % 2:
-        raise _refuse(
-            "heads", config.heads, f"a width a head that is even, not {config.head_dim}, for rotary time"
-        )
-    if config.kind == "discrete" and any(side % config.merge for side in config.grid):
-        raise _refuse("merge", config.merge, f"a divisor of both sides of the grid, {config.grid}")
-    if config.kind == "discrete" and config.mask_id >= MOST_IDS:
-        raise _refuse("merge", config.merge, "fewer tokens: their ids together must fit 62 bits")
-    if config.kind == "continuous" and any(side % config.patch for side in config.grid):
-        raise _refuse("patch", config.patch, f"a divisor of both sides of the grid, {config.grid}")
-
-
-def _check_sets(config: HMAConfig) -> None:
-    if not config.conditioning or set(config.conditioning) - set(CONDITIONINGS):
-        raise _refuse("conditioning", config.conditioning, "some of " + ", ".join(CONDITIONINGS))
-    if set(config.objectives) - set(OBJECTIVES):
-        raise _refuse("objectives", config.objectives, "weights for some of " + ", ".join(OBJECTIVES))
+    known = bool(config.conditioning) and set(config.conditioning) <= set(CONDITIONINGS)
+    yield "conditioning", known, f"some of {', '.join(CONDITIONINGS)}"
+    known = set(config.objectives) <= set(OBJECTIVES)
+    yield "objectives", known, f"weights for some of {', '.join(OBJECTIVES)}"
     weights = list(config.objectives.values())
-    if not weights or min(weights) < 0 or not 0 < sum(weights) < math.inf:
-        raise _refuse("objectives", config.objectives, "weights of at least 0 that do not all vanish")
-    if config.video_loss == "regression" and config.kind == "discrete":
-        raise _refuse("video_loss", "regression", "diffusion, or a continuous tokenizer")
-    if config.video_loss == "regression" and not config.copy_previous:
-        raise _refuse("copy_previous", False, "true: regression predicts the change since the frame before")
+    fits = bool(weights) and min(weights) >= 0 and 0 < sum(weights) < math.inf
+    yield "objectives", fits, "weights of at least 0 that do not all vanish"
+    regression = config.video_loss == "regression"
+    yield "video_loss", not (regression and discrete), "diffusion, or a continuous tokenizer"
+    change = "true: regression predicts the change since the frame before"
+    yield "copy_previous", config.copy_previous or not regression, change
     if config.trunk == "unet":
-        _check_unet(config)
-    if config.shared_modulation and config.released:
-        raise _refuse("layout", "released", "ours, as shared_modulation is on")
+        yield from _unet_rules(config)
+    yield "layout", not (config.shared_modulation and config.released), "ours, as shared_modulation is on"
 
 
-def _check_unet(config: HMAConfig) -> None:
-    if config.kind == "discrete":
-        raise _refuse("trunk", "unet", "transformer, or a continuous tokenizer")
+def _unet_rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
+    yield "trunk", config.kind != "discrete", "transformer, or a continuous tokenizer"
     for name, value in (
         ("conditioning", ("modulation",)),
         ("shared_modulation", True),
         ("layout", "ours"),
         ("absent_action", "embedding"),
     ):
-        if getattr(config, name) != value:
-            raise _refuse(name, getattr(config, name), f"{value!r}, as the trunk is a unet")
-    if not config.levels or min(config.levels) < 1:
-        raise _refuse("levels", config.levels, "at least one width, all at least 1")
-    side = 2 ** (len(config.levels) - 1)
-    if any(size % side for size in (config.token_grid[0] // config.views, config.token_grid[1])):
-        raise _refuse(
-            "levels", config.levels, f"fewer: tokens lie on {config.token_grid}, not multiples of {side}"
-        )
+        yield name, getattr(config, name) == value, f"{value!r}, as the trunk is a unet"
+    levels = config.levels
+    yield "levels", bool(levels) and min(levels) >= 1, "at least one width, all at least 1"
+    side = 2 ** (len(levels) - 1)
+    fits = not any(size % side for size in (config.token_grid[0] // config.views, config.token_grid[1]))
+    yield "levels", fits, f"fewer: tokens lie on {config.token_grid}, not multiples of {side}"
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -164,29 +165,24 @@ def _digest(found: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(found).encode()).hexdigest()
 
 
+@dataclass
 class _Robot:
     """The benchmark of one robot; its probe is trained when a part needs it, and comes out the same again."""
 
-    def __init__(
-        self,
-        world: World,
-        robot: str,
-        protocol: Protocol,
-        seed: int,
-        kept: KeptParts,
-        tell: Callable[[str], None],
-    ) -> None:
-        self.world, self.robot, self.protocol, self.seed = world, robot, protocol, seed
-        self.kept, self.tell = kept, tell
-        self.scenes = Scenes.of(world, robot, protocol.scenes, seed)
-        self._probe: Probe | None = None
+    world: World
+    robot: str
+    protocol: Protocol
+    seed: int
+    kept: KeptParts
+    tell: Callable[[str], None]
 
-    @property
+    @cached_property
+    def scenes(self) -> Scenes:
+        return Scenes.of(self.world, self.robot, self.protocol.scenes, self.seed)
+
+    @cached_property
     def probe(self) -> Probe:
-        if self._probe is None:
-            stride = self.scenes.stride
-            self._probe = train_probe(self.robot, self.world.tokenizer, stride, self.seed, self.tell)
-        return self._probe
+        return train_probe(self.robot, self.world.tokenizer, self.scenes.stride, self.seed, self.tell)
 
     def measured(self) -> tuple[dict[str, Any], dict[str, list[float]], dict[str, Any]]:
         """Return the figures, those of each scene, and those of each frame of the action sequences."""

@@ -154,7 +154,7 @@ class Passes:
         if self.engine.compiled is not None and carried is not before:
             # CUDA graphs replay with the addresses of their recording. Memory that is not marked would be
             # copied into the graph's own before each pass, and what a pass writes would be lost.
-            for memory in carried.tensors():
+            for memory in carried.memory:
                 torch._dynamo.mark_static_address(memory)
         return carried
 

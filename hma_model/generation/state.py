@@ -287,7 +287,7 @@ class RowState:
         self.frames[index, :length], self.known[index, :length] = kept.frames, kept.known
         self.chunks[index, :length, :width] = kept.chunks
         if kept.carried is not None:
-            self.carry(kept.carried.tokens, kept.carried.tensors()[0].dtype).put(index, kept.carried)
+            self.carry(kept.carried.tokens, kept.carried.memory[0].dtype).put(index, kept.carried)
         for i, row in enumerate(rows):
             self.embodiments[row] = kept.embodiments[i]
             self.times[row], self.pending[row] = kept.times[i], kept.pending[i]

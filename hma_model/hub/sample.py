@@ -38,9 +38,7 @@ def add_samples(checkpoint: StrPath | Checkpoint, data: Iterable[StrPath]) -> li
     for folder in data:
         shards = ShardSet(folder)
         name = shards.embodiment.id
-        if name not in source.embodiments:
-            known = ", ".join(source.embodiments) or "none"
-            raise CheckpointError(source.folder, f"has no embodiment {name!r}", f"it has: {known}")
+        source.chosen([name])  # raises if it is not there
         home = source.folder / "embodiments" / name
         for part, content in zip((SAMPLE, FILM), _shown(source, shards)):
             write_atomic(home / part, content)

@@ -123,11 +123,10 @@ class WorldModelPolicy(PreTrainedPolicy):
                 self._world.open(self._embodiment, image[None], seed=row) for row, image in enumerate(images)
             ]
         else:
-            chunks = np.stack(self._taken, axis=1)
-            by_session = zip(self._sessions, images, chunks, strict=True)
-            seen, taken = {}, {}
-            for session, image, chunk in by_session:
-                seen[session], taken[session] = image, chunk
+            seen, taken = (
+                dict(zip(self._sessions, values, strict=True))
+                for values in (images, np.stack(self._taken, axis=1))
+            )
             self._world.observe(seen, taken)
         self._taken = []
         said = self._world.act(self._sessions)

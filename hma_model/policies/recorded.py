@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from hma_data.console import print_table
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.errors import UsageError
-from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
@@ -49,8 +49,7 @@ from hma_model.policies.scores import (
     run,
     sampling_of,
 )
-from hma_model.worlds.images import seen_cameras
-from hma_model.worlds.prompts import default_frames, shard_window
+from hma_model.worlds.prompts import SeenShards, default_frames
 from hma_model.worlds.scenes import at_rest
 from hma_model.worlds.world import World, load_world
 
@@ -206,10 +205,9 @@ def recorded_beginnings(world: World, scenes: Scenes, shards: ShardSet) -> tuple
     if not rows:
         fault = f"has no held-out episode of {count} frames without a pause"
         raise UsageError(shards.folder, fault, "give other shards")
-    cameras = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
-    reader = EpisodeReader(shards, shards.columns(cameras))
+    seen = SeenShards(shards, cameras_for(world.model, shards))
     at = np.arange(0, span + 1, shards.row_stride)
-    kept = [shard_window(shards, reader, row, cameras, at) for row in rows[: len(scenes.numbers)]]
+    kept = [seen.window(row, at) for row in rows[: len(scenes.numbers)]]
     prompts = [kept[number % len(kept)] for number in range(len(scenes.numbers))]
     dims = len(scenes.dimensions)
     # the action in force at the last frame of the prompt; without one, a target is zero

@@ -23,15 +23,14 @@ import numpy as np
 from hma_data.errors import HMAError, MissingDependencyError, UsageError
 from hma_data.hub.repository import Repository
 from hma_data.lab import imported
-from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import REPOSITORY
 from hma_model.arrays import Bools, Floats, Images
 from hma_model.evaluation.agreement import Accuracy, accuracy, share_interval
 from hma_model.generation.decode import cameras_for
 from hma_model.policies.lerobot import TASK
 from hma_model.worlds.env import Judge
-from hma_model.worlds.images import seen_cameras
-from hma_model.worlds.prompts import require_fit, seen_frames
+from hma_model.worlds.prompts import SeenShards, require_fit
 from hma_model.worlds.world import World
 
 LIMIT = 0.5  # least reward of a success, as lerobot's
@@ -232,12 +231,11 @@ def measured_judge(
         )
         remedy = f"give {SHARDS} with {NEEDED} or more of each"
         raise HMAError(where, fault, remedy)
-    names = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
-    model = RewardModel(source, names, embodiment, str(world.model.device))
-    reader = EpisodeReader(shards, shards.columns(names))
+    seen = SeenShards(shards, cameras_for(world.model, shards))
+    model = RewardModel(source, seen.cameras, embodiment, str(world.model.device))
     judged = np.empty(len(rows), np.bool_)
     for place, row in enumerate(rows):
-        frames, _ = seen_frames(shards, reader, row, names)
+        frames, _ = seen.episode(row)
         images = world.shown(frames[:: shards.row_stride])
         judged[place] = model.success(model.score(images[None]))[0]
         tell(f"measuring the judge: episode {place + 1} of {len(rows)}")

@@ -24,7 +24,7 @@ from hma_data.lab.scripted import steerable
 from hma_data.lab.simulator import embodiment, simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
-from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
@@ -49,8 +49,8 @@ from hma_model.synthetic.recorder import (
     write_as_lerobot,
     write_shards,
 )
-from hma_model.worlds.images import Prompt, seen_cameras
-from hma_model.worlds.prompts import default_frames, require_fit, shard_window
+from hma_model.worlds.images import Prompt
+from hma_model.worlds.prompts import SeenShards, default_frames, require_fit
 from hma_model.worlds.scenes import at_rest
 from hma_model.worlds.world import World, load_world
 
@@ -277,8 +277,8 @@ class _Maker:
         if shards is not None:
             require_fit(world.model, name, shards)
             self._long = self._long_enough(shards)
-            self.cameras = seen_cameras(cameras_for(world.model, shards), shards.manifest.cameras)
-            self._reader = EpisodeReader(shards, shards.columns(self.cameras))
+            self._seen = SeenShards(shards, cameras_for(world.model, shards))
+            self.cameras = self._seen.cameras
 
     def _policy(self, commands: str) -> Policy:
         kind, _, number = commands.partition("=")
@@ -437,7 +437,7 @@ class _Maker:
             row = self._long[(number + draw) % len(self._long)]
             start = row["begin"] + int(rng.integers(row["room"])) // every * every
             at = start // every + shards.row_stride * np.arange(length)
-            window = shard_window(shards, self._reader, row, self.cameras, at)
+            window = self._seen.window(row, at)
             if np.isfinite(window.chunks[:needed]).all():
                 return row, window
         fault = f"has hardly a window of {length} frames whose actions are all known"

@@ -21,7 +21,7 @@ from hma_data.errors import UsageError
 from hma_data.loading.views import Cameras, Views, view_count
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST
-from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.storage.files import file_sha256
@@ -30,7 +30,7 @@ from hma_model.arrays import Bools, Float32s
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.generation.commands import card, described
 from hma_model.worlds.images import fitted, recorded_cameras, seen_cameras, trained_cameras
-from hma_model.worlds.prompts import seen_frames
+from hma_model.worlds.prompts import SeenShards
 from hma_model.worlds.world import World
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
@@ -128,8 +128,8 @@ class ShardFilm:
         cameras = trained_cameras(card(world.model, embodiment or shards.embodiment.id))
         if embodiment in (None, shards.embodiment.id) or view_count(cameras) > 1:
             Views.of(shards, cameras)  # raises if one of them is not there
-        self.cameras = seen_cameras(cameras, shards.manifest.cameras)
-        self._reader = EpisodeReader(shards, shards.columns(self.cameras))
+        self._seen = SeenShards(shards, cameras)
+        self.cameras = self._seen.cameras
 
     def episodes(self) -> list[FilmEpisode]:
         """Return the episodes."""
@@ -158,7 +158,7 @@ class ShardFilm:
     def labelled(self, number: int) -> tuple[NDArray[Any], Float32s, Bools]:
         """Return the frames (T, …), the chunks (T, K) that follow them, and which are known (T,)."""
         row, part = self._parts[number]
-        stored, columns = seen_frames(self._shards, self._reader, row, self.cameras)
+        stored, columns = self._seen.episode(row)
         actions = columns["action"]
         at = np.array(part[:: self._step])
         spans = at[:, None] + np.arange(self._step)

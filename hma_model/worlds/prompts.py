@@ -18,6 +18,7 @@ from hma_data.episodes.images import prepared
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import record
 from hma_data.lab.simulator import simulated
+from hma_data.loading.views import Cameras
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import EpisodeReader, ShardSet
@@ -195,8 +196,7 @@ def _of_shards(model: HMA, embodiment: str, folder: StrPath, part: EpisodePart) 
     chosen = rows[part.number([row["id"] for row in rows], shards.folder)]
     every = shards.manifest.frame_stride
     at = part.rows(model, episode_pieces(shards, chosen), shards.row_stride, every)
-    names = seen_cameras(cameras_for(model, shards), shards.manifest.cameras)
-    return shard_window(shards, EpisodeReader(shards, shards.columns(names)), chosen, names, at)
+    return SeenShards(shards, cameras_for(model, shards)).window(chosen, at)
 
 
 def require_fit(model: HMA, embodiment: str, shards: ShardSet) -> None:
@@ -210,36 +210,35 @@ def require_fit(model: HMA, embodiment: str, shards: ShardSet) -> None:
         raise HMAError(shards.folder, fault, f"{embodiment} takes {space.stride} of {space.action_dim}")
 
 
-def shard_window(
-    shards: ShardSet,
-    reader: EpisodeReader,
-    row: Mapping[str, Any],
-    cameras: Sequence[str],
-    at: Ints,
-) -> Prompt:
-    """Return the frames at some rows (P,) of an episode, as of `seen_frames`, and the chunks between them."""
-    frames, columns = seen_frames(shards, reader, row, cameras)
-    chunks = _chunks(columns["action"], columns.get("action_known"), at, shards.row_stride)
-    return Prompt(frames[at], chunks)
-
-
-def seen_frames(
-    shards: ShardSet, reader: EpisodeReader, row: Mapping[str, Any], cameras: Sequence[str]
-) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:
-    """Return the frames (T, …) of an episode with the views of cameras stacked, and its columns.
+class SeenShards:
+    """The episodes of a shard set as a model sees them: the views of its cameras side by side.
 
     Args:
-        shards: the set.
-        reader: of the cameras' columns of the set.
-        row: of episodes.parquet.
-        cameras: their names, see `seen_cameras`.
+        cameras: those that the model was trained on.
+
+    Attributes:
+        cameras: names of the views.
     """
-    views = []
-    for name in cameras:
-        columns = reader.episode(row, name)
-        (stored,) = (columns[key] for key in columns if key in ("tokens", "latents"))
-        views.append(shards.tokens(stored))
-    return np.concatenate(views, axis=-2), columns
+
+    def __init__(self, shards: ShardSet, cameras: Cameras) -> None:
+        self.shards = shards
+        self.cameras = seen_cameras(cameras, shards.manifest.cameras)
+        self._reader = EpisodeReader(shards, shards.columns(self.cameras))
+
+    def episode(self, row: Mapping[str, Any]) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:
+        """Return the frames (T, …) of an episode, a row of episodes.parquet, and its columns."""
+        views = []
+        for name in self.cameras:
+            columns = self._reader.episode(row, name)
+            (stored,) = (columns[key] for key in columns if key in ("tokens", "latents"))
+            views.append(self.shards.tokens(stored))
+        return np.concatenate(views, axis=-2), columns
+
+    def window(self, row: Mapping[str, Any], at: Ints) -> Prompt:
+        """Return the frames at some rows (P,) of an episode, and the chunks between them."""
+        frames, columns = self.episode(row)
+        known = columns.get("action_known")
+        return Prompt(frames[at], _chunks(columns["action"], known, at, self.shards.row_stride))
 
 
 def _of_lerobot(model: HMA, embodiment: str, folder: StrPath, part: EpisodePart) -> Prompt:

@@ -10,8 +10,8 @@ B batch, T frames of a pass, S tokens of a frame, N = S + action tokens, D width
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol, Self
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -92,24 +92,37 @@ class TimePositions:
         return TimePositions(positions, allowed, (cos, sin), slots=slots, rows=self.rows)
 
 
-class Carried(Protocol):
-    """What a rollout carries of the past frames of its rows, beside the frames themselves."""
+@dataclass(frozen=True)
+class Carried:
+    """What a rollout carries of the past frames of its rows, beside the frames themselves.
 
-    @property
-    def tokens(self) -> int:
-        """Return N of the frames."""
+    Attributes:
+        memory: what a pass writes in place, of one type on one device.
+        axis: that of the slots in each; the next one is that of the rows.
+        tokens: N of the frames.
+    """
+
+    memory: list[Tensor]
+    axis: int
+    tokens: int
 
     def fits(self, slots: int, tokens: int, dtype: torch.dtype, device: torch.device) -> bool:
         """Check whether this is for so many slots a row and tokens a frame."""
+        kept = self.memory[0]
+        return (kept.shape[self.axis], self.tokens, kept.dtype, kept.device) == (slots, tokens, dtype, device)
 
-    def take(self, rows: Tensor) -> Self:
+    def take(self, rows: Tensor) -> "Carried":
         """Return a copy of some rows."""
+        return replace(self, memory=[kept.index_select(self.axis + 1, rows) for kept in self.memory])
 
-    def put(self, rows: Tensor, other: Self) -> None:
+    def put(self, rows: Tensor, other: "Carried") -> None:
         """Replace rows by all rows of another one."""
+        for own, theirs in zip(self.memory, other.memory, strict=True):
+            own.index_copy_(self.axis + 1, rows, theirs)
 
     def tensors(self) -> list[Tensor]:
-        """Return its memory, which a pass writes in place."""
+        """Return its memory."""
+        return self.memory
 
 
 class Trunk(Protocol):
@@ -142,7 +155,7 @@ class Trunk(Protocol):
         """
 
     def __call__(
-        self, x: Tensor, conditioning: Conditioning, times: TimePositions, carried: Any = None
+        self, x: Tensor, conditioning: Conditioning, times: TimePositions, carried: Carried | None = None
     ) -> Tensor:
         """Map embedded frames (B, T, S, D) to features (B, T, N, D); action tokens come last in a frame.
 

@@ -2,14 +2,13 @@
 
 A block applies bidirectional attention among the tokens of a frame, modulation by the action, causal
 attention over time at each place of the frame, and an MLP. No information flows backwards in time, so a
-rollout carries the keys and values of past frames (`KeyValues`).
+rollout carries the keys and values of past frames.
 
 B batch, T frames, S tokens of a frame, N = S + action tokens, D width, L layers, R cache slots.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -21,62 +20,13 @@ from hma_model.config import HMAConfig
 from hma_model.network.linear import Linear, after_gelu, after_norm, recomputed
 from hma_model.network.rotary import rotate, rotate_qkv, turns_of
 from hma_model.network.stem import LatentEmbedding, Modulation, NoiseEmbedding, TokenEmbedding
-from hma_model.network.trunks.contract import Conditioning, TimePositions, rows_at
+from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions, rows_at
 
 SEQUENCE_LIMIT = 2**15  # of one call of attention: kernels of a GPU refuse 65,536 and more
 # Keys up to which attention in bfloat16 on a CPU is computed as products of all sequences at once: the fused
 # kernel's backward pass takes about 7 times as long at 12 keys and 5 times at 32.
 PRODUCT_KEYS = 128
 CACHED_SCORES = 2**20  # scores that stay in a core's cache between their products
-
-
-@dataclass
-class LayerCache:
-    """The cached keys and values of one layer; the values of a frame are contiguous, as computed.
-
-    Attributes:
-        time: (2, R, B, N, heads, head_dim).
-        action: (2, R, B, heads, head_dim); None without cross-attention.
-    """
-
-    time: Tensor
-    action: Tensor | None = None
-
-    def take(self, rows: Tensor) -> "LayerCache":
-        """Return a copy of some rows."""
-        action = None if self.action is None else self.action[:, :, rows]
-        return LayerCache(self.time[:, :, rows], action)
-
-
-@dataclass(frozen=True)
-class KeyValues:
-    """The keys and values of past frames, which a rollout carries (`hma_model.network.trunks.contract`)."""
-
-    layers: list[LayerCache]
-
-    @property
-    def tokens(self) -> int:
-        """Return N of the frames."""
-        return self.layers[0].time.shape[3]
-
-    def fits(self, slots: int, tokens: int, dtype: torch.dtype, device: torch.device) -> bool:
-        """Check whether this is for so many slots a row and tokens a frame."""
-        kept = self.layers[0].time
-        return (kept.shape[1], kept.shape[3], kept.dtype, kept.device) == (slots, tokens, dtype, device)
-
-    def take(self, rows: Tensor) -> "KeyValues":
-        """Return a copy of some rows."""
-        return KeyValues([layer.take(rows) for layer in self.layers])
-
-    def put(self, rows: Tensor, other: "KeyValues") -> None:
-        """Replace rows by all rows of another one."""
-        for own, theirs in zip(self.tensors(), other.tensors(), strict=True):
-            own[:, :, rows] = theirs
-
-    def tensors(self) -> list[Tensor]:
-        """Return the memory of all layers, which a pass writes in place."""
-        pairs = ((layer.time, layer.action) for layer in self.layers)
-        return [kept for pair in pairs for kept in pair if kept is not None]
 
 
 def remember(cache: Tensor, new: tuple[Tensor, Tensor], times: TimePositions) -> Tensor:
@@ -227,12 +177,12 @@ class TemporalAttention(Attention):
         super().__init__(config)
         self.rotary = not config.released
 
-    def forward(self, x: Tensor, norm: nn.Module, times: TimePositions, cache: LayerCache | None) -> Tensor:
+    def forward(self, x: Tensor, norm: nn.Module, times: TimePositions, cache: Tensor | None) -> Tensor:
         """Apply `norm` and attention over time to (B, T, N, D); keep the shape."""
         turned = times if self.rotary else None
         if cache is not None:
             q, k, v = self.project(x, norm, turned, within=True)
-            return self.proj(self._recall(q, times, remember(cache.time, (k, v), times)))
+            return self.proj(self._recall(q, times, remember(cache, (k, v), times)))
         b, t, n, width = x.shape
         q, k, v = self.project(x.transpose(1, 2).reshape(b * n, t, width), norm, turned)
         mask = None if times.causal else times.allowed
@@ -286,7 +236,7 @@ class ActionAttention(nn.Module):
         self.kv = Linear(width, 2 * width, bias=config.qkv_bias)
         self.proj = Linear(width, width)
 
-    def forward(self, x: Tensor, embedding: Tensor, times: TimePositions, cache: LayerCache | None) -> Tensor:
+    def forward(self, x: Tensor, embedding: Tensor, times: TimePositions, cache: Tensor | None) -> Tensor:
         """Attend from tokens (B, T, N, D) to action embeddings (B, T, D); return (B, T, N, D)."""
         b, t, n, _ = x.shape
         q = self.q(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
@@ -294,8 +244,8 @@ class ActionAttention(nn.Module):
         q = rotate(q, (cos, sin))  # (B, N, T, heads, head_dim)
         k, v = self.kv(embedding).unflatten(-1, (2, self.heads, -1)).unbind(2)
         k = rotate(k, times.rotary)
-        if cache is not None and cache.action is not None:
-            k, v = remember(cache.action, (k, v), times).transpose(1, 2)
+        if cache is not None:
+            k, v = remember(cache, (k, v), times).transpose(1, 2)
         k, v = k.transpose(1, 2), v.transpose(1, 2)  # (B, heads, keys, head_dim)
         queries = q.permute(0, 3, 2, 1, 4).flatten(2, 3)  # (B, heads, T*N, head_dim)
         mask = times.allowed.repeat_interleave(n, dim=-2)
@@ -346,7 +296,7 @@ class Block(nn.Module):
         conditioning: Conditioning,
         layer: int,
         times: TimePositions,
-        cache: LayerCache | None,
+        cache: Sequence[Tensor | None],
     ) -> Tensor:
         """Apply the block to tokens (B, T, N, D); keep the shape."""
         qkv = self.space.project(x.flatten(0, 1), self.space_norm)
@@ -356,8 +306,8 @@ class Block(nn.Module):
         if conditioning.modulation is not None:
             x = x + recomputed(self.modulation_out, self.modulate, x, conditioning, layer)
         if self.action is not None and conditioning.embedding is not None:
-            x = x + self.action(self.action_norm(x), conditioning.embedding, times, cache)
-        x = x + self.time(x, self.time_norm, times, cache)
+            x = x + self.action(self.action_norm(x), conditioning.embedding, times, cache[1])
+        x = x + self.time(x, self.time_norm, times, cache[0])
         return x + self.mlp(x, self.mlp_norm)
 
     def modulate(self, x: Tensor, conditioning: Conditioning, layer: int) -> Tensor:
@@ -415,22 +365,21 @@ class Transformer(nn.Module):
         x: Tensor = self.embed(frames, masked, previous)
         return x if corruption is None or self.noise is None else x + self.noise(corruption)
 
-    def carry(
-        self, rows: int, slots: int, tokens: int, dtype: torch.dtype, device: torch.device
-    ) -> KeyValues:
-        """Return a cache for frames of N tokens."""
-        config = self.config
-        crossed = "cross_attention" in config.conditioning
-        of_actions = (2, slots, rows, config.heads, config.head_dim)
-        of_frames = (2, slots, rows, tokens, config.heads, config.head_dim)
-        layers = []
-        for _ in range(config.layers):
-            action = torch.zeros(of_actions, dtype=dtype, device=device) if crossed else None
-            layers.append(LayerCache(torch.zeros(of_frames, dtype=dtype, device=device), action))
-        return KeyValues(layers)
+    def carry(self, rows: int, slots: int, tokens: int, dtype: torch.dtype, device: torch.device) -> Carried:
+        """Return the cached keys and values of each layer.
+
+        Those of frames are (2, R, B, N, heads, head_dim); after them, with cross-attention, lie those of
+        actions, (2, R, B, heads, head_dim). The values of a frame are contiguous, as computed.
+        """
+        heads = self.config.heads, self.config.head_dim
+        of_layer: list[tuple[int, ...]] = [(2, slots, rows, tokens, *heads)]
+        if "cross_attention" in self.config.conditioning:
+            of_layer.append((2, slots, rows, *heads))
+        shapes = of_layer * self.config.layers
+        return Carried([torch.zeros(shape, dtype=dtype, device=device) for shape in shapes], 1, tokens)
 
     def forward(
-        self, x: Tensor, conditioning: Conditioning, times: TimePositions, carried: KeyValues | None = None
+        self, x: Tensor, conditioning: Conditioning, times: TimePositions, carried: Carried | None = None
     ) -> Tensor:
         """Map embedded frames to features, as `Trunk.__call__` says."""
         config = self.config
@@ -438,8 +387,9 @@ class Transformer(nn.Module):
             copies = conditioning.tokens.unsqueeze(2).expand(-1, -1, config.action_tokens, -1)
             x = torch.cat([x, copies.to(x.dtype)], dim=2)
         x = self.embed_norm(x + rows_at(self.position, times.positions)[..., : x.shape[2], :])
+        each = 0 if carried is None else len(carried.memory) // config.layers
         for layer, block in enumerate(self.blocks):
-            cache = None if carried is None else carried.layers[layer]
+            cache = (None, None) if carried is None else carried.memory[layer * each : (layer + 1) * each]
             if self.checkpointing and self.training and torch.is_grad_enabled():
                 x = checkpoint(block, x, conditioning, layer, times, cache, use_reentrant=False)
             else:

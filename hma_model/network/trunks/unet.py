@@ -3,8 +3,7 @@
 In the paper's terms this is masked autoregression with all tokens of the next frame masked at once. A frame's
 tokens lie on their full grid. Each frame of a pass sees the frames before it at the same place, the newest
 first, and spreads what it sees by convolutions at several resolutions; every convolution is modulated by the
-actions. Nothing is computed of past frames but their embedding, so a rollout carries only embeddings
-(`Embeddings`).
+actions. Nothing is computed of past frames but their embedding, so a rollout carries only embeddings.
 
 B batch, T frames, S = h*w tokens of a frame, D width, A ages (the frame itself and the frames before it),
 R slots of a row, E width of the conditioning.
@@ -12,7 +11,6 @@ R slots of a row, E width of the conditioning.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -22,45 +20,9 @@ from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
 from hma_model.network.stem import LatentEmbedding, NoiseEmbedding
-from hma_model.network.trunks.contract import Conditioning, TimePositions
+from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions
 
 CONDITIONING = 192  # E
-
-
-@dataclass(frozen=True)
-class Embeddings:
-    """The embeddings of past frames and of their actions, which a rollout carries (`contract.Carried`).
-
-    Attributes:
-        frames: (R, rows, S, D).
-        actions: (R, rows, D).
-    """
-
-    frames: Tensor
-    actions: Tensor
-
-    @property
-    def tokens(self) -> int:
-        """Return S."""
-        return self.frames.shape[2]
-
-    def fits(self, slots: int, tokens: int, dtype: torch.dtype, device: torch.device) -> bool:
-        """Check whether this is for so many slots a row and tokens a frame."""
-        kept = self.frames
-        return (kept.shape[0], kept.shape[2], kept.dtype, kept.device) == (slots, tokens, dtype, device)
-
-    def take(self, rows: Tensor) -> "Embeddings":
-        """Return a copy of some rows."""
-        return Embeddings(self.frames[:, rows], self.actions[:, rows])
-
-    def put(self, rows: Tensor, other: "Embeddings") -> None:
-        """Replace rows by all rows of another one."""
-        slots = len(other.frames)
-        self.frames[:slots, rows], self.actions[:slots, rows] = other.frames, other.actions
-
-    def tensors(self) -> list[Tensor]:
-        """Return its memory, which a pass writes in place."""
-        return [self.frames, self.actions]
 
 
 def convolve(conv: nn.Module, x: Tensor) -> Tensor:
@@ -161,15 +123,13 @@ class UNet(nn.Module):
         x: Tensor = self.embed(frames, masked, previous)
         return x if corruption is None or self.noise is None else x + self.noise(corruption)
 
-    def carry(
-        self, rows: int, slots: int, tokens: int, dtype: torch.dtype, device: torch.device
-    ) -> Embeddings:
-        """Return the memory for the embeddings of past frames."""
+    def carry(self, rows: int, slots: int, tokens: int, dtype: torch.dtype, device: torch.device) -> Carried:
+        """Return the embeddings of past frames (R, rows, S, D) and of their actions (R, rows, D)."""
         frames = torch.zeros(slots, rows, tokens, self.config.width, dtype=dtype, device=device)
-        return Embeddings(frames, torch.zeros_like(frames[:, :, 0]))
+        return Carried([frames, torch.zeros_like(frames[:, :, 0])], 0, tokens)
 
     def forward(
-        self, x: Tensor, conditioning: Conditioning, times: TimePositions, carried: Embeddings | None = None
+        self, x: Tensor, conditioning: Conditioning, times: TimePositions, carried: Carried | None = None
     ) -> Tensor:
         """Map embedded frames to features, as `Trunk.__call__` says; those before `wanted` are zeros."""
         actions = conditioning.embedding
@@ -179,7 +139,7 @@ class UNet(nn.Module):
             frames, of_actions = x.flatten(0, 1), actions.flatten(0, 1)
             index, seen = self._of_window(times, len(x))
         else:
-            frames, of_actions = carried.frames.flatten(0, 1), carried.actions.flatten(0, 1)
+            frames, of_actions = (kept.flatten(0, 1) for kept in carried.memory)
             assert times.slots is not None
             slots = times.slots.flatten()
             frames.index_copy_(0, slots, x.flatten(0, 1).to(frames.dtype))
@@ -215,11 +175,11 @@ class UNet(nn.Module):
         begin = torch.arange(batch, device=ages.device).view(-1, 1, 1) * len(times.positions)
         return begin + index, seen.unsqueeze(0)
 
-    def _of_slots(self, times: TimePositions, carried: Embeddings) -> tuple[Tensor, Tensor]:
+    def _of_slots(self, times: TimePositions, carried: Carried) -> tuple[Tensor, Tensor]:
         """Return as `_of_window` the indices among the slots of all rows, one slot after the other."""
         assert times.slots is not None
         ages = torch.arange(self.config.frames, device=times.positions.device)
-        slots, rows = carried.frames.shape[:2]
+        slots, rows = carried.memory[0].shape[:2]
         positions = times.positions.unsqueeze(-1)  # (B, T, 1)
         seen = ages <= positions
         held = positions - torch.minimum(ages, positions)

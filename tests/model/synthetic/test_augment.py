@@ -28,6 +28,7 @@ from hma_model.synthetic import recorder
 from hma_model.synthetic.augment import Augmentation, augment
 from hma_model.synthetic.recorder import SyntheticEpisode, write_shards
 from hma_model.worlds.images import Prompt
+from hma_model.worlds.prompts import SeenShards
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
 from tests.model.shards import state_pauses
@@ -261,7 +262,7 @@ def test_episodes_of_the_same_beginning_differ(world, real, tmp_path, monkeypatc
 
 @pytest.mark.slow
 def test_windows_with_unknown_actions_are_left_out(world, real, tmp_path, monkeypatch) -> None:
-    read, unknown = augment_module.shard_window, [True]
+    read, unknown = SeenShards.window, [True]
 
     def gaps(*given: Any) -> Prompt:
         frames, chunks = read(*given)
@@ -269,7 +270,7 @@ def test_windows_with_unknown_actions_are_left_out(world, real, tmp_path, monkey
         chunks[2, 0] = np.nan if all(unknown) or given[-1][0] % 2 else chunks[2, 0]
         return Prompt(frames, chunks)
 
-    monkeypatch.setattr(augment_module, "shard_window", gaps)
+    monkeypatch.setattr(SeenShards, "window", gaps)
     with pytest.raises(UsageError, match="hardly a window of 6 frames whose actions are all known"):
         augment(tmp_path / "none", asked(source="real"), world=world, shards=real)
     unknown.append(False)
