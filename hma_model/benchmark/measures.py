@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_model.arrays import Float32s, Floats, Images, Ints
+from hma_model.arrays import Float32s, Floats, Images
 from hma_model.evaluation.agreement import share_interval
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded, summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, psnr
@@ -55,11 +55,6 @@ def played(world: World, true: TrueArena, actions: Sequence[Float32s]) -> tuple[
     return np.stack(images, axis=1), np.stack(unsure, axis=1)
 
 
-def parts_read(probe: Probe) -> Ints:
-    """Return the numbers of the parts whose places the probe reads."""
-    return np.concatenate([probe.own, probe.loose])
-
-
 def choose(
     world: World, scenes: Scenes, probe: Probe, policy: Policy, frames: int, choices: int = CHOICES
 ) -> Arrays:
@@ -69,7 +64,7 @@ def choose(
         `psnr`, `copy_psnr` (of the first frame repeated), `uncertainty` (N, C, T); `true`, `made`
         (N, C, T, P, 2) places.
     """
-    kept = parts_read(probe)
+    kept = np.concatenate([probe.own, probe.loose])  # the parts whose places the probe reads
     names = ("psnr", "copy_psnr", "true", "made", "uncertainty")
     found: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
     for choice in range(choices):

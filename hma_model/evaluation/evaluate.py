@@ -34,7 +34,6 @@ from hma_model.evaluation.losses import (
     episodes_of,
     masked_val_loss,
     no_window,
-    opened,
     unconditional_baseline,
     validation_losses,
     windows,
@@ -170,7 +169,7 @@ def measure(
         CheckpointError: the model was trained on another tokenizer.
         UsageError: the split has no window, or the prompt leaves no frame to predict.
     """
-    shards = opened(data)
+    shards = data if isinstance(data, ShardSet) else ShardSet(data)
     plan = WindowPlan.of(model, shards, settings)
     first, seed, draws = plan.prompt, settings.seed, settings.draws
     batches = list(
@@ -252,9 +251,7 @@ def _losses(
     by_window |= {"masked_loss": masked_nats, "masked_accuracy": masked_hits}
     table: dict[str, Any] = summary("loss", by_window["loss"], seed, 6, episodes, NATURAL) | {
         "shuffled_loss": masked_val_loss(model, other),
-        "baseline_loss": unconditional_baseline(
-            [shards], batches, cameras, model.config.factored, model.config.merge
-        ).mean(),
+        "baseline_loss": unconditional_baseline([shards], batches, model.config, cameras).mean(),
     }
     if table["loss"] is not None:  # a model that takes squares of tokens as one has a loss of squares
         table["stored_loss"] = round(table["loss"] / model.config.merge**2, 6)

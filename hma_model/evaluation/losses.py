@@ -7,7 +7,7 @@ frequencies of the training tokens: a model that ignores its input would reach i
 B batch, T frames, F digits, V values a digit.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,7 +22,7 @@ from hma_data.loading.views import FIRST_CAMERA, Cameras, Views
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
 from hma_model.arrays import Floats, Ints
-from hma_model.config import OBJECTIVES
+from hma_model.config import OBJECTIVES, HMAConfig
 from hma_model.evaluation.metrics import teacher_forced
 from hma_model.network.model import HMA
 
@@ -31,26 +31,24 @@ BASELINE_FRAMES = 200_000
 
 @dataclass
 class Means:
-    """Sums and counts of sample values by embodiment, and the values in their order."""
+    """Values of samples, in their order, and the embodiment of each."""
 
-    sums: dict[str, float] = field(default_factory=dict)
-    counts: dict[str, int] = field(default_factory=dict)
+    names: list[str] = field(default_factory=list)
     samples: list[float] = field(default_factory=list)
 
     def add(self, names: Sequence[str], values: Tensor | NDArray[Any]) -> None:
         """Add one value a sample, (B,)."""
+        self.names += names
         self.samples += values.tolist()
-        for name, value in zip(names, values.tolist()):
-            self.sums[name] = self.sums.get(name, 0.0) + value
-            self.counts[name] = self.counts.get(name, 0) + 1
 
     def by_embodiment(self) -> dict[str, float]:
         """Return the mean of each embodiment, sorted by id."""
-        return {name: self.sums[name] / self.counts[name] for name in sorted(self.sums)}
+        whose, values = np.array(self.names), np.array(self.samples)
+        return {name: float(values[whose == name].mean()) for name in sorted(set(self.names))}
 
     def mean(self) -> float:
         """Return the mean over all samples; NaN if there are none."""
-        return sum(self.sums.values()) / max(sum(self.counts.values()), 1) if self.counts else float("nan")
+        return float(np.mean(self.samples)) if self.samples else float("nan")
 
 
 def windows(
@@ -127,18 +125,17 @@ def masked_val_loss(model: HMA, batches: Iterable[Batch]) -> float:
 
 def digit_frequencies(
     shards: ShardSet,
-    max_frames: int = BASELINE_FRAMES,
+    factored: Sequence[int],
     cameras: Cameras = FIRST_CAMERA,
-    factored: Sequence[int] | None = None,
+    max_frames: int = BASELINE_FRAMES,
 ) -> list[Floats]:
     """Return the frequency of each value of each digit in train: F arrays (V,), add-one smoothed.
 
-    `factored` states the values of each digit, low digit first; by default it is the tokenizer's.
+    `factored` states the values of each digit, low digit first.
 
     Of more than `max_frames` frames, only row groups spread evenly over them are counted, about `max_frames`
     frames at most.
     """
-    factored = factored or shards.spec.factored or (shards.spec.vocab_size or 1,)
     counts = [np.ones(values) for values in factored]
     files = list(zip(shards.shards("train"), shards.row_groups("train")))
     groups = [(name, group) for name, rows in files for group in range(len(rows))]
@@ -154,28 +151,25 @@ def digit_frequencies(
 
 
 def unconditional_baseline(
-    train: Mapping[str, ShardSet] | Sequence[StrPath | ShardSet],
+    sets: Iterable[ShardSet],
     batches: Iterable[Batch],
+    config: HMAConfig,
     cameras: Cameras = FIRST_CAMERA,
-    factored: Sequence[int] | None = None,
-    merge: int = 1,
 ) -> Means:
     """Return the cross-entropy of each embodiment's training frequencies, which ignores all input.
 
     Args:
-        train: shard sets (or the str or path of each), whose train frames are counted, digit by digit.
+        sets: those whose train frames are counted, digit by digit.
         batches: validation windows of discrete tokens.
+        config: of the model, which says what digits and squares of tokens there are.
         cameras: as `WindowDataset` takes them.
-        factored: values of each digit, low digit first; by default the tokenizer's.
-        merge: the side of a square of tokens that counts as one, as `HMAConfig.merge`.
 
     Returns:
         Nats a token by embodiment, over the frames from the second on, as in `masked_val_loss`.
     """
-    sets = train.values() if isinstance(train, Mapping) else [opened(item) for item in train]
     scores = {
-        s.embodiment.id: [np.log(p) for p in digit_frequencies(s, cameras=cameras, factored=factored)]
-        for s in sets
+        shards.embodiment.id: [np.log(p) for p in digit_frequencies(shards, config.factored, cameras)]
+        for shards in sets
     }
     means = Means()
     for batch in batches:
@@ -185,10 +179,5 @@ def unconditional_baseline(
             for digit in scores[name]:
                 nats -= digit[rest % len(digit)]
                 rest //= len(digit)
-            means.add([name], np.array([nats.mean() * merge**2]))
+            means.add([name], np.array([nats.mean() * config.merge**2]))
     return means
-
-
-def opened(item: StrPath | ShardSet) -> ShardSet:
-    """Return a shard set, opened if it is not yet."""
-    return item if isinstance(item, ShardSet) else ShardSet(item)

@@ -18,6 +18,7 @@ from hma_model.arrays import Float32s
 from hma_model.policies.arenas import Arena, Scenes
 
 STATE, TASK = "observation.state", "task"
+CONFIG = "config.json"
 
 
 class LeRobotPolicy:
@@ -33,7 +34,7 @@ class LeRobotPolicy:
 
     def __init__(self, source: str, scenes: Scenes, device: str = "cpu") -> None:
         self.name = f"policy lerobot:{source}"
-        _require_there(source, self.name)
+        hub_repository(source, self.name, "policy")
         with imported("lerobot"):
             from lerobot.configs.policies import PreTrainedConfig
             from lerobot.policies.factory import get_policy_class, make_pre_post_processors
@@ -105,13 +106,18 @@ class LeRobotPolicy:
         return state
 
 
-def _require_there(source: str, where: str) -> None:
-    """Raise HMAError if there is no such folder or repository; the loader asks the Hub even for a path."""
+def hub_repository(source: str, where: str, what: str) -> Repository | None:
+    """Return the hub repository of what lerobot has saved; None of a folder.
+
+    Raises:
+        HMAError: there is no such folder or repository; lerobot's loader would ask the Hub even for a path.
+    """
     if Path(source).is_dir():
-        return
+        return None
     if not REPOSITORY.fullmatch(source):
-        raise HMAError(
-            where, "no such folder", "give the folder of a policy, or ORGANISATION/NAME on the Hub"
-        )
-    if "config.json" not in Repository(source, name=where).files():
-        raise HMAError(where, "has no config.json", "give a policy that lerobot has saved")
+        remedy = f"give the folder of a {what}, or ORGANISATION/NAME on the Hub"
+        raise HMAError(where, "no such folder", remedy)
+    repository = Repository(source, name=where)
+    if CONFIG not in repository.files():
+        raise HMAError(where, f"has no {CONFIG}", f"give a {what} that lerobot has saved")
+    return repository

@@ -35,7 +35,7 @@ from hma_model.policies.arenas import Beginning, ModelArena, Scenes
 from hma_model.policies.base import Judged, Policy, begin, checked
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import policy_facts
-from hma_model.policies.report import write_files
+from hma_model.policies.report import rate, write_files
 from hma_model.policies.rewards import RewardJudge, labelled_shards, measured_judge
 from hma_model.policies.scores import (
     EPISODES,
@@ -125,12 +125,7 @@ class ModelEvaluation:
 
     def table(self) -> list[list[Any]]:
         """Return a row of COLUMNS for each policy."""
-        rows = []
-        for row in self.rows():
-            low, high = row["model_success_interval"]
-            success = f"{row['model_success']:.0%} ({low:.0%}–{high:.0%})"
-            rows.append([row["policy"], success, round(row["model_score"], 2)])
-        return rows
+        return [[row["policy"], rate(row, "model"), round(row["model_score"], 2)] for row in self.rows()]
 
 
 def evaluate_recorded(

@@ -41,18 +41,19 @@ def table(found: PolicyEvaluation) -> list[list[Any]]:
     return [
         [
             row["policy"],
-            _rate(row, "true"),
-            _rate(row, "model"),
+            rate(row, "true"),
+            rate(row, "model"),
             round(row["true_score"], 1),
             round(row["model_score"], 1),
             f"{row['episodes_alike']:.0%}",
-            _rate(row, "replayed"),
+            rate(row, "replayed"),
         ]
         for row in found.rows()
     ]
 
 
-def _rate(row: dict[str, Any], name: str) -> str:
+def rate(row: dict[str, Any], name: str) -> str:
+    """Return the share of successes of a row in words, with its interval."""
     low, high = row[f"{name}_success_interval"]
     return f"{row[f'{name}_success']:.0%} ({low:.0%}–{high:.0%})"
 

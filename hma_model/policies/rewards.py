@@ -21,14 +21,12 @@ from unittest.mock import patch
 import numpy as np
 
 from hma_data.errors import HMAError, MissingDependencyError, UsageError
-from hma_data.hub.repository import Repository
 from hma_data.lab import imported
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.paths import REPOSITORY
 from hma_model.arrays import Bools, Floats, Images
 from hma_model.evaluation.agreement import Accuracy, accuracy, share_interval
 from hma_model.generation.decode import cameras_for
-from hma_model.policies.lerobot import TASK
+from hma_model.policies.lerobot import CONFIG, TASK, hub_repository
 from hma_model.worlds.env import Judge
 from hma_model.worlds.prompts import SeenShards, require_fit
 from hma_model.worlds.world import World
@@ -37,7 +35,7 @@ LIMIT = 0.5  # least reward of a success, as lerobot's
 FRAMES_AT_ONCE = 64
 NEEDED = 4  # held-out successes, and failures, with which a judge that is always right passes
 SHARDS = "--from SHARDS (lerobot-eval: --env.judge_from)"
-CONFIG, WEIGHTS = "config.json", "model.safetensors"
+WEIGHTS = "model.safetensors"
 PREPROCESSOR = "*preprocessor.json"
 VIDEO_MODELS = ("sarm", "robometer", "topreward")  # they score a video and its text, not a frame
 
@@ -266,17 +264,10 @@ def labelled_shards(world: World, embodiment: str, given: Any, judge: str) -> Sh
 
 def _folder(source: str, where: str) -> Path:
     """Return the folder of a reward model, of a repository without any file that could hold code."""
-    folder = Path(source)
-    if not folder.is_dir():
-        if not REPOSITORY.fullmatch(source):
-            remedy = "give the folder of a reward model, or ORGANISATION/NAME on the Hub"
-            raise HMAError(where, "no such folder", remedy)
-        repository = Repository(source, name=where)
+    folder, repository = Path(source), hub_repository(source, where, "reward model")
+    if repository is not None:
         names = [name for name in repository.files() if "/" not in name]
-        wanted = [name for name in names if name.endswith((".json", ".safetensors"))]
-        if CONFIG not in wanted:
-            raise HMAError(where, f"has no {CONFIG}", "give a reward model that lerobot has saved")
-        folder = repository.pull(wanted)
+        folder = repository.pull([name for name in names if name.endswith((".json", ".safetensors"))])
     for name in (CONFIG, WEIGHTS):
         if not (folder / name).is_file():
             raise HMAError(where, f"has no {name}", "give a reward model that lerobot has saved")

@@ -349,21 +349,16 @@ class _Maker:
             self.judge = found.model
         if self.probe is not None or not settings.looked_at:
             return
-        name = settings.embodiment
-        seed = settings.seed
-        tokenizer = self.world.tokenizer
-        stride = self.scenes.stride
-        tell = partial(on_progress, 0)
-        self.probe = train_probe(name, tokenizer, stride, seed, tell)
+        name, seed, tell = settings.embodiment, settings.seed, partial(on_progress, 0)
+        seen = name, self.world.tokenizer, self.scenes.stride
+        self.probe = train_probe(*seen, seed, tell)
         if settings.judge and not settings.rewarded:
             task = task_of(name, settings.judge)
-            frames = settings.frames + 1
-            judge = train_judge(
-                name, tokenizer, stride, frames, task, seed=seed, probe=self.probe, tell=tell
+            self.judge = train_judge(
+                *seen, settings.frames + 1, task, seed=seed, probe=self.probe, tell=tell
             )  # fmt: skip
-            self.judge = judge
             if isinstance(self.policy, Judged):
-                self.policy.judged(judge)
+                self.policy.judged(self.judge)
 
     def _make(self, numbers: range, tell: Callable[[float], None]) -> SyntheticBatch:
         begun = self._simulated(numbers) if self.shards is None else self._recorded(self.shards, numbers)

@@ -9,7 +9,7 @@ T frames, A action dims, K = stride · A.
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from itertools import batched
 from pathlib import Path
 from typing import Any
@@ -121,7 +121,6 @@ class ShardFilm:
     """
 
     def __init__(self, world: World, shards: ShardSet, step: int, embodiment: str | None = None) -> None:
-        self._shards = shards
         self._step = step
         rows = shards.episodes.to_pylist()
         self._parts = [(row, part) for row in rows for part in episode_pieces(shards, row, step)]
@@ -133,7 +132,7 @@ class ShardFilm:
 
     def episodes(self) -> list[FilmEpisode]:
         """Return the episodes."""
-        content = f"{self._manifest_sha256} {self.cameras} {self._step}"
+        content = f"{file_sha256(self._seen.shards.folder / MANIFEST)} {self.cameras} {self._step}"
         found = []
         for number, (row, part) in enumerate(self._parts):
             whole = len(part) == row["length"]
@@ -146,10 +145,6 @@ class ShardFilm:
     def numbers(self, split: str) -> list[int]:
         """Return the numbers of the episodes of a split."""
         return [number for number, (row, _) in enumerate(self._parts) if row["split"] == split]
-
-    @cached_property
-    def _manifest_sha256(self) -> str:
-        return file_sha256(self._shards.folder / MANIFEST)
 
     def stored(self, number: int) -> NDArray[Any]:
         """Return the frames (T, …) of an episode."""

@@ -49,12 +49,12 @@ class HeldOut:
             "objective": objective.name,
             "loss": found.mean(),
             "loss_by_embodiment": found.by_embodiment(),
-            "windows": sum(found.counts.values()),
+            "windows": len(found.samples),
         }
         if video and model.config.kind == "discrete":
             if self._baseline is None:
                 self._baseline = losses.unconditional_baseline(
-                    self._all, self._batches(), recipe.cameras, model.config.factored, model.config.merge
+                    self._all.values(), self._batches(), model.config, recipe.cameras
                 )
             facts["perplexity"] = perplexity(facts["loss"])
             facts["accuracy"] = accuracy.mean()

@@ -1,9 +1,9 @@
 """Write the metrics of a training run, show its progress, and pass the figures to trackers.
 
-`metrics.jsonl` has one line a step (`"kind": "train"`) and one line an evaluation (`"kind": "eval"`). A
-terminal shows one line that changes; any other output gets a line every few seconds. The recipe may name
-trackers: TensorBoard's event files in `tensorboard/` of the run's folder (`tensorboard --logdir RUN` shows
-them), trackio or wandb. An OSError is converted by the caller, see `hma_model.training.runtime.run_errors`.
+`metrics.jsonl` has one line a step (`"kind": "train"`) and one line an evaluation (`"kind": "eval"`). The
+recipe may name trackers: TensorBoard's event files in `tensorboard/` of the run's folder (`tensorboard
+--logdir RUN` shows them), trackio or wandb. An OSError is converted by the caller, see
+`hma_model.training.runtime.run_errors`.
 """
 
 import hashlib
@@ -15,24 +15,20 @@ import sys
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
-from hma_data.console import human_times
+from hma_data.console import Update, progress
 from hma_data.errors import MissingDependencyError, install_command
 from hma_data.storage.files import finite, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.rollout_video import SHEETS
 from hma_model.training.recipe import Recipe
 
-if TYPE_CHECKING:
-    from rich.live import Live
-
 METRICS, KINDS, EVENTS = "metrics.jsonl", ("train", "eval"), "tensorboard"
-PLAIN_SECONDS = 10.0
 SMOOTHING = 20  # steps over which a shown loss is averaged
-LISTED = 6  # robots whose losses a line of progress names
-PACING = 50  # steps from which the speed and the remaining time are estimated
+LISTED = 6  # robots whose losses the progress names
 
 
 def read_metrics(out: StrPath) -> list[dict[str, Any]]:
@@ -157,7 +153,7 @@ class RunLog:
         self, out: Path, steps: int, begin: int, show: bool = True, write: bool = True,
         trackers: Sequence[Tracker] = (),
     ) -> None:  # fmt: skip
-        self._steps, self._begin, self._show, self._write_it = steps, begin, show, write
+        self._steps, self._show, self._write_it = steps, show, write
         self._trackers = trackers
         self._path = out / METRICS
         kept = [line for line in read_metrics(out) if line["step"] <= begin]
@@ -167,36 +163,25 @@ class RunLog:
         self._last: dict[str, Any] = {}
         evaluations = (line for line in reversed(kept) if line["kind"] == "eval")
         self._evaluation: dict[str, Any] = next(evaluations, {})
-        self._paces: deque[float] = deque(maxlen=PACING)  # seconds of steps of this session
-        self._spent, self._shown, self._said = 0.0, 0.0, (-1, -1)
-        self._opened = time.monotonic()
-        self._live: Live | None = None
+        self._file: TextIO | None = None
+        self._update: Update | None = None
+        self._closing = ExitStack()
 
     def __enter__(self) -> "RunLog":
-        self._file: TextIO | None = self._path.open("a", encoding="utf-8") if self._write_it else None
-        if self._show and sys.stderr.isatty():
-            from rich.console import Console
-            from rich.live import Live
-
-            first = f"step {self._begin}/{self._steps}: waiting for the first step"
-            self._live = Live(first, console=Console(stderr=True), refresh_per_second=4)
-            self._live.__enter__()
+        for tracker in self._trackers:
+            self._closing.callback(tracker.close)
+        if self._write_it:
+            self._file = self._closing.enter_context(self._path.open("a", encoding="utf-8"))
+        if self._show:
+            self._update = self._closing.enter_context(progress("training", self._steps, "steps"))
         return self
 
     def __exit__(self, *fault: Any) -> None:
-        self._present(force=True)
-        if self._live:
-            self._live.__exit__(*fault)
-        if self._file:
-            self._file.close()
-        for tracker in self._trackers:
-            tracker.close()
+        self._closing.__exit__(*fault)
 
     def note(self, text: str) -> None:
         """Print a note for the user."""
-        if self._live:
-            self._live.console.print(text, markup=False, highlight=False)
-        elif self._show:
+        if self._show:
             print(text, file=sys.stderr, flush=True)
 
     def step(self, facts: dict[str, Any]) -> None:
@@ -204,24 +189,21 @@ class RunLog:
         self._write({"kind": "train", **facts})
         self._track("train", facts, ("loss", "lr", "grad_norm", "step_seconds", "memory_mib", "skipped"))
         self._last = facts
-        self._spent += facts["step_seconds"]
-        number = facts["step"] - self._begin
-        if number == 2:  # the first step of a session includes compilation and the start of the workers
-            self._paces.clear()
-        self._paces.append(facts["step_seconds"] - (facts.get("data_seconds", 0.0) if number == 1 else 0.0))
         for name, loss in facts["loss_by_embodiment"].items():
             recent = self._recent.setdefault(name, deque(maxlen=SMOOTHING))
             if math.isfinite(loss):  # skipped steps are counted separately
                 recent.append(loss)
-        self._present()
+        if self._update:  # CPU seconds may end the run sooner than its steps, as the share that is done tells
+            step, done = facts["step"], facts.get("done")
+            total = min(self._steps, round(step / min(done, 1))) if done else self._steps
+            self._update(step, self._words(), total)
 
     def evaluation(self, facts: dict[str, Any]) -> None:
         """Add a line of kind eval."""
         self._write({"kind": "eval", **facts})
         self._track("eval", facts, ("loss", "perplexity", "accuracy", "baseline"))
         self._evaluation = facts
-        if not self._live:
-            self._present(force=True)
+        self.note(f"step {facts['step']}: {self._words()}")
 
     def sync(self) -> None:
         """Flush the lines to disk, because the checkpoint that is written next continues from them."""
@@ -248,39 +230,13 @@ class RunLog:
             self._file.write(_line(values))
             self._file.flush()
 
-    def _present(self, force: bool = False) -> None:
-        if not self._last or not self._show:
-            return
-        if self._live:
-            self._live.update(self._text())
-        elif force or time.monotonic() - self._shown >= PLAIN_SECONDS:
-            self._shown = time.monotonic()
-            news = self._last["step"], self._evaluation.get("step", -1)
-            if news != self._said:  # the same step again differs in its times alone
-                print(self._text(), file=sys.stderr, flush=True)
-            self._said = news
-
-    def _pace(self) -> tuple[float, str]:
-        """Return windows a second of the last steps, and the session's time so far and still needed."""
-        done = max(self._last["step"] - self._begin, 1)
-        seconds = max(sum(self._paces) / max(len(self._paces), 1), 1e-9)
-        besides = max(time.monotonic() - self._opened - self._spent, 0.0) / done
-        left = (self._expected() - self._last["step"]) * (seconds + besides)
-        return self._last["windows"] / seconds, human_times(time.monotonic() - self._opened, left)
-
-    def _expected(self) -> int:
-        """Return the number of steps of the run, by the share that is done: CPU seconds may end it sooner."""
-        done = self._last.get("done")
-        return min(self._steps, round(self._last["step"] / min(done, 1))) if done else self._steps
-
-    def _text(self) -> str:
-        rate, times = self._pace()
+    def _words(self) -> str:
+        """Return the losses of the last steps and of the last evaluation in words."""
         losses = _listed({n: sum(v) / len(v) if v else math.nan for n, v in sorted(self._recent.items())})
         found = self._evaluation.get("loss")
         held = "" if not self._evaluation else f", validation {'-' if found is None else f'{found:.3f}'}"
         skipped = f", {self._last['skipped']} steps skipped" if self._last.get("skipped") else ""
-        where = f"step {self._last['step']}/{self._expected()}"
-        return f"{where}: loss {losses}{held}, {rate:.1f} windows/s, {times}{skipped}"
+        return f"loss {losses}{held}{skipped}"
 
 
 def _listed(losses: dict[str, float]) -> str:

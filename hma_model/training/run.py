@@ -209,8 +209,8 @@ class Run:
         if self.model.config.kind != "discrete":
             return
         drawn = zip(self.train_data.mixture.p, self.sets.values())
-        given: Any = {"cameras": self.recipe.cameras, "factored": self.model.config.factored}
-        shares = [[p * d for d in digit_frequencies(s, **given)] for p, s in drawn]
+        given = self.model.config.factored, self.recipe.cameras
+        shares = [[p * d for d in digit_frequencies(shards, *given)] for p, shards in drawn]
         digits = [sum(digit) for digit in zip(*shares)]
         bias = np.log(np.concatenate(digits * self.model.config.merge**2))
         own = self.model.token_readout.linear.bias
@@ -297,7 +297,8 @@ class Run:
         generator = torch.Generator().manual_seed(seed_for(recipe.seed, "masks", self.step, number))
         with self.parallel_model.passing(last):
             with self._autocast():
-                with self._uncompiled():
+                # not compiled: each number of windows would be compiled anew
+                with torch.compiler.set_stance("force_eager") if recipe.compile else nullcontext():
                     batch = self._with_own_past(number, batch)
                 output = self.parallel_model(batch, generator=generator)
             if not output.loss.requires_grad:
@@ -313,10 +314,6 @@ class Run:
             return batch
         draws = torch.Generator().manual_seed(seed_for(recipe.seed, "self_forward", self.step, number))
         return forwarded(self.model, batch, recipe.self_forward, recipe.self_forward_frames, draws)
-
-    def _uncompiled(self) -> AbstractContextManager[Any]:
-        """Let compiled blocks run as they are: each number of windows would be compiled anew."""
-        return torch.compiler.set_stance("force_eager") if self.recipe.compile else nullcontext()
 
     def _autocast(self) -> AbstractContextManager[Any]:
         if self.recipe.precision == "fp32":

@@ -168,21 +168,22 @@ def test_the_baseline_is_the_cross_entropy_of_the_training_digits(data, batch):
     low, high = (np.bincount(digits, minlength=8) + 1 for digits in (tokens % 8, tokens // 8))
     truth = batch.tokens[:, 1:].numpy()
     expected = -np.log(low / low.sum())[truth % 8] - np.log(high / high.sum())[truth // 8]
-    assert unconditional_baseline([data], [batch]).mean() == pytest.approx(expected.mean())
+    assert unconditional_baseline([shards], [batch], CONFIG).mean() == pytest.approx(expected.mean())
 
 
 def test_the_baseline_of_each_embodiment_is_its_own(data, tmp_path):
     other = make_shards(tmp_path / "hand", "hand", dims=3, seed=3)
     batches = [next(windows(folder, "val", 4, 5)) for folder in (data, other)]
-    both = unconditional_baseline([data, other], batches)
+    sets = ShardSet(data), ShardSet(other)
+    both = unconditional_baseline(sets, batches, CONFIG)
     assert both.by_embodiment() == {
-        "arm": unconditional_baseline([data], batches[:1]).mean(),
-        "hand": unconditional_baseline([other], batches[1:]).mean(),
+        "arm": unconditional_baseline(sets[:1], batches[:1], CONFIG).mean(),
+        "hand": unconditional_baseline(sets[1:], batches[1:], CONFIG).mean(),
     }
 
 
 def test_frequencies_of_a_part_of_the_data_stay_frequencies(data):
-    for part in digit_frequencies(ShardSet(data), max_frames=1):
+    for part in digit_frequencies(ShardSet(data), (8, 8), max_frames=1):
         assert part.sum() == pytest.approx(1) and (part > 0).all()
 
 

@@ -101,9 +101,10 @@ def test_what_cannot_be_a_folder_is_wrong_usage(recipe, out):
 def test_every_line_of_progress_is_said_once(recipe, tmp_path, capsys):
     train(recipe(), out=tmp_path / "run")
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == len(set(lines)) and lines[-1].startswith("windows: ")
-    shown = "\n".join(lines)
-    assert "step 6/6: loss arm" in shown and "validation" in shown and "\x1b" not in shown
+    assert len(lines) == len(set(lines)) and lines[-2].startswith("windows: ")
+    assert lines[-1].startswith("training: 6/6 steps") and "loss arm" in lines[-1]
+    assert lines[-3].startswith("step 6: loss arm") and "validation" in lines[-3]
+    assert "\x1b" not in "".join(lines)
 
 
 def test_a_line_of_metrics_that_is_damaged_is_left_out(recipe, whole, tmp_path):
