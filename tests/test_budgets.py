@@ -35,7 +35,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/export": (990, 7_660, 7),
     "hma_model/generation": (1_670, 13_500, 10),
     "hma_model/hub": (1_060, 8_200, 6),
-    "hma_model/lerobot_env": (615, 4_650, 3),
+    "hma_model/lerobot_env": (635, 4_758, 3),
     "hma_model/network": (3_215, 27_950, 16),
     "hma_model/play": (1_655, 11_950, 8),
     "hma_model/policies": (2_825, 20_100, 14),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_515, 28_900, 18),
     "hma_model/worlds": (1_520, 11_300, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_650, 510_750
+PRODUCT_LINES, PRODUCT_NODES = 64_650, 510_778
 TEST_LINES = 47_948
 DOC_WORDS = 40_340
 

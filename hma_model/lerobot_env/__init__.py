@@ -71,6 +71,7 @@ class HMAEnvConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         with in_one_line():
+            refuse_own_checkpoint()
             self._read(self._located())
 
     @property
@@ -159,6 +160,24 @@ def published_envs(file: str, repo: str | None, n_envs: int, cfg: Any = None) ->
     checkpoint, chosen = located(source, names)
     world = load_world(source, device=given.get("device", "cpu"))
     return {name: {0: made(checkpoint, name, n_envs, world, given)} for name in chosen}
+
+
+def refuse_own_checkpoint() -> None:
+    """Check that --policy.path of lerobot's command line is no checkpoint of ours, which lerobot cannot read.
+
+    Raises:
+        UsageError: it is one.
+    """
+    path = parser.get_path_arg("policy")
+    if path is None:
+        return
+    try:
+        Checkpoint.open(path)
+    except HMAError:
+        return
+    fault = "is a checkpoint of this toolkit, and lerobot reads only configurations of its own"
+    remedy = f"give --policy.type=hma --policy.checkpoint={path} in place of --policy.path"
+    raise UsageError("--policy.path", fault, remedy)
 
 
 def require_fit(config: HMAEnvConfig) -> None:

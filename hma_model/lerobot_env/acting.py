@@ -83,6 +83,11 @@ class WorldModelPolicy(PreTrainedPolicy):
             )
             self._world.model.require_readout(POLICY, config.checkpoint)
             self._commands = self._world.action_spec(self._embodiment)
+            given = len(self._commands.low)
+            taken = (config.output_features or {}).get("action")
+            if taken is not None and tuple(taken.shape) != (given,):
+                fault = f"gives {given} values of action, the environment takes {taken.shape[0]}"
+                raise UsageError(f"policy {self._embodiment}", fault, "give a policy of this robot")
         self.network = self._world.model  # lerobot moves it and counts its parameters
         self._sessions: list[int] = []
         self.reset()

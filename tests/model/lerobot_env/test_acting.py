@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
@@ -15,6 +16,7 @@ from hma_data.errors import HMAError, UsageError
 from hma_data.lab import family
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint.io import save
+from hma_model.lerobot_env import HMAEnvConfig
 from hma_model.lerobot_env.acting import WorldModelConfig, WorldModelPolicy
 from hma_model.policies.acting import Acting
 from hma_model.policies.arenas import Scenes, TrueArena
@@ -79,9 +81,21 @@ def test_what_does_not_fit_is_one_line(run: Path, tmp_path: Path) -> None:
         policy.select_action(batch(np.zeros((1, 8, 8, 3), np.uint8), "observation.images.hand"))
     with pytest.raises(UsageError, match="not by lerobot"):
         policy.forward({})
+    three = {"action": PolicyFeature(FeatureType.ACTION, (3,))}
+    with pytest.raises(UsageError, match="gives 2 values of action, the environment takes 3"):
+        WorldModelPolicy(WorldModelConfig(checkpoint=str(run), device="cpu", output_features=three))
     saved(tmp_path / "dreams")
     with pytest.raises(HMAError, match="was not trained to act"):
         WorldModelPolicy(WorldModelConfig(checkpoint=str(tmp_path / "dreams"), device="cpu"))
+
+
+def test_its_folder_as_the_path_of_a_policy_is_told_the_way_that_works(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--policy.path={run}"])
+    told = f"error: --policy.path: is a checkpoint .* give --policy.type=hma --policy.checkpoint={run}"
+    with pytest.raises(SystemExit, match=told):
+        HMAEnvConfig(embodiment=ROBOT)
 
 
 def test_lerobot_eval_runs_it(run: Path, tmp_path: Path) -> None:
