@@ -32,7 +32,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/cli": (1_721, 10_700, 12),
     "hma_model/demo": (485, 4_100, 4),
     "hma_model/evaluation": (4_470, 36_000, 23),
-    "hma_model/export": (990, 7_660, 7),
+    "hma_model/export": (1_056, 8_078, 8),
     "hma_model/generation": (1_670, 13_500, 10),
     "hma_model/hub": (1_060, 8_200, 6),
     "hma_model/lerobot_env": (635, 4_758, 3),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_515, 28_900, 18),
     "hma_model/worlds": (1_520, 11_300, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_650, 510_778
-TEST_LINES = 47_948
+PRODUCT_LINES, PRODUCT_NODES = 64_703, 511_161
+TEST_LINES = 48_087
 DOC_WORDS = 40_340
 
 

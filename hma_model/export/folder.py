@@ -9,7 +9,8 @@
     robots/ID/chunks.npy     (starts, P - 1, K) commands between them; NaN where they are unknown
     robots/ID/start-0.png    the last known frame of each start
     robots/ID/replays.npy    (starts, R - 1, K) recorded commands from there on, if there is a simulator
-    robots/ID/replay-0.webp  R true images under them, in rows, of each start
+    robots/ID/replay-0.webp  R true images under them, in rows, of each start, or
+    robots/ID/table.png      the background of the page's own simulator
     index.html, *.js, *.css  the page; ort/ if its runtime was copied
 
 P frames of a start, K = stride * action dim.
@@ -27,12 +28,14 @@ from numpy.typing import NDArray
 from hma_data import __version__
 from hma_data.episodes.images import opencv
 from hma_data.errors import OutputError
+from hma_data.lab.family.bodies import Body
 from hma_data.storage.files import new_folder, read_json, to_json, write_atomic
 from hma_model.export import require_onnx
 from hma_model.export.files import facts, write_graph, write_part
 from hma_model.export.graphs import Port, StemGraph, StepGraph, require_exportable
 from hma_model.export.page import page_names, require_runtime, write_page
 from hma_model.export.starts import Start, round_weights, take_starts
+from hma_model.export.truth import body_values
 from hma_model.play.holding import UNKNOWN, holdings
 from hma_model.play.pads import describe
 from hma_model.worlds.scenes import Drivable
@@ -189,23 +192,34 @@ def _write_robot(folder: Path, model: "HMA", robot: Drivable, starts: Sequence[S
         "chunks": f"robots/{name}/chunks.npy",
         "pictures": pictures,
         "held": [start.action.tolist() for start in starts],
-        "replays": _write_replays(home, starts),
+        "replays": write_replays(home, starts),
+        "simulator": _write_simulator(home, starts),
     }
 
 
-def _write_replays(home: Path, starts: Sequence[Start]) -> dict[str, Any] | None:
-    """Write recorded commands and true images; return what the manifest says of them."""
+def write_replays(home: Path, starts: Sequence[Start]) -> dict[str, Any] | None:
+    """Write recorded commands, and true images if the page cannot draw them; return their entry."""
     replays = [start.replay for start in starts if start.replay is not None]
     if not replays:
         return None
     _save(home / "replays.npy", np.stack(replays))
     place, strips = f"robots/{home.name}", []
     for number, start in enumerate(starts):
-        assert start.true is not None
-        path = home / f"replay-{number}.webp"
-        write_atomic(path, _webp(start.true))
-        strips.append(facts(path) | {"file": f"{place}/{path.name}"})
+        if start.true is not None:
+            path = home / f"replay-{number}.webp"
+            write_atomic(path, _webp(start.true))
+            strips.append(facts(path) | {"file": f"{place}/{path.name}"})
     return {"chunks": f"{place}/replays.npy", "strips": strips, "columns": COLUMNS}
+
+
+def _write_simulator(home: Path, starts: Sequence[Start]) -> dict[str, Any] | None:
+    """Write what the page simulates the robot with; return what the manifest says of it."""
+    tables = [start.table for start in starts if start.table is not None]
+    if not tables:
+        return None
+    body = Body.of(home.name)
+    write_atomic(home / "table.png", _png(body.canvas))
+    return {"body": body_values(body), "canvas": f"robots/{home.name}/table.png", "tables": tables}
 
 
 def _webp(images: NDArray[np.uint8]) -> bytes:

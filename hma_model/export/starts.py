@@ -11,8 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hma_data.lab.family.table import BlockTable
 from hma_data.tokenizers.network import NetworkTokenizer
 from hma_model.export.files import rounded
+from hma_model.export.truth import table_values
 from hma_model.play.session import psnr
 from hma_model.worlds.scenes import Drivable, LabScene
 from hma_model.worlds.world import World
@@ -35,7 +37,9 @@ class Start:
         action: (A,) that leaves the robot as it is.
         image: (H, W, 3) of the last frame.
         replay: (R - 1, K) that the recorder's driver takes from here on; None without a simulator.
-        true: (R, H, W, 3) images of the simulator under them, the start's first; likewise.
+        true: (R, H, W, 3) images of the simulator under them, the start's first; None also where the page
+            simulates the robot itself.
+        table: the state of that simulation.
     """
 
     frames: NDArray[Any]
@@ -44,6 +48,7 @@ class Start:
     image: NDArray[np.uint8]
     replay: NDArray[np.float32] | None = None
     true: NDArray[np.uint8] | None = None
+    table: dict[str, Any] | None = None
 
 
 def take_starts(world: World, robot: Drivable, count: int) -> list[Start]:
@@ -57,12 +62,21 @@ def take_starts(world: World, robot: Drivable, count: int) -> list[Start]:
         session = world.open(name, frames, chunks)
         start = Start(frames, chunks, scene.action, world.image(session))
         if isinstance(scene, LabScene):
-            rest = [scene.advance(None) for _ in range(REPLAY_FRAMES - 1)]
-            true = np.stack([scene.prompt.frames[-1], *(image for _, image in rest)])
-            start = replace(start, replay=np.stack([chunk for chunk, _ in rest]), true=true)
+            start = _with_truth(start, scene)
         found.append(start)
         world.close(session)
     return found
+
+
+def _with_truth(start: Start, scene: LabScene) -> Start:
+    """Return a start with recorded actions, and with a simulation for the page or true images."""
+    simulation = scene.simulator.simulation
+    table = table_values(simulation) if isinstance(simulation, BlockTable) else None
+    rest = [scene.advance(None) for _ in range(REPLAY_FRAMES - 1)]
+    start = replace(start, replay=np.stack([chunk for chunk, _ in rest]), table=table)
+    if table is None:
+        start = replace(start, true=np.stack([scene.prompt.frames[-1], *(image for _, image in rest)]))
+    return start
 
 
 def round_weights(

@@ -23,7 +23,7 @@ class BlockTable:
     def __init__(self, body: Body, pose: Floats, blocks: Floats) -> None:
         self.body, self.pose, self.blocks = body, pose.copy(), blocks.copy()
         self.held = -1  # the block that is carried
-        self._grasp = np.zeros(2)  # its place from the tip, in the tip's direction and beside it
+        self.grasp = np.zeros(2)  # its place from the tip, in the tip's direction and beside it
         self._radii = np.array([block.radius for block in body.blocks])
         self._push()
 
@@ -80,9 +80,9 @@ class BlockTable:
             far = np.linalg.norm(self.blocks - tip, axis=1)
             if far.min() < REACH:
                 self.held = int(far.argmin())
-                self._grasp = turn @ (self.blocks[self.held] - tip) * (1.0, 0.0 if gripper else 1.0)
+                self.grasp = turn @ (self.blocks[self.held] - tip) * (1.0, 0.0 if gripper else 1.0)
         if self.held >= 0:
-            self.blocks[self.held] = tip + self._grasp @ turn
+            self.blocks[self.held] = tip + self.grasp @ turn
             if gripper:
                 self.pose[-1] = max(self.pose[-1], min(GRIP - 0.01, (self._radii[self.held] - 0.9) / 8))
 
@@ -112,9 +112,9 @@ class BlockTable:
                 far = float(np.hypot(*gap)) or 1e-6
                 depth = self._radii[one] + self._radii[other] - far
                 if depth > 0:
-                    shares = np.array([free[one], free[other]]) / max(1, free[one] + free[other])
-                    self.blocks[one] += gap / far * depth * shares[0]
-                    self.blocks[other] -= gap / far * depth * shares[1]
+                    # Each of two free blocks gives way by the whole depth: recordings were made so.
+                    self.blocks[one] += gap / far * depth * free[one]
+                    self.blocks[other] -= gap / far * depth * free[other]
                     touched = True
         return touched
 

@@ -1,6 +1,7 @@
 // The page of an exported model: choose a robot and a start, and drive.
 
 import { Controls, cap, fill } from "./controls.js";
+import { Table, paint } from "./family.js";
 import { Decoder, Loader, World, fetchRuntime, openReplays, readManifest, startRuntime } from "./world.js";
 
 const $ = (id) => document.getElementById(id);
@@ -8,6 +9,7 @@ const asked = new URLSearchParams(location.search);
 let manifest, ort, model, backend, robot, world = null, start = 0;
 let paused = true, begun = false, wanted = 0, made = 0, frame = 0, times = [], due = 0, opening = 0;  // frames computed, and shown
 let replays = null, replaying = false;  // recorded actions and true images from each start, and whether they are followed
+let canvas = null, table = null;  // the background of the robot's simulator, and its state; null without one
 let making = Promise.resolve(), showing = Promise.resolve();  // a frame at a time, and the image of the one before
 const loader = new Loader((done, total) => {
   $("bar").max = Math.max(total, done); $("bar").value = done;
@@ -97,11 +99,17 @@ async function hasGpu(emulated) {  // one that the processor emulates is slow
   } catch { return false; }
 }
 
-async function poster() {  // show the start at once
+async function loadImage(url) {  // null if there is none
+  if (!url) return null;
   const image = new Image();
-  image.src = robot.pictures[start];
+  image.src = url;
   await image.decode().catch(() => {});
-  if (image.width) { size(image.width, image.height); $("view").getContext("2d").drawImage(image, 0, 0); }
+  return image.width ? image : null;
+}
+
+async function poster() {  // show the start at once
+  const image = await loadImage(robot.pictures[start]);
+  if (image) { size(image.width, image.height); $("view").getContext("2d").drawImage(image, 0, 0); }
 }
 
 async function openRobot() {
@@ -113,11 +121,12 @@ async function openRobot() {
   start = 0;
   await making;
   await showing;
-  const opened = await World.open(ort, manifest, robot, loader, model);
+  const [opened, background] = await Promise.all([World.open(ort, manifest, robot, loader, model), loadImage(robot.simulator && robot.simulator.canvas)]);
   if (turn !== opening) return;  // another robot was chosen meanwhile
   opened.temperature = manifest.temperature === null ? null : Number($("temperature").value);
   world = opened;
   replays = null;
+  canvas = background;
   $("scene").hidden = robot.pictures.length < 2;
   if (!robot.follows) note(robot.id + " does not follow its actions in this model: drive another robot to see it answer.");
   await begin(0);
@@ -131,12 +140,16 @@ async function begin(number) {
   start = number;
   run(false);
   begun = false; wanted = 0;
-  follow(false); showTruth(false);
+  follow(false);
+  if (!robot.simulator) showTruth(false);
   await making;
   await showing;
   made = frame = 0;
   await poster();
   await world.begin(start);
+  table = canvas && new Table(robot.simulator.body, robot.simulator.tables[start]);
+  showTruth(Boolean(table));
+  if (table) drawTruth(table.shapes());
   controls.open(robot, robot.held[start]);
   metered();
   counted();
@@ -180,12 +193,14 @@ async function make() {
   due = $("fast").checked ? now : Math.max(due + period, now);
   begun = true;
   made += 1;
-  const error = current.metered(robot.meter);
+  const width = robot.dimensions.length;
+  if (table) for (let i = 0; i < robot.stride; i++) table.advance(chunk.slice(i * width, (i + 1) * width));
+  const shapes = table && table.shapes(), error = current.metered(robot.meter);
   await showing;
-  if (current === world) showing = show(current, current.image(), { number, chunk, followed, error, begunAt }).catch(fail);
+  if (current === world) showing = show(current, current.image(), { number, chunk, followed, shapes, error, begunAt }).catch(fail);
 }
 
-async function show(current, made, { number, chunk, followed, error, begunAt }) {  // while the next frame is computed
+async function show(current, made, { number, chunk, followed, shapes, error, begunAt }) {  // while the next frame is computed
   const image = await made;
   if (current !== world) return;
   const now = performance.now();
@@ -194,7 +209,7 @@ async function show(current, made, { number, chunk, followed, error, begunAt }) 
   metered(error);
   controls.used(number);
   if (followed && replaying) controls.follow(chunk.slice(-robot.dimensions.length));
-  followed ? drawTruth() : $("unknown").hidden = false;
+  followed || shapes ? drawTruth(shapes) : $("unknown").hidden = false;
   times = [...times.filter((time) => now - time < 4000), now];
   $("fps").textContent = times.length > 1 ? (1000 * (times.length - 1) / (now - times[0])).toFixed(1) : "–";
   $("fps").title = `The model took ${(now - begunAt).toFixed(0)} ms`;
@@ -230,8 +245,13 @@ function follow(on) {
 
 function showTruth(on) { $("true-figure").hidden = !on; $("left").classList.toggle("two", on); $("unknown").hidden = true; }
 
-function drawTruth() {
-  const { strip, columns } = replays[start], view = $("true-view"), side = strip.width / columns;
+function drawTruth(shapes) {
+  const view = $("true-view");
+  if (shapes) {
+    [view.height, view.width] = manifest.image;
+    return paint(view, canvas, shapes);
+  }
+  const { strip, columns } = replays[start], side = strip.width / columns;
   view.width = view.height = side;
   view.getContext("2d").drawImage(strip, frame % columns * side, Math.floor(frame / columns) * side, side, side, 0, 0, side, side);
 }
@@ -241,7 +261,8 @@ async function replay() {
   const turn = opening;
   await begin(start);
   if (turn !== opening || !replays) return;  // another robot was chosen meanwhile
-  showTruth(true); drawTruth(); follow(true);
+  if (!table) { showTruth(true); drawTruth(); }
+  follow(true);
   run(true);
 }
 

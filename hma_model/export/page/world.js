@@ -81,12 +81,12 @@ export async function readNumbers(url, loader) {  // a .npy file: its numbers an
   return { values: new kind(content.buffer, 10 + size), shape: /'shape': \(([^)]*)\)/.exec(header)[1].split(",").filter((one) => one.trim()).map(Number) };
 }
 
-export async function openReplays(robot, loader) {  // recorded actions from each start, and the true images in one picture
+export async function openReplays(robot, loader) {  // recorded actions from each start, and perhaps the true images in one picture
   if (!robot.replays) return null;
   const { strips, columns } = robot.replays, [numbers, ...parts] = await Promise.all([readNumbers(robot.replays.chunks, loader), ...strips.map((one) => loader.part(one))]);
   const [, count, width] = numbers.shape, chunks = rows(numbers, width);
   const images = await Promise.all(parts.map((part) => createImageBitmap(new Blob([part], { type: "image/webp" }))));
-  return images.map((strip, i) => ({ strip, columns, chunks: chunks.slice(i * count, (i + 1) * count) }));
+  return robot.pictures.map((_, i) => ({ strip: images[i], columns, chunks: chunks.slice(i * count, (i + 1) * count) }));
 }
 
 function rows({ values, shape }, size) {  // the numbers of each place of the first axes

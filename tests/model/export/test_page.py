@@ -13,10 +13,16 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import pytest
 
+from hma_data.lab.family.bodies import Body
+from hma_data.lab.family.table import BlockTable
+from hma_model.export.folder import write_replays
 from hma_model.export.page import VERSION, write_page
+from hma_model.export.starts import Start
+from hma_model.play.session import psnr
 from tests.browser_fixtures import EMULATED_GPU, FLAGS
 from tests.model.export.checkpoints import ROBOT, Driver
 
@@ -168,7 +174,7 @@ def test_200_frames_driven_by_keys_are_those_of_onnxruntime_and_it_works_offline
 
 
 def test_a_replay_shows_the_true_images_until_a_person_drives(page: "Page", server: Any, site: Path) -> None:
-    chunks = np.load(site / "sub" / "page" / "robots" / ROBOT / "replays.npy")[0]
+    chunks = without_simulator(site / "sub" / "page")[0]
     page.goto(address(server))
     page.wait_for_selector("#replay:visible")
     assert page.is_hidden("#true-figure")
@@ -183,6 +189,67 @@ def test_a_replay_shows_the_true_images_until_a_person_drives(page: "Page", serv
     page.wait_for_selector("#unknown:visible")
     page.keyboard.press("r")
     page.wait_for_selector("#true-figure", state="hidden")
+
+
+def without_simulator(folder: Path) -> Any:
+    """Replace the simulator of an export's page by true images; return the recorded chunks of each start."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (robot,) = manifest["robots"]
+    recorded = np.load(folder / robot["replays"]["chunks"])
+    images = np.zeros((recorded.shape[1] + 1, *manifest["image"]), np.uint8)
+    starts = [Start(*[np.zeros(1)] * 4, replay, images) for replay in recorded]
+    robot["replays"] = write_replays(folder / "robots" / ROBOT, starts)
+    robot["simulator"] = None
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    return recorded
+
+
+def test_the_simulator_in_the_page_follows_a_person_and_a_replay(
+    page: "Page", server: Any, site: Path
+) -> None:
+    page.goto(address(server))
+    page.wait_for_selector("#replay:visible")
+    assert page.is_visible("#true-figure")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.focus("#fast")
+    page.keyboard.press("Space")
+    page.focus("#stage")
+    page.keyboard.down("ArrowUp")
+    frames(page, 10, 1)
+    page.keyboard.press("p")
+    folder = site / "sub" / "page"
+    (robot,) = json.loads((folder / "manifest.json").read_text())["robots"]
+    shown = true_image(page)  # and no frame is still to come
+    driven = [chunk for chunk, _ in page.evaluate("kept")]
+    table = simulated(robot, driven)
+    assert np.abs(table.pose - robot["simulator"]["tables"][0]["pose"]).max() > 5
+    assert psnr(shown, table.picture()) > 30
+
+    page.keyboard.press("v")
+    page.wait_for_function(f"kept.length >= {len(driven) + 10}")
+    page.keyboard.press("p")
+    shown, count = true_image(page), page.evaluate("kept.length") - len(driven)
+    recorded = np.load(folder / robot["replays"]["chunks"])[0]
+    assert psnr(shown, simulated(robot, recorded[:count]).picture()) > 30
+
+
+def simulated(robot: dict[str, Any], chunks: Any) -> BlockTable:
+    """Return the laboratory's simulation of an export's robot, from its first start on."""
+    begun = robot["simulator"]["tables"][0]
+    table = BlockTable(Body.of(robot["id"]), np.array(begun["pose"]), np.array(begun["blocks"]))
+    for action in np.float32(chunks).reshape(-1, len(robot["dimensions"])):
+        table.advance(action)
+    return table
+
+
+def true_image(page: "Page") -> Any:
+    """Return what stands still on the canvas of the truth."""
+    taken = [""]
+    while len(taken) < 2 or taken[-1] != taken[-2]:
+        page.wait_for_timeout(1000)
+        taken.append(page.evaluate("document.getElementById('true-view').toDataURL('image/png')"))
+    content = np.frombuffer(base64.b64decode(taken[-1].split(",")[1]), np.uint8)
+    return cv2.imdecode(content, cv2.IMREAD_COLOR_RGB)
 
 
 def test_keys_are_looked_at_before_each_frame(page: "Page", server: Any) -> None:
