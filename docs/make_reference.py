@@ -112,8 +112,8 @@ def yaml_page() -> str:
     """Return the page of all keys of a robot's YAML, from the JSON Schema of the registry."""
     schema = json.loads((FOLDER.parents[1] / "registry/embodiment.schema.json").read_text())
     parts = [
-        f"{MADE}# Keys of a robot's YAML\n\n`hma registry schema` prints the JSON Schema that this page is "
-        "made of. [Adding a robot](../adding-a-robot.md) explains the keys by three examples. "
+        f"{MADE}# Keys of a robot's YAML\n\nThis page is made from the JSON Schema that "
+        "`hma registry schema` prints. [Adding a robot](../adding-a-robot.md) explains the keys in examples. "
         "Unknown keys are errors.",
         "## The file",
         _keys(schema),
@@ -190,8 +190,8 @@ def recipe_page() -> str:
     choices = [f"`{path.stem}`" for path in sorted((FOLDER.parents[1] / "recipes/train").glob("*.yaml"))]
     parts = [
         f"{MADE}# Keys of a recipe\n\nA recipe is a YAML file with these keys, for `hma train RECIPE "
-        "[key=value …]` and `hma finetune`. `extends: NAME` begins with another recipe. On the "
-        f"command line a dot goes one level down: `model.layers=4`. These ship with the toolkit: "
+        "[key=value …]` and `hma finetune`. `extends: NAME` starts from another recipe. On the "
+        f"command line a dot addresses nested keys: `model.layers=4`. These recipes ship with the toolkit: "
         f"{', '.join(choices)}. Unknown keys are errors.",
         "## The run",
         _fields(Recipe),

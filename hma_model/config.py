@@ -109,26 +109,22 @@ class HMAConfig:
 
     kind: str = "discrete"  # discrete: VQ tokens, cross-entropy; continuous: latents, diffusion head
     trunk: str = "transformer"  # see `hma_model.network.trunks`
-    layers: int = 32  # U-Net: blocks at each resolution, down and up
-    width: int = 256
-    levels: tuple[int, ...] = (
-        48,
-        96,
-        192,
-    )  # of a U-Net: channels at each resolution, each half the one before
-    heads: int = 8
-    mlp_ratio: float = 4.0
+    layers: int = 32  # blocks; U-Net: blocks at each resolution, down and up
+    width: int = 256  # values per token
+    levels: tuple[int, ...] = (48, 96, 192)  # U-Net: channels at each resolution, the finest first
+    heads: int = 8  # attention heads
+    mlp_ratio: float = 4.0  # hidden width of the MLP, in widths
     frames: int = 12  # T, the window; in a longer rollout, temporal attention sees this many frames
     grid: tuple[int, int] = (16, 16)  # the tokenizer's (h, w); a continuous model's tokens are patches of it
     views: int = 1  # cameras in a frame, stacked along the height: a frame has views · h rows of tokens
 
     factored: tuple[int, ...] = (512, 512)  # discrete: values a digit, low digit first
     merge: int = 1  # discrete: the side of a square of stored tokens that becomes one token of the trunk
-    channels: int = 4  # continuous: the latents' channels,
-    patch: int = 2  # the side of a patch that becomes one token,
-    latent_scale: float = 1.0  # and the factor by which stored latents are multiplied
+    channels: int = 4  # continuous: the latents' channels
+    patch: int = 2  # continuous: the side of a square of latents that becomes one token of the trunk
+    latent_scale: float = 1.0  # continuous: the factor by which stored latents are multiplied
 
-    conditioning: tuple[str, ...] = ("modulation",)  # any of CONDITIONINGS together
+    conditioning: tuple[str, ...] = ("modulation",)  # any of modulation, concat, add, cross_attention
     shared_modulation: bool = False  # False: modulation weights per embodiment (paper); True: in the trunk
     action_tokens: int = 1  # copies of the action embedding appended to a frame's tokens (concat)
     # The conditioning of a pass without any actions. "embedding": a learned embedding replaces each action;
@@ -142,12 +138,12 @@ class HMAConfig:
     action_alignment: str = "previous"  # chunk k conditions frame k+1; "current": frame k (released)
 
     # "released": learned absolute times, so no rollout is longer than the window; no norm before temporal
-    # attention or after the last block; the projection after the modulated norm by embodiment; raw targets
-    # of actions.
+    # attention or after the last block; a projection per embodiment after the modulated norm; unnormalized
+    # action targets
     layout: str = "ours"
     qkv_bias: bool = False
     mlp_bias: bool = True
-    qk_norm: bool = False  # norms of queries and keys in place of those before spatial attention and MLP
+    qk_norm: bool = False  # normalize queries and keys, not the inputs of spatial attention and MLP
     mup: bool = False  # attention scale 8 / head_dim, and a readout scaled down as the width grows
     base_width: int = 256  # the width at which muP's multipliers are one
 
@@ -155,21 +151,21 @@ class HMAConfig:
     objectives: Mapping[str, float] = field(default_factory=lambda: {"forward": 1.0})
     action_loss: str = "mse"
     label_smoothing: float = 0.01
-    corrupt_max: float = 0.2  # discrete: a sample's share of digits replaced at random is U(0, this)
-    # continuous: the standard deviation of the noise in a visible frame, in units of its corruption, which is
-    # drawn as that of digits, so corrupt_max and the history below count here too
+    # Each sample's corruption is drawn from U(0, corrupt_max): the share of digits replaced at random.
+    corrupt_max: float = 0.2
+    # continuous: the noise in a visible frame has the standard deviation latent_noise × corruption
     latent_noise: float = 0.0
-    told_noise: bool = False  # the model's input has each frame's corruption; 0 after training
+    told_noise: bool = False  # an input tells the model each frame's corruption; 0 after training
     # The share of samples whose longer history stays unmasked, with later frames corrupted more.
     history_probability: float = 0.2
-    # The frames of a training pass that predicts video. "window": the window's, masked (paper). "pairs": the
-    # recorded frames, and a masked copy of each from the second on, which attends to the earlier ones.
+    # The frames of a training pass that predicts video. "window": the window's frames, masked (paper).
+    # "pairs": the recorded frames, and masked copies from the second on that attend to earlier recorded ones.
     training_pass: str = "window"
     whole_share: float = 0.5  # pairs: the share of fully masked copies
     # The input embedding of a masked token. "learned": one vector (paper). "previous": that vector plus the
     # embedding of the same position in the previous frame.
     masked_input: str = "learned"
-    position_init: str = "random"  # of positions in a frame; "sinusoid": 2-D sinusoids
+    position_init: str = "random"  # initial embeddings of positions in a frame; "sinusoid": 2-D sinusoids
     # discrete: how a token's digits are predicted. "together": independently of one another (paper).
     # "chain": autoregressively, the low digit first.
     digit_order: str = "together"
@@ -177,15 +173,15 @@ class HMAConfig:
     # share of each value.
     copy_previous: bool = False
 
-    # continuous: "diffusion", the head below; "regression": the change since the previous frame, by squared
-    # and absolute error, where moving values weigh up to 1 + motion_weight
+    # continuous: "diffusion": the diffusion head; "regression": squared and absolute error of the change
+    # since the previous frame, in which moving values weigh up to 1 + motion_weight
     video_loss: str = "diffusion"
-    motion_weight: float = 6.0
-    diffusion_target: str = "velocity"  # what the head predicts: defined at full noise too; "noise" (paper)
-    diffusion_depth: int = 3
-    diffusion_width: int = 1024
-    diffusion_sample_steps: int = 4  # the paper's 100 are for the noise
-    diffusion_variance: bool = False  # the head has variance outputs, which DDIM never reads (released)
+    motion_weight: float = 6.0  # see video_loss
+    diffusion_target: str = "velocity"  # what the head predicts; the paper's is "noise"
+    diffusion_depth: int = 3  # layers of the head
+    diffusion_width: int = 1024  # width of the head
+    diffusion_sample_steps: int = 4  # DDIM steps; the paper takes 100 with the target "noise"
+    diffusion_variance: bool = False  # the head has variance outputs, which DDIM ignores (released)
 
     tokenizer: Mapping[str, Any] = field(default_factory=dict)  # the tokenizer's spec, kept for checkpoints
 
@@ -332,7 +328,7 @@ def _rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
     fits = bool(config.factored) and min(config.factored) >= 2
     yield "factored", fits, "at least one digit of at least two values"
     yield "heads", not config.width % config.heads, f"a divisor of the width, {config.width}"
-    even = f"a width a head that is even, not {config.head_dim}, for rotary time"
+    even = f"an even width per head, not {config.head_dim}, for rotary time"
     yield "heads", config.released or not config.head_dim % 2, even
     name = "merge" if discrete else "patch"
     divides = not any(side % getattr(config, name) for side in grid)
@@ -349,7 +345,7 @@ def _rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
     yield "objectives", fits, "weights of at least 0 that do not all vanish"
     regression = config.video_loss == "regression"
     yield "video_loss", not (regression and discrete), "diffusion, or a continuous tokenizer"
-    change = "true: regression predicts the change since the frame before"
+    change = "true: regression predicts the change since the previous frame"
     yield "copy_previous", config.copy_previous or not regression, change
     if config.trunk == "unet":
         yield from _unet_rules(config)

@@ -92,8 +92,8 @@ def convert(
     val_fraction: Annotated[
         float | None,
         _data(
-            help="Validation share of episodes; default: 5 %, but at least 5 episodes (of fewer than 20 a "
-            "quarter); with --to lerobot 0."
+            help="Validation share of episodes; default: 5 %, but at least 5 episodes (a quarter if "
+            "fewer than 20); with --to lerobot 0."
         ),
     ] = None,
     seed: Annotated[int, _data(help="Seed of the split.")] = 0,

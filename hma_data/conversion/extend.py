@@ -112,7 +112,7 @@ def _refuse_damaged(out: Path, base: Manifest) -> None:
                 out / shard.path, fault, "restore it from a copy, or start over with --overwrite"
             )
     if damaged := damaged_files(out, base):
-        remedy = f"hma shards restat {out} writes it anew from the shards"
+        remedy = f"hma shards restat {out} rebuilds it from the shards"
         raise OutputError(damaged[0], "is missing, or changed since the manifest was written", remedy)
 
 

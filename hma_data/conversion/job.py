@@ -166,12 +166,12 @@ class Conversion:
 
     def __post_init__(self) -> None:
         if self.to == "lerobot" and self.lerobot is not None:
-            raise UsageError("--lerobot", "writes a dataset beside shards", "leave out --to lerobot")
+            raise UsageError("--lerobot", "writes a dataset in addition to shards", "leave out --to lerobot")
         if self.lerobot is not None:
             one, other = (Path(as_text(folder)).resolve() for folder in (self.out, self.lerobot))
             if one.is_relative_to(other) or other.is_relative_to(one):
                 fault = f"is {self.lerobot}, --out {self.out}: one is inside the other"
-                raise UsageError("--lerobot", fault, "name two folders that lie beside each other")
+                raise UsageError("--lerobot", fault, "give two separate folders")
         if self.extend and (self.to == "lerobot" or self.lerobot is not None):
             raise UsageError("--extend", "is for shards alone", MERGE)
         if self.to == "shards" and self.settings.drop_idle:

@@ -377,7 +377,7 @@ class LeRobotHolder:
 
     def __init__(self, out: Path, embodiment: Embodiment, uri: str) -> None:
         if is_remote(out):
-            fault = "is no folder of this machine, and lerobot writes no other"
+            fault = "is not a local folder, and lerobot writes only to those"
             remedy = "write one, and upload it with hf upload or LeRobotDataset.push_to_hub"
             raise UsageError(str(out), fault, remedy)
         self.out, self._robot, self._uri = out.resolve() if out.is_symlink() else out, embodiment, uri

@@ -145,7 +145,7 @@ def _make_shard(job: _NewSet, plan: Plan, out: Path, unit: ShardUnit, refused: S
             views = {camera: readers[number].episode(item, camera) for camera in layout.cameras}
             if any((view["episode_index"] != old.episode_index).any() for view in views.values()):
                 fault = f"its rows from {old.row_start} on are not episode {old.episode_index}"
-                remedy = "hma shards verify tells what is damaged"
+                remedy = "hma shards verify shows what is damaged"
                 raise ShardError(job.sets[number].folder / old.shard, fault, remedy)
             writer.add(_rows_of(index, views, layout))
             for name, own in layout.stats(views[layout.cameras[0]], slice(old.length)).items():
@@ -430,7 +430,7 @@ def _as_found(folder: Path) -> Derived:
     plan = max((footer.plan for footer in footers), key=lambda plan: len(plan.get("extends", ())))
     for name, footer in zip(names, footers):
         if footer.plan["hash"] not in plan_hashes(plan) or footer.name != name:
-            raise ShardError(folder / name, "is of another conversion than the shards beside it", REMAKE)
+            raise ShardError(folder / name, "belongs to another conversion than the other shards", REMAKE)
     embodiment, spec = stored_embodiment(folder), TokenizerSpec.from_json(plan["tokenizer"])
     listed = _listed(folder)
     own = {row.episode_index for footer in footers for row in footer.episodes if not row.source}

@@ -191,7 +191,7 @@ def proposed(offsets: dict[str, Offset]) -> Iterator[Finding]:
     for name, offset in offsets.items():
         if offset.tolerance_ms and offset.after_ms:
             numbers = {"after_ms": offset.after_ms[0], "tolerance_ms": offset.tolerance_ms}
-            said = f"{name} beside {offset.camera}: {offset.said}"
+            said = f"{name} vs {offset.camera}: {offset.said}"
             yield Finding("offset", "info", said, f"set sync: {{{offset.pairing}}}", name, numbers)
 
 
@@ -455,7 +455,7 @@ def _shard_set(folder: Path) -> Iterator[Finding]:
     manifest = shards.manifest
     kept = sum(split["episodes"] for split in manifest.splits.values())
     if manifest.quarantined:
-        said = f"{manifest.quarantined:,} episodes beside {kept:,} kept; reasons in quarantine.jsonl"
+        said = f"{manifest.quarantined:,} episodes refused, {kept:,} kept; reasons in quarantine.jsonl"
         yield Finding("quarantine", "warn", said)
     if not manifest.splits["train"]["episodes"]:
         yield Finding("split", "error", "no episode is in the train split")

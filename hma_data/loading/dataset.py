@@ -63,9 +63,7 @@ def open_sets(data: Sequence[StrPath | ShardSet], cameras: Cameras = FIRST_CAMER
         if shards.spec != first.spec:
             mine, other = (f"{spec.name} ({spec.digest})" for spec in (shards.spec, first.spec))
             fault = f"was tokenized by {mine}, but {first.folder} by {other}"
-            raise ShardError(
-                shards.folder, fault, "one mixture takes one tokenizer: convert one of them again"
-            )
+            raise ShardError(shards.folder, fault, "a mixture needs one tokenizer: convert one of them again")
     return sets
 
 

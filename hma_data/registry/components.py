@@ -87,7 +87,7 @@ class Component(SpecModel):
     range: tuple[Number, Number] | None = Field(
         None, description="[low, high] of the values; changes nothing"
     )
-    representation: Representation | None = Field(None, description="of an angle or a rotation")
+    representation: Representation | None = Field(None, description="how an angle or rotation is represented")
     gripper: Gripper | None = Field(
         None,
         description="meaning of a high value; opening_ and closing_is_high are for relative actions",
@@ -189,7 +189,7 @@ class Sync(SpecModel):
     )
     beyond: Literal["refuse", "mask"] = Field(
         "refuse",
-        description="beyond max_skew_ms: refuse the episode, or mask numbers; images always refuse it",
+        description="above max_skew_ms: refuse the episode, or mask numbers; images always refuse it",
     )
     action_shift: Count = Field(
         0,
@@ -287,7 +287,7 @@ class Hdf5Layout(SourceLayout):
         None, description="drop: omit the observation after the last action"
     )
     metadata: str | None = Field(
-        None, description="JSON file beside each file; its values replace {names} in a camera's key"
+        None, description="JSON file next to each file; its values replace {names} in a camera's key"
     )
     frames_missing: int = Field(
         0, ge=0, description="maximum number of rows at the end without a video frame; they are dropped"
@@ -299,8 +299,8 @@ class LeRobotLayout(SourceLayout):
 
     pairing: Literal["time", "index"] | None = Field(
         None,
-        description="default: by timestamp, if the video fits its episodes; time: by timestamp, whatever the "
-        "number of frames; index: row i has frame i, whatever the stamps say",
+        description="default: by timestamp, if the video fits its episodes; time: by timestamp, "
+        "without that check; index: row i has frame i",
     )
 
 
@@ -331,7 +331,7 @@ class HandsLayout(SourceLayout):
         "detector", "landmarks", "epic_kitchens_hand_objects", "ego4d_fho", "egoexo4d_hand_pose"
     ] = Field("detector", description="source of the hand positions")
     annotations: str | None = Field(
-        None, description="file or folder of the labels, absolute or below the videos' folder, the default"
+        None, description="file or folder of the labels, absolute, or in the videos' folder, the default"
     )
     models: str | None = Field(
         None, description="of the detector: folder of .tflite files or a .task bundle; else $HMA_HAND_MODELS"

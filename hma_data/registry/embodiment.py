@@ -84,7 +84,7 @@ class Embodiment(SpecModel):
     source: SourceSpec = Field(description="location and format of the recordings")
     quality: Quality = Field(Quality(), description="rules for episodes with blank or still images")
     stats_key: str | None = Field(
-        None, description="name shared by embodiments of one robot and control mode: statistics and stem"
+        None, description="robots with the same key and control mode share statistics and stem"
     )
     license: str | None = Field(None, description="license of the recordings, with its source")
     provenance: dict[str, str] = Field(default_factory=dict, description="key of this file -> its source")

@@ -175,7 +175,7 @@ class Manifest:
         """
         folder = place(folder)
         path = folder / MANIFEST
-        restat = f"hma shards restat {folder} writes it anew from the shards"
+        restat = f"hma shards restat {folder} rebuilds it from the shards"
         if not path.is_file():
             if not isinstance(folder, RemotePath) and (found := misplaced(folder, "a shard set")):
                 raise ShardError(folder, *found)

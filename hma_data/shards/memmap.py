@@ -67,7 +67,7 @@ def export(
     places = {split: out} if split else {name: out / name for name in have}
     for place in places.values():
         if place.exists() and (not place.is_dir() or any(place.iterdir())):
-            raise OutputError(place, "is there already", "choose a new --out, or delete it")
+            raise OutputError(place, "already exists", "choose a new --out, or delete it")
     total = sum(shards.manifest.splits[name]["frames"] for name in places)
     done = 0
     for name, place in places.items():

@@ -109,7 +109,7 @@ class ShardSet:
         try:
             return [dict(parse_json(line)) for line in path.read_text(encoding="utf-8").splitlines()]
         except (OSError, ValueError, TypeError) as fault:
-            remedy = f"hma shards restat {self.folder} writes it anew"
+            remedy = f"hma shards restat {self.folder} rebuilds it"
             raise ShardError(path, f"cannot be read: {fault}", remedy) from fault
 
     def camera_index(self, camera: str | None) -> int:
@@ -163,7 +163,7 @@ class ShardSet:
             with self._opened(shard) as file:
                 table = file.read_row_groups(list(row_groups), columns=list(columns), use_threads=False)
         except (OSError, pa.ArrowException) as fault:
-            remedy = "hma shards verify tells what is damaged"
+            remedy = "hma shards verify shows what is damaged"
             raise ShardError(path, f"cannot be read: {fault}", remedy) from fault
         return {name: to_numpy(table[name]) for name in columns}
 

@@ -229,7 +229,7 @@ def fetch(files: Any, path: str, start: int, end: int) -> bytes:
     """Return the bytes from `start` up to `end`; fewer where the file ends before."""
     data: bytes = attempt(files, path, lambda: files.cat_file(path, start=start, end=end))
     if len(data) > end - start:
-        fault = f"its server sent {len(data)} bytes where {end - start} were asked for"
+        fault = f"its server sent {len(data)} bytes, {end - start} were requested"
         raise SourceError(path, fault, "the server ignores range requests: copy the files here")
     return data
 

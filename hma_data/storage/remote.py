@@ -319,7 +319,7 @@ def fetch_range(path: RemotePath, start: int, stop: int) -> bytes:
     def ask() -> bytes:
         data = bytes(path.files.cat_file(path.key, start=start, end=stop))
         if len(data) != stop - start:
-            raise ConnectionError(f"{len(data)} bytes came where {stop - start} were asked for")
+            raise ConnectionError(f"{len(data)} bytes arrived, {stop - start} were requested")
         return data
 
     return attempt(path, "read", ask)

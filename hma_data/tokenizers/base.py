@@ -198,5 +198,5 @@ def check_tokens(tokens: NDArray[Any], spec: TokenizerSpec) -> None:
     if spec.vocab_size and tokens.size and (int(tokens.max()) >= spec.vocab_size or int(tokens.min()) < 0):
         raise TokenizerError(
             spec.name,
-            f"ids must lie in 0..{spec.vocab_size - 1}, but these lie in {tokens.min()}..{tokens.max()}",
+            f"ids must be in 0..{spec.vocab_size - 1}, but these are in {tokens.min()}..{tokens.max()}",
         )

@@ -115,7 +115,7 @@ class NetworkTokenizer:
             return made.numpy()
         latents = made.float().numpy()
         if not np.abs(latents).max() <= np.finfo(np.float16).max:
-            raise TokenizerError(spec.name, "its network made latents that float16 cannot hold", OTHER)
+            raise TokenizerError(spec.name, "its network made latents too large for float16", OTHER)
         return latents
 
     @torch.inference_mode()

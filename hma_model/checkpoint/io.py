@@ -86,7 +86,7 @@ def save(
         action_stats(stats.get(name, {}), f"{folder}: statistics of {name}")
     foreign = any(folder.iterdir()) if folder.is_dir() else folder.exists()
     if foreign and not (folder / CONFIG).is_file():
-        raise CheckpointError(folder, "is there already and is no checkpoint", "choose another folder")
+        raise CheckpointError(folder, "already exists and is not a checkpoint", "choose another folder")
     try:
         with new_folder(folder) as new:
             if base:

@@ -159,7 +159,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def demo(
     out: Annotated[Path, Option(help="Output folder.")] = Path("hma-demo"),
     episodes: Annotated[int, Option(min=4, help="Episodes of each of the two robots.")] = 32,
-    steps: Annotated[int | None, Option(min=1, help="Maximum steps of each training.")] = None,
+    steps: Annotated[int | None, Option(min=1, help="Maximum training steps.")] = None,
     seed: Annotated[int, Option(min=0, help="Random seed of recording and training.")] = 0,
 ) -> None:
     """Finetune the bundled world model on two new robots: record, convert, finetune, publish, report.

@@ -18,7 +18,7 @@ def benchmark(
     out: Annotated[Path, Option(help="Folder for benchmark.json, benchmark.md and benchmark.html.")] = Path(
         "hma-benchmark"
     ),
-    quick: Annotated[bool, Option("--quick", help="One robot and few episodes: minutes.")] = False,
+    quick: Annotated[bool, Option("--quick", help="One robot and few episodes; takes minutes.")] = False,
     compare: Annotated[
         tuple[Path, Path] | None, Option(metavar="A B", help="Compare two results instead of measuring.")
     ] = None,
@@ -37,7 +37,7 @@ def benchmark(
     Example: hma benchmark embedded --quick --out card
     """
     if (checkpoint is None) == (compare is None):
-        raise UsageError("hma benchmark", "takes a checkpoint or --compare", "give one of the two")
+        raise UsageError("hma benchmark", "needs a checkpoint or --compare", "give one of the two")
     from hma_model.benchmark.report import COLUMNS, compared, read_results, rows, write_report
     from hma_model.benchmark.run import FULL, QUICK
     from hma_model.benchmark.run import benchmark as run

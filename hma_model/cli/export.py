@@ -17,7 +17,7 @@ def export(
         list[Path] | None, Argument(help="Shard sets, whose held-out episodes give frames to start from.")
     ] = None,
     embodiment: Embodiments = None,
-    starts: Annotated[int, Option(min=1, max=20, help="Scenes of each robot to start from.")] = 3,
+    starts: Annotated[int, Option(min=1, max=20, help="Start scenes per robot.")] = 3,
     unmask_steps: UnmaskSteps = 2,
     half: Annotated[
         bool, Option("--half/--float32", help="Weights in float16 if that costs less than 0.1 dB.")

@@ -28,7 +28,7 @@ UnmaskSteps = Annotated[
 ]
 Temperature = Annotated[
     float | None,
-    Option("--temperature", min=0, help="Sampling temperature; 0 is greedy; default 0.5, for latents 0."),
+    Option("--temperature", min=0, help="Sampling temperature; 0 is greedy; default: 0.5, or 0 for latents."),
 ]
 SampleSteps = Annotated[
     int | None, Option("--sample-steps", min=1, help="DDIM steps of a continuous model; default: its own.")
@@ -41,11 +41,11 @@ Precision = Annotated[
     ),
 ]
 Compile = Annotated[
-    bool, Option("--compile", help="Compile the trunk for rollouts; takes a minute, faster on a GPU.")
+    bool, Option("--compile", help="Compile the trunk for rollouts: takes a minute, then faster on a GPU.")
 ]
 Device = Annotated[
     str,
-    Option("--device", help="Device of model and tokenizer: auto (a GPU if available), cpu, cuda or mps."),
+    Option("--device", help="Device: auto (a GPU if available), cpu, cuda or mps."),
 ]
 Cameras = Annotated[
     str | None,

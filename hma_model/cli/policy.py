@@ -26,8 +26,8 @@ MaxError = Annotated[
     float | None,
     Option(
         min=0,
-        help="Largest expected state error at an episode's end, px of 128, by the calibrated uncertainty; "
-        "episodes above it are left out.",
+        help="Expected state error (px of 128) above which augment drops episodes, and policy-eval also "
+        "reports the judge without them.",
     ),
 ]
 
@@ -135,12 +135,12 @@ def augment(
         int, Option(min=4, help="Frames to generate per episode; the last has no action and is not stored.")
     ] = 40,
     commands: Annotated[
-        str, Option(help="Actions: replay, perturb=SHARE of their deviation, or a policy of hma policy-eval.")
+        str, Option(help="Actions: replay, perturb=SIGMA (noise, in std), or a policy of hma policy-eval.")
     ] = "replay",
     keep: Annotated[float, Option(help="Share of episodes to keep, lowest uncertainty first.")] = 0.5,
     max_error: MaxError = None,
     judge: Annotated[
-        str, Option(help="Keep only successes: moved, reached, placed, moved=PX, or of a reward model.")
+        str, Option(help="Keep only successes of a judge: moved, moved=PX, reached, placed, a reward model.")
     ] = "",
     lerobot: Annotated[Path | None, Option(help="Also write a LeRobotDataset v3.0 to this folder.")] = None,
     unmask_steps: UnmaskSteps = 2,
@@ -211,7 +211,7 @@ def label_actions(
     device: Device = "auto",
     json: Json = False,
 ) -> None:
-    """Label action-free video: write shards with inferred actions, print the error on recorded ones.
+    """Infer the actions of action-free video: write labelled shards, print the error on recorded actions.
 
     Example: hma label-actions film --checkpoint runs/inverse -e mover_04 --out labelled/mover_04
     """

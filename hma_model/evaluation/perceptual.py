@@ -69,7 +69,7 @@ def open_networks(
     """Open networks, each `FILE#SHA256` (str or path).
 
     Raises:
-        UsageError: a file is not there, is not the one of its hash, or is no TorchScript.
+        UsageError: a file is not there, is not the one of its hash, or is not TorchScript.
     """
     scripts: dict[str, Any] = {}
     facts: dict[str, dict[str, str]] = {}
@@ -94,13 +94,13 @@ def open_script(file: StrPath, metric: str) -> tuple[Any, dict[str, str]]:
     found = file_sha256(path)
     if not stated:
         remedy = f"compare with its publisher's, and give {option} {name}#{found}"
-        raise UsageError(option, f"{name} comes without its SHA-256, which is {found}", remedy)
+        raise UsageError(option, f"{name} is given without its SHA-256, which is {found}", remedy)
     if found != stated.lower():
         raise UsageError(option, f"{name} has the SHA-256 {found}, not {stated}", "get the file again")
     try:
         script = torch.jit.load(path, map_location="cpu").eval()
-    except Exception as fault:  # torch raises several kinds for a file that is no TorchScript
-        raise UsageError(option, f"{name} is no TorchScript", f"give {REMEDIES[metric]}") from fault
+    except Exception as fault:  # torch raises several kinds for a file that is not TorchScript
+        raise UsageError(option, f"{name} is not TorchScript", f"give {REMEDIES[metric]}") from fault
     return script, {"file": Path(name).name, "sha256": found}
 
 

@@ -59,7 +59,7 @@ def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str
         where, fault = folder / MANIFEST, problem
         if damaged:
             where, fault = damaged[0], f"is not the file that {MANIFEST} names"
-        remedy = f"hma shards verify {folder} tells all; hma shards restat {folder} writes small files anew"
+        remedy = f"hma shards verify {folder} shows all; hma shards restat {folder} rebuilds small files"
         raise ShardError(where, fault, remedy)
     store = _open(as_address(target), write=True, private=private)
     page = _page(manifest, store.repo)
@@ -133,7 +133,7 @@ def _refuse_others(store: Store, manifest: Manifest) -> dict[str, int]:
     strange = [name for name in files if not (name in _OWN_FILES or SHARD_NAME.fullmatch(name))]
     strange = [name for name in strange if not name.endswith(f"/{FINDER}")]
     if strange:
-        raise HubError(store.name, f"holds something else: {strange[0]}", "push to a place of its own")
+        raise HubError(store.name, f"holds something else: {strange[0]}", "push to another address")
     if MANIFEST not in files:
         return files
     there = _published(store, f"delete {MANIFEST} there if the set is yours, and push again")[0]
@@ -141,7 +141,7 @@ def _refuse_others(store: Store, manifest: Manifest) -> dict[str, int]:
     theirs = (there.embodiment.id, there.tokenizer.name, there.tokenizer.weights_sha256)
     if ours != theirs:
         fault = f"holds the shard set of {theirs[0]} under {theirs[1]}, not of {ours[0]} under {ours[1]}"
-        raise HubError(store.name, fault, "push to a place of its own")
+        raise HubError(store.name, fault, "push to another address")
     return files
 
 

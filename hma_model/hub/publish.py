@@ -159,7 +159,7 @@ def _changes(
         if there.get("trunk_sha256") != source.trunk_sha256:
             theirs, ours = str(there.get("trunk_sha256"))[:16], source.trunk_sha256[:16]
             fault = f"has another trunk: {theirs}, this checkpoint's is {ours}"
-            raise HubError(store.name, fault, f"{own_place}, or finetune on the trunk that is there")
+            raise HubError(store.name, fault, f"{own_place}, or finetune from the published trunk")
         if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
             raise HubError(store.name, "has the same trunk with another tokenizer", own_place)
     else:
@@ -168,7 +168,7 @@ def _changes(
         foreign = [name for name in sorted(files) if name.split("/")[0] not in own]
         if foreign and (store.repo is None or MANIFEST in foreign):
             named = "a shard set" if MANIFEST in foreign else f"something else: {foreign[0]}"
-            raise HubError(store.name, f"holds {named}", "push to a place of its own")
+            raise HubError(store.name, f"holds {named}", "push to another address")
         changes[CONFIG] = inside(source.folder, CONFIG)
     if TRUNK not in files:
         changes[TRUNK] = inside(source.folder, TRUNK)

@@ -307,7 +307,7 @@ class Connection:
         self._credit = min(MESSAGE_BURST, restored) - (SCENE_COST if begins else 1)
         self._filled = now
         if self._credit < 0:
-            raise UsageError("messages", "come faster than a person sends them")
+            raise UsageError("messages", "are sent too fast")
 
     def leave(self) -> None:
         """Let the session stand still."""

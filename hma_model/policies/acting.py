@@ -124,7 +124,7 @@ class Acting:
         config = world.model.config
         world.model.require_readout(POLICY, where)
         if horizon > 1 and not config.predicts_video:
-            raise UsageError(where, "predicts no video to look ahead in", "give horizon=1")
+            raise UsageError(where, "predicts no video, so it cannot look ahead", "give horizon=1")
         for name, value in {"horizon": horizon, "memory": memory}.items():
             if value is not None and value < 1:
                 raise UsageError(where, f"{name}={value} is not allowed", "give 1 or more")

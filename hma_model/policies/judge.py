@@ -106,7 +106,7 @@ def task_of(robot: str, words: str = "moved") -> Task:
             raise ValueError
     except ValueError:
         remedy = f"give {' or '.join(TASKS)}, if wanted with px: moved={BLOCK_MOVED:g}"
-        raise UsageError("judge", f"{words!r} is no task", remedy) from None
+        raise UsageError("judge", f"{words!r} is not a task", remedy) from None
     if name == "placed" and truth.goal_of(robot) is None:
         known = ", ".join(truth.PUSHERS)
         raise UsageError("judge", f"{robot} has no goal to place a part at", f"robots with one: {known}")

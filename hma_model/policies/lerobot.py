@@ -100,7 +100,7 @@ class LeRobotPolicy:
         if state is None or state.shape[1] != self._state:
             have = "none" if state is None else f"one of {state.shape[1]}"
             fault = (
-                f"takes a state of {self._state} values, and of {arena.scenes.name} the images tell {have}"
+                f"takes a state of {self._state} values, but the images of {arena.scenes.name} give {have}"
             )
             raise HMAError(self.name, fault, "give a policy that acts from images alone")
         return state

@@ -257,7 +257,7 @@ def labelled_shards(world: World, embodiment: str, given: Any, judge: str) -> Sh
     for shards in there:
         if shards.embodiment.id == embodiment:
             return shards
-    fault = f"no recorded episodes of {embodiment} tell how often it is right"
+    fault = f"no recorded episodes of {embodiment} measure its accuracy"
     remedy = f"give {SHARDS} whose held-out episodes have {NEEDED} or more labelled successes and failures"
     raise UsageError(f"judge {judge}", fault, remedy)
 

@@ -86,7 +86,7 @@ def config_from_released(
                     _WHERE, f"{name} is {value!r}, not a whole number from 1 to {most}", _REMEDY
                 )
         if not values.get("proj_bias", True):
-            raise CheckpointError(_WHERE, "is without proj_bias, unlike any release", _REMEDY)
+            raise CheckpointError(_WHERE, "has no proj_bias, unlike every release", _REMEDY)
         shared = _shared(values, grid)
         own = _continuous(values) if continuous else _discrete(values)
         return HMAConfig(**_LAYOUT, **shared, **own)

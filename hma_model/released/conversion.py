@@ -113,7 +113,7 @@ def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[
 
     out = as_path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise CheckpointError(out, "is there already", "choose another folder")
+        raise CheckpointError(out, "already exists", "choose another folder")
     opened = Checkpoint.open(checkpoint)
     values = config_to_released(opened.config, opened.folder)
     model = load(opened, embodiments)

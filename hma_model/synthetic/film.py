@@ -89,11 +89,11 @@ def read_film(world: World, place: StrPath, embodiment: str, hz: float) -> list[
         step = max(1, round(rows_hz / hz))
         if abs(rows_hz / step / hz - 1) > RATE_TOLERANCE:
             fault = f"has {rows_hz:g} frames a second; the model takes {hz:g}"
-            remedy = "convert the film with --frames all, or at a multiple of the model's rate"
+            remedy = "convert the video with --frames all, or at a multiple of the model's rate"
             raise UsageError(path, fault, remedy)
         return ShardFilm(world, found, step, embodiment).episodes()
     if world.model.config.views > 1:
-        fault = f"has films of one camera, and the model sees {world.model.config.views} at once"
+        fault = f"has videos of one camera, but the model sees {world.model.config.views} at once"
         raise UsageError(path, fault, "convert the recordings with --cameras, and give the shards")
     return _video_episodes(world, path, found, embodiment, hz)
 

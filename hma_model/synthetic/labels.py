@@ -141,7 +141,7 @@ def label_actions(
             labelled, refused = _label(model, spec, episodes, kept, on_progress)
             if not labelled:
                 fault = f"has no usable episode; the first: {refused[0].message}"
-                raise UsageError(as_path(film).name, fault, "give longer film")
+                raise UsageError(as_path(film).name, fault, "give longer videos")
             cameras = seen_cameras(trained_cameras(card(model, embodiment)), recorded_cameras(robot))
             tokens = world.tokenizer.spec
             manifest = write_shards(folder, labelled, tokens, robot, of_film, ORIGIN, refused, cameras)
@@ -212,8 +212,8 @@ def measure(
     spread = tuple(values.std(axis=0).tolist())
     found = LabelError(shards.folder.name, split, names, tuple(rmse.tolist()), spread, len(values))
     if not any(share is not None and share > 0 for share in found.explained):
-        fault = "inferred actions are no better than their mean on labelled film"
-        raise HMAError(spec.embodiment, fault, "train the inverse model longer, or on more film")
+        fault = "inferred actions are no better than their mean on labelled video"
+        raise HMAError(spec.embodiment, fault, "train the inverse model longer, or on more data")
     return found
 
 
@@ -225,7 +225,7 @@ def _check_set(model: HMA, embodiment: str, check: StrPath | None) -> ShardSet:
         sets = model.source.shards() if model.source else []
     found = [one for one in sets if one.embodiment.id == embodiment]
     if not found:
-        fault = "no labelled film of it is known"
+        fault = "it has no labelled recordings here"
         if check is not None:
             fault = f"{check} is of {sets[0].embodiment.id}"
         raise UsageError(embodiment, fault, "name labelled shards of it that were held out: --check SHARDS")

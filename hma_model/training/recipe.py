@@ -121,10 +121,10 @@ class Recipe(_Settings):
     cameras: CameraChoice = Field("first", description="first, drawn, a name, or a list of stacked views")
     mixture: MixtureSettings = MixtureSettings()
     frames: Count = Field(12, ge=2, le=4096, description="frames T per window")
-    short: Literal["drop", "pad"] = Field("drop", description="episodes shorter than a window")
+    short: Literal["drop", "pad"] = Field("drop", description="rule for episodes shorter than a window")
     batch_size: Count = Field(8, ge=1, description="windows per forward pass")
     accumulate: Count = Field(1, ge=1, description="forward passes per step")
-    model: dict[str, Any] = Field({}, description="fields of HMAConfig")
+    model: dict[str, Any] = Field({}, description="keys of the network, [below](#model)")
     objectives: dict[str, Number] = Field({"forward": 1.0}, description="objective -> sampling weight")
 
     start: Place | None = Field(None, description="a checkpoint to start from: folder, run, URI or hub repo")
@@ -133,7 +133,7 @@ class Recipe(_Settings):
         "like", description="with start: a new robot's stem starts from a similar robot's, or fresh"
     )
     # a token's digits: the tokenizer's, or split into this many values (FSQ's levels) or joined up to them
-    digits: Count = Field(0, ge=0, description="0: the tokenizer's; 8 splits 512 into 8 · 8 · 8; 512 joins")
+    digits: Count = Field(0, ge=0, description="8 splits 512 into 8 · 8 · 8; 512 joins; 0: the tokenizer's")
     # model.merge or model.patch, unless the recipe gives it, is the least that leaves so few
     places: Count = Field(0, ge=0, description="maximum trunk tokens per camera frame; 0: no limit")
 
@@ -141,9 +141,11 @@ class Recipe(_Settings):
     # an end by time: of a rank's process in steps, all its threads; lr then falls by the share that is spent
     cpu_seconds: Number = Field(0.0, ge=0, description="maximum CPU seconds of training steps; 0: no limit")
     lr: Number = Field(3e-4, gt=0, le=1e6)
-    optimizer: Literal["adamw", "muon"] = Field("adamw", description="muon: for the matrices of the blocks")
+    optimizer: Literal["adamw", "muon"] = Field("adamw", description="muon: for matrices of the blocks")
     muon_lr: Number = Field(0.02, gt=0, le=1e3, description="muon: maximum spectral norm of a step")
-    lr_rule: Literal["plain", "paper"] = Field("plain", description="paper: see optim.learning_rate")
+    lr_rule: Literal["plain", "paper"] = Field(
+        "plain", description="paper: lr × windows per step / 64 (1 to 8)"
+    )
     warmup: Steps = Field(100, description="warm-up steps of lr from 0")
     schedule: Literal["constant_with_warmup", "cosine"] = "constant_with_warmup"
     lr_end: Share = Field(0.1, description="cosine: final lr as a share of lr")
@@ -151,7 +153,7 @@ class Recipe(_Settings):
     eps: Number = Field(1e-8, gt=0, le=1e6)
     weight_decay: Number = Field(0.05, ge=0, le=1e6)
     clip: Number = Field(1.0, gt=0, description="limit of the gradient norm")
-    nonfinite: Literal["stop", "skip"] = Field("stop", description="action at a non-finite loss")
+    nonfinite: Literal["stop", "skip"] = Field("stop", description="what a non-finite loss does")
     ema: Beta = Field(0.0, description="decay of averaged weights, which are evaluated and saved; 0: off")
     self_forward: Share = Field(0.0, description="share of windows with a self-predicted past")
     self_forward_frames: Count = Field(2, ge=1, description="consecutive self-predicted frames")
@@ -159,22 +161,22 @@ class Recipe(_Settings):
 
     seed: Count = Field(42, ge=0, lt=2**63)
     precision: Literal["auto", "fp32", "bf16"] = Field(
-        "auto", description="of the network's products; auto: bf16 where it is faster"
+        "auto", description="of matrix products; auto: bf16 where it is faster"
     )
     device: str = Field("auto", pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")
     parallel: Literal["ddp", "fsdp"] = Field("ddp", description="with torchrun: parallelism of the network")
     compile: bool = Field(False, description="torch.compile of the trunk's blocks")
     checkpointing: bool = Field(False, description="recompute activations: less memory, a third more time")
     workers: Count = Field(1, ge=0, le=512, description="prefetch threads per rank")
-    eval_every: Steps = Field(250, description="steps between evaluations; 0 only at the end")
+    eval_every: Steps = Field(250, description="steps between evaluations; 0: only at the end")
     eval_windows: Count = Field(64, ge=1, description="validation windows per embodiment")
     pictures: Steps = Field(1, description="windows per robot that an evaluation rolls out as images")
     pictures_share: Number = Field(0.05, ge=0, description="maximum share of time for these images")
-    checkpoint_every: Steps = Field(250, description="steps between checkpoints; 0 only at the end")
+    checkpoint_every: Steps = Field(250, description="steps between checkpoints; 0: only at the end")
     keep_last: Count = Field(3, ge=1, description="number of checkpoints to keep")
     report: bool = Field(True, description="write report.html")
-    track: Trackers = Field((), description="trackers of the figures; each needs its package")
-    project: str = Field("hma", description="the name under which trackio and wandb file the run")
+    track: Trackers = Field((), description="experiment trackers; each needs its package")
+    project: str = Field("hma", description="project name in trackio and wandb")
     out: Place | None = Field(None, description="the run's folder")
 
     @property

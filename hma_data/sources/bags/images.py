@@ -225,7 +225,7 @@ def _pixels(message: Any, where: str, pixel: int) -> Images:
     stated = str(child(message, "encoding"))
     height, width, step = (int(child(message, name)) for name in ("height", "width", "step"))
     if min(height, width) < 1 or height * width > MAX_PIXELS:
-        raise EpisodeError(where, f"an image claims {width}×{height} pixels, the most is {MAX_PIXELS:,}")
+        raise EpisodeError(where, f"an image claims {width}×{height} pixels, the maximum is {MAX_PIXELS:,}")
     planar = stated.lower() in ("nv12", "nv21")  # rows of colour, half as many, follow those of luma
     rows, row = height * 3 // 2 if planar else height, width * pixel
     step = step or row

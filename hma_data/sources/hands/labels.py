@@ -193,7 +193,7 @@ def _parts(columns: dict[str, Any], path: Path) -> dict[str, NDArray[np.float64]
         found["center"] = (box[:, :2] + box[:, 2:]) / 2
     if not found:
         forms = "; ".join(", ".join(names) for names in _FORMS.values())
-        raise SourceError(path, "has no columns that place a hand", f"give landmarks, or one of: {forms}")
+        raise SourceError(path, "has no columns with hand positions", f"give landmarks, or one of: {forms}")
     return found
 
 

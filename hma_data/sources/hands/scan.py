@@ -109,7 +109,7 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
         survey.note(link)
     beside = Counter(item.suffix.lower() for item in _near(local_path(uri)))
     if tables := ", ".join(f"{beside[suffix]:,} {suffix}" for suffix in TABLE_SUFFIXES if beside[suffix]):
-        said = f"these videos are read as videos of hands; beside them are {tables}"
+        said = f"these videos are read as videos of hands; next to them are {tables}"
         survey.note(Finding("files", "info", said, f"for a robot's videos: {ROBOT_VIDEOS_PAGE}"))
     headers: dict[str, Header] = {}
     for name, video in videos.items():

@@ -128,7 +128,7 @@ def _one(file: Path, folder: Path, pattern: str, what: str) -> Path:
                 for item in folder.rglob("*")
                 if item.suffix.lower() in (*SUFFIXES, ".json")
             )
-            remedy = f"beside it are {', '.join(beside[:MAX_NAMES]) or 'no videos'}"
+            remedy = f"next to it are {', '.join(beside[:MAX_NAMES]) or 'no videos'}"
             raise EpisodeError(file, f"{what}: {fault} {pattern}", remedy)
         [path] = found
     if leaves(path, folder):

@@ -27,7 +27,7 @@ TIME_TOLERANCE = 0.25  # of a frame's period, between the time of a row and the 
 HOLE = 1.5  # frame periods between two frames, above which a frame is missing between them
 BY_INDEX = "source: {layout: {pairing: index}}"
 BY_TIME = "source: {layout: {pairing: time}}"
-_REMEDY = f"look at it; where its stamps are right, set {BY_TIME}; where row i belongs to frame i, {BY_INDEX}"
+_REMEDY = f"check the video: if its stamps are right, set {BY_TIME}; if row i has frame i, {BY_INDEX}"
 _held = threading.local()  # key of a camera -> its open video: version 3 has hundreds of episodes in a file
 
 

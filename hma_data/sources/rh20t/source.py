@@ -74,7 +74,7 @@ def scenes(uri: str) -> dict[str, Path]:
     if not found:
         remedy = "name RH20T_cfg1 to RH20T_cfg7, or the folder with them"
         if people:
-            remedy = f"its {people} folders _human are films of people: read them with source.format hands"
+            remedy = f"its {people} folders _human are videos of people: read them with source.format hands"
         raise nothing_there(uri, root, "has no scene of RH20T (task_…_user_…_scene_…_cfg_…)", remedy)
     return {path.relative_to(root).as_posix(): path for path in sorted(found)}
 
@@ -203,7 +203,7 @@ class Film(FilmRows):
         stamps = scene.stamps(camera)
         self.lacking = len(stamps) - len(self.file)
         if self.lacking < 0:
-            fault = f"has {len(self.file)} frames, {STAMPS} beside it only {len(stamps)} times"
+            fault = f"has {len(self.file)} frames, but {STAMPS} has only {len(stamps)} times"
             raise EpisodeError(self.file.path, fault)
         super().__init__(self.file, stamps[: len(self.file)].astype(np.float64) / 1e3)
 

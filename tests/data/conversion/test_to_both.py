@@ -155,7 +155,9 @@ def test_one_folder_inside_the_other_is_refused_before_anything_is_written(
     out: str, dataset: str, tmp_path: Path
 ) -> None:
     data, robot = hdf5(tmp_path)
-    with pytest.raises(UsageError, match="--lerobot: is .*one is inside the other — name two folders"):
+    with pytest.raises(
+        UsageError, match="--lerobot: is .*one is inside the other — give two separate folders"
+    ):
         Conversion(robot, str(data), "fsq-8", tmp_path / out, lerobot=tmp_path / dataset)
 
 

@@ -328,7 +328,7 @@ def test_tables_beside_videos_are_told(tmp_path: Path) -> None:
     encode_video(tmp_path / "videos/a.mp4", range(24))
     (tmp_path / "videos/robot.csv").write_text("t,x\n")
     (finding,) = [one for one in inspect_recording(str(tmp_path))["findings"] if one["check"] == "files"]
-    assert finding["severity"] == "info" and "beside them are 1 .csv" in finding["message"]
+    assert finding["severity"] == "info" and "next to them are 1 .csv" in finding["message"]
     assert "HDF5 with separate videos" in finding["remedy"]
 
 

@@ -116,7 +116,7 @@ def test_saving_over_a_checkpoint_replaces_it_whole(folder):
 
 def test_a_folder_with_something_else_is_not_overwritten(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(CheckpointError, match="is no checkpoint"):
+    with pytest.raises(CheckpointError, match="is not a checkpoint"):
         save(tmp_path, {"arm": 2})
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 

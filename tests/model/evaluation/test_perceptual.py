@@ -108,7 +108,7 @@ def script(tmp_path: Path) -> Path:
 
 def test_a_file_without_its_hash_or_with_another_one_is_refused(script: Path) -> None:
     found = file_sha256(script)
-    with pytest.raises(UsageError, match=f"comes without its SHA-256, which is {found} — .*#{found}"):
+    with pytest.raises(UsageError, match=f"is given without its SHA-256, which is {found} — .*#{found}"):
         open_script(script, "fid")
     with pytest.raises(UsageError, match="has the SHA-256"):
         open_script(f"{script}#{'0' * 64}", "fid")
@@ -118,7 +118,7 @@ def test_a_file_without_its_hash_or_with_another_one_is_refused(script: Path) ->
 
 def test_a_file_that_is_no_torchscript_is_refused_with_how_to_get_one(tmp_path: Path) -> None:
     torch.save({"a.weight": torch.rand(3)}, tmp_path / "a.pth")
-    with pytest.raises(UsageError, match=r"is no TorchScript — give --lpips .*jit.trace of lpips"):
+    with pytest.raises(UsageError, match=r"is not TorchScript — give --lpips .*jit.trace of lpips"):
         open_networks(lpips=pinned(tmp_path / "a.pth"))
 
 

@@ -56,9 +56,7 @@ def test_a_folder_of_somebody_elses_files_stays_as_it_is(folder, tmp_path, name)
     mine = tmp_path / "project" / name
     mine.parent.mkdir(parents=True)
     mine.write_text("# My project")
-    with pytest.raises(
-        HubError, match=rf"project: holds something else: {name} — push to a place of its own"
-    ):
+    with pytest.raises(HubError, match=rf"project: holds something else: {name} — push to another address"):
         hub.push(folder, tmp_path / "project")
     assert mine.read_text() == "# My project"
     assert [path for path in (tmp_path / "project").rglob("*") if path.is_file()] == [mine]

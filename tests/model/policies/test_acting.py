@@ -80,7 +80,7 @@ def test_models_that_cannot_act_and_unknown_options_are_refused() -> None:
     world, scenes = actor(), Scenes.of(actor(), ROBOT, 1, 0)
     with pytest.raises(HMAError, match="was not trained to act, but for forward — train one"):
         Acting(world, scenes)
-    with pytest.raises(UsageError, match="predicts no video to look ahead in"):
+    with pytest.raises(UsageError, match="predicts no video, so it cannot look ahead"):
         Acting(actor("policy"), scenes, horizon=2)
     with pytest.raises(UsageError, match="horizon=0 is not allowed — give 1 or more"):
         Acting(actor("full"), scenes, horizon=0)

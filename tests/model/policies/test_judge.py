@@ -148,6 +148,6 @@ def test_a_judge_that_is_no_better_than_chance_is_refused(episodes: None) -> Non
 
 @pytest.mark.parametrize("words", ["fly", "moved=far", "moved=0", "reached=999"])
 def test_words_that_are_no_task_are_refused(words: str) -> None:
-    with pytest.raises(UsageError, match="is no task"):
+    with pytest.raises(UsageError, match="is not a task"):
         task_of("rails_03", words)
     assert task_of("pusht_fast").limit == 10 and task_of("arm1_02", "reached=9").limit == -9

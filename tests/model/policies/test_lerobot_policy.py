@@ -84,7 +84,7 @@ def test_a_state_that_images_do_not_tell_is_refused(tmp_path: Path) -> None:
     saved(tmp_path, state=7)
     policy, arena = read_policy(f"lerobot:{tmp_path}", scenes()), TrueArena(scenes(), 64)
     begin("it", policy, arena)
-    with pytest.raises(HMAError, match="takes a state of 7 values, and of rails_03 the images tell one of 2"):
+    with pytest.raises(HMAError, match="takes a state of 7 values, but the images of rails_03 give one of 2"):
         checked("it", policy, arena)
 
 

@@ -119,7 +119,7 @@ def test_inference_reads_each_chunk_off_a_window_around_it(world: World) -> None
 
 @pytest.mark.slow
 def test_labels_no_better_than_the_mean_are_refused(world: World, real: Path, tmp_path: Path) -> None:
-    with pytest.raises(HMAError, match="are no better than their mean on labelled film"):
+    with pytest.raises(HMAError, match="are no better than their mean on labelled video"):
         label_actions(real, tmp_path / "out", ROBOT, checkpoint="run", world=world, check=real)
     assert not (tmp_path / "out").exists()
 
@@ -158,7 +158,7 @@ def test_what_cannot_be_labelled_is_refused(world: World, tmp_path: Path) -> Non
     film(tmp_path)
     with pytest.raises(HMAError, match="run: was not trained to infer actions, but for forward"):
         run(world=World(tiny_model(ROBOT), get_tokenizer("fsq-8")))
-    with pytest.raises(UsageError, match="no labelled film of it is known — .*--check SHARDS"):
+    with pytest.raises(UsageError, match="it has no labelled recordings here — .*--check SHARDS"):
         run()
     (tmp_path / "empty").mkdir()
     with pytest.raises(UsageError, match="empty: is no shard set and no folder with video files"):
@@ -303,7 +303,7 @@ def test_films_of_one_camera_are_refused_by_a_model_of_several(three: ShardSet, 
     world = trained_on(["side", "top"], three, tmp_path / "model")
     (tmp_path / "film").mkdir()
     (tmp_path / "film" / "a.mp4").touch()
-    with pytest.raises(UsageError, match="has films of one camera, and the model sees 2 at once"):
+    with pytest.raises(UsageError, match="has videos of one camera, but the model sees 2 at once"):
         read_film(world, tmp_path / "film", three.embodiment.id, 5.0)
 
 

@@ -144,7 +144,7 @@ def spoil(folder: Path, how: str) -> None:
 @pytest.mark.parametrize(
     ("how", "said"),
     [
-        ("no video", r"exterior_2: there is no recordings/MP4/33.mp4 — beside it are .*22.mp4"),
+        ("no video", r"exterior_2: there is no recordings/MP4/33.mp4 — next to it are .*22.mp4"),
         ("no metadata", r"there is no metadata_\*.json"),
         ("two metadata", r"2 files match metadata_\*.json"),
         ("no serial", r"has no 'ext1_cam_serial' for .* — it has wrist_cam_serial"),
