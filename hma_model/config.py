@@ -173,7 +173,7 @@ class HMAConfig:
     # share of each value.
     copy_previous: bool = False
 
-    # continuous: "diffusion": the diffusion head; "regression": squared and absolute error of the change
+    # Continuous. "diffusion": the diffusion head; "regression": squared and absolute error of the change
     # since the previous frame, in which moving values weigh up to 1 + motion_weight
     video_loss: str = "diffusion"
     motion_weight: float = 6.0  # see video_loss

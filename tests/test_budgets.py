@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_703, 511_161
 TEST_LINES = 48_087
-DOC_WORDS = 40_344
+DOC_WORDS = 40_303
 
 
 @cache
