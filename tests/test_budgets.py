@@ -26,12 +26,12 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/sources": (12_534, 104_664, 50),
     "hma_data/storage": (1_655, 10_881, 11),
     "hma_data/tokenizers": (3_251, 23_456, 17),
-    "hma_model": (510, 3_000, 4),
+    "hma_model": (505, 3_000, 4),
     "hma_model/benchmark": (845, 7_250, 5),
     "hma_model/checkpoint": (885, 6_600, 5),
     "hma_model/cli": (1_721, 10_700, 12),
     "hma_model/demo": (485, 4_100, 4),
-    "hma_model/evaluation": (4_470, 36_000, 23),
+    "hma_model/evaluation": (4_465, 35_950, 23),
     "hma_model/export": (1_056, 8_078, 8),
     "hma_model/generation": (1_670, 13_500, 10),
     "hma_model/hub": (1_060, 8_200, 6),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_515, 28_900, 18),
     "hma_model/worlds": (1_520, 11_300, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_703, 511_161
+PRODUCT_LINES, PRODUCT_NODES = 64_700, 511_161
 TEST_LINES = 48_087
 DOC_WORDS = 40_303
 

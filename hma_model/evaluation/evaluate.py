@@ -315,9 +315,11 @@ def _notes(
         )
     if not config.sees_actions:
         notes.append("it was trained without action inputs, so all rollouts ignore actions")
-    if wrong := sum(int((~part.finite).sum()) for part in joined.values()):
-        total = sum(part.finite.size for part in joined.values())
-        notes.append(f"{wrong} of {total} predicted frames are NaN or infinite: the checkpoint has diverged")
+    finite = np.isfinite(np.concatenate([part.psnr.ravel() for part in joined.values()]))
+    if wrong := int((~finite).sum()):
+        notes.append(
+            f"{wrong} of {finite.size} predicted frames are NaN or infinite: the checkpoint has diverged"
+        )
     if table["loss"] is None:
         notes.append("the loss is not finite: the checkpoint has diverged")
     if 2 * still > count:

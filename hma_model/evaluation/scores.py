@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from hma_data.loading.dataset import Batch
-from hma_model.arrays import Bools, Floats
+from hma_model.arrays import Floats
 from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, Episodes, horizon_summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, SSIM_RANGE, psnr, ssim
@@ -29,7 +29,6 @@ class Scores:
     psnr: Floats
     ssim: Floats
     lpips: Floats | None
-    finite: Bools
 
     @classmethod
     def of(cls, pictures: RolloutImages, judge: FeatureCollector | None = None) -> "Scores":
@@ -44,27 +43,21 @@ class Scores:
         if judge and judge.networks.lpips:
             lpips = known(judge.networks.lpips_of(truth, predicted))
         signal = psnr(truth, predicted, limit=PSNR_LIMIT)
-        return cls(known(signal), known(ssim(truth, predicted)), lpips, pictures.finite)
+        return cls(known(signal), known(ssim(truth, predicted)), lpips)
 
     @classmethod
     def mean(cls, draws: "list[Scores]") -> "Scores":
         """Return the means over draws."""
-        return cls._combined(draws, partial(np.mean, axis=0), partial(np.all, axis=0))
+        return cls._combined(draws, partial(np.mean, axis=0))
 
     @classmethod
     def join(cls, batches: "list[Scores]") -> "Scores":
-        return cls._combined(batches, np.concatenate, np.concatenate)
+        return cls._combined(batches, np.concatenate)
 
     @classmethod
-    def _combined(
-        cls, parts: "list[Scores]", rule: Callable[..., Any], of_finite: Callable[..., Any]
-    ) -> "Scores":
-        return cls(
-            rule([part.psnr for part in parts]),
-            rule([part.ssim for part in parts]),
-            None if parts[0].lpips is None else rule([part.lpips for part in parts]),
-            of_finite([part.finite for part in parts]),
-        )
+    def _combined(cls, parts: "list[Scores]", rule: Callable[..., Any]) -> "Scores":
+        lpips = None if parts[0].lpips is None else rule([part.lpips for part in parts])
+        return cls(rule([part.psnr for part in parts]), rule([part.ssim for part in parts]), lpips)
 
     def figures(self, seed: int, episodes: Episodes = None) -> dict[str, Any]:
         """Return the means over windows, with their intervals; `episodes` are the windows' own."""
