@@ -203,6 +203,15 @@ def toy_recording(toy_file: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(toy_file, tmp_path))
 
 
+@pytest.fixture
+def toy_yaml(tmp_path: Path) -> Path:
+    """The YAML of that robot beside `toy.hdf5`, a recording of three episodes of 14 to 16 frames."""
+    write_toy(tmp_path / "toy.hdf5", [14, 15, 16])
+    path = tmp_path / "toy_arm.yaml"
+    path.write_text(ARM_YAML)
+    return path
+
+
 SMALL = Settings(val_fraction=0.2, shard_frames=60)  # several shards of each split
 
 

@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_520, 11_300, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_700, 511_161
-TEST_LINES = 48_087
+TEST_LINES = 48_086
 DOC_WORDS = 40_303
 
 

@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from hma_data.registry.embodiment import Embodiment
 from tests.data.bag_files import START_NS, arm
+from tests.hostile import without_index
 
 LATE_NS = 5_000_000
 CAMERA, COMMAND, GRIPPER, STATE, TASK = "/cam", "/command", "/gripper", "/state", "/task"
@@ -112,11 +113,7 @@ def ros1(folder: Path, run: Run, compression: str | None = None, chunk: int = 40
 def ros1_without_index(folder: Path, run: Run) -> Path:
     """As a recorder that was killed leaves it."""
     path = ros1(folder, run)
-    data = bytearray(path.read_bytes())
-    at = data.index(b"index_pos=") + len(b"index_pos=")
-    data = data[: int.from_bytes(data[at : at + 8], "little")]
-    data[at : at + 8] = bytes(8)
-    path.write_bytes(data)
+    path.write_bytes(without_index(path.read_bytes()))
     return path
 
 

@@ -4,7 +4,6 @@ import json
 import os
 import random
 import signal
-import threading
 import time
 import uuid
 from contextlib import suppress
@@ -23,6 +22,7 @@ from hma_data.storage.remote import is_remote, place
 from tests.conftest import SMALL, BlockTokenizer, StoppingTokenizer, write_toy
 from tests.conftest import convert_toy as run
 from tests.data.conversion.jobs import ends, files, start
+from tests.hostile import at_once
 
 S3 = pytest.param("s3", marks=pytest.mark.slow)
 IN_PROCESS = pytest.mark.parametrize("out", ["folder", "memory"], indirect=True)
@@ -91,11 +91,7 @@ def test_shares_in_any_order_make_what_one_job_makes(count, toy_arm, toy_file, o
 @IN_PROCESS
 def test_shares_run_side_by_side_and_one_of_them_finishes(toy_arm, toy_file, out, whole) -> None:
     job = Conversion(toy_arm, toy_file, BlockTokenizer(), out, settings=SMALL)
-    threads = [threading.Thread(target=job.run_share, args=(Share(i, 3),)) for i in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(job.run_share, [Share(i, 3) for i in range(3)])
     assert files(out) == whole
 
 

@@ -1,6 +1,5 @@
 """A YAML edited after the conversion: the same command brings target_hz and stride into a finished set."""
 
-import threading
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from hma_data.storage.locks import LOCK
 from tests.command import hma
 from tests.conftest import ARM_YAML, SMALL, BlockTokenizer, contents, write_toy
 from tests.conftest import convert_toy as run
+from tests.hostile import at_once
 
 
 def robot(target_hz: float = 5, more: str = "") -> Embodiment:
@@ -120,11 +120,7 @@ def test_shares_that_find_a_finished_set_bring_the_stride_once(toy_recording, tm
             if isinstance(summary := job.run_share(share), Summary):
                 done.append(summary)
 
-    threads = [threading.Thread(target=work, args=(index,)) for index in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(work, range(3))
     assert [item.changed for item in done if item.changed] == ["stride 10 → 2: the model now sees 5 Hz"]
     assert shards(out) == before and verify(out) == [] and ShardSet(out).embodiment.stride == 2
 
@@ -138,10 +134,15 @@ def test_a_share_of_a_finished_set_writes_nothing_where_nothing_has_changed(toy_
     assert (out / "manifest.json").stat().st_mtime_ns == before
 
 
+def first_day(folder: Path) -> Path:
+    """A folder of recordings, with that of monday."""
+    (folder / "recorded").mkdir()
+    write_toy(folder / "recorded/monday.hdf5", range(20, 26))
+    return folder / "recorded"
+
+
 def test_an_extended_set_takes_the_stride_with_and_without_new_episodes(tmp_path) -> None:
-    recording, out = tmp_path / "recorded", tmp_path / "out"
-    recording.mkdir()
-    write_toy(recording / "monday.hdf5", range(20, 26))
+    recording, out = first_day(tmp_path), tmp_path / "out"
     run(robot(1), recording, out)
     write_toy(recording / "tuesday.hdf5", range(20, 26))
     extended = run(robot(5), recording, out, extend=True)
@@ -152,9 +153,7 @@ def test_an_extended_set_takes_the_stride_with_and_without_new_episodes(tmp_path
 
 
 def test_an_extension_killed_before_its_manifest_is_finished_by_the_next_run(tmp_path, monkeypatch) -> None:
-    recording, out = tmp_path / "recorded", tmp_path / "out"
-    recording.mkdir()
-    write_toy(recording / "monday.hdf5", range(20, 26))
+    recording, out = first_day(tmp_path), tmp_path / "out"
     run(robot(), recording, out)
     write_toy(recording / "tuesday.hdf5", range(20, 26))
 

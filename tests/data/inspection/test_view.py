@@ -16,7 +16,7 @@ from hma_data.inspection.view import view_recording, view_shards
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from tests.command import fails, hma
-from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.conftest import ARM_YAML, BlockTokenizer
 
 
 def reader(path: Path) -> Any:
@@ -44,16 +44,8 @@ def pictures(entity: dict[str, list[Any]]) -> np.ndarray:
     return np.stack([cv2.imdecode(blob, cv2.IMREAD_COLOR)[..., ::-1] for blob in blobs])
 
 
-@pytest.fixture
-def arm(tmp_path: Path) -> Path:
-    """The YAML of the toy arm, beside its recording `toy.hdf5`."""
-    write_toy(tmp_path / "toy.hdf5", [14, 15, 16])
-    (tmp_path / "toy_arm.yaml").write_text(ARM_YAML)
-    return tmp_path / "toy_arm.yaml"
-
-
-def test_a_recording_is_shown_frame_by_frame(arm: Path, tmp_path: Path) -> None:
-    view_recording(tmp_path / "toy.hdf5", arm, 1).save(tmp_path / "seen.rrd")
+def test_a_recording_is_shown_frame_by_frame(toy_yaml: Path, tmp_path: Path) -> None:
+    view_recording(tmp_path / "toy.hdf5", toy_yaml, 1).save(tmp_path / "seen.rrd")
     found = read(tmp_path / "seen.rrd")
     with h5py.File(tmp_path / "toy.hdf5") as file:
         actions, image = file["data/demo_1/actions"][:], file["data/demo_1/obs/image"][:]
@@ -71,7 +63,7 @@ def test_a_recording_is_shown_frame_by_frame(arm: Path, tmp_path: Path) -> None:
     assert list(reader(tmp_path / "seen.rrd").blueprints())
 
 
-def test_a_shard_set_is_shown_by_its_decoded_tokens(arm: Path, tmp_path: Path) -> None:
+def test_a_shard_set_is_shown_by_its_decoded_tokens(toy_yaml: Path, tmp_path: Path) -> None:
     settings = Settings(val_fraction=0.3, cameras=("top", "side"))
     robot, tokenizer = Embodiment.from_yaml(ARM_YAML), BlockTokenizer()
     convert(robot, str(tmp_path / "toy.hdf5"), tokenizer, tmp_path / "set", settings=settings)
@@ -89,7 +81,7 @@ def test_a_shard_set_is_shown_by_its_decoded_tokens(arm: Path, tmp_path: Path) -
         assert shown.shape == decoded.shape and np.abs(shown - decoded).max() < 8
 
 
-def test_unknown_actions_are_a_gap(arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_actions_are_a_gap(toy_yaml: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from hma_data.inspection import view as module
 
     whole = module.to_clip
@@ -100,17 +92,17 @@ def test_unknown_actions_are_a_gap(arm: Path, tmp_path: Path, monkeypatch: pytes
         return clip
 
     monkeypatch.setattr(module, "to_clip", masked)
-    view_recording(tmp_path / "toy.hdf5", arm).save(tmp_path / "seen.rrd")
+    view_recording(tmp_path / "toy.hdf5", toy_yaml).save(tmp_path / "seen.rrd")
     values = np.array(read(tmp_path / "seen.rrd")["/actions"]["Scalars:scalars"])
     assert np.isnan(values[:4]).all() and np.isfinite(values[4:]).all()
 
 
-def test_what_cannot_be_shown_says_what_to_do(arm, tmp_path, monkeypatch) -> None:
+def test_what_cannot_be_shown_says_what_to_do(toy_yaml, tmp_path, monkeypatch) -> None:
     recording = tmp_path / "toy.hdf5"
     fails(hma("view", recording), 2, "add -e ROBOT")
-    fails(hma("view", recording, "-e", arm, "--episode", 3), 2, "3 episodes")
-    fails(hma("view", recording, "-e", arm, "--out", "seen.mp4"), 2, ".rrd")
+    fails(hma("view", recording, "-e", toy_yaml, "--episode", 3), 2, "3 episodes")
+    fails(hma("view", recording, "-e", toy_yaml, "--out", "seen.mp4"), 2, ".rrd")
     monkeypatch.setitem(__import__("sys").modules, "rerun", None)
-    fails(hma("view", recording, "-e", arm), 1, "uv sync --inexact --extra view")
+    fails(hma("view", recording, "-e", toy_yaml), 1, "uv sync --inexact --extra view")
     with pytest.raises(MissingDependencyError):
-        view_recording(recording, arm)
+        view_recording(recording, toy_yaml)

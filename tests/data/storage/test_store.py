@@ -142,14 +142,20 @@ def test_a_remote_set_reads_as_the_local_one(both: tuple[Path, RemotePath], cach
     )
 
 
+def damaged_shard(folder: RemotePath) -> str:
+    """Change a byte of the first shard; return its path in the set."""
+    name = ShardSet(folder).manifest.shards[0].path
+    data = bytearray((folder / name).read_bytes())
+    data[100] ^= 1
+    put_bytes(bytes(data), folder / name)
+    return name
+
+
 def test_info_and_verify_take_uris(both: tuple[Path, RemotePath]) -> None:
     assert {**describe(Path(str(both[1]))), "folder": ""} == {**describe(both[0]), "folder": ""}
     assert verify(Path(str(both[1]))) == []
     put_bytes(b"stray", both[1] / "train/stray.txt")
-    name = ShardSet(both[1]).manifest.shards[0].path
-    data = bytearray((both[1] / name).read_bytes())
-    data[100] ^= 1
-    put_bytes(bytes(data), both[1] / name)
+    name = damaged_shard(both[1])
     problems = verify(both[1])
     assert any("sha256 differs" in problem and name in problem for problem in problems)
     assert any("train/stray.txt: is not in the manifest" in problem for problem in problems)
@@ -167,10 +173,7 @@ def test_a_set_that_is_not_there_is_one_clear_error(bucket: RemotePath) -> None:
 
 
 def test_a_copy_with_other_bytes_than_the_manifest_says_is_refused(both: tuple[Path, RemotePath]) -> None:
-    name = ShardSet(both[1]).manifest.shards[0].path
-    data = bytearray((both[1] / name).read_bytes())
-    data[100] ^= 1
-    put_bytes(bytes(data), both[1] / name)
+    name = damaged_shard(both[1])
     with pytest.raises(ShardError, match="its bytes are not those of the manifest"):
         ShardSet(both[1]).read(name, [0], ["action"])
     assert not list((shard_cache.cache_folder() / "shards").iterdir())

@@ -23,6 +23,7 @@ from hma_data.storage.remote import RemotePath, place, put_bytes
 from tests.conftest import SMALL, write_toy
 from tests.conftest import convert_toy as run
 from tests.data.conversion.jobs import files
+from tests.hostile import at_once
 
 
 @pytest.fixture(autouse=True)
@@ -199,11 +200,7 @@ def test_of_several_plans_at_once_one_is_made(toy_arm, toy_recording, out, tmp_p
         except OutputError as fault:
             refused.append(str(fault))
 
-    threads = [threading.Thread(target=one, args=[seed]) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(one, range(4))
     assert len(made) == 1 and len(refused) == 3
     run(toy_arm, toy_recording, tmp_path / "alone", settings=replace(SMALL, seed=made[0]))
     assert files(out) == files(tmp_path / "alone")

@@ -30,7 +30,6 @@ from hma_data.tokenizers.training.eval import (
     write_report,
 )
 from hma_data.tokenizers.training.frames import films_of, read_films
-from tests.conftest import ARM_YAML, write_toy
 from tests.data.tokenizer_files import draw_scene
 
 RUNNER = CliRunner()
@@ -46,12 +45,8 @@ def pictures(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def arm(tmp_path: Path) -> tuple[Embodiment, Path]:
-    """A robot of two cameras, and a recording of three episodes."""
-    write_toy(tmp_path / "toy.hdf5", [14, 15, 16])
-    path = tmp_path / "toy_arm.yaml"
-    path.write_text(ARM_YAML)
-    return Embodiment.load(path), tmp_path / "toy.hdf5"
+def arm(toy_yaml: Path) -> tuple[Embodiment, Path]:
+    return Embodiment.load(toy_yaml), toy_yaml.with_name("toy.hdf5")
 
 
 # -- frames

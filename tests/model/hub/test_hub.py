@@ -1,6 +1,5 @@
 """Hubs in folders and behind fsspec: one embodiment at a time, atomic, and never another trunk."""
 
-import threading
 from pathlib import Path
 
 import fsspec
@@ -16,6 +15,7 @@ from hma_model.hub.listing import list_embodiments
 from hma_model.hub.stores import FolderStore
 from hma_model.network.model import HMA
 from tests.conftest import contents
+from tests.hostile import at_once
 from tests.model.robots import make_model, save
 from tests.model.robots import yaml as robot_yaml
 
@@ -198,11 +198,7 @@ def test_a_failed_push_leaves_the_hub_as_it_was(source, tmp_path, monkeypatch):
 def test_people_who_push_at_once_all_get_in_and_into_the_readme(source, tmp_path):
     names = [f"robot{number}" for number in range(4)]
     folders = [other_robot(source, tmp_path / name, name, 2, seed) for seed, name in enumerate(names)]
-    threads = [threading.Thread(target=hub.push, args=(folder, tmp_path / "hub")) for folder in folders]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(lambda folder: hub.push(folder, tmp_path / "hub"), folders)
     assert sorted(checkpoint.load(tmp_path / "hub").embodiments) == names
     page = (tmp_path / "hub/README.md").read_text()
     assert all(f"| `{name}` |" in page for name in names)

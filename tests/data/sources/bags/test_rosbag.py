@@ -32,6 +32,7 @@ from tests.data.bag_files import (
     write_ros1,
 )
 from tests.data.hub_cache import as_snapshot
+from tests.hostile import without_index
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -95,12 +96,8 @@ def test_a_clip_of_a_bag_pairs_each_picture_with_the_command_in_force(bags, reco
 
 
 def test_a_bag_without_index_is_read_to_its_end(bags, recording, tmp_path) -> None:
-    data = bytearray(bags["ros1-lz4"].read_bytes())
-    at = data.index(b"index_pos=") + len(b"index_pos=")
-    data = data[: int.from_bytes(data[at : at + 8], "little")]  # a recorder that was killed
-    data[at : at + 8] = bytes(8)
     path = tmp_path / "killed.bag.active"
-    path.write_bytes(data)
+    path.write_bytes(without_index(bags["ros1-lz4"].read_bytes()))
     assert SOURCE.index(str(path), arm())[0].frames == len(recording.pictures)
     np.testing.assert_array_equal(read(path, arm()).actions[0].values, recording.commands.astype(np.float32))
 

@@ -20,6 +20,7 @@ from hma_data.registry.components import Camera
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from tests.data.fresh import run_fresh
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture, turn
+from tests.hostile import damage
 
 LENGTH = 40
 
@@ -135,14 +136,8 @@ def test_a_playlist_named_mp4_opens_nothing_else(tmp_path: Path, video: Path) ->
 
 @given(data=st.data())
 def test_a_cut_or_flipped_file_gives_right_frames_or_our_error(video, tmp_path, data) -> None:
-    whole = bytearray(video.read_bytes())
-    at = data.draw(st.integers(0, len(whole) - 1))
-    if cut := data.draw(st.booleans()):
-        whole = whole[:at]
-    else:
-        whole[at] ^= data.draw(st.integers(1, 255))
-    path = tmp_path / "bad.mp4"
-    path.write_bytes(whole)
+    path = Path(shutil.copyfile(video, tmp_path / "bad.mp4"))
+    cut = damage(data, path)
     try:
         file = VideoFile(path)
         frames = file.frames(range(min(len(file), 1000)))

@@ -14,6 +14,7 @@ from hma_data.sources.base import open_source
 from hma_data.sources.hands.runs import videos_of
 from tests.data import hands_files as made
 from tests.data.videos import HEIGHT, WIDTH
+from tests.hostile import damage
 
 LENGTH = 30
 
@@ -165,13 +166,7 @@ def test_any_cut_or_changed_byte_ends_in_an_error_of_ours_or_a_reading(folder, c
     else:
         table = folder / ("hands.csv" if name == "a.mp4" else name)
         made.write_table(table, made.rows("a", LENGTH))
-    content = bytearray((folder / name).read_bytes())
-    at = data.draw(st.integers(0, len(content) - 1))
-    if data.draw(st.booleans()):
-        content = content[:at]
-    else:
-        content[at] ^= data.draw(st.integers(1, 255))
-    (folder / name).write_bytes(content)
+    damage(data, folder / name)
     source, robot = open_source("hands"), made.hand_video(labels)
     try:
         for ref in source.index(str(folder), robot):

@@ -23,6 +23,7 @@ from hma_data.sources.hdf5.file import OPEN_FILES, rows
 from tests.data.fresh import run_fresh
 from tests.data.hdf5_files import H, T, W, embodiment, fill
 from tests.data.hub_cache import as_snapshot
+from tests.hostile import damage
 
 
 @pytest.fixture
@@ -423,14 +424,8 @@ def test_a_damaged_file_among_others_is_one_refused_episode(demos: Path) -> None
 
 @given(data=st.data())
 def test_a_cut_or_flipped_file_gives_only_our_errors(demos: Path, data: st.DataObject) -> None:
-    whole = bytearray(demos.read_bytes())
-    at = data.draw(st.integers(0, len(whole) - 1))
-    if data.draw(st.booleans()):
-        whole = whole[:at]
-    else:
-        whole[at] ^= data.draw(st.integers(1, 255))
-    path = demos.with_name("bad.hdf5")
-    path.write_bytes(whole)
+    path = Path(shutil.copyfile(demos, demos.with_name("bad.hdf5")))
+    damage(data, path)
     source = open_source("hdf5")
     try:
         source.inspect(str(path))

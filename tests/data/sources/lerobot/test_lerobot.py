@@ -34,6 +34,7 @@ from tests.data.videos import (
     make_v3,
     number_of,
 )
+from tests.hostile import damage
 
 LENGTHS = (12, 9, 15)
 
@@ -356,13 +357,7 @@ def test_a_cut_or_flipped_file_gives_only_our_errors(originals, tmp_path_factory
     shutil.copytree(originals[data.draw(st.sampled_from(["v2", "v3"]))], folder)
     files = sorted(path for path in folder.rglob("*.*") if path.is_file())
     path = data.draw(st.sampled_from(files))
-    content = bytearray(path.read_bytes())
-    at = data.draw(st.integers(0, len(content) - 1))
-    if data.draw(st.booleans()):
-        content = content[:at]
-    else:
-        content[at] ^= data.draw(st.integers(1, 255))
-    path.write_bytes(content)
+    damage(data, path)
     source = open_source("lerobot")
     try:
         source.inspect(str(folder))
