@@ -360,7 +360,7 @@ def test_without_a_usable_episode_nothing_is_written(tmp_path: Path) -> None:
 
 def test_a_store_and_an_extension_are_refused(tmp_path: Path) -> None:
     data, robot = hdf5(tmp_path)
-    with pytest.raises(UsageError, match="no folder of this machine"):
+    with pytest.raises(UsageError, match="is not a local folder"):
         to_lerobot(robot, data, "memory://somewhere/set")
     with pytest.raises(UsageError, match="--extend"):
         to_lerobot(robot, data, tmp_path / "out", extend=True)

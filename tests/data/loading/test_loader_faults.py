@@ -165,7 +165,7 @@ def test_one_flipped_bit_of_a_column_is_found(sets: list[Path], column: str) -> 
 
 def test_sets_of_two_tokenizers_are_refused_naming_both(sets: list[Path]) -> None:
     edit(sets[1], lambda values: values["tokenizer"].update(weights_sha256="0" * 64))
-    with pytest.raises(ShardError, match="one mixture takes one tokenizer") as raised:
+    with pytest.raises(ShardError, match="a mixture needs one tokenizer") as raised:
         MixtureDataset(sets, 4, 6)
     assert str(sets[0]) in str(raised.value) and str(sets[1]) in str(raised.value)
 

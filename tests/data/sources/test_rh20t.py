@@ -80,7 +80,7 @@ def test_scenes_are_found_in_nested_folders_and_films_of_people_are_not(recordin
     assert {detect(path) for path in (recording, recording.parent, recording / SCENE)} == {"rh20t"}
     shutil.rmtree(recording / SCENE)
     shutil.rmtree(recording / second)
-    with pytest.raises(SourceError, match="films of people"):
+    with pytest.raises(SourceError, match="videos of people"):
         open_source("rh20t").index(recording)
 
 

@@ -274,7 +274,7 @@ def test_latents_too_large_to_store_are_refused(tmp_path, weights):
     state = load_file(weights)
     state["encoder.layers.8.bias"] = torch.full((4,), 1e6)
     save_file(state, tmp_path / "loud.safetensors")
-    with pytest.raises(TokenizerError, match="float16 cannot hold"):
+    with pytest.raises(TokenizerError, match="too large for float16"):
         get_tokenizer("taesd", weights=str(tmp_path / "loud.safetensors")).encode(frames(1))
 
 

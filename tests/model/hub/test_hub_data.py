@@ -126,7 +126,7 @@ def test_another_robots_set_is_not_overwritten(server, shards, tmp_path):
     push_data(shards, REPO)
     before = dataset(server).files
     with pytest.raises(
-        HubError, match=r"holds the shard set of arm under raw, not of hand.*a place of its own"
+        HubError, match=r"holds the shard set of arm under raw, not of hand.*push to another address"
     ):
         push_data(make_shards(tmp_path / "hand", "hand"), REPO)
     assert dataset(server).files == before

@@ -61,7 +61,7 @@ BAD_LABELS = {
     "no parquet": ("landmarks", {"hands.parquet": "PAR1 or so"}, "cannot be read"),
     "no side": ("landmarks", {"hands.csv": "video,frame,x,y\na,1,0.5,0.5\n"}, "has no column 'side'"),
     "odd side": ("landmarks", {"hands.csv": "video,frame,side,x,y\na,1,up,0.5,0.5\n"}, "'side' holds 'up'"),
-    "no place": ("landmarks", {"hands.csv": "video,frame,side\na,1,left\n"}, "no columns that place a hand"),
+    "no place": ("landmarks", {"hands.csv": "video,frame,side\na,1,left\n"}, "no columns with hand"),
     "word": ("landmarks", {"hands.csv": "video,frame,side,x,y\na,one,left,1,1\n"}, "cannot be read: .*one"),
     "torn": ("landmarks", {"hands.csv": "video,frame,side,x,y\na,1,left\n"}, "Expected 5 columns, got 3"),
     "other videos": ("landmarks", {"hands.csv": "video,frame,side,x,y\nz,1,left,1,1\n"}, "labels are of z"),
