@@ -92,7 +92,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: st
         return
     table = Table(title=Text(title) if title else None, title_justify="left", box=SIMPLE, pad_edge=False)
     for i, name in enumerate(columns):
-        numeric = _is_numeric([row[i] for row in rows])
+        numeric = is_numeric([row[i] for row in rows])
         table.add_column(Text(name), justify="right" if numeric else "left", no_wrap=numeric)
     for row in cells:
         table.add_row(*map(Text, row))
@@ -116,7 +116,7 @@ def _print_paragraphs(console: Any, columns: Sequence[str], cells: list[list[str
         console.print(Padding(named, (0, 0, 0, 2)))
 
 
-def _is_numeric(values: Sequence[Any]) -> bool:
+def is_numeric(values: Sequence[Any]) -> bool:
     """Check whether a column holds numbers and no words; "unknown" stands for a number."""
     words = [value for value in values if isinstance(value, str) and value != "unknown"]
     return not words and any(isinstance(value, int | float | Decimal) for value in values)

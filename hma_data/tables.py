@@ -7,11 +7,10 @@ leave its column.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import Decimal
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from hma_data.console import cell_text, print_table
+from hma_data.console import cell_text, is_numeric, print_table
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -44,7 +43,7 @@ class Table:
         """Return it as HTML; columns of numbers are aligned to the right."""
         from markupsafe import Markup
 
-        numeric = [_is_numeric([row[column] for row in self.rows]) for column in range(len(self.columns))]
+        numeric = [is_numeric([row[column] for row in self.rows]) for column in range(len(self.columns))]
         lines = [[_shown(cell).partition("\n")[::2] for cell in line] for line in (self.columns, *self.rows)]
         dense = len(self.columns) > MANY_COLUMNS
         return Markup(fill("hma_data", "table.html", lines=lines, numeric=numeric, dense=dense))
@@ -66,11 +65,6 @@ def _environment(package: str) -> "Environment":
         trim_blocks=True,
         lstrip_blocks=True,
     )
-
-
-def _is_numeric(cells: Sequence[Any]) -> bool:
-    known = [cell for cell in cells if cell is not None]
-    return bool(known) and all(isinstance(cell, int | float | Decimal) for cell in known)
 
 
 def _shown(cell: Any) -> str:

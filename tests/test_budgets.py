@@ -13,17 +13,17 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (667, 3_755, 7),
+    "hma_data": (661, 3_695, 7),
     "hma_data/cli": (1_545, 11_038, 8),
     "hma_data/conversion": (4_210, 31_264, 14),
-    "hma_data/episodes": (1_677, 14_704, 9),
+    "hma_data/episodes": (1_670, 14_636, 9),
     "hma_data/hub": (512, 3_787, 3),
-    "hma_data/inspection": (2_153, 20_106, 8),
-    "hma_data/lab": (3_327, 30_634, 16),
-    "hma_data/loading": (1_285, 10_976, 6),
-    "hma_data/registry": (1_283, 8_240, 6),
-    "hma_data/shards": (2_533, 19_482, 11),
-    "hma_data/sources": (12_534, 104_664, 50),
+    "hma_data/inspection": (2_151, 20_090, 8),
+    "hma_data/lab": (3_327, 30_594, 16),
+    "hma_data/loading": (1_283, 10_976, 6),
+    "hma_data/registry": (1_287, 8_311, 6),
+    "hma_data/shards": (2_532, 19_464, 11),
+    "hma_data/sources": (12_519, 104_603, 50),
     "hma_data/storage": (1_655, 10_881, 11),
     "hma_data/tokenizers": (3_251, 23_456, 17),
     "hma_model": (505, 3_000, 4),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_515, 28_900, 18),
     "hma_model/worlds": (1_520, 11_300, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_700, 511_161
+PRODUCT_LINES, PRODUCT_NODES = 64_665, 510_920
 TEST_LINES = 48_086
 DOC_WORDS = 40_303
 

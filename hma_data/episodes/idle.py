@@ -63,17 +63,12 @@ def _may_be_motion(part: Component, action: Action) -> bool:
 
 def _numbers(clip: Clip, embodiment: Embodiment) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the values (T, n) of action and state that are no motions, and by how much each may change."""
-    found: list[NDArray[np.float64]] = [np.zeros((len(clip), 0))]
-    limits: list[NDArray[np.float64]] = [np.zeros(0)]
-    for part, values in _parts(clip.actions, embodiment.action):
-        if not _is_motion(part, embodiment.action):
-            found.append(values)
-            limits.append(_limits(values))
+    action = embodiment.action
+    found = [values for part, values in _parts(clip.actions, action) if not _is_motion(part, action)]
     if embodiment.state is not None and clip.states is not None:
-        for _, values in _parts(clip.states, embodiment.state):
-            found.append(values)
-            limits.append(_limits(values))
-    return np.concatenate(found, axis=1), np.concatenate(limits)
+        found += [values for _, values in _parts(clip.states, embodiment.state)]
+    none = np.zeros((len(clip), 0))  # where all values are motions
+    return np.concatenate([none, *found], axis=1), np.concatenate([none[0], *map(_limits, found)])
 
 
 def _limits(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -91,6 +86,4 @@ def _motions(clip: Clip, action: Action) -> NDArray[np.bool_]:
 
 
 def _parts(values: NDArray[np.float32], vector: Vector) -> list[tuple[Component, NDArray[np.float64]]]:
-    ends = np.cumsum([part.dims for part in vector.components])
-    pieces = np.split(values.astype(np.float64), ends[:-1], axis=1)
-    return list(zip(vector.components, pieces, strict=True))
+    return [(part, values[:, span].astype(np.float64)) for part, span in vector.spans()]

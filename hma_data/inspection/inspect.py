@@ -422,10 +422,8 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
     wild = [f"{names[i]} {actions[:, i].min():.4g} to {actions[:, i].max():.4g}" for i in np.flatnonzero(far)]
     if wild:
         yield Finding("outliers", "warn", f"values more than 30 deviations off: {', '.join(wild)}")
-    at = 0
-    for part in robot.action.components:
-        values = actions[:, at : at + part.dims]
-        at += part.dims
+    for part, span in robot.action.spans():
+        values = actions[:, span]
         low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
         if part.range and values.size and not part.range[0] <= low <= high <= part.range[1]:
             said = f"{part.key} lies in {low:.4g} to {high:.4g}, its range says {list(part.range)}"

@@ -4,6 +4,7 @@ They are frozen and validated when made; `hma_data.registry.embodiment` puts the
 """
 
 import re
+from itertools import accumulate, pairwise
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -122,6 +123,11 @@ class Vector(SpecModel):
     def dims(self) -> int:
         """Return the width of the whole vector."""
         return sum(component.dims for component in self.components)
+
+    def spans(self) -> list[tuple[Component, slice]]:
+        """Return each component with the place of its values in the vector."""
+        edges = pairwise(accumulate((component.dims for component in self.components), initial=0))
+        return [(component, slice(*edge)) for component, edge in zip(self.components, edges, strict=True)]
 
     def names(self) -> list[str]:
         """Return a name for each value, made from the key where the YAML gives none."""

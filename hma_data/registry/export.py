@@ -49,10 +49,8 @@ def _modalities(vector: Vector | None, feature: str, own: bool, delta: bool) -> 
         return {}
     found: dict[str, dict[str, Any]] = {}
     names = component_names(vector)
-    offset = 0
-    for name, component in zip(names, vector.components, strict=True):
-        start = (component.slice[0] if component.slice else 0) if own else offset
-        offset += component.dims
+    for name, (component, span) in zip(names, vector.spans(), strict=True):
+        start = (component.slice[0] if component.slice else 0) if own else span.start
         moves = (
             delta
             if component.gripper is None

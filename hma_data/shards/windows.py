@@ -41,8 +41,6 @@ class WindowIndex:
         short_episodes: number of episodes left out because they, or all their pieces, are too short.
         padded_episodes: number of short pieces that are padded and give one window.
         divided_episodes: number of episodes that a pause divides.
-        unit_first: (G+1,) number of windows before each row group; row group g starts windows
-            unit_first[g] to unit_first[g+1].
         edges: (G+1,) first row of each row group.
         groups: (G, 2) shard index and row group in it.
     """
@@ -54,7 +52,6 @@ class WindowIndex:
     short_episodes: int
     padded_episodes: int
     divided_episodes: int
-    unit_first: Ints
     edges: Ints
     groups: Ints
     _starts: Ints  # (N,) first row of each piece that has windows
@@ -91,7 +88,7 @@ class WindowIndex:
         before = np.concatenate([[0], np.cumsum(windows[keep])]).astype(np.int64)
         used = np.zeros(len(episodes.length), np.bool_)
         used[owner[keep]] = True
-        index = cls(
+        return cls(
             frames=frames,
             row_stride=stride,
             span=span,
@@ -99,15 +96,17 @@ class WindowIndex:
             short_episodes=int((~used).sum()),
             padded_episodes=int(padded.sum()),
             divided_episodes=len(np.unique(owner[1:][np.diff(owner) == 0])),
-            unit_first=np.zeros(0, np.int64),
             edges=edges,
             groups=groups,
             _starts=starts[keep],
             _lengths=lengths[keep],
             _before=before,
         )
-        object.__setattr__(index, "unit_first", index._windows_before(edges))
-        return index
+
+    @cached_property
+    def unit_first(self) -> Ints:
+        """Return (G+1,) windows before the row groups; group g starts unit_first[g] to unit_first[g+1]."""
+        return self._windows_before(self.edges)
 
     @cached_property
     def offsets(self) -> Ints:

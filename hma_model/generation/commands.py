@@ -55,12 +55,11 @@ class Commands:
         low, high = np.full((space.action_dim, 2), (-np.inf, np.inf), np.float32).T if seen is None else seen
         names: list[str] = [f"action_{i}" for i in range(space.action_dim)]
         if robot is not None:
-            names, at = robot.action.names(), 0
+            names = robot.action.names()
             low, high = low.copy(), high.copy()
-            for part in robot.action.components:
+            for part, span in robot.action.spans():
                 if part.range:
-                    low[at : at + part.dims], high[at : at + part.dims] = part.range
-                at += part.dims
+                    low[span], high[span] = part.range
         rate = robot.rate_hz if robot is not None and robot.states_rate else None
         return cls(embodiment, tuple(names), space.stride, rate, low, high, seen)
 

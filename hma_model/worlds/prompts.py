@@ -256,11 +256,10 @@ def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
     if len(keys) < len(robot.cameras):
         raise HMAError(folder, f"has {len(keys)} cameras, {robot.id} has {len(robot.cameras)}", PROMPT_FORMS)
     values = robot.to_dict()
-    at = 0
-    parts = []
-    for part in robot.action.components:
-        parts.append({"key": "action", "dims": part.dims, "slice": [at, at + part.dims]})
-        at += part.dims
+    parts = [
+        {"key": "action", "dims": part.dims, "slice": [span.start, span.stop]}
+        for part, span in robot.action.spans()
+    ]
     cameras = [
         {"name": camera.name, "key": key, "resize": camera.resize} for camera, key in zip(robot.cameras, keys)
     ]

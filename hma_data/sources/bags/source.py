@@ -313,9 +313,8 @@ class _EpisodeReading:
         A `stamp` at the camera or at a component says that its author knows better.
         """
         primary, stated = self._embodiment.primary_camera, self._embodiment.sync.stamp
-        state = self._embodiment.state.components if self._embodiment.state else ()
         others = [(camera.key, camera.stamp) for camera in self._embodiment.cameras]
-        for component in (*self._embodiment.action.components, *state):
+        for component in self._embodiment.components:
             others.append((parse_key(component.key, self._counts, self._where).topic, component.stamp))
         topics = dict.fromkeys(topic for topic, stamp in others if not (stamp or primary.stamp))
         clocks = []

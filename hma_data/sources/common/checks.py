@@ -174,8 +174,8 @@ def time_findings(key: str, times: StreamTimes, camera: bool = False, episode: s
     """
     where = f"{episode}: {key}" if episode else key
 
-    def found(check: str, said: str, remedy: str = "", **numbers: float) -> Finding:
-        return Finding(check, "warn", f"{where}: {said}", remedy, key, numbers)
+    def found(check: str, said: str, **numbers: float) -> Finding:
+        return Finding(check, "warn", f"{where}: {said}", key=key, numbers=numbers)
 
     if times.infinite:
         yield found("finite", f"{times.infinite} times are not finite", count=times.infinite)

@@ -5,12 +5,11 @@ import os
 import re
 from collections.abc import Collection
 from pathlib import Path
-from typing import BinaryIO, cast
 
 from hma_data.errors import SourceError
 from hma_data.sources.common.checks import Finding
 from hma_data.storage.kinds import unreadable
-from hma_data.storage.remote import RemotePath, is_remote, place, remote_file
+from hma_data.storage.remote import LargeFile, is_remote, place
 
 
 def is_away(uri: str) -> bool:
@@ -73,15 +72,10 @@ def leaves(path: Path, folder: Path) -> bool:
 def first_bytes(path: Path, count: int) -> bytes:
     """Return the first bytes of a file; empty when it cannot be read."""
     try:
-        with _opened(path) as file:
+        with LargeFile(path).open() as file:
             return file.read(count)
     except OSError:
         return b""
-
-
-def _opened(path: Path) -> BinaryIO:
-    """Open a file to read a few bytes at some places."""
-    return cast(BinaryIO, remote_file(path)) if isinstance(path, RemotePath) else path.open("rb")
 
 
 def file_fingerprint(path: Path) -> str:
@@ -91,7 +85,7 @@ def file_fingerprint(path: Path) -> str:
     """
     size = path.stat().st_size
     digest = hashlib.sha256(str(size).encode())
-    with _opened(path) as file:
+    with LargeFile(path).open() as file:
         for offset in (0, max(0, size // 2 - 32768), max(0, size - 65536)):
             file.seek(offset)
             digest.update(file.read(65536))

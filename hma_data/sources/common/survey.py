@@ -275,16 +275,8 @@ class Survey:
         if found and found[1] > 1e3 * max(period_s, own):
             said = f"{key}: p95 {found[1]:.1f} ms from the first camera's frames, max {found[2]:.1f} ms"
             numbers = dict(zip(("p50_ms", "p95_ms", "max_ms"), found, strict=True))
-            self.note(
-                Finding(
-                    "skew",
-                    "warn",
-                    said,
-                    "the stream pauses or loses messages; check the recording",
-                    key,
-                    numbers,
-                )
-            )
+            remedy = "the stream pauses or loses messages; check the recording"
+            self.note(Finding("skew", "warn", said, remedy, key, numbers))
 
     # -- results
 
