@@ -23,9 +23,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_283, 10_976, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_532, 19_464, 11),
-    "hma_data/sources": (12_519, 104_603, 50),
+    "hma_data/sources": (12_528, 104_699, 50),
     "hma_data/storage": (1_655, 10_881, 11),
-    "hma_data/tokenizers": (3_251, 23_456, 17),
+    "hma_data/tokenizers": (3_274, 23_686, 17),
     "hma_model": (505, 3_000, 4),
     "hma_model/benchmark": (845, 7_250, 5),
     "hma_model/checkpoint": (885, 6_600, 5),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_515, 28_900, 18),
     "hma_model/worlds": (1_520, 11_300, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_665, 510_920
-TEST_LINES = 48_086
+PRODUCT_LINES, PRODUCT_NODES = 64_697, 511_246
+TEST_LINES = 48_096
 DOC_WORDS = 40_303
 
 

@@ -1,14 +1,16 @@
 """`magvit2` and `magvit2-plain`: encode with Open-MAGVIT2, the discrete tokenizer of the paper's release.
 
 Both take 256×256 images and give 16×16 ids of 18 bits, two digits of 512. They load 1X's
-`magvit2.ckpt` (the default), checkpoints of its form, and plain safetensors of `encoder.*` and
+`magvit2.ckpt` (the default), TencentARC's checkpoints, and plain safetensors of `encoder.*` and
 `decoder.*`. Widths, levels and blocks are derived from the weights. Some checkpoints, 1X's among them,
 hold averaged weights (`model_ema.*`) beside the plain ones: `magvit2` uses the averaged weights. The
 paper's own loader overwrites the averaged weights with the plain ones: `magvit2-plain` gives that
 loader's ids.
 
 The network is a convolutional autoencoder whose latents are reduced to their signs (lookup-free
-quantisation, Yu et al. 2024). Parameter names are those of the released checkpoints.
+quantisation, Yu et al. 2024). Parameter names are those of the released checkpoints. The first
+checkpoints (1X's among them) have a plain decoder. In later ones (`adaptive`), each stage of the decoder
+has a group norm whose scale and shift come from the code.
 
 B images, S side, z channels of the code, h = S / 2^(levels-1). Pixels are in [-1, 1].
 """
@@ -55,12 +57,14 @@ class Magvit2Config:
         z: channels of the code, which is the number of bits of a token.
         mult: channels of each level as multiples of `base`; each level except the last halves the side.
         res_blocks: residual blocks a level.
+        adaptive: whether the decoder has adaptive group norms.
     """
 
     base: int = 128
     z: int = 18
     mult: tuple[int, ...] = (1, 1, 2, 2, 4)
     res_blocks: int = 2
+    adaptive: bool = False
 
     @property
     def stride(self) -> int:
@@ -136,6 +140,20 @@ class UpLevel(nn.Module):
         return self.upsample(self.block(x))
 
 
+class AdaptiveNorm(nn.Module):
+    """A group norm whose scale comes from the code's spread over the image, and its shift from the mean."""
+
+    def __init__(self, z: int, width: int) -> None:
+        super().__init__()
+        self.gamma, self.beta = nn.Linear(z, width), nn.Linear(z, width)
+
+    def forward(self, x: Tensor, codes: Tensor) -> Tensor:
+        flat = codes.flatten(2)
+        scale = self.gamma((flat.var(dim=2) + EPS).sqrt())
+        shift = self.beta(flat.mean(dim=2))
+        return functional.group_norm(x, GROUPS, eps=EPS) * scale[:, :, None, None] + shift[:, :, None, None]
+
+
 class Encoder(nn.Module):
     """The encoder: (B, 3, S, S) pixels -> (B, z, h, h), whose signs are the code."""
 
@@ -167,12 +185,16 @@ class Decoder(nn.Module):
         self.conv_in = nn.Conv2d(config.z, after[-1], 3, padding=1)
         self.mid_block = _blocks(after[-1], after[-1], config.res_blocks)
         self.up = nn.ModuleList(UpLevel(before[i], after[i], config.res_blocks, i == 0) for i in levels)
+        norms = (AdaptiveNorm(config.z, before[i]) for i in levels if config.adaptive)
+        self.adaptive = nn.ModuleList(norms)
         self.norm_out = nn.GroupNorm(GROUPS, after[0], eps=EPS)
         self.conv_out = nn.Conv2d(after[0], 3, 3, padding=1)
 
     def forward(self, codes: Tensor) -> Tensor:
         x = self.mid_block(self.conv_in(codes))
         for i in reversed(range(len(self.up))):
+            if self.adaptive:
+                x = self.adaptive[i](x, codes)
             x = self.up[i](x)
         return self.conv_out(functional.silu(self.norm_out(x)))
 
@@ -232,6 +254,7 @@ def derive_config(tensors: Mapping[str, Tensor]) -> Magvit2Config:
         z=tensors["encoder.conv_out.weight"].shape[0],
         mult=tuple(width // base for width in widths),
         res_blocks=len(numbers(tensors, "encoder.down.0.block.")),
+        adaptive=any(name.startswith("decoder.adaptive.") for name in tensors),
     )
 
 

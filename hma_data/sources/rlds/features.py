@@ -25,6 +25,7 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.rlds.example import Example
 
 Shape = tuple[int | None, ...]
+BFLOAT16 = "bfloat16"  # NumPy lacks this dtype: values become float32
 MAX_TENSOR_BYTES = 1 << 28  # most bytes of one value, against decompression bombs and errors
 
 # Content keys of a feature in features.json -> the class that wrote it; files before TFDS 4.6 name the class.
@@ -104,8 +105,8 @@ def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> Rlds
         return RldsFeature(name, "text", shape, "string", nesting)
     encoding = str(content.get("encoding") or "none").lower()
     try:
-        readable = np.dtype(dtype).kind in "fiub"
-    except TypeError:  # bfloat16, float8 and the like
+        readable = dtype == BFLOAT16 or np.dtype(dtype).kind in "fiub"
+    except TypeError:  # float8 and the like
         readable = False
     if not nesting and shape and shape[0] is None and encoding == "none":
         shape, nesting = shape[1:], (None,)  # an episode without `steps`: the tensor is the sequence
@@ -159,7 +160,7 @@ class Steps:
             values = self._decoded(feature, name)
             inner = values.shape[1:]
         else:
-            values = self.example.numbers(name).astype(feature.dtype, copy=False)
+            values = self.example.numbers(name).astype(_given(feature), copy=False)
         try:
             return values.reshape([*sizes, *(-1 if size is None else size for size in inner)])
         except ValueError as fault:
@@ -236,7 +237,7 @@ class Steps:
         values = [_tensor_of(blob, feature, shape, self.name) for blob, shape in zip(blobs, shapes)]
         if len({value.shape for value in values}) > 1:
             raise EpisodeError(self.name, f"{feature.name} changes shape from step to step")
-        return np.stack(values) if values else np.zeros((0, 0), feature.dtype)
+        return np.stack(values) if values else np.zeros((0, 0), _given(feature))
 
 
 def scalar(example: Example, feature: RldsFeature) -> Any:
@@ -247,21 +248,29 @@ def scalar(example: Example, feature: RldsFeature) -> Any:
         blobs = example.blobs(feature.name)
         return bytes(blobs[0]).decode(errors="replace") if blobs else None
     values = example.numbers(feature.name) if feature.kind == "number" else ()
-    return np.asarray(values).astype(feature.dtype)[0].item() if len(values) == 1 else None
+    return np.asarray(values).astype(_given(feature))[0].item() if len(values) == 1 else None
 
 
 def _tensor_of(blob: memoryview, feature: RldsFeature, shape: Any, where: str) -> NDArray[Any]:
     """Decode one tensor that is encoded to bytes; at most one of the sizes of `shape` is None."""
     sizes = [-1 if size is None else int(size) for size in shape]
-    dtype = np.dtype(feature.dtype)
+    dtype = np.dtype(np.uint16 if feature.dtype == BFLOAT16 else feature.dtype)
     limit = MAX_TENSOR_BYTES if -1 in sizes else math.prod(sizes) * dtype.itemsize + 1
     try:
         data: Any = blob
         if feature.encoding == "zlib":
             data = zlib.decompressobj().decompress(blob, min(limit, MAX_TENSOR_BYTES))
-        return np.frombuffer(data, dtype).reshape(sizes)
+        values = np.frombuffer(data, dtype).reshape(sizes)
     except (zlib.error, ValueError) as fault:
         raise EpisodeError(where, f"{feature.name} is not {_printed(feature)}: {fault}") from fault
+    if feature.dtype == BFLOAT16:
+        return (values.astype(np.uint32) << 16).view(np.float32)
+    return values
+
+
+def _given(feature: RldsFeature) -> np.dtype:
+    """Return the dtype of the values that are handed out."""
+    return np.dtype(np.float32 if feature.dtype == BFLOAT16 else feature.dtype)
 
 
 def _printed(feature: RldsFeature) -> str:
