@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_697, 511_246
 TEST_LINES = 48_096
-DOC_WORDS = 40_303
+DOC_WORDS = 40_348
 
 
 @cache

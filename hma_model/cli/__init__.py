@@ -95,7 +95,7 @@ def _show_brackets(command: Any) -> None:
 
 @cache
 def _command() -> Any:
-    """Return the command of all verbs; it takes 0.1 s to make, and a process may run several."""
+    """Return the command of all verbs; making it takes 0.03 s, and a process may run several."""
     command = typer.main.get_command(app)
     _show_brackets(command)
     return command
