@@ -202,7 +202,7 @@ def test_new_prompts_and_rows_that_begin_anew_compile_nothing_more(graphs: Graph
     rollout.step(batch.actions[:, 2], known=torch.tensor([True, False]))
     assert len(graphs) == kinds > 2
     for steps in (1, 3, 4, 5, 6, 7):  # each takes other numbers of tokens, more than torch compiles by itself
-        rollout.decoding = replace(rollout.decoding, steps=steps)
+        rollout.decoding = replace(rollout.decoding, unmask_steps=steps)
         rollout.step(batch.actions[:, 3])
     assert len(graphs) > torch._dynamo.config.recompile_limit
 
