@@ -9,16 +9,7 @@ import pytest
 
 from hma_data.errors import UsageError
 from tests.command import ROOT, fails, hma, hma_process
-from tests.conftest import ARM_YAML, write_toy
-
-
-@pytest.fixture
-def arm(tmp_path: Path) -> Path:
-    """A recording and its YAML; the YAML's path."""
-    write_toy(tmp_path / "toy.hdf5", [4, 5, 6])
-    path = tmp_path / "toy_arm.yaml"
-    path.write_text(ARM_YAML)
-    return path
+from tests.conftest import ARM_YAML
 
 
 def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
@@ -71,7 +62,7 @@ for words in (
     assert done.stderr.count("error: ") == len(done.stderr.splitlines()) == 15
 
 
-def test_a_ctrl_c_says_what_is_kept(arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ctrl_c_says_what_is_kept(toy_yaml: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stopped(*arguments: object, **options: object) -> None:
         (tmp_path / "o" / "train").mkdir(parents=True)
         (tmp_path / "o" / "train" / "shard-00000.parquet").touch()
@@ -79,7 +70,7 @@ def test_a_ctrl_c_says_what_is_kept(arm: Path, tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr("hma_data.conversion.job.Conversion.run", stopped)
     source, out = str(tmp_path / "toy.hdf5"), str(tmp_path / "o")
-    done = hma("convert", "-e", str(arm), "--source", source, "--out", out)
+    done = hma("convert", "-e", toy_yaml, "--source", source, "--out", out)
     fails(done, 130, "interrupted: 1 finished shard", "run the same command again to continue")
 
 
@@ -110,17 +101,16 @@ def test_tab_completes_verbs_robots_tokenizers_and_recipes(monkeypatch: pytest.M
 
 
 @pytest.mark.slow
-def test_the_whole_data_road_on_a_toy_recording(arm: Path, tmp_path: Path) -> None:
+def test_the_whole_data_road_on_a_toy_recording(toy_yaml: Path, tmp_path: Path) -> None:
     out = tmp_path / "shards"
     source = str(tmp_path / "toy.hdf5")
-    write_toy(tmp_path / "toy.hdf5", [14, 15, 16])
     made = hma(
-        "convert", "-e", str(arm), "--source", source, "--tokenizer", "fsq-8", "--out", str(out), "--json"
+        "convert", "-e", toy_yaml, "--source", source, "--tokenizer", "fsq-8", "--out", str(out), "--json"
     )
     assert made.returncode == 0, made.stderr
     assert json.loads(made.stdout)["episodes"] == 3
     again = hma(
-        "convert", "-e", str(arm), "--source", source, "--tokenizer", "fsq-8", "--out", str(out), "--json"
+        "convert", "-e", toy_yaml, "--source", source, "--tokenizer", "fsq-8", "--out", str(out), "--json"
     )
     assert json.loads(again.stdout)["shards_made"] == 0
     assert hma("shards", "verify", str(out)).returncode == 0
@@ -132,7 +122,7 @@ def test_the_whole_data_road_on_a_toy_recording(arm: Path, tmp_path: Path) -> No
     assert (tmp_path / "seen" / "preview.mp4").stat().st_size > 1000
 
 
-def test_infer_writes_a_yaml_whose_questions_validate_lists(arm: Path, tmp_path: Path) -> None:
+def test_infer_writes_a_yaml_whose_questions_validate_lists(toy_yaml: Path, tmp_path: Path) -> None:
     out = tmp_path / "mine.yaml"
     assert (
         hma("registry", "infer", str(tmp_path / "toy.hdf5"), "--id", "mine", "--out", str(out)).returncode
@@ -168,26 +158,26 @@ def test_an_unknown_embodiment_names_near_ones() -> None:
     fails(hma("convert", "-e", "pusht_fats", "--out", "/nonexistent/o"), 1, "pusht_fast", "registry list")
 
 
-def test_a_wrong_yaml_lists_every_problem(arm: Path, tmp_path: Path) -> None:
-    arm.write_text(ARM_YAML.replace("frequency_hz: 10", "frequency_hz: -3").replace("kind:", "kinds:"))
+def test_a_wrong_yaml_lists_every_problem(toy_yaml: Path, tmp_path: Path) -> None:
+    toy_yaml.write_text(ARM_YAML.replace("frequency_hz: 10", "frequency_hz: -3").replace("kind:", "kinds:"))
     done = hma(
-        "convert", "-e", str(arm), "--source", str(tmp_path / "toy.hdf5"), "--out", str(tmp_path / "o")
+        "convert", "-e", toy_yaml, "--source", str(tmp_path / "toy.hdf5"), "--out", str(tmp_path / "o")
     )
-    fails(done, 1, str(arm), "frequency_hz", "-3", "kinds: unknown key, did you mean 'kind'")
+    fails(done, 1, str(toy_yaml), "frequency_hz", "-3", "kinds: unknown key, did you mean 'kind'")
     assert not (tmp_path / "o").exists()
 
 
-def test_a_missing_recording_and_a_folder_of_nothing(arm: Path, tmp_path: Path) -> None:
+def test_a_missing_recording_and_a_folder_of_nothing(toy_yaml: Path, tmp_path: Path) -> None:
     out = str(tmp_path / "o")
-    fails(hma("convert", "-e", str(arm), "--source", str(tmp_path / "no.hdf5"), "--out", out), 1, "no.hdf5")
+    fails(hma("convert", "-e", toy_yaml, "--source", str(tmp_path / "no.hdf5"), "--out", out), 1, "no.hdf5")
     (tmp_path / "empty folder").mkdir()
     fails(hma("inspect", str(tmp_path / "empty folder")), 1, "holds no files")
 
 
-def test_a_truncated_hdf5(arm: Path, tmp_path: Path) -> None:
+def test_a_truncated_hdf5(toy_yaml: Path, tmp_path: Path) -> None:
     toy = tmp_path / "toy.hdf5"
     toy.write_bytes(toy.read_bytes()[: toy.stat().st_size // 2])
-    fails(hma("convert", "-e", str(arm), "--source", str(toy), "--out", str(tmp_path / "o")), 1, "toy.hdf5")
+    fails(hma("convert", "-e", toy_yaml, "--source", str(toy), "--out", str(tmp_path / "o")), 1, "toy.hdf5")
     assert not (tmp_path / "o").exists()
 
 
@@ -223,8 +213,8 @@ def test_a_warning_is_one_line_without_its_place_in_the_code() -> None:
     assert done.stderr == "warning: two lines\n"
 
 
-def test_a_recording_is_named_first_or_by_source_but_once(arm: Path, tmp_path: Path) -> None:
-    words = ["-e", str(arm), "--out", str(tmp_path / "o"), "--tokenizer", "fsq-8", "--dry-run", "--json"]
+def test_a_recording_is_named_first_or_by_source_but_once(toy_yaml: Path, tmp_path: Path) -> None:
+    words = ["-e", toy_yaml, "--out", str(tmp_path / "o"), "--tokenizer", "fsq-8", "--dry-run", "--json"]
     recording = str(tmp_path / "toy.hdf5")
     first, named = hma("convert", recording, *words), hma("convert", "--source", recording, *words)
     assert first.returncode == named.returncode == 0, first.stderr + named.stderr
@@ -232,8 +222,8 @@ def test_a_recording_is_named_first_or_by_source_but_once(arm: Path, tmp_path: P
     fails(hma("convert", recording, "--source", recording, *words), 2, "name the recording once")
 
 
-def test_progress_names_the_robot_not_its_file(arm: Path, tmp_path: Path) -> None:
-    renamed = arm.rename(tmp_path / "embodiment.yaml")
+def test_progress_names_the_robot_not_its_file(toy_yaml: Path, tmp_path: Path) -> None:
+    renamed = toy_yaml.rename(tmp_path / "embodiment.yaml")
     words = ["-e", str(renamed), "--out", str(tmp_path / "o"), "--tokenizer", "fsq-8", "--workers", "0"]
     done = hma("convert", str(tmp_path / "toy.hdf5"), *words)
     assert done.returncode == 0, done.stderr

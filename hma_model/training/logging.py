@@ -153,7 +153,7 @@ class RunLog:
         self, out: Path, steps: int, begin: int, show: bool = True, write: bool = True,
         trackers: Sequence[Tracker] = (),
     ) -> None:  # fmt: skip
-        self._steps, self._show, self._write_it = steps, show, write
+        self._steps, self._total, self._show, self._write_it = steps, steps, show, write
         self._trackers = trackers
         self._path = out / METRICS
         kept = [line for line in read_metrics(out) if line["step"] <= begin]
@@ -195,8 +195,8 @@ class RunLog:
                 recent.append(loss)
         if self._update:  # CPU seconds may end the run sooner than its steps, as the share that is done tells
             step, done = facts["step"], facts.get("done")
-            total = min(self._steps, round(step / min(done, 1))) if done else self._steps
-            self._update(step, self._words(), total)
+            self._total = min(self._steps, round(step / min(done, 1))) if done else self._steps
+            self._update(step, self._words(), self._total)
 
     def evaluation(self, facts: dict[str, Any]) -> None:
         """Add a line of kind eval."""
@@ -204,6 +204,8 @@ class RunLog:
         self._track("eval", facts, ("loss", "perplexity", "accuracy", "baseline"))
         self._evaluation = facts
         self.note(f"step {facts['step']}: {self._words()}")
+        if self._update:
+            self._update(facts["step"], self._words(), self._total)
 
     def sync(self) -> None:
         """Flush the lines to disk, because the checkpoint that is written next continues from them."""

@@ -226,3 +226,12 @@ def test_a_loss_that_is_no_number_leaves_the_shown_mean_one(tmp_path, capsys):
         log.step(facts(2, loss=math.nan, skipped=1))
     last = capsys.readouterr().err.splitlines()[-1]
     assert "loss arm 2.000" in last and "1 steps skipped" in last
+
+
+def test_the_last_line_has_the_last_evaluation(tmp_path, capsys):
+    with RunLog(tmp_path, 2, 0) as log:
+        log.evaluation(facts(1, loss=3.0))
+        log.step(facts(2))
+        log.evaluation(facts(2, loss=1.5))
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "training: 2/2 steps" in last and "validation 1.500" in last
