@@ -28,6 +28,7 @@ from hma_model.checkpoint.folder import Checkpoint
 from hma_model.hub.publish import located
 from hma_model.lerobot_env.vector import LeRobotVectorEnv, camera_names, judged_task, state_source
 from hma_model.worlds.images import image_shape
+from hma_model.worlds.prompts import read_prompt
 from hma_model.worlds.world import World, load_world
 
 Envs = dict[str, dict[int, LeRobotVectorEnv]]
@@ -46,7 +47,8 @@ class HMAEnvConfig(EnvConfig):
         judge: a task or a reward model that judges success, as of `hma policy-eval --judge`; None for none.
         judge_from: shards with success labels, which measure a reward model.
         state: whether policies are told the state, read off the images, where it can be learned.
-        prompt: what all episodes start from, as `hma play --prompt`; None draws from the simulator.
+        prompt: what all episodes start from, as `hma play --prompt`; None draws from the simulator, or from
+            the held-out episodes of the training's shards.
         size: side in pixels of the images; None for that of the model.
         device, unmask_steps, temperature: as of `load_world`.
         task: what policies are told; by default the robot's id.
@@ -88,6 +90,7 @@ class HMAEnvConfig(EnvConfig):
                 self.checkpoint, device=self.device, unmask_steps=self.unmask_steps,
                 temperature=self.temperature,
             )  # fmt: skip
+            read_prompt(world.model, self.embodiment, self.prompt)  # or a refusal before what takes minutes
             env = made(self._located(), self.embodiment, n_envs, world, vars(self))
             _ = env.reader, env.judge  # what they say of themselves comes before the evaluation
             return {self.type: {0: env}}

@@ -134,22 +134,25 @@ def read_prompt(model: HMA, embodiment: str, prompt: Any = None, *, seed: int = 
 
 
 def starting_window(model: HMA, embodiment: str, seed: int = 0) -> Prompt:
-    """Return a prompt that comes along: the first frames of an episode of a laboratory robot.
+    """Return a prompt that comes along: the first frames of an episode, which the seed names.
 
-    The robot is simulated: episode 0 of `hma_data.lab.record` with this seed.
+    A laboratory robot is simulated: episode 0 of `hma_data.lab.record` with this seed. Another one has the
+    held-out episodes of the shards that it was trained on, if these are still here.
 
     Raises:
-        HMAError: the model lacks the embodiment, or it is no robot of the laboratory.
+        HMAError: the model lacks the embodiment, or there is neither a simulator nor such shards.
     """
     robot = described(model, embodiment)
-    if robot is None or not simulated(embodiment):
-        raise HMAError(
-            f"prompt of {embodiment}",
-            "none is included: it is not one of the toolkit's simulated robots",
-            PROMPT_FORMS,
-        )
-    with tempfile.TemporaryDirectory() as folder:
-        return _of_recording(model, robot, record(embodiment, folder, 1, seed), EpisodePart())
+    if robot is not None and simulated(embodiment):
+        with tempfile.TemporaryDirectory() as folder:
+            return _of_recording(model, robot, record(embodiment, folder, 1, seed), EpisodePart())
+    for shards in model.source.shards() if model.source else ():
+        if shards.embodiment.id == embodiment:
+            splits = shards.episodes["split"].to_pylist()
+            held = [number for number, split in enumerate(splits) if split == "val"] or range(len(splits))
+            return _of_shards(model, embodiment, shards.folder, EpisodePart(held[seed % len(held)]))
+    fault = "none is included: it has no simulator here, and the shards of its training are not here"
+    raise HMAError(f"prompt of {embodiment}", fault, PROMPT_FORMS)
 
 
 def _of_mapping(model: HMA, embodiment: str, prompt: Mapping[str, Any]) -> Prompt:

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from hma_data.errors import HMAError
+from hma_data.shards.reader import ShardSet
 from hma_data.sources.lerobot.writer import origin_of
+from hma_data.tokenizers.base import get_tokenizer
 from hma_model import lerobot_env
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.hub import push
@@ -19,6 +21,8 @@ from hma_model.worlds.world import World
 from tests.hub_server import Hub
 from tests.hub_state import REPO
 from tests.model.policies.test_lerobot_policy import CAMERA, saved
+from tests.model.shards import make_shards
+from tests.model.true_world import trained_on
 
 pytestmark = pytest.mark.slow  # of the import of lerobot
 pytest_plugins = ["tests.hub_fixtures"]
@@ -127,6 +131,17 @@ def test_settings_that_are_wrong(given: dict[str, Any], said: str) -> None:
     with pytest.raises(HMAError) as fault:
         HMAEnvConfig(**given)
     assert str(fault.value).startswith(said) and "\n" not in str(fault.value)
+
+
+def test_a_robot_without_a_start_is_refused_before_anything_is_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shards = ShardSet(make_shards(tmp_path / "shards", "twist_arm", spec=get_tokenizer("fsq-8").spec))
+    trained_on("first", shards, tmp_path / "model")
+    config = HMAEnvConfig(checkpoint=str(tmp_path / "model"), embodiment="twist_arm")
+    monkeypatch.setattr(lerobot_env, "made", lambda *given: pytest.fail("environments were made"))
+    with pytest.raises(HMAError, match="prompt of twist_arm: none is included"):
+        config.create_envs(1)
 
 
 @pytest.mark.parametrize(

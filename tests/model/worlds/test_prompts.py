@@ -1,5 +1,6 @@
 """Prompts from everything that an episode may start from."""
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,15 +11,17 @@ import pytest
 from hma_data.episodes.sheets import write_png
 from hma_data.errors import HMAError
 from hma_data.lab import record
+from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.cli import main
 from hma_model.network.model import HMA
 from hma_model.simulate import read_prompt, starting_window
 from tests.model.network_parts import small_model
-from tests.model.shards import state_pauses
+from tests.model.shards import make_shards, state_pauses
+from tests.model.true_world import trained_on
 
-MOVER, ARM = "mover_10", "planar_arm"
+MOVER, ARM, RECORDED = "mover_10", "planar_arm", "arm"
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +142,21 @@ def test_a_prompt_crosses_no_pause(model: HMA, shards: Path, tmp_path: Path) -> 
 
 def test_another_robot_needs_a_prompt() -> None:
     with pytest.raises(
-        HMAError, match="none is included: it is not one of the toolkit's simulated robots — give an image"
+        HMAError, match="no simulator here, and the shards of its training are not here — give an image"
     ):
         starting_window(small_model(), "arm")
+
+
+def test_a_recorded_robot_starts_from_the_held_out_episodes_of_its_training(tmp_path: Path) -> None:
+    shards = ShardSet(make_shards(tmp_path / "shards", RECORDED, episodes=6, held_out=2))
+    folder = tmp_path / "run" / "checkpoints" / "step-00000001"
+    model = trained_on("first", shards, folder).model
+    (tmp_path / "run" / "recipe.json").write_text(json.dumps({"data": [str(shards.folder)]}))
+    held = [row["id"] for row in shards.episodes.to_pylist() if row["split"] == "val"]
+    for seed, name in enumerate([*held, held[0]]):
+        own = starting_window(model, RECORDED, seed)
+        expected = read_prompt(model, RECORDED, {"shards": shards.folder, "episode": name})
+        assert np.array_equal(own[0], expected[0]) and np.array_equal(own[1], expected[1])
+    shutil.rmtree(shards.folder)
+    with pytest.raises(HMAError, match="the shards of its training are not here"):
+        starting_window(model, RECORDED)
