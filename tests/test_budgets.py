@@ -35,18 +35,18 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/export": (1_056, 8_078, 8),
     "hma_model/generation": (1_670, 13_500, 10),
     "hma_model/hub": (1_060, 8_200, 6),
-    "hma_model/lerobot_env": (635, 4_758, 3),
+    "hma_model/lerobot_env": (638, 4_776, 3),
     "hma_model/network": (3_215, 27_950, 16),
     "hma_model/play": (1_655, 11_950, 8),
     "hma_model/policies": (2_825, 20_100, 14),
     "hma_model/released": (825, 7_100, 4),
     "hma_model/synthetic": (1_205, 9_100, 5),
-    "hma_model/training": (3_515, 28_900, 18),
-    "hma_model/worlds": (1_520, 11_300, 6),
+    "hma_model/training": (3_515, 28_909, 18),
+    "hma_model/worlds": (1_521, 11_348, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_697, 511_246
-TEST_LINES = 48_096
-DOC_WORDS = 40_348
+PRODUCT_LINES, PRODUCT_NODES = 64_705, 511_404
+TEST_LINES = 48_128
+DOC_WORDS = 40_357
 
 
 @cache
