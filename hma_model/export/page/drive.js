@@ -36,28 +36,33 @@ async function main() {
   const named = manifest.robots.find((one) => one.id === asked.get("robot"));
   robot = named || manifest.robots[0];
   await poster();
+  const { onWasm, onGpu, threads } = await runtimeOf(gpu);
+  backend = gpu && asks === "webgpu" ? "webgpu" : "wasm";
+  model = backend === "webgpu" ? await onGpu() : await onWasm();
+  await openRobot();
+  if (gpu && backend === "wasm") await tryGpu(onGpu);
+  document.body.dataset.backend = backend;
+  $("backend").textContent = backend === "webgpu" ? "WebGPU" : `WASM, ${threads} threads`;
+  loop();
+}
+
+async function runtimeOf(gpu) {  // how the model's two graphs are opened: that of the next frame, and that of its image
   const graphs = [loader.part(manifest.page.step), loader.part(manifest.page.image)];
   for (const graph of graphs) graph.catch(() => {});  // they are awaited below
-  const runtime = await fetchRuntime(manifest, loader, gpu ? "webgpu" : "wasm");
-  const threads = crossOriginIsolated ? Number(asked.get("threads")) || Math.min(4, navigator.hardwareConcurrency || 1) : 1;
-  const half = Math.max(1, threads >> 1);  // for images
-  ort = await startRuntime(runtime, Math.max(1, threads - half));
+  const files = await fetchRuntime(manifest, loader, gpu ? "webgpu" : "wasm");
+  const cores = crossOriginIsolated ? Number(asked.get("threads")) || Math.min(4, navigator.hardwareConcurrency || 1) : 1;
+  const images = Math.max(1, cores >> 1), steps = Math.max(1, cores - images);  // threads
+  ort = await startRuntime(files, steps);
   const open = async (graph, ...providers) => ort.InferenceSession.create(await graph, { executionProviders: providers });
+  const onWasm = async () => {
+    const [step, decoder] = await Promise.all([open(graphs[0], "wasm"), graphs[1].then((graph) => Decoder.open(files, graph, images))]);
+    return { step, decoder };
+  };
   const onGpu = async () => {
     const [step, decoder] = [await open(graphs[0], "webgpu", "wasm"), await open(graphs[1], "webgpu", "wasm")];
     return { step, decoder: { image: async (frame) => (await decoder.run({ next_frame: frame })).image.data } };
   };
-  backend = gpu && asks === "webgpu" ? "webgpu" : "wasm";
-  if (backend === "webgpu") model = await onGpu();
-  else {
-    const [step, decoder] = await Promise.all([open(graphs[0], "wasm"), graphs[1].then((graph) => Decoder.open(runtime, graph, half))]);
-    model = { step, decoder };
-  }
-  await openRobot();
-  if (gpu && backend === "wasm") await tryGpu(onGpu);
-  document.body.dataset.backend = backend;
-  $("backend").textContent = backend === "webgpu" ? "WebGPU" : `WASM, ${ort.env.wasm.numThreads + half} threads`;
-  loop();
+  return { onWasm, onGpu, threads: steps + images };
 }
 
 async function tryGpu(open) {  // a driver may compute wrongly, and the processor may be faster
@@ -128,7 +133,8 @@ async function openRobot() {
   replays = null;
   canvas = background;
   $("scene").hidden = robot.pictures.length < 2;
-  if (!robot.follows) note(robot.id + " does not follow its actions in this model: drive another robot to see it answer.");
+  if (robot.simulator && !canvas) note(robot.simulator.canvas + " cannot be loaded, so the true simulator is not shown: copy the exported folder again");
+  else if (!robot.follows) note(robot.id + " does not follow its actions in this model: drive another robot to see it answer.");
   await begin(0);
   const found = await openReplays(robot, loader).catch(() => null);  // the page drives without them too
   if (turn !== opening) return;

@@ -52,7 +52,7 @@ export async function readManifest() {
   catch { throw new Error("manifest.json cannot be loaded: is the host reachable?"); }
   if (!answer.ok) throw new Error("manifest.json is missing here: this page belongs into a folder of hma export");
   const manifest = await answer.json().catch(() => ({}));
-  if (manifest.format !== "hma-export" || manifest.format_version !== 1) throw new Error("manifest.json is not that of an export which this page reads");
+  if (manifest.format !== "hma-export" || manifest.format_version !== 1 || !manifest.page) throw new Error("manifest.json is not that of an export which this page reads");
   return manifest;
 }
 
@@ -111,7 +111,7 @@ export class Decoder {  // makes images in a worker, while the page computes the
   ask(message) {  // one question at a time
     return new Promise((done, failed) => {
       this.worker.onmessage = ({ data: { fault, image } }) => fault ? failed(new Error(fault)) : done(image);
-      this.worker.onerror = () => failed(new Error("decoder.js does not run in this browser: use one of 2023 or later"));
+      this.worker.onerror = () => failed(new Error("decoder.js cannot be loaded: copy the exported folder again, or use a browser of 2023 or later"));
       this.worker.postMessage(message);
     });
   }

@@ -282,6 +282,22 @@ def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(
     assert said(page) == "manifest.json is missing here: this page belongs into a folder of hma export"
 
 
+@pytest.mark.parametrize(
+    ("name", "place", "words"),
+    [
+        ("decoder.js", "#veil-text", "decoder.js cannot be loaded"),
+        ("family.js", "#veil-text", "A script of the page is missing"),
+        (f"robots/{ROBOT}/table.png", "#note", "table.png cannot be loaded"),
+    ],
+)
+def test_a_missing_file_of_the_page_is_said(
+    page: "Page", server: Any, site: Path, name: str, place: str, words: str
+) -> None:
+    (site / "sub" / "page" / name).unlink()
+    page.goto(address(server))
+    page.wait_for_function(f"document.querySelector('{place}').textContent.includes('{words}')")
+
+
 @pytest.mark.parametrize("trunk", ["tokens", "pixels"])
 def test_webgpu_makes_the_frames_of_wasm(
     trunk: str,
