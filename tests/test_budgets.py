@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_521, 11_348, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_705, 511_404
-TEST_LINES = 48_128
+TEST_LINES = 48_144
 DOC_WORDS = 40_357
 
 
