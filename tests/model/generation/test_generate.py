@@ -41,14 +41,13 @@ def _rollout(
 
 @pytest.mark.parametrize(
     ("layout", "prompt", "actions"),
-    [(layout, 3, True) for layout in LAYOUTS]  # within the window of five frames, and then beyond it
-    + [(layout, prompt, True) for layout in ("rotary", "released", "chain") for prompt in (1, 7)]
+    [(layout, prompt, True) for layout in LAYOUTS for prompt in (1, 7)]  # below and above the window of five
     + [("rotary", 3, False), ("released", 3, False), ("cross", 3, False)],
 )
 def test_the_cache_changes_nothing(layout: str, prompt: int, actions: bool) -> None:
     model = small_model(**LAYOUTS[layout])
     how = {"unmask_steps": 3, "temperature": 0.5}
-    cached, plain = (_rollout(model, cache, prompt, 5, actions, **how) for cache in (True, False))
+    cached, plain = (_rollout(model, cache, prompt, 7, actions, **how) for cache in (True, False))
     assert torch.equal(cached, plain)
 
 
