@@ -275,14 +275,16 @@ def test_finished_results_of_a_killed_job_still_record_meters_and_remove_its_par
 ) -> None:
     shutil.copytree(folders[0], tmp_path / "out")
     (tmp_path / "out" / WORK).mkdir()
-    recorded: list[Any] = []
+    found = json.loads((tmp_path / "out" / RESULTS).read_text())
+    (robot, one), *_ = found["measures"].items()
+    assert all("missing" in other["calibration"] for other in found["measures"].values())
+    one["calibration"], recorded = {"meter": {"limit": 2.0}}, list[Any]()
+    del found["sha256"]
+    (tmp_path / "out" / RESULTS).write_text(json.dumps(found))
     monkeypatch.setattr(running, "record_locally", lambda *given: recorded.append(given[2:]))
-    found = benchmark("it", tmp_path / "out", TINY, world=world_of(FlawlessWorld))
-    meters = {robot: one["calibration"].get("meter") for robot, one in found["measures"].items()}
-    assert (
-        recorded == [(robot, meter, "meter") for robot, meter in meters.items() if meter]
-        and not (tmp_path / "out" / WORK).exists()
-    )
+    benchmark("it", tmp_path / "out", TINY, world=world_of(FlawlessWorld))
+    assert recorded == [(robot, {"limit": 2.0}, "meter")]
+    assert not (tmp_path / "out" / WORK).exists()
 
 
 def test_a_checkpoint_that_may_only_be_read_gets_no_meter_and_no_error(
