@@ -30,7 +30,7 @@ from hma_model.network.conditioning import ActionConditioning, Groups, condition
 from hma_model.network.head import sampling_levels
 from hma_model.network.network import Network
 from hma_model.network.stem import from_digits, patchify, to_digits, unpatchify
-from hma_model.network.trunks.contract import Conditioning, TimePositions, ring_times
+from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions, ring_times
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -113,7 +113,7 @@ class StepGraph(nn.Module):
         own = "modulation" in config.conditioning and not config.shared_modulation
         width = config.width * (1 + 2 * config.layers * own)
         self.actions = Port("actions", (2, width), "float32")
-        memory = [tuple(one.shape) for one in self._memory().tensors()]
+        memory = [tuple(one.shape) for one in self._carried().memory]
         self.state = [
             Port("time", (1,), "int32"),
             Port("frame", config.frame_shape, "int32" if self.discrete else "float32"),
@@ -159,7 +159,7 @@ class StepGraph(nn.Module):
         trunk: Any = self.trunk  # that of a discrete model embeds tokens
         return trunk.embed
 
-    def _memory(self) -> Any:
+    def _carried(self) -> Carried:
         config = self.config
         tokens = config.tokens_per_frame + config.appended_tokens
         return self.trunk.carry(1, self.slots, tokens, torch.float32, torch.device("cpu"))
@@ -174,18 +174,18 @@ class StepGraph(nn.Module):
             rest: the memory, then the draws.
         """
         count = len(self.state) - 2
-        memory = self._memory()
-        for own, given in zip(memory.tensors(), rest[:count], strict=True):
+        past = self._carried()
+        for own, given in zip(past.memory, rest[:count], strict=True):
             own.copy_(given)
         draws = dict(zip((port.name for port in self.draws), rest[count:], strict=True))
         times = ring_times(self.config, torch.cat([time, time + 1]).long().unsqueeze(0), self.slots)
         times.wanted = 1
         conditioning = self._condition(actions)
         if not self.discrete:
-            stored = self._patches(frame, conditioning, times, memory, draws)
-            return self._image(stored), time + 1, stored, *memory.tensors()
-        stored, nats = self._tokens(frame, conditioning, times, memory, draws)
-        return self._image(stored), time + 1, stored, *memory.tensors(), nats
+            stored = self._patches(frame, conditioning, times, past, draws)
+            return self._image(stored), time + 1, stored, *past.memory
+        stored, nats = self._tokens(frame, conditioning, times, past, draws)
+        return self._image(stored), time + 1, stored, *past.memory, nats
 
     def _condition(self, actions: Tensor) -> Conditioning:
         config = self.config
@@ -198,7 +198,7 @@ class StepGraph(nn.Module):
         return Conditioning(embedding, modulation, tokens=embedding if config.appended_tokens else None)
 
     def _passes(
-        self, conditioning: Conditioning, times: TimePositions, memory: Any, embed: Any, rank: Tensor | None
+        self, conditioning: Conditioning, times: TimePositions, past: Carried, embed: Any, rank: Tensor | None
     ) -> Iterator[tuple[Tensor, Tensor | None, slice]]:
         """Yield for each pass the features (1, S, D), the places (1, k) that it decides, and their numbers.
 
@@ -212,9 +212,9 @@ class StepGraph(nn.Module):
                 continue
             pair = embed(masked)
             if left == tokens:
-                features = self.trunk(pair, conditioning, times, memory)
+                features = self.trunk(pair, conditioning, times, past)
             else:
-                features = self.trunk(pair[:, 1:].contiguous(), conditioning.last(), times.last(), memory)
+                features = self.trunk(pair[:, 1:].contiguous(), conditioning.last(), times.last(), past)
             places = None
             if rank is not None:
                 places = rank.masked_fill(~masked, -1.0).topk(count, dim=1).indices
@@ -225,7 +225,7 @@ class StepGraph(nn.Module):
     # -- tokens
 
     def _tokens(
-        self, frame: Tensor, conditioning: Conditioning, times: TimePositions, memory: Any, draws: Any
+        self, frame: Tensor, conditioning: Conditioning, times: TimePositions, past: Carried, draws: Any
     ) -> tuple[Tensor, Tensor]:
         """Return the next frame's tokens (h, w) int32, and their mean entropy (1,) as of `Rollout`."""
         before = self._digits(frame.long())
@@ -240,7 +240,7 @@ class StepGraph(nn.Module):
                 torch.stack([before, digits], 1), torch.stack([shown, masked], 1), [-1, 0]
             )
 
-        for features, places, own in self._passes(conditioning, times, memory, embed, draws.get("rank")):
+        for features, places, own in self._passes(conditioning, times, past, embed, draws.get("rank")):
             noise = gumbel[:, :, own]
 
             unsure: list[Tensor] = []
@@ -274,7 +274,7 @@ class StepGraph(nn.Module):
     # -- patches of latents
 
     def _patches(
-        self, frame: Tensor, conditioning: Conditioning, times: TimePositions, memory: Any, draws: Any
+        self, frame: Tensor, conditioning: Conditioning, times: TimePositions, past: Carried, draws: Any
     ) -> Tensor:
         """Return the next frame's latents (c, H, W) as stored."""
         config = self.config
@@ -286,7 +286,7 @@ class StepGraph(nn.Module):
             return self.trunk.embed_frames(torch.stack([before, patches], 1), hidden, [-1, 0], None)
 
         kept = before.unsqueeze(1) if config.copy_previous else None
-        for features, places, own in self._passes(conditioning, times, memory, embed, draws.get("rank")):
+        for features, places, own in self._passes(conditioning, times, past, embed, draws.get("rank")):
             conditions = self._readout(features.unsqueeze(1), times.positions[:, -1], kept)[:, 0]
             noise = draws["noise"][own] if "noise" in draws else None
             made = self._readout.sample(_at(conditions, places)[0], None, 0.0, noise).unsqueeze(0)

@@ -120,10 +120,6 @@ class Carried:
         for own, theirs in zip(self.memory, other.memory, strict=True):
             own.index_copy_(self.axis + 1, rows, theirs)
 
-    def tensors(self) -> list[Tensor]:
-        """Return its memory."""
-        return self.memory
-
 
 class Trunk(Protocol):
     """What embodiments share.

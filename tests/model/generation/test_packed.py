@@ -104,7 +104,7 @@ def test_products_of_fewer_bits_keep_the_features_near(precision: str, near: flo
         rollout = Rollout(model, batch.embodiment, 2, precision=way)
         rollout.prompt(batch.tokens[:, :3], batch.actions, seeds=[1, 2])
         rollout.step(batch.actions[:, 2])
-        seen.append(rollout.state.carried.tensors()[-1].flatten())
+        seen.append(rollout.state.carried.memory[-1].flatten())
     assert torch.nn.functional.cosine_similarity(*seen, dim=0) > near
     assert not torch.equal(*seen)
 

@@ -159,10 +159,10 @@ def test_the_cache_stays_in_place_over_prompts_and_resets() -> None:
     model = small_model()
     rollout = Rollout(model, "arm", 3)
     play(model, rollout)
-    before = [memory.data_ptr() for memory in rollout.state.carried.tensors()]
+    before = [memory.data_ptr() for memory in rollout.state.carried.memory]
     rollout.prompt(torch.zeros(3, 2, 4, 4, dtype=torch.long), None)
     rollout.step(torch.zeros(3, WIDEST))
-    assert [memory.data_ptr() for memory in rollout.state.carried.tensors()] == before
+    assert [memory.data_ptr() for memory in rollout.state.carried.memory] == before
 
 
 @pytest.mark.parametrize(
