@@ -153,13 +153,16 @@ class Rollout:
             compile=self.engine.compiled is not None, precision=self.engine.precision,
         )  # fmt: skip
         other.decoding = self.decoding
-        other.restore(range(len(rows)), self.snapshot().take(rows))
+        other.restore(range(len(rows)), self._copied(rows))
         return other
 
     def snapshot(self, rows: Sequence[int] | None = None) -> Snapshot:
         """Return a copy of the state of some rows, by default all."""
-        chosen = self._chosen(rows)
-        return replace(self.state.snapshot(chosen), passive=self.passes.passive)
+        return self._copied(self._chosen(rows))
+
+    def _copied(self, rows: list[int]) -> Snapshot:
+        """Return a copy of the state of rows, of which some may be the same."""
+        return replace(self.state.snapshot(rows), passive=self.passes.passive)
 
     def restore(self, rows: Sequence[int], snapshot: Snapshot) -> None:
         """Put rows into the state of a snapshot of as many rows, from any rollout of the same model."""

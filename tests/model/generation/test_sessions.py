@@ -9,6 +9,7 @@ import torch
 from hma_data.errors import HMAError
 from hma_model.generation.rollout import Rollout
 from hma_model.network.model import HMA
+from hma_model.network.trunks.contract import Carried
 from tests.model.generation.test_generate import LAYOUTS
 from tests.model.network_parts import ARM, HAND, small_model
 
@@ -135,6 +136,21 @@ def test_a_snapshot_goes_on_in_any_row_of_any_rollout(layout: str) -> None:
     advance(rollout, sessions)
     expected = alone(model, sessions[0], {"temperature": 0.7})
     assert torch.equal(torch.stack(sessions[0].made), torch.stack(expected))
+
+
+def test_a_fork_of_some_rows_copies_these_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = small_model()
+    rollout, sessions = Rollout(model, "arm", 4), {row: Session(model, row, "arm", 2) for row in range(4)}
+    for row, session in sessions.items():
+        session.begin(rollout, row)
+    advance(rollout, sessions)
+    take, copied = Carried.take, list[int]()
+    monkeypatch.setattr(Carried, "take", lambda own, rows: copied.append(len(rows)) or take(own, rows))
+    fork = rollout.fork(2, [1])
+    assert copied == [2]
+    chunk, known = sessions[1].chunks[1], sessions[1].known[1]
+    own = rollout.step(chunk, known=known, rows=[1])
+    assert torch.equal(fork.step(chunk.expand(2, -1), known=known.expand(2)), own.expand(2, -1, -1))
 
 
 def test_forks_part_with_their_chunks_and_leave_the_rollout_as_it_is() -> None:
