@@ -42,7 +42,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/released": (825, 7_100, 4),
     "hma_model/synthetic": (1_205, 9_100, 5),
     "hma_model/training": (3_515, 28_909, 18),
-    "hma_model/worlds": (1_521, 11_348, 6),
+    "hma_model/worlds": (1_524, 11_400, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_705, 511_404
 TEST_LINES = 48_144

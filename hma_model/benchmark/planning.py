@@ -83,9 +83,8 @@ def reached(world: World, scenes: Scenes, probe: Probe, way: str) -> Bools:
     elif way == "truth":
         found = plan(in_truth, low, high, count, rng)
     else:
-        with world.drawing(
-            unmask_steps=1, temperature=0.0
-        ):  # the likeliest frames in one pass, as `plan:cem` does
+        # the likeliest frames in one pass, as `plan:cem` does
+        with world.drawing(unmask_steps=1, temperature=0.0):
             cost.open([scene.prompt for scene in begun])
             found = plan(in_model, low, high, count, rng)
         for session in cost.sessions:

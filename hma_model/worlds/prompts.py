@@ -136,8 +136,9 @@ def read_prompt(model: HMA, embodiment: str, prompt: Any = None, *, seed: int = 
 def starting_window(model: HMA, embodiment: str, seed: int = 0) -> Prompt:
     """Return a prompt that comes along: the first frames of an episode, which the seed names.
 
-    A laboratory robot is simulated: episode 0 of `hma_data.lab.record` with this seed. Another one has the
-    held-out episodes of the shards that it was trained on, if these are still here.
+    A laboratory robot is simulated: episode 0 of `hma_data.lab.record` with this seed. Another one starts
+    from an episode of the shards that it was trained on, if these are still here. The episode is long enough
+    for a prompt, and held out if any such one is.
 
     Raises:
         HMAError: the model lacks the embodiment, or there is neither a simulator nor such shards.
@@ -148,8 +149,10 @@ def starting_window(model: HMA, embodiment: str, seed: int = 0) -> Prompt:
             return _of_recording(model, robot, record(embodiment, folder, 1, seed), EpisodePart())
     for shards in model.source.shards() if model.source else ():
         if shards.embodiment.id == embodiment:
-            splits = shards.episodes["split"].to_pylist()
-            held = [number for number, split in enumerate(splits) if split == "val"] or range(len(splits))
+            span = (default_frames(model) - 1) * shards.row_stride
+            rows = shards.episodes.to_pylist()
+            fit = [n for n, row in enumerate(rows) if max(map(len, episode_pieces(shards, row))) > span]
+            held = [n for n in fit if rows[n]["split"] == "val"] or fit or [0]  # the first one says the fault
             return _of_shards(model, embodiment, shards.folder, EpisodePart(held[seed % len(held)]))
     fault = "none is included: it has no simulator here, and the shards of its training are not here"
     raise HMAError(f"prompt of {embodiment}", fault, PROMPT_FORMS)

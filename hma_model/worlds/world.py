@@ -100,7 +100,7 @@ class World:
 
         Args:
             embodiment: an id.
-            changes: of the frames' way from `decoding`, by field.
+            changes: fields in which the drawing of the frames differs from `decoding`.
         """
         source = self.model.source
         card = source.card(embodiment) if source and embodiment in source.embodiments else {}

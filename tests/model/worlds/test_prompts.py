@@ -147,6 +147,29 @@ def test_another_robot_needs_a_prompt() -> None:
         starting_window(small_model(), "arm")
 
 
+def test_a_recorded_robot_starts_from_no_episode_that_is_too_short(tmp_path: Path) -> None:
+    shards = ShardSet(make_shards(tmp_path / "shards", RECORDED, episodes=6, held_out=2))
+    folder = tmp_path / "run" / "checkpoints" / "step-00000001"
+    model = trained_on("first", shards, folder).model
+    (tmp_path / "run" / "recipe.json").write_text(json.dumps({"data": [str(shards.folder)]}))
+    names = [row["id"] for row in shards.episodes.to_pylist()]
+    short = {7: 9, 15: 9}  # pauses that leave pieces of eight rows; a prompt takes eleven
+
+    def started(seed: int) -> Any:
+        return starting_window(model, RECORDED, seed).frames
+
+    def first(name: str) -> Any:
+        return read_prompt(model, RECORDED, {"shards": shards.folder, "episode": name}).frames
+
+    state_pauses(shards.folder, {}, {}, {}, {}, short)
+    assert all(np.array_equal(started(seed), first(names[5])) for seed in range(2))
+    state_pauses(shards.folder, {}, short, {}, {}, short, short)
+    assert all(np.array_equal(started(seed), first(names[n])) for seed, n in enumerate((0, 2, 3, 0)))
+    state_pauses(shards.folder, *[short] * 6)
+    with pytest.raises(HMAError, match="6 frames.* do not fit an episode of 24 rows"):
+        started(0)
+
+
 def test_a_recorded_robot_starts_from_the_held_out_episodes_of_its_training(tmp_path: Path) -> None:
     shards = ShardSet(make_shards(tmp_path / "shards", RECORDED, episodes=6, held_out=2))
     folder = tmp_path / "run" / "checkpoints" / "step-00000001"
