@@ -221,30 +221,32 @@ def progress(description: str, total: float = 0, unit: str = "frames") -> Iterat
         yield lines
         lines.close()
         return
-    from rich.console import Console
+    from rich.console import Console, Group, RenderableType
+    from rich.live import Live
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-    from rich.table import Column
+    from rich.text import Text
 
-    with Progress(
+    bar = Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
         TextColumn("{task.fields[amount]}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        # The last column alone is shortened in a narrow terminal.
-        TextColumn("{task.fields[extra]}", markup=False, table_column=Column(ratio=1, no_wrap=True)),
-        expand=True,
-        console=Console(stderr=True),
-        refresh_per_second=5,
-    ) as bar:
-        number = bar.add_task(description, total=total or None, amount="", extra="")
-        [task] = bar.tasks
+    )
+    words = Text(no_wrap=True, overflow="ellipsis")  # below the bar, which leaves no room in 80 columns
+    number = bar.add_task(description, total=total or None, amount="")
+    [task] = bar.tasks
 
-        def update(done: float, extra: str = "", total: float | None = None) -> None:
-            whole = total or task.total
-            amount = _amount(done, whole or 0, task.speed or 0, unit)
-            bar.update(number, completed=done, total=whole, extra=extra, amount=amount)
+    def update(done: float, extra: str = "", total: float | None = None) -> None:
+        whole = total or task.total
+        amount = _amount(done, whole or 0, task.speed or 0, unit)
+        words.plain = extra
+        bar.update(number, completed=done, total=whole, amount=amount)
 
+    def shown() -> RenderableType:
+        return Group(bar, words) if words.plain else bar
+
+    with Live(get_renderable=shown, console=Console(stderr=True), refresh_per_second=5):
         yield update
 
 
@@ -254,7 +256,12 @@ def _amount(done: float, total: float, rate: float, unit: str) -> str:
         text = human_bytes(done) + (f" of {human_bytes(total)}" if total else "")
         return text + (f", {human_bytes(rate)}/s" if rate > 0 else "")
     text = f"{done:,.0f}" + (f"/{total:,.0f}" if total else "") + f" {unit}"
-    return text + (f", {rate:,.{1 if rate < 10 else 0}f}/s" if rate > 0 else "")
+    return text + (f", {_rate(rate)}/s" if rate > 0 else "")
+
+
+def _rate(rate: float) -> str:
+    """Return a rate with at least two digits: a step of a training may take a minute."""
+    return f"{rate:.2g}" if rate < 1 else f"{rate:,.{1 if rate < 10 else 0}f}"
 
 
 def human_times(elapsed: float, left: float | None) -> str:

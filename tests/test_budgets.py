@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (661, 3_695, 7),
+    "hma_data": (668, 3_755, 7),
     "hma_data/cli": (1_545, 11_038, 8),
     "hma_data/conversion": (4_210, 31_264, 14),
     "hma_data/episodes": (1_670, 14_636, 9),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_515, 28_909, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_705, 511_404
-TEST_LINES = 48_144
+PRODUCT_LINES, PRODUCT_NODES = 64_713, 511_550
+TEST_LINES = 48_216
 DOC_WORDS = 40_357
 
 

@@ -28,6 +28,29 @@ def test_progress_tells_elapsed_from_remaining_time(monkeypatch, capsys, begun_s
     assert capsys.readouterr().err == ""  # what has been shown is not shown again at the end
 
 
+def test_a_rate_below_one_a_second_is_not_rounded_to_nothing(monkeypatch, capsys) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
+    with console.progress("training", unit="steps") as update:
+        update(1000, total=1100)
+        clock[0] = 1200.0
+        update(1030, total=1100)
+    line = "training: 1,030/1,100 steps, 0.025/s, 20 min 00 s so far, 46 min 40 s left\n"
+    assert capsys.readouterr().err == line
+
+
+def test_words_of_progress_fit_a_terminal_of_80_columns(monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    losses = "loss arm1_02 2.200, rails_03 2.000, validation 1.500"
+    with console.progress("training", 1200, "steps") as update:
+        update(1007, losses)
+        update(1008, losses)
+    shown = re.sub(r"\x1b\[[\d;?]*[A-Za-z]", "", capsys.readouterr().err).splitlines()
+    assert any("1,008/1,200 steps" in line for line in shown) and losses in map(str.strip, shown)
+
+
 def test_bytes_have_their_own_unit_and_an_unknown_total_is_left_out(capsys) -> None:
     with console.progress("verify", unit="bytes") as update:
         update(0, total=45_400)
