@@ -282,6 +282,18 @@ def write_sheet(path: Path, rows: Sequence[tuple[Images, str]]) -> None:
     write_png(path, grid([list(images) for images, _ in rows], [label for _, label in rows]))
 
 
+def wholeness(probe: "Probe", pictures: Any, true: Any) -> Any:
+    """Return how much of the robot of true pictures (…, S, S, 3) others show; 1 is all of it.
+
+    It is the mean over the robot's readable parts that the true picture shows. What counts are the pixels of
+    each part's colour, wherever they are; a true picture of another time has some 0.9.
+    """
+    wanted, given = (probe.areas(some)[..., probe.own] for some in (true, pictures))
+    seen = wanted >= LEAST_PIXELS
+    kept = np.where(seen, np.minimum(given / np.maximum(wanted, 1), 1), 0).sum(axis=-1)
+    return kept / np.maximum(seen.sum(axis=-1), 1)
+
+
 BENCH = Bench(
     "long rollouts: how far the robot is from where its commands took it, read off the picture",
     {
@@ -297,15 +309,3 @@ BENCH = Bench(
     },
     run,
 )
-
-
-def wholeness(probe: "Probe", pictures: Any, true: Any) -> Any:
-    """Return how much of the robot of true pictures (…, S, S, 3) others show; 1 is all of it.
-
-    It is the mean over the robot's readable parts that the true picture shows. What counts are the pixels of
-    each part's colour, wherever they are; a true picture of another time has some 0.9.
-    """
-    wanted, given = (probe.areas(some)[..., probe.own] for some in (true, pictures))
-    seen = wanted >= LEAST_PIXELS
-    kept = np.where(seen, np.minimum(given / np.maximum(wanted, 1), 1), 0).sum(axis=-1)
-    return kept / np.maximum(seen.sum(axis=-1), 1)

@@ -173,6 +173,13 @@ def draw(found: list[Found], path: Path) -> None:
     write_sheet(path, rows)
 
 
+def mean_of(values: Any) -> float | None:
+    """Return the mean of the finite values, None if there are none."""
+    kept = np.asarray(values, dtype=np.float64)
+    kept = kept[np.isfinite(kept)]
+    return round(float(kept.mean()), 3) if kept.size else None
+
+
 BENCH = Bench(
     "objects in closed loop: what is left of them, whether they keep their shape, how far they are off",
     {
@@ -191,10 +198,3 @@ BENCH = Bench(
     run,
     choices={"driver": ("own", "wander", "contact")},
 )
-
-
-def mean_of(values: Any) -> float | None:
-    """Return the mean of the finite values, None if there are none."""
-    kept = np.asarray(values, dtype=np.float64)
-    kept = kept[np.isfinite(kept)]
-    return round(float(kept.mean()), 3) if kept.size else None
