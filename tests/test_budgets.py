@@ -41,10 +41,10 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_825, 20_100, 14),
     "hma_model/released": (825, 7_100, 4),
     "hma_model/synthetic": (1_205, 9_100, 5),
-    "hma_model/training": (3_515, 28_909, 18),
+    "hma_model/training": (3_517, 28_940, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_713, 511_550
+PRODUCT_LINES, PRODUCT_NODES = 64_715, 511_560
 TEST_LINES = 48_216
 DOC_WORDS = 40_357
 

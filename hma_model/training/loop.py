@@ -149,6 +149,8 @@ def _loop(
 ) -> None:
     recipe, stopped = run.recipe, False
     _show_notes(run, log)
+    if run.step and run.done < 1:
+        log.note(f"continues after step {run.step:,}")  # the next line may take minutes
     while run.done < 1 and not stopped:
         facts = run.advance()
         log.step(facts)

@@ -13,7 +13,7 @@ from hma_model.checkpoint.weights import read_tensors, write_tensors
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
 from tests.model.robots import SPEC
-from tests.model.runs import TINY, same
+from tests.model.runs import TINY, same, train_until
 from tests.model.shards import make_shards
 
 
@@ -105,6 +105,13 @@ def test_every_line_of_progress_is_said_once(recipe, tmp_path, capsys):
     assert lines[-1].startswith("training: 6/6 steps") and "loss arm" in lines[-1]
     assert lines[-3].startswith("step 6: loss arm") and "validation" in lines[-3]
     assert "\x1b" not in "".join(lines)
+
+
+def test_a_resumed_run_says_where_it_continues(recipe, tmp_path, capsys):
+    train_until(recipe(), tmp_path / "run", 5)
+    for said in (["continues after step 4"], []):  # and a finished one says nothing of it
+        train(recipe(), out=tmp_path / "run")
+        assert [line for line in capsys.readouterr().err.splitlines() if line.startswith("continues")] == said
 
 
 def test_a_line_of_metrics_that_is_damaged_is_left_out(recipe, whole, tmp_path):
