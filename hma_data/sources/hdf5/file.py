@@ -152,7 +152,7 @@ class EpisodeGroup:
 
     file: Path
     group: str = WHOLE_FILE
-    fault: str = ""
+    fault: tuple[str, ...] = ()  # and the remedy
 
     def __str__(self) -> str:
         return str(self.file) if self.group == WHOLE_FILE else f"{self.file}:{self.group}"
@@ -228,7 +228,7 @@ class EpisodeFinder:
     def group(self, place: EpisodeGroup) -> h5py.Group:
         """Return the episode's group, in the open file."""
         if place.fault:
-            raise EpisodeError(place, place.fault, "copy the group into this file")
+            raise EpisodeError(place, *place.fault)
         return member(self._files.get(place.file), place.group, str(place))
 
     def _inside(self, file: Path, pattern: str | None) -> dict[str, EpisodeGroup]:
@@ -361,20 +361,26 @@ def inside(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
     return item if item is not None and item.file.filename == group.file.filename else None
 
 
-def _matching(group: h5py.Group, parts: list[str]) -> Iterator[tuple[str, str]]:
+def _matching(group: h5py.Group, parts: list[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield the paths of the groups that match a pattern, one part a level, and why one cannot be read."""
     for name in group:
         if not fnmatchcase(name, parts[0]):
             continue
         item = inside(group, name)
         if item is None:
-            link = group.get(name, getlink=True)
-            other = f"{link.filename}:" if isinstance(link, h5py.ExternalLink) else ""
-            yield name, f"is a link to {other}{link.path}, which is not in this file"
+            yield name, _why_not(group.get(name, getlink=True))
         elif isinstance(item, h5py.Group) and parts[1:]:
             yield from ((f"{name}/{rest}", fault) for rest, fault in _matching(item, parts[1:]))
         elif isinstance(item, h5py.Group):
-            yield name, ""
+            yield name, ()
+
+
+def _why_not(link: Any) -> tuple[str, str]:
+    """Return why a member of a group cannot be read, and what helps."""
+    if not isinstance(link, h5py.SoftLink | h5py.ExternalLink):
+        return "cannot be read", "the file is damaged there: copy it again"
+    other = f"{link.filename}:" if isinstance(link, h5py.ExternalLink) else ""
+    return f"is a link to {other}{link.path}, which is not in this file", "copy the group into this file"
 
 
 def _safe(name: str) -> str:

@@ -81,6 +81,19 @@ def test_a_link_out_of_the_file_or_to_nothing_is_an_episode_that_is_refused(tmp_
     assert said in problems(path)
 
 
+def test_a_demo_whose_header_is_damaged_is_an_episode_that_is_refused(tmp_path: Path) -> None:
+    path, source = linked(tmp_path, h5py.SoftLink("/store/x")), open_source("hdf5")
+    with h5py.File(path) as file:
+        at = h5py.h5o.get_info(file["data/demo_2"].id).addr
+    content = bytearray(path.read_bytes())
+    content[at] ^= 0x10  # the version of its header
+    path.write_bytes(content)
+    assert [ref.id for ref in source.index(str(path), robot())] == ["demo_0", "demo_1", "demo_2"]
+    with pytest.raises(EpisodeError, match="demo.hdf5:data/demo_2: cannot be read — the file is damaged"):
+        source.read(str(path), "demo_2", robot())
+    assert "data/demo_2: cannot be read" in problems(path)
+
+
 def test_a_mask_that_names_an_absent_demo_is_named(tmp_path: Path) -> None:
     path = linked(tmp_path, h5py.SoftLink("/store/x"))
     with h5py.File(path, "a") as file:
