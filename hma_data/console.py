@@ -85,9 +85,10 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: st
         for row in [list(columns), *cells]:
             print("  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip())
         return
-    is_terminal = sys.stdout.isatty()
-    console = Console(width=None if is_terminal else 200, soft_wrap=not is_terminal, highlight=False)
-    if is_terminal and sum(widths) + GAP * len(columns) > console.width:
+    is_terminal, room = sys.stdout.isatty(), sum(widths) + GAP * len(columns)
+    width = None if is_terminal else max(200, room)
+    console = Console(width=width, soft_wrap=not is_terminal, highlight=False)
+    if is_terminal and room > console.width:
         _print_paragraphs(console, columns, cells, title)
         return
     table = Table(title=Text(title) if title else None, title_justify="left", box=SIMPLE, pad_edge=False)

@@ -72,7 +72,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         if self.val_fraction is not None and not 0 <= self.val_fraction < 1:
-            raise UsageError("--val-fraction", f"must be from 0 to 1, not {self.val_fraction}")
+            raise UsageError("--val-fraction", f"must be at least 0 and below 1, not {self.val_fraction:g}")
         if self.limit is not None and self.limit < 1:
             raise UsageError("--limit", f"must be at least 1, is {self.limit}")
         if self.shard_frames is not None and self.shard_frames < 1:

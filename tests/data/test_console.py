@@ -80,6 +80,15 @@ def test_a_table_too_wide_for_a_terminal_shows_all_its_figures(width, monkeypatc
     assert all(f"figure {i}: {1000.5 + i:,.4g}" in words for i in range(14))
 
 
+def test_a_table_off_a_terminal_cuts_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    path, figures = "runs/" + 30 * "long-name/", [1000.5 + i for i in range(30)]
+    console.print_table(
+        ["checkpoint", *(f"figure {i}" for i in range(30)), "words"], [[path, *figures, "w " * 90]]
+    )
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if path in line]
+    assert row.split() == [path, *(f"{one:,.4g}" for one in figures), *90 * ["w"]]
+
+
 def test_a_ctrl_c_becomes_an_error_with_the_words() -> None:
     with (
         pytest.raises(Interrupted, match="interrupted: 3 shards kept"),

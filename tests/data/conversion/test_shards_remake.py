@@ -92,7 +92,7 @@ def test_split_by_instruction_keeps_equal_instructions_together(made: Path, tmp_
 
 
 def test_split_refuses_what_it_cannot_do(made: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="must be from 0 to 1"):
+    with pytest.raises(UsageError, match="must be at least 0 and below 1"):
         split(made, tmp_path / "a", val_fraction=1.5)
     with pytest.raises(UsageError, match="instruction"):
         split(made, tmp_path / "a", by="colour")
