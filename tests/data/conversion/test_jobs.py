@@ -184,6 +184,20 @@ def test_storage_that_stays_away_ends_the_job_and_quarantines_nobody(
     assert contents(tmp_path / "out") == whole
 
 
+@pytest.mark.parametrize("refused", [["__init__"], ["write_table", "close"]], ids=["at once", "later"])
+def test_a_disk_that_refuses_any_byte_is_one_error_without_a_remnant(
+    refused: list[str], toy_arm: Embodiment, toy_file: Path, tmp_path: Path, monkeypatch
+) -> None:
+    def full(*arguments: object, **options: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    for method in refused:
+        monkeypatch.setattr(f"pyarrow.parquet.ParquetWriter.{method}", full)
+    with pytest.raises(OutputError, match=r"shard-00000.parquet: .*No space left on device .* free space"):
+        run(toy_arm, toy_file, tmp_path / "out")
+    assert not list((tmp_path / "out").rglob("*.part"))
+
+
 def test_a_full_disk_is_one_error_and_what_was_made_is_kept(
     toy_arm: Embodiment, toy_file: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
 ) -> None:
