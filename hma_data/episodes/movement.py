@@ -208,7 +208,8 @@ class Kept:
     def __str__(self) -> str:
         if not self.moved:
             return "nothing moves in the sampled frames"
+        share = format(100 * self.share, ".2g" if self.share < 0.1 else ".0f")
         return (
-            f"moving pixels ({100 * self.share:.2g} % of the image) are decoded at {self.psnr_db:.1f} dB: "
+            f"moving pixels ({share} % of the image) are decoded at {self.psnr_db:.1f} dB: "
             f"decoded frames show {self.change_shown:.0%} of the recorded change"
         )

@@ -133,5 +133,9 @@ def test_kept_counts_the_pixels_that_move_and_how_much_of_their_change_is_shown(
     exact.add(film, film)
     blind.add(film, np.full_like(film, 60))
     assert (exact.share, exact.psnr_db, exact.change_shown) == (112 / 1200, 99.0, 1.0)
+    assert "(9.3 % of the image)" in str(exact)
+    everywhere = Kept()
+    everywhere.add(np.arange(0, 90, 30, dtype=np.uint8)[:, None, None, None] + np.zeros_like(film), film)
+    assert "(100 % of the image)" in str(everywhere)
     assert blind.change_shown == 0 and blind.lost and not exact.lost
     assert blind.psnr_db == pytest.approx(10 * np.log10(255**2 / (100**2 * 48 / 112)))
