@@ -42,6 +42,7 @@ from hma_data.shards.manifest import (
     Manifest,
     damaged_files,
     digest_of_texts,
+    restat_remedy,
     shard_sizes,
 )
 from hma_data.shards.schema import RowLayout, to_numpy
@@ -112,8 +113,8 @@ def _refuse_damaged(out: Path, base: Manifest) -> None:
                 out / shard.path, fault, "restore it from a copy, or start over with --overwrite"
             )
     if damaged := damaged_files(out, base):
-        remedy = f"hma shards restat {out} rebuilds it from the shards"
-        raise OutputError(damaged[0], "is missing, or changed since the manifest was written", remedy)
+        fault = "is missing, or changed since the manifest was written"
+        raise OutputError(damaged[0], fault, restat_remedy(out))
 
 
 def _refuse_changed(

@@ -7,6 +7,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -218,7 +219,7 @@ class RowDecoder:
             fault = "latents are not finite"
         if fault:
             folder = self.shards.folder
-            raise ShardError(f"{folder}/{shard}", fault, f"run: hma shards verify {folder}")
+            raise ShardError(f"{folder}/{shard}", fault, f"run: hma shards verify {quote(str(folder))}")
 
     def __getstate__(self) -> dict[str, Any]:
         kept = {key: value for key, value in self.__dict__.items() if key != "_lock"}

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import batched
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -175,7 +176,7 @@ class Manifest:
         """
         folder = place(folder)
         path = folder / MANIFEST
-        restat = f"hma shards restat {folder} rebuilds it from the shards"
+        restat = restat_remedy(folder)
         if not path.is_file():
             if not isinstance(folder, RemotePath) and (found := misplaced(folder, "a shard set")):
                 raise ShardError(folder, *found)
@@ -240,10 +241,24 @@ def shard_sizes(folder: Path) -> dict[str, int]:
 
 
 def stored_embodiment(folder: Path) -> Embodiment:
-    """Read the embodiment.yaml of a shard set."""
+    """Read the embodiment.yaml of a shard set.
+
+    Raises:
+        ShardError: it cannot be read.
+        RegistryError: it is damaged.
+    """
     path = folder / EMBODIMENT
-    text = path.read_text(encoding="utf-8", errors="replace")
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as fault:
+        remedy = "the same hma convert writes it again"
+        raise ShardError(path, f"cannot be read: {fault.strerror or fault}", remedy) from fault
     return Embodiment.from_yaml(text, str(path))
+
+
+def restat_remedy(folder: Path) -> str:
+    """Return the command that rebuilds a derived file of a shard set, as a sentence for an error."""
+    return f"hma shards restat {quote(str(folder))} rebuilds it from the shards"
 
 
 def seal_problem(text: bytes) -> str:

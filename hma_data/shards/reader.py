@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from hma_data.errors import ShardError, UsageError
-from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile
+from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile, restat_remedy
 from hma_data.shards.schema import flag_pauses, mask_columns, to_numpy, token_column
 from hma_data.storage.files import cache_folder, file_sha256, parse_json, part_of
 from hma_data.storage.kinds import misplaced
@@ -109,8 +109,7 @@ class ShardSet:
         try:
             return [dict(parse_json(line)) for line in path.read_text(encoding="utf-8").splitlines()]
         except (OSError, ValueError, TypeError) as fault:
-            remedy = f"hma shards restat {self.folder} rebuilds it"
-            raise ShardError(path, f"cannot be read: {fault}", remedy) from fault
+            raise ShardError(path, f"cannot be read: {fault}", restat_remedy(self.folder)) from fault
 
     def camera_index(self, camera: str | None) -> int:
         """Return the place of a camera among those of the set; None means the first."""

@@ -35,6 +35,7 @@ from hma_data.shards.manifest import (
     ShardFile,
     damaged_files,
     plan_hash,
+    restat_remedy,
     seal_problem,
     stored_embodiment,
 )
@@ -74,7 +75,7 @@ def verify(
         fault = seal_problem((folder / MANIFEST).read_bytes()) or _plan_problem(manifest)
     except (HMAError, OSError) as unreadable:
         return [_line(unreadable, folder / MANIFEST)]
-    restat = f"hma shards restat {folder} rebuilds it from the shards"
+    restat = restat_remedy(folder)
     found = [f"{folder / MANIFEST}: {fault} — {restat}"] if fault else []
     derived = Derived(manifest.plan, manifest.embodiment, manifest.tokenizer, manifest.source)
     for shard, problems, footer in _checked(folder, manifest, workers, quick, on_progress):

@@ -5,6 +5,7 @@ The files have the layout of `docs/format.md`. README.md tells the hub's viewer 
 
 import tempfile
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from hma_data.conversion.publish import SMALL, publish
@@ -59,7 +60,8 @@ def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str
         where, fault = folder / MANIFEST, problem
         if damaged:
             where, fault = damaged[0], f"is not the file that {MANIFEST} names"
-        remedy = f"hma shards verify {folder} shows all; hma shards restat {folder} rebuilds small files"
+        named = quote(str(folder))
+        remedy = f"hma shards verify {named} shows all; hma shards restat {named} rebuilds small files"
         raise ShardError(where, fault, remedy)
     store = _open(as_address(target), write=True, private=private)
     page = _page(manifest, store.repo)

@@ -16,7 +16,7 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import restat
 from hma_data.errors import ShardError
-from hma_data.shards.manifest import MANIFEST, Manifest, derive, plan_hash, seal_problem
+from hma_data.shards.manifest import EMBODIMENT, MANIFEST, Manifest, derive, plan_hash, seal_problem
 from hma_data.shards.verify import verify
 from tests.conftest import toy_shards, write_toy
 
@@ -285,6 +285,19 @@ def test_restat_refuses_when_shards_are_missing_and_no_manifest_tells(sound: Pat
     (sound / "train" / "shard-00001.parquet").unlink()
     with pytest.raises(ShardError, match="hma convert"):
         restat(sound)
+
+
+def test_restat_names_a_missing_embodiment_where_the_manifest_is_lost_too(sound: Path) -> None:
+    (sound / MANIFEST).unlink()
+    (sound / EMBODIMENT).unlink()
+    with pytest.raises(ShardError, match=r"embodiment.yaml: cannot be read: No such file .* hma convert"):
+        restat(sound)
+
+
+def test_the_command_that_helps_names_a_folder_with_a_space_as_a_shell_takes_it(sound: Path) -> None:
+    folder = sound.rename(sound.with_name("my set"))
+    (folder / MANIFEST).write_text("{")
+    one(verify(folder), "is damaged", f"hma shards restat '{folder}' rebuilds")
 
 
 def test_restat_refuses_a_damaged_shard(sound: Path) -> None:
