@@ -104,7 +104,7 @@ def read_films(
             pictures = read_pictures(file, frames)
             film = [resize(picture[None], size, "short_side_crop", resize_filter) for picture in pictures]
         except TokenizerError as fault:
-            skipped = f": {fault}"
+            skipped = f": {fault.where}: {fault.fault}"
             on_skip(str(fault))
             continue
         if film:
@@ -134,7 +134,7 @@ def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
         for index in _evenly(len(video), frames):
             yield video.frames([index])[0]
     except EpisodeError as fault:
-        raise TokenizerError(path, f"cannot be decoded as a video: {fault.fault}") from fault
+        raise TokenizerError(path, fault.fault, fault.remedy) from fault
 
 
 def recording_films(
