@@ -13,19 +13,19 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (668, 3_755, 7),
+    "hma_data": (669, 3_768, 7),
     "hma_data/cli": (1_545, 11_038, 8),
-    "hma_data/conversion": (4_210, 31_264, 14),
-    "hma_data/episodes": (1_670, 14_636, 9),
+    "hma_data/conversion": (4_211, 31_266, 14),
+    "hma_data/episodes": (1_671, 14_652, 9),
     "hma_data/hub": (512, 3_787, 3),
     "hma_data/inspection": (2_151, 20_090, 8),
     "hma_data/lab": (3_327, 30_594, 16),
-    "hma_data/loading": (1_283, 10_976, 6),
+    "hma_data/loading": (1_284, 10_984, 6),
     "hma_data/registry": (1_287, 8_311, 6),
-    "hma_data/shards": (2_532, 19_464, 11),
-    "hma_data/sources": (12_528, 104_699, 50),
+    "hma_data/shards": (2_551, 19_540, 11),
+    "hma_data/sources": (12_534, 104_760, 50),
     "hma_data/storage": (1_655, 10_881, 11),
-    "hma_data/tokenizers": (3_274, 23_686, 17),
+    "hma_data/tokenizers": (3_274, 23_695, 17),
     "hma_model": (505, 3_000, 4),
     "hma_model/benchmark": (845, 7_250, 5),
     "hma_model/checkpoint": (885, 6_600, 5),
@@ -34,7 +34,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/evaluation": (4_465, 35_950, 23),
     "hma_model/export": (1_056, 8_078, 8),
     "hma_model/generation": (1_670, 13_500, 10),
-    "hma_model/hub": (1_060, 8_200, 6),
+    "hma_model/hub": (1_060, 8_209, 6),
     "hma_model/lerobot_env": (638, 4_776, 3),
     "hma_model/network": (3_215, 27_950, 16),
     "hma_model/play": (1_655, 11_950, 8),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_517, 28_940, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_715, 511_560
-TEST_LINES = 48_216
+PRODUCT_LINES, PRODUCT_NODES = 64_746, 511_734
+TEST_LINES = 48_276
 DOC_WORDS = 40_357
 
 
