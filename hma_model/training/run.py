@@ -49,6 +49,7 @@ from hma_model.training.resume import (
 from hma_model.training.runtime import (
     ENVIRONMENT,
     RECIPE,
+    attention_form,
     choose_precision,
     environment,
 )
@@ -150,8 +151,9 @@ class Run:
             return choose_precision(recipe, config, self.device, begun)
 
         precision, reason = self.ranks.once(choose)
-        self.arithmetic = f"precision {precision}: {reason}"
-        return recipe.model_copy(update={"precision": precision})
+        chosen = recipe.model_copy(update={"precision": precision})
+        self.arithmetic = f"precision {precision}: {reason}; {attention_form(chosen, config, self.device)}"
+        return chosen
 
     def _config(self, recipe: Recipe) -> HMAConfig:
         if self.start:
