@@ -41,11 +41,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_825, 20_100, 14),
     "hma_model/released": (825, 7_100, 4),
     "hma_model/synthetic": (1_205, 9_100, 5),
-    "hma_model/training": (3_517, 28_940, 18),
+    "hma_model/training": (3_529, 29_018, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_746, 511_734
-TEST_LINES = 48_276
+PRODUCT_LINES, PRODUCT_NODES = 64_758, 511_814
+TEST_LINES = 48_280
 DOC_WORDS = 40_357
 
 
