@@ -32,11 +32,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/cli": (1_721, 10_700, 12),
     "hma_model/demo": (485, 4_100, 4),
     "hma_model/evaluation": (4_465, 35_950, 23),
-    "hma_model/export": (1_056, 8_078, 8),
+    "hma_model/export": (1_189, 9_374, 9),
     "hma_model/generation": (1_670, 13_500, 10),
     "hma_model/hub": (1_060, 8_209, 6),
     "hma_model/lerobot_env": (638, 4_776, 3),
-    "hma_model/network": (3_215, 27_950, 16),
+    "hma_model/network": (3_230, 28_241, 16),
     "hma_model/play": (1_655, 11_950, 8),
     "hma_model/policies": (2_825, 20_100, 14),
     "hma_model/released": (825, 7_100, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_529, 29_018, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_758, 511_814
-TEST_LINES = 48_280
+PRODUCT_LINES, PRODUCT_NODES = 64_913, 513_449
+TEST_LINES = 48_364
 DOC_WORDS = 40_357
 
 

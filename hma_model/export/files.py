@@ -17,6 +17,7 @@ from torch import nn
 
 from hma_data.storage.files import atomic_path, file_sha256
 from hma_model.export.graphs import Port, example
+from hma_model.export.winograd import rewrite
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -58,12 +59,20 @@ def write_graph(
     return facts(path)
 
 
-def write_part(whole: Path, path: Path, inputs: Sequence[str], outputs: Sequence[str]) -> dict[str, Any]:
-    """Write the part of a graph that computes some outputs from some inputs, and return its file's facts."""
+def write_part(
+    whole: Path, path: Path, inputs: Sequence[str], outputs: Sequence[str], *, winograd: bool = False
+) -> dict[str, Any]:
+    """Write the part of a graph that computes some outputs from some inputs, and return its file's facts.
+
+    Args:
+        winograd: see `hma_model.export.winograd`.
+    """
     from onnx import load
     from onnx.utils import Extractor
 
     made = Extractor(load(whole)).extract_model(list(inputs), list(outputs))
+    if winograd:
+        rewrite(made)
     with atomic_path(path) as part:
         part.write_bytes(made.SerializeToString())
     return facts(path)

@@ -3,7 +3,8 @@
     manifest.json            what is in the folder; written last
     step.onnx                one frame of any robot
     page-step.onnx           for the page: the same without its image
-    page-image.onnx          for the page: the image of a frame
+    page-image.onnx          for the page: the image of a frame, on a processor
+    page-image-gpu.onnx      and on a GPU
     robots/ID/stem.onnx      what commands of a robot mean to the step
     robots/ID/frames.npy     (starts, P, …) known frames, as the step takes them
     robots/ID/chunks.npy     (starts, P - 1, K) commands between them; NaN where they are unknown
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
 
 FORMAT, FORMAT_VERSION = "hma-export", 1
 MANIFEST, STEP, ROBOTS = "manifest.json", "step.onnx", "robots"
-PARTS = ("page-step.onnx", "page-image.onnx")
+PARTS = ("page-step.onnx", "page-image.onnx", "page-image-gpu.onnx")
 COLUMNS = 10  # true images in a row of a picture
 QUALITY = 90  # of WebP
 
@@ -126,12 +127,16 @@ def export_folder(
 
 
 def _write_parts(folder: Path, step: StepGraph) -> dict[str, Any]:
-    """Write the two graphs of the page, which makes an image while it computes the next frame."""
+    """Write the graphs of the page, which makes an image while it computes the next frame."""
     image, *others = step.outputs
-    names = [port.name for port in step.inputs]
+    names, (of_step, of_image, on_gpu) = (
+        [port.name for port in step.inputs],
+        (folder / part for part in PARTS),
+    )
     return {
-        "step": write_part(folder / STEP, folder / PARTS[0], names, others),
-        "image": write_part(folder / STEP, folder / PARTS[1], ["next_frame"], [image]),
+        "step": write_part(folder / STEP, of_step, names, others),
+        "image": write_part(folder / STEP, of_image, ["next_frame"], [image], winograd=True),
+        "gpu_image": write_part(folder / STEP, on_gpu, ["next_frame"], [image]),
     }
 
 

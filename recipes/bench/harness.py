@@ -23,6 +23,7 @@ BENCHES: dict[str, str] = {  # name -> module of this folder:object
     "lerobot": "sources:LEROBOT",
     "loader": "loader:BENCH",
     "mup": "mup:BENCH",
+    "page": "page:BENCH",
     "play": "play:BENCH",
     "quality": "quality:BENCH",
     "scale": "scale:BENCH",

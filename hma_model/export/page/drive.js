@@ -2,7 +2,7 @@
 
 import { Controls, cap, fill } from "./controls.js";
 import { Table, paint } from "./family.js";
-import { Decoder, Loader, World, fetchRuntime, openReplays, readManifest, startRuntime } from "./world.js";
+import { Loader, Session, World, fetchRuntime, openReplays, readManifest, startRuntime } from "./world.js";
 
 const $ = (id) => document.getElementById(id);
 const asked = new URLSearchParams(location.search);
@@ -47,21 +47,18 @@ async function main() {
 }
 
 async function runtimeOf(gpu) {  // how the model's two graphs are opened: that of the next frame, and that of its image
-  const graphs = [loader.part(manifest.page.step), loader.part(manifest.page.image)];
-  for (const graph of graphs) graph.catch(() => {});  // they are awaited below
+  const { page } = manifest, step = loader.part(page.step), image = loader.part(page.image);
+  for (const graph of [step, image]) graph.catch(() => {});  // they are awaited below
   const files = await fetchRuntime(manifest, loader, gpu ? "webgpu" : "wasm");
   const cores = crossOriginIsolated ? Number(asked.get("threads")) || Math.min(4, navigator.hardwareConcurrency || 1) : 1;
   const images = Math.max(1, cores >> 1), steps = Math.max(1, cores - images);  // threads
-  ort = await startRuntime(files, steps);
-  const open = async (graph, ...providers) => ort.InferenceSession.create(await graph, { executionProviders: providers });
-  const onWasm = async () => {
-    const [step, decoder] = await Promise.all([open(graphs[0], "wasm"), graphs[1].then((graph) => Decoder.open(files, graph, images))]);
-    return { step, decoder };
+  ort = await startRuntime(files, 1);
+  const open = async (image, ...providers) => {
+    const sessions = [[step, steps], [image, images]].map(async ([graph, count]) => Session.open(files, await graph, count, ...providers));
+    const [first, second] = await Promise.all(sessions);
+    return { step: first, decoder: second };
   };
-  const onGpu = async () => {
-    const [step, decoder] = [await open(graphs[0], "webgpu", "wasm"), await open(graphs[1], "webgpu", "wasm")];
-    return { step, decoder: { image: async (frame) => (await decoder.run({ next_frame: frame })).image.data } };
-  };
+  const onWasm = () => open(image, "wasm"), onGpu = () => open(loader.part(page.gpu_image), "webgpu", "wasm");
   return { onWasm, onGpu, threads: steps + images };
 }
 
@@ -70,7 +67,9 @@ async function tryGpu(open) {  // a driver may compute wrongly, and the processo
   for (const one of held) one.disabled = true;  // a session makes one frame at a time
   try {
     const found = await open();
-    if (await world.better(found)) { model.decoder.close(); model = world.model = found; backend = "webgpu"; }
+    const better = await world.better(found), slower = better ? model : found;
+    for (const one of Object.values(slower)) one.close();
+    if (better) { model = world.model = found; backend = "webgpu"; await world.begin(start); }
   } catch { /* it stays on WebAssembly */ }
   for (const one of held) one.disabled = false;
 }

@@ -93,30 +93,32 @@ function rows({ values, shape }, size) {  // the numbers of each place of the fi
   return Array.from({ length: values.length / size }, (_, i) => values.slice(i * size, (i + 1) * size));
 }
 
+const numbers = ({ dtype, shape }, data = new TYPES[dtype](product(shape))) => ({ type: dtype, data, dims: shape });
+
 const product = (shape) => shape.reduce((one, other) => one * other, 1);
 
 function normal() { return Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random()); }
 
-export class Decoder {  // makes images in a worker, while the page computes the next frame
+export class Session {  // a graph in a worker: the page stays free, and two graphs run side by side
   constructor() {
-    this.worker = new Worker(new URL("decoder.js", import.meta.url), { type: "module" });
+    this.worker = new Worker(new URL("session.js", import.meta.url), { type: "module" });
   }
 
-  static async open(runtime, graph, threads) {
-    const made = new Decoder();
-    await made.ask({ runtime, graph, threads });
-    return made;
+  static async open(runtime, graph, threads, ...providers) {
+    const opened = new Session();
+    await opened.ask({ runtime, graph, threads, providers });
+    return opened;
   }
 
   ask(message) {  // one question at a time
     return new Promise((done, failed) => {
-      this.worker.onmessage = ({ data: { fault, image } }) => fault ? failed(new Error(fault)) : done(image);
-      this.worker.onerror = () => failed(new Error("decoder.js cannot be loaded: copy the exported folder again, or use a browser of 2023 or later"));
+      this.worker.onmessage = ({ data: { fault, made } }) => fault ? failed(new Error(fault)) : done(made);
+      this.worker.onerror = () => failed(new Error("session.js cannot be loaded: copy the exported folder again, or use a browser of 2023 or later"));
       this.worker.postMessage(message);
     });
   }
 
-  image({ type, data, dims }) { return this.ask({ type, data, dims }); }
+  run(inputs, give, keep = []) { return this.ask({ inputs, give, keep }); }  // `keep` names what the next run takes of this one
 
   close() { this.worker.terminate(); }
 }
@@ -139,7 +141,7 @@ export class World {  // one robot
 
   async begin(start) {  // give the model the known frames of a start
     this.before = new Float32Array(this.width).fill(NaN);
-    this.state = Object.fromEntries(this.manifest.state.map((one) => [one.name, this.tensor(one)]));
+    this.given = this.nothing();
     for (let i = 0; i < this.known; i++) {
       this.put(this.frames[start * this.known + i]);
       if (i < this.known - 1) await this.advance(this.chunks[start * (this.known - 1) + i]);
@@ -156,12 +158,12 @@ export class World {  // one robot
     return { px: px[i - 1] + share * (px[i] - px[i - 1]), warns: stated >= meter.limit };
   }
 
+  nothing() { return Object.fromEntries(this.manifest.state.map((one) => [one.name, numbers(one)])); }  // the state before any frame
+
   put(frame) {
     const port = this.manifest.state.find((one) => one.name === "frame");
-    this.state.frame = this.tensor(port, TYPES[port.dtype].from(frame));
+    this.given.frame = numbers(port, TYPES[port.dtype].from(frame));
   }
-
-  tensor(port, values = new TYPES[port.dtype](product(port.shape))) { return new this.ort.Tensor(port.dtype, values, port.shape); }
 
   draws() {
     const made = {};
@@ -169,22 +171,22 @@ export class World {  // one robot
       const values = new Float32Array(product(port.shape));
       const draw = port.law === "normal" ? normal : Math.random;
       for (let i = 0; i < values.length; i++) values[i] = draw();
-      made[port.name] = this.tensor(port, values);
+      made[port.name] = numbers(port, values);
     }
-    if (this.temperature !== null) made.temperature = this.tensor({ dtype: "float32", shape: [] }, Float32Array.of(this.temperature));
+    if (this.temperature !== null) made.temperature = numbers({ dtype: "float32", shape: [] }, Float32Array.of(this.temperature));
     return made;
   }
 
   async inputs(chunk) {  // of the next step
     const pair = new Float32Array(2 * this.width);
     pair.set(this.before); pair.set(chunk, this.width);
-    const { actions } = await this.stem.run({ chunks: this.tensor({ dtype: "float32", shape: [2, this.width] }, pair) });
-    return { actions, ...this.state, ...this.draws() };
+    const { actions: { type, data, dims } } = await this.stem.run({ chunks: new this.ort.Tensor("float32", pair, [2, this.width]) });
+    return { actions: { type, data, dims }, ...this.draws(), ...this.given };
   }
 
   async better(other) {  // whether that model makes the same image as this one, in less time
-    const inputs = await this.inputs(new Float32Array(this.width)), found = [];
-    const make = async ({ step, decoder }) => decoder.image((await step.run(inputs)).next_frame);
+    const inputs = { ...this.nothing(), ...await this.inputs(new Float32Array(this.width)) }, found = [];
+    const make = async ({ step, decoder }) => (await decoder.run(await step.run(inputs, ["next_frame"]), ["image"])).image.data;
     for (const model of [this.model, other]) {
       await make(model);  // the first run also compiles
       const begun = performance.now(), pixels = await make(model);
@@ -195,12 +197,16 @@ export class World {  // one robot
   }
 
   async advance(chunk) {  // compute the next frame
-    const made = await this.model.step.run(await this.inputs(chunk));
-    for (const name of Object.keys(this.state)) this.state[name] = made["next_" + name];
+    const names = this.manifest.state.map((one) => one.name);
+    const { next_frame, uncertainty } = await this.model.step.run(await this.inputs(chunk), ["next_frame", "uncertainty"], names);
+    this.given = {};
+    this.frame = next_frame;
     this.before = Float32Array.from(chunk);
-    const calibrated = made.uncertainty && this.temperature === this.manifest.temperature;
-    this.unsure += calibrated ? made.uncertainty.data[0] ** POWER : NaN;
+    const calibrated = uncertainty && this.temperature === this.manifest.temperature;
+    this.unsure += calibrated ? uncertainty.data[0] ** POWER : NaN;
   }
 
-  image() { return this.model.decoder.image(this.state.frame); }  // of the newest frame, as RGB bytes
+  async image() {  // of the newest frame, as RGB bytes
+    return (await this.model.decoder.run({ next_frame: this.frame }, ["image"])).image.data;
+  }
 }

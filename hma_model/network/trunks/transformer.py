@@ -33,7 +33,9 @@ def remember(cache: Tensor, new: tuple[Tensor, Tensor], times: TimePositions) ->
     """Write keys and values (B, T, ...) into a cache (2, R, rows, ...); return that of the pass's rows."""
     assert times.slots is not None
     # `slots` numbers (slot, row) pairs: one index_copy_ writes frames of rows at different times.
-    cache.flatten(1, 2).index_copy_(1, times.slots.flatten(), torch.stack(new).flatten(1, 2))
+    slots = times.slots.flatten()
+    both = torch.cat([slots, slots + cache.shape[1] * cache.shape[2]])  # of keys, and of values
+    cache.flatten(0, 2).index_copy_(0, both, torch.cat(new).flatten(0, 1))
     return cache if times.rows is None else cache[:, :, times.rows]
 
 
@@ -66,6 +68,8 @@ def attend(
             made: Tensor = _InCache.apply(q, k, v, scale)
             return made
         return attend(q.float(), k.float(), v.float(), mask, scale, causal).to(q.dtype)
+    if torch.compiler.is_exporting():
+        return _attend_by_products(q, k, v, mask, scale, causal)
     if len(q) <= SEQUENCE_LIMIT:
         return F.scaled_dot_product_attention(q, k, v, mask, is_causal=causal, scale=scale)
     masks: Sequence[Tensor | None] = [mask] * -(-len(q) // SEQUENCE_LIMIT)
@@ -192,7 +196,8 @@ class TemporalAttention(Attention):
         """Attend from queries (B, T, N, heads, head_dim) to the rows' cache; return (B, T, N, D)."""
         b, t, n, heads, size = q.shape
         allowed = times.allowed if times.allowed.dim() == 3 else times.allowed.unsqueeze(0)
-        if torch.compiler.is_compiling():
+        exporting = torch.compiler.is_exporting()
+        if torch.compiler.is_compiling() and not exporting:
             return self._recall_fused(q, allowed, cache)
         if q.device.type != "cpu" or q.dtype != torch.float32:
             queries = q.transpose(1, 2).flatten(0, 1).transpose(1, 2)  # (B*N, heads, T, head_dim)
@@ -206,7 +211,7 @@ class TemporalAttention(Attention):
         k, v = cache.flatten(2, 4).transpose(1, 2)  # (B*N*heads, R, head_dim)
         hidden = times.once("hidden", lambda: self._hidden(allowed, n * heads))
         scores = torch.baddbmm(hidden, rows, k.transpose(1, 2), alpha=self.scale)
-        weights = scores.permute(2, 0, 1).softmax(0).permute(1, 2, 0)
+        weights = scores.softmax(-1) if exporting else scores.permute(2, 0, 1).softmax(0).permute(1, 2, 0)
         return torch.bmm(weights, v).view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
 
     def _recall_fused(self, q: Tensor, allowed: Tensor, cache: Tensor) -> Tensor:

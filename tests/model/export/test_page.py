@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,12 +18,14 @@ import cv2
 import numpy as np
 import pytest
 
+from hma_data.errors import UsageError
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.table import BlockTable
 from hma_model.export.folder import write_replays
 from hma_model.export.page import VERSION, write_page
 from hma_model.export.starts import Start
 from hma_model.play.session import psnr
+from recipes.bench.harness import load
 from tests.browser_fixtures import EMULATED_GPU, FLAGS
 from tests.model.export.checkpoints import ROBOT, Driver
 
@@ -285,7 +288,7 @@ def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(
 @pytest.mark.parametrize(
     ("name", "place", "words"),
     [
-        ("decoder.js", "#veil-text", "decoder.js cannot be loaded"),
+        ("session.js", "#veil-text", "session.js cannot be loaded"),
         ("family.js", "#veil-text", "A script of the page is missing"),
         (f"robots/{ROBOT}/table.png", "#note", "table.png cannot be loaded"),
     ],
@@ -356,3 +359,12 @@ def test_a_browser_without_simd_is_one_clear_line(page: "Page", server: Any) -> 
     page.add_init_script("WebAssembly.validate = () => false;")
     page.goto(address(server))
     assert said(page).startswith("This browser has no WebAssembly with SIMD")
+
+
+def test_the_bench_counts_frames(site: Path, browser: "Browser") -> None:
+    given = {"export": str(site / "sub" / "page"), "robot": ROBOT, "frames": 5}
+    with ThreadPoolExecutor(1) as pool:  # a thread has one Playwright, and this one has the fixture's
+        (row,) = pool.submit(load("page").run, given).result()
+    assert row["frames_per_second"] > 0 and "WASM" in row["backend"] and float(row["shown"]) > 0
+    with pytest.raises(UsageError, match="no folder of hma export"):
+        load("page").run({"export": str(site), "robot": ROBOT, "frames": 5})
