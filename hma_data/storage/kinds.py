@@ -60,7 +60,7 @@ def own_layout(files: Iterable[Path]) -> str:
 def unreadable(path: Path, fault: str, remedy: str) -> tuple[str, str]:
     """Return fault and remedy of a file or folder that could not be read.
 
-    They are those given, unless it is a Git LFS pointer or there is no permission: then that is the reason.
+    They are those given, unless the file is empty, is a Git LFS pointer, or may not be read.
     """
     if is_remote(path):
         return fault, remedy
@@ -71,8 +71,11 @@ def unreadable(path: Path, fault: str, remedy: str) -> tuple[str, str]:
             return "may not be read: permission denied", f"ask its owner, or run chmod u+rX {path}"
         if path.is_file():
             with path.open("rb") as file:
-                if file.read(len(LFS)) == LFS:
-                    return "is a Git LFS pointer instead of the file", "run git lfs pull in its folder"
+                begin = file.read(len(LFS))
+            if begin == LFS:
+                return "is a Git LFS pointer instead of the file", "run git lfs pull in its folder"
+            if not begin:
+                return "is empty", "copy it again from where it was recorded"
     except PermissionError:
         return "may not be read: permission denied", f"ask the owner of {path.parent}"
     except OSError:

@@ -113,7 +113,9 @@ def read_bytes(path: Path, error: type[HMAError] = RegistryError) -> bytes:
     try:
         if not path.is_file():
             found = misplaced(path, "a YAML file")
-            raise error(path, *(found or ("is not a file" if path.exists() else "no such file",)))
+            raise error(
+                path, *(found or ("is not a file" if path.exists() else "no such file", "check the path"))
+            )
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
     except OSError as fault:

@@ -75,7 +75,9 @@ def frame_table(path: Path) -> FrameTable:
     try:
         state = path.stat()
     except OSError as fault:
-        raise EpisodeError(path, *unreadable(path, "no such video file", "")) from fault
+        raise EpisodeError(
+            path, *unreadable(path, "no such video file", "copy the recording again, whole")
+        ) from fault
     return _cached_table(str(path), state.st_size, state.st_mtime_ns)
 
 
@@ -94,7 +96,7 @@ def _cached_table(path: str, size: int, changed: int) -> FrameTable:
             if stamp is None:
                 raise EpisodeError(path, "its frames carry no times", "rewrite it as MP4")
             if packet.is_corrupt:
-                raise EpisodeError(path, f"is damaged or cut off at frame {len(shown)}")
+                raise EpisodeError(path, f"is damaged or cut off at frame {len(shown)}", "copy it again")
             delays.add(None if packet.pts is None or packet.dts is None else packet.pts - packet.dts)
             if packet.is_keyframe:
                 keyframes.append((stamp, stamp if packet.dts is None else packet.dts))
@@ -361,6 +363,6 @@ def _explained(path: str) -> Iterator[None]:
         yield
     except (FFmpegError, MemoryError, OverflowError, UnicodeDecodeError) as fault:
         said = getattr(fault, "strerror", None) or fault
-        remedy = "the file may be cut off or damaged"
+        remedy = "it may be cut off or damaged: copy it again"
         fault_and_remedy = unreadable(Path(path), f"cannot be decoded as video: {said}", remedy)
         raise EpisodeError(path, *fault_and_remedy) from fault

@@ -134,7 +134,7 @@ def explained(where: object, error: type[HMAError] = EpisodeError) -> Iterator[N
         yield
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, ArithmeticError, MemoryError) as fault:
         said = (str(fault).splitlines() or [type(fault).__name__])[0]
-        remedy = "the file may be cut off or damaged"
+        remedy = "it may be cut off or damaged: copy it again"
         if "plugin" in said or ("filter" in said and "not registered" in said):
             remedy = (
                 "it is compressed in a way that HDF5 alone does not know; rewrite it with h5repack -f GZIP=4"

@@ -300,10 +300,10 @@ def parquet_explained(where: object, error: type[HMAError]) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as fault:
-        raise error(where, "no such file") from fault
+        raise error(where, "no such file", "copy the dataset again, whole") from fault
     except (pa.ArrowException, OSError, ValueError, LookupError, TypeError) as fault:
         said = (str(fault).splitlines() or [type(fault).__name__])[0]
-        remedy = "the file may be cut off or damaged"
+        remedy = "it may be cut off or damaged: copy it again"
         reason = unreadable(Path(str(where)), f"cannot be read as parquet: {said}", remedy)
         raise error(where, *reason) from fault
 

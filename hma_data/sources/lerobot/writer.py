@@ -69,7 +69,7 @@ class DatasetWriter:
         sides = [side for item in features.values() if item["dtype"] == "video" for side in item["shape"][:2]]
         # H.264 has half as many colours as pixels a side, which an odd side does not allow.
         pixels = "yuv444p" if any(side % 2 for side in sides) else "yuv420p"
-        self._failures = _PictureFailures()
+        self._failures, self._folder = _PictureFailures(), folder
         self._writer = dataset.create(
             f"lab/{name}",
             fps,
@@ -100,6 +100,7 @@ class DatasetWriter:
         self._failures.close()
         with _quiet():
             self._writer.finalize()
+        _share_videos(self._folder)
 
 
 class _PictureFailures(logging.Handler):
@@ -213,6 +214,7 @@ def join_datasets(parts: Sequence[Path], folder: Path, name: str) -> None:
             aggregate.aggregate_datasets([f"lab/{name}"] * len(parts), f"lab/{name}", list(parts), folder)
     finally:
         aggregate.tqdm = bars
+    _share_videos(folder)
     stats = folder / "meta" / "stats.json"  # lerobot writes its features in another order in each process
     stats.write_text(json.dumps(read_json(stats, SourceError), indent=4, sort_keys=True), encoding="utf-8")
 
@@ -225,6 +227,14 @@ def set_splits(folder: Path, splits: Mapping[str, str]) -> None:
     info = load_info(folder)
     info.splits = dict(splits)
     write_info(info, folder)
+
+
+def _share_videos(folder: Path) -> None:
+    """Give videos the permissions of the other files: lerobot makes some as private temporary files."""
+    about = folder / "meta" / "info.json"
+    if about.is_file():
+        for video in folder.rglob("*.mp4"):
+            video.chmod(about.stat().st_mode & 0o777)
 
 
 @contextmanager

@@ -151,6 +151,7 @@ def test_lerobot_reads_what_the_shards_hold(kind: str, frames: str, tmp_path: Pa
                 seen = prepare(frame(item, cameras[name].key), cameras[name], SIZE)
                 stored = raw.decode(shards.tokens(values[column])[at - start][None])
                 assert np.abs(seen.astype(int) - stored).mean() < 3, (name, at)
+    assert len({file.stat().st_mode for file in (tmp_path / "out").rglob("*.*") if file.is_file()}) == 1
     assert ("recorded_time" in dataset.features) == (kind == "bag" or frames == "strided")
 
 

@@ -54,6 +54,15 @@ def test_a_git_lfs_pointer_is_called_one(name: str, tmp_path: Path) -> None:
     assert "is a Git LFS pointer" in said and "run git lfs pull" in said
 
 
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_empty_file_is_called_empty(name: str, tmp_path: Path) -> None:
+    recording = FORMATS[name](tmp_path)
+    for file in data_files(recording):
+        file.write_bytes(b"")
+    assert examine(str(recording))[0].severity == "error"
+    assert "empty" in " ".join(map(str, examine(str(recording))))
+
+
 def test_weights_that_are_a_git_lfs_pointer_are_called_one(tmp_path: Path) -> None:
     from hma_data.tokenizers import get_tokenizer
 

@@ -96,7 +96,7 @@ def test_a_video_that_is_left_out_is_told_with_its_fault_once_and_what_may_be_wr
     with pytest.raises(TokenizerError):
         list(read_films(tmp_path, 64, on_skip=skipped.append))
     (said,) = skipped
-    assert said.count("cannot be decoded") == 1 and said.endswith("the file may be cut off or damaged")
+    assert said.count("cannot be decoded") == 1 and said.endswith("copy it again")
 
 
 def test_a_film_without_pictures_is_refused(tmp_path):
