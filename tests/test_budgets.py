@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_524, 11_400, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_930, 513_541
-TEST_LINES = 48_374
+TEST_LINES = 48_377
 DOC_WORDS = 40_357
 
 

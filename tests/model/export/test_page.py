@@ -45,14 +45,17 @@ document.addEventListener("frame", ({ detail: { chunk, image } }) => {
 });
 """
 
-# Chromium calls its emulated GPU real, and each interval is shorter, or longer, than the one before.
+# Chromium calls its emulated GPU real, and of the intervals that the page compares each is shorter, or longer,
+# than the one before. Others, such as animation frames, look at the clock at any time.
 REAL_GPU = """
 if (self.GPUAdapterInfo) {
   Object.defineProperty(GPUAdapterInfo.prototype, "isFallbackAdapter", { get: () => false });
 }
 let asked = 0;
+const clock = performance.now.bind(performance);
+performance.now = () => new Error().stack.includes("World.better") ? told(++asked) : clock();
 """
-SHORTER, LONGER = "performance.now = () => 1e6 - 1e6 / ++asked;", "performance.now = () => ++asked ** 2;"
+SHORTER, LONGER = "const told = (asked) => 1e6 - 1e6 / asked;", "const told = (asked) => asked ** 2;"
 
 
 @pytest.fixture(scope="session")
