@@ -45,8 +45,8 @@ document.addEventListener("frame", ({ detail: { chunk, image } }) => {
 });
 """
 
-# Chromium calls its emulated GPU real. Each interval that the page compares is shorter, or longer, than the one
-# before. Others, such as animation frames, look at the clock at any time.
+# Chromium calls its emulated GPU real. Each interval that the page compares is shorter, or longer, than the
+# one before. Others, such as animation frames, look at the clock at any time.
 REAL_GPU = """
 if (self.GPUAdapterInfo) {
   Object.defineProperty(GPUAdapterInfo.prototype, "isFallbackAdapter", { get: () => false });
