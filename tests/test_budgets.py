@@ -32,7 +32,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/cli": (1_721, 10_700, 12),
     "hma_model/demo": (485, 4_100, 4),
     "hma_model/evaluation": (4_465, 35_950, 23),
-    "hma_model/export": (1_189, 9_374, 9),
+    "hma_model/export": (1_189, 9_410, 9),
     "hma_model/generation": (1_670, 13_500, 10),
     "hma_model/hub": (1_060, 8_209, 6),
     "hma_model/lerobot_env": (638, 4_776, 3),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_529, 29_018, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_930, 513_541
+PRODUCT_LINES, PRODUCT_NODES = 64_930, 513_577
 TEST_LINES = 48_377
 DOC_WORDS = 40_357
 

@@ -55,8 +55,13 @@ async function runtimeOf(gpu) {  // how the model's two graphs are opened: that 
   ort = await startRuntime(files, 1);
   const open = async (image, ...providers) => {
     const sessions = [[step, steps], [image, images]].map(async ([graph, count]) => Session.open(files, await graph, count, ...providers));
-    const [first, second] = await Promise.all(sessions);
-    return { step: first, decoder: second };
+    try {
+      const [first, second] = await Promise.all(sessions);
+      return { step: first, decoder: second };
+    } catch (fault) {
+      for (const one of sessions) one.then((session) => session.close(), () => {});
+      throw fault;
+    }
   };
   const onWasm = () => open(image, "wasm"), onGpu = () => open(loader.part(page.gpu_image), "webgpu", "wasm");
   return { onWasm, onGpu, threads: steps + images };

@@ -106,7 +106,8 @@ export class Session {  // a graph in a worker: the page stays free, and two gra
 
   static async open(runtime, graph, threads, ...providers) {
     const opened = new Session();
-    await opened.ask({ runtime, graph, threads, providers });
+    try { await opened.ask({ runtime, graph, threads, providers }); }
+    catch (fault) { opened.close(); throw fault; }
     return opened;
   }
 

@@ -1,16 +1,14 @@
 """The exported page in a real browser, from a plain static server in a sub-folder."""
 
 import base64
-import functools
 import http.server
 import json
 import os
 import shutil
 import subprocess
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,14 +16,14 @@ import cv2
 import numpy as np
 import pytest
 
-from hma_data.errors import UsageError
+from hma_data.errors import HMAError, UsageError
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.table import BlockTable
 from hma_model.export.folder import write_replays
 from hma_model.export.page import VERSION, write_page
 from hma_model.export.starts import Start
 from hma_model.play.session import psnr
-from recipes.bench.harness import load
+from recipes.bench.page import run, served
 from tests.browser_fixtures import EMULATED_GPU, FLAGS
 from tests.model.export.checkpoints import ROBOT, Driver
 
@@ -90,21 +88,6 @@ def with_runtime(export: Path, runtime: Path, folder: Path) -> Path:
 def server(site: Path) -> Iterator[http.server.ThreadingHTTPServer]:
     with served(site) as made:
         yield made
-
-
-@contextmanager
-def served(site: Path) -> Iterator[http.server.ThreadingHTTPServer]:
-    """Serve a folder on loopback."""
-
-    class Handler(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *arguments: Any) -> None:
-            pass
-
-    made = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(site)))
-    threading.Thread(target=made.serve_forever, daemon=True).start()
-    yield made
-    made.shutdown()
-    made.server_close()
 
 
 @pytest.fixture
@@ -367,7 +350,17 @@ def test_a_browser_without_simd_is_one_clear_line(page: "Page", server: Any) -> 
 def test_the_bench_counts_frames(site: Path, browser: "Browser") -> None:
     given = {"export": str(site / "sub" / "page"), "robot": ROBOT, "frames": 5}
     with ThreadPoolExecutor(1) as pool:  # a thread has one Playwright, and this one has the fixture's
-        (row,) = pool.submit(load("page").run, given).result()
+        (row,) = pool.submit(run, given).result()
     assert row["frames_per_second"] > 0 and "WASM" in row["backend"] and float(row["shown"]) > 0
     with pytest.raises(UsageError, match="no folder of hma export"):
-        load("page").run({"export": str(site), "robot": ROBOT, "frames": 5})
+        run(given | {"export": str(site)})
+    with pytest.raises(UsageError, match=f"robot=none is not in .* — give one of {ROBOT}"):
+        run(given | {"robot": "none"})
+
+
+def test_the_bench_says_what_the_page_says(site: Path, browser: "Browser") -> None:
+    graph = site / "sub" / "page" / "page-image.onnx"
+    graph.write_bytes(graph.read_bytes()[:-1])
+    given = {"export": str(graph.parent), "robot": ROBOT, "frames": 5}
+    with ThreadPoolExecutor(1) as pool, pytest.raises(HMAError, match=r"the page says: page-image\.onnx has"):
+        pool.submit(run, given).result()
