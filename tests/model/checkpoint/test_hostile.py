@@ -118,7 +118,7 @@ FLOAT8 = torch.float8_e4m3fn
 OWN = {**SPEC.to_json(), "weights_sha256": "0" * 64}
 HOSTILE: dict[str, tuple[str, Edit, str]] = {  # the file, what is done to it, and what the error says
     "a trunk cut short": (TRUNK, cut(1000), r"trunk\.safetensors: is another trunk"),
-    "an empty trunk": (TRUNK, cut(0), r"trunk\.safetensors: is another trunk"),
+    "an empty trunk": (TRUNK, cut(0), r"trunk\.safetensors: is empty — copy it again"),
     "no trunk": (TRUNK, Path.unlink, r"trunk\.safetensors.*again"),
     "another trunk": (TRUNK, of_another_trunk, r"trunk\.safetensors: is another trunk"),
     "a bit of the head": (HEAD, flip(), r"head\.safetensors: is not the file that card\.json names"),
