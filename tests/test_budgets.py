@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_284, 10_984, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_551, 19_540, 11),
-    "hma_data/sources": (12_546, 104_836, 50),
+    "hma_data/sources": (12_552, 104_849, 50),
     "hma_data/storage": (1_660, 10_897, 11),
     "hma_data/tokenizers": (3_274, 23_695, 17),
     "hma_model": (505, 3_000, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_529, 29_018, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_930, 513_577
-TEST_LINES = 48_377
+PRODUCT_LINES, PRODUCT_NODES = 64_936, 513_590
+TEST_LINES = 48_389
 DOC_WORDS = 40_357
 
 

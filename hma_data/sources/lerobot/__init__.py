@@ -13,6 +13,12 @@ def _is_of_the_hub(uri: str) -> bool:
     return uri.startswith("hf://") or (bool(found) and not path.exists() and not path.parent.exists())
 
 
+_OTHERS = (  # files of a dataset that shows its format where meta/info.json is missing
+    "meta/episodes.jsonl",
+    "meta/episodes/chunk-000/file-000.parquet",
+    "data/chunk-000/episode_000000.parquet",
+    "data/chunk-000/file-000.parquet",
+)
 RECOGNITION = Recognition(
-    label="a LeRobotDataset (meta/info.json)", uri=_is_of_the_hub, layout=("meta/info.json",)
+    label="a LeRobotDataset (meta/info.json)", uri=_is_of_the_hub, layout=("meta/info.json", *_OTHERS)
 )

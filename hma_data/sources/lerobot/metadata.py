@@ -124,7 +124,7 @@ class Folder:
         self.root = self._fetch_meta(self.repo) if self.repo else local
         if not (self.root / "meta" / "info.json").is_file():
             there = "has no meta/info.json" if self.root.exists() else "does not exist"
-            raise SourceError(uri, there, "give the folder of a LeRobotDataset, or its name on the Hub")
+            raise SourceError(uri, there, "give the folder of a whole LeRobotDataset, or its name on the Hub")
 
     def path(self, relative: str) -> Path:
         """Return the local path of a file, which need not exist.

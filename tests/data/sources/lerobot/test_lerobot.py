@@ -21,6 +21,7 @@ from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.detect import detect
 from hma_data.sources.lerobot.metadata import fill
 from hma_data.sources.lerobot.writer import origin_of
+from tests.command import fails, hma
 from tests.data.hub_cache import as_snapshot
 from tests.data.videos import (
     CAMERA,
@@ -347,6 +348,15 @@ def test_a_folder_that_is_none_says_so(tmp_path: Path) -> None:
     ):  # fmt: skip
         with pytest.raises(SourceError, match=said):
             open_source("lerobot").index(str(uri))
+
+
+@pytest.mark.parametrize("name", ["v2", "v3"])
+def test_a_dataset_without_its_info_is_known_as_one(copy: Callable[[str], Path], name: str) -> None:
+    folder = copy(name)
+    (folder / "meta/info.json").unlink()
+    fails(hma("inspect", folder), 1, "has no meta/info.json — give the folder of a whole LeRobotDataset")
+    shutil.rmtree(folder / "meta")
+    assert detect(folder) == "lerobot"
 
 
 @pytest.mark.slow
