@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_529, 29_018, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_936, 513_590
-TEST_LINES = 48_389
+PRODUCT_LINES, PRODUCT_NODES = 64_935, 513_586
+TEST_LINES = 48_391
 DOC_WORDS = 40_357
 
 

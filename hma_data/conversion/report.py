@@ -42,8 +42,7 @@ class Summary:
     """The result of a conversion.
 
     Attributes:
-        reasons: error type and message (without the ids where there are several) -> number of episodes
-            refused for it.
+        reasons: message (without the ids where there are several) -> number of episodes refused for it.
         flags: name -> count over all episodes, such as masked_actions; see docs/format.md.
         frame_sizes: camera -> (height, width) of its recorded frames; empty if no shard was made.
         left_out: number of the recording's episodes that `only` and `exclude` leave out.
@@ -171,7 +170,7 @@ def refusal_reasons(refused: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     """Return reason -> number of refused episodes; reasons that differ in the episode's id alone are one."""
     told: dict[str, list[str]] = {}
     for item in refused:
-        text = plain = f"{item['type']}: {item['message']}"
+        text = plain = item["message"]
         if any(letter.isdigit() for letter in item["id"]):  # a numbered id would keep equal reasons apart
             text = re.sub(rf"(?<!\w){re.escape(item['id'])}(?!\w)", "<episode>", text)
         told.setdefault(text, []).append(plain)

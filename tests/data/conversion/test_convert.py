@@ -67,6 +67,8 @@ def test_a_bad_episode_goes_to_quarantine_and_the_rest_goes_on(toy_arm, toy_reco
         file["data/demo_3/actions"][4, 1] = np.nan
     summary = run(toy_arm, toy_recording, tmp_path / "out")
     line = json.loads((tmp_path / "out" / "quarantine.jsonl").read_text())
+    (reason,) = summary.reasons
+    assert reason == line["message"]
     assert line["id"] == "demo_3"
     assert "not finite at frame 4" in line["message"]
     assert summary.too_many
