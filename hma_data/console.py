@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from decimal import Decimal
 from typing import Any, Protocol
 
-from hma_data.errors import HMAError, Interrupted
+from hma_data.errors import HMAError, Interrupted, escaped
 
 
 class Update(Protocol):
@@ -40,7 +40,7 @@ def run_script(main: Callable[[], None]) -> None:
         if os.environ.get("HMA_DEBUG"):
             raise
         remedy = "free space or see to the permissions, and run the same command again"
-        where = fault.filename or "a file"
+        where = escaped(str(fault.filename or "a file"))
         raise SystemExit(fail(f"{where}: {fault.strerror or fault} — {remedy}", 1)) from None
     except KeyboardInterrupt:
         raise SystemExit(fail("interrupted", 130)) from None
@@ -48,8 +48,13 @@ def run_script(main: Callable[[], None]) -> None:
 
 def fail(text: str, code: int) -> int:
     """Print an error as one line to standard error; return the exit code."""
-    print(f"error: {' '.join(text.split())}", file=sys.stderr)
+    say(f"error: {' '.join(text.split())}", err=True)
     return code
+
+
+def say(text: str, err: bool = False, flush: bool = False) -> None:
+    """Print one line, to standard error with `err`; control characters out of names are escaped."""
+    print(escaped(text), file=sys.stderr if err else sys.stdout, flush=flush)
 
 
 def print_json(values: Any) -> None:
@@ -131,12 +136,12 @@ def cell_text(value: Any, digits: int = 4) -> str:
         return f"{value:,.{digits}g}" if abs(value) < 10**digits else f"{value:,.0f}"
     if isinstance(value, int) and not isinstance(value, bool):
         return f"{value:,}"
-    return str(value)
+    return escaped(str(value))
 
 
 def print_lines(lines: Iterable[tuple[str, str]]) -> None:
     """Print pairs of a title and a text with the texts in one column, folded to a terminal's width."""
-    pairs = list(lines)
+    pairs = [(escaped(title), escaped(text)) for title, text in lines]
     width = min(max((len(title) for title, _ in pairs), default=0), LONGEST_TITLE)
     room = shutil.get_terminal_size().columns - width - 2 if sys.stdout.isatty() else 0
     last = ""

@@ -3,8 +3,10 @@
 The command line prints an error as one line and exits with `exit_code`; programs read the attributes.
 """
 
+import re
 from pathlib import Path
 
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")  # lone surrogates: bytes not UTF-8
 _CHECKOUT = Path(__file__).parents[1] / "pyproject.toml"
 
 
@@ -25,7 +27,7 @@ class HMAError(Exception):
         super().__init__(where, fault, remedy)
 
     def __str__(self) -> str:
-        text = f"{self.where}: {self.fault}" if self.where else self.fault
+        text = f"{escaped(self.where)}: {self.fault}" if self.where else self.fault
         return f"{text} — {self.remedy}" if self.remedy else text
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
@@ -106,6 +108,11 @@ class HubError(HMAError):
 
 class MissingDependencyError(HMAError):
     """An optional package is not installed; the remedy is the command that installs it."""
+
+
+def escaped(text: str) -> str:
+    """Return a text of one line: control characters, as in a folder's name, become \\n, \\x1b …"""
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def install_command(extra: str = "") -> str:

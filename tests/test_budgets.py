@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (669, 3_768, 7),
+    "hma_data": (681, 3_878, 7),
     "hma_data/cli": (1_545, 11_038, 8),
     "hma_data/conversion": (4_211, 31_266, 14),
     "hma_data/episodes": (1_671, 14_652, 9),
@@ -29,7 +29,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model": (505, 3_000, 4),
     "hma_model/benchmark": (845, 7_250, 5),
     "hma_model/checkpoint": (885, 6_600, 5),
-    "hma_model/cli": (1_721, 10_700, 12),
+    "hma_model/cli": (1_723, 10_700, 12),
     "hma_model/demo": (485, 4_100, 4),
     "hma_model/evaluation": (4_465, 35_950, 23),
     "hma_model/export": (1_189, 9_410, 9),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_529, 29_018, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_935, 513_586
-TEST_LINES = 48_391
+PRODUCT_LINES, PRODUCT_NODES = 64_951, 513_700
+TEST_LINES = 48_411
 DOC_WORDS = 40_357
 
 

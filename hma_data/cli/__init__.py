@@ -3,7 +3,6 @@
 Only light modules are imported here. Each verb imports what it needs when it runs.
 """
 
-import sys
 from typing import Annotated
 
 import typer
@@ -16,7 +15,7 @@ from hma_data.cli.options import Json
 from hma_data.cli.registry import registry_app
 from hma_data.cli.shards import shards_app
 from hma_data.cli.tokenizer import tokenizer_app
-from hma_data.console import human_count, print_json, print_table
+from hma_data.console import human_count, print_json, print_table, say
 from hma_data.storage.paths import recipe_module
 
 DATA = "Recordings and shards"  # the panel of `hma --help`
@@ -64,7 +63,7 @@ def bench(
         print_table(columns, [[result.get(key) for key in columns] for result in results], title=chosen.about)
         facts = told["machine"]
         cores = human_count(facts["cores"], "core")
-        print(f"{facts['processor']}, {cores}, load {facts['load_average']}, {facts['date']}")
+        say(f"{facts['processor']}, {cores}, load {facts['load_average']}, {facts['date']}")
     if fault := chosen.fault(results):
-        print(fault, file=sys.stderr)
+        say(fault, err=True)
         raise Exit(1)

@@ -18,6 +18,7 @@ from hma_data.console import (
     print_json,
     print_table,
     progress,
+    say,
 )
 from hma_data.errors import UsageError
 
@@ -235,9 +236,9 @@ def _shown(name: str) -> "Iterator[Callable[[Progress], None]]":
         def show(state: "Progress") -> None:
             nonlocal notices, retries
             for line in state.notices[notices:]:
-                typer.echo(line, err=True)
+                say(line, err=True)
             for reason in state.retries[retries:]:
-                typer.echo(f"retrying: a worker {reason}", err=True)
+                say(f"retrying: a worker {reason}", err=True)
             notices, retries = len(state.notices), len(state.retries)
             words = f"{state.episodes:,}/{state.total_episodes:,} episodes, {human_bytes(state.bytes)}"
             if state.quarantined:
@@ -288,21 +289,21 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
     print_table(["shard", "episodes", "recorded frames, about"], [list(unit.values()) for unit in units])
     stride = plan.facts["frame_stride"]
     kept = f" (1 of {stride} is kept)" if stride > 1 else ""
-    print(
+    say(
         f"{uri}: {human_count(plan.episodes, 'episode')}, about {plan.frames:,} recorded frames{kept} into "
         f"{human_count(len(units), 'shard')}, about {human_bytes(cost.bytes)}"
     )
     if dataset:
-        print(f"and into a LeRobotDataset v3.0 of {dataset['fps']} fps, {conversion.lerobot}")
+        say(f"and into a LeRobotDataset v3.0 of {dataset['fps']} fps, {conversion.lerobot}")
     _print_cameras(
         cameras_line(plan.facts["cameras"], robot), cost.frame_sizes, robot, opened.spec.image_size
     )
     _print_left_out(plan.left_out)
     if cost.seconds is None:
-        print(f"time unknown, no episode could be read: {cost.fault}")
+        say(f"time unknown, no episode could be read: {cost.fault}")
     else:
         each = f" in each of {tasks} tasks" if tasks > 1 else ""
-        print(
+        say(
             f"about {human_seconds(cost.seconds)} with --workers {workers}{each}: one worker converts "
             f"{cost.frames_per_second:,.0f} frames/s, measured on one episode"
         )
@@ -325,7 +326,7 @@ def _print_dataset_plan(conversion: "Conversion", json: bool) -> None:
         return
     stride = plan.facts["frame_stride"]
     kept = f" (1 of {stride} is kept)" if stride > 1 else ""
-    print(
+    say(
         f"{uri}: {human_count(plan.episodes, 'episode')}, about {plan.frames:,} recorded frames{kept} into a "
         f"LeRobotDataset v3.0 of {facts['fps']} fps, made in {human_count(len(plan.units), 'part')}"
     )
@@ -349,9 +350,10 @@ def _report_share(done: "UnfinishedShare", share: "Share | None", json: bool) ->
         return
     missing, made = human_count(done.missing, "shard"), human_count(done.made_shards, "shard")
     name = f"share {share.name} " if share else ""
-    print(f"{done.out}: {name}made {made} ({done.kept_shards} were there already)", end="")
-    print(f", {human_seconds(done.seconds)}; {missing} left for other shares; the last to finish", end="")
-    print(" writes the manifest")
+    say(
+        f"{done.out}: {name}made {made} ({done.kept_shards} were there already), "
+        f"{human_seconds(done.seconds)}; {missing} left for other shares; the last one writes the manifest"
+    )
 
 
 def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float, json: bool) -> None:
@@ -367,22 +369,22 @@ def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float,
             print(summary.held_out)
         if summary.flags:
             counts = [f"{count:,} {flag_words(name)}" for name, count in summary.flags.items()]
-            print(f"flags: {', '.join(counts)}")
+            say(f"flags: {', '.join(counts)}")
         if summary.changed:
             print(summary.changed)
         if summary.warning:
-            typer.echo(f"warning: {summary.warning}", err=True)
+            say(f"warning: {summary.warning}", err=True)
         for note in summary.notes:
-            typer.echo(f"warning: {note}", err=True)
+            say(f"warning: {note}", err=True)
         for finding in lasting:
             warns = finding.severity == "warn"
-            typer.echo(f"{'warning: ' * warns}{finding}", err=warns)
+            say(f"{'warning: ' * warns}{finding}", err=warns)
     reasons = {reason: count for one in summary.outputs for reason, count in one.reasons.items()}
     for reason, count in sorted(reasons.items(), key=lambda item: -item[1])[:REASONS_PRINTED]:
-        typer.echo(f"quarantine: {count:,} × {reason}", err=True)
+        say(f"quarantine: {count:,} × {reason}", err=True)
     for one in summary.outputs:
         if one.too_many:
-            typer.echo(
+            say(
                 f"error: {one.out}: {human_count(one.manifest.quarantined, 'episode')} in quarantine, more "
                 f"than --max-quarantine {max_quarantine:g} allows; what was converted is kept "
                 "— see quarantine.jsonl; --exclude leaves them out",
@@ -424,7 +426,7 @@ def _print_made(summary: "Summary") -> None:
     manifest = summary.manifest
     if manifest.plan.get("to") == "lerobot":
         totals, facts = manifest.to_json()["totals"], manifest.plan["dataset"]
-        print(
+        say(
             f"{summary.out}: LeRobotDataset v3.0, {human_count(totals['episodes'], 'episode')}, "
             f"{totals['frames']:,} frames at {facts['fps']} fps, {human_bytes(summary.bytes)}, "
             f"{human_seconds(summary.seconds)}"
@@ -432,25 +434,25 @@ def _print_made(summary: "Summary") -> None:
         _print_sizes(facts["sizes"])
         return
     kept = f" ({summary.kept_shards} were there already)" if summary.kept_shards else ""
-    print(f"{totals_line(summary.out, manifest)}{kept}, {human_seconds(summary.seconds)}")
+    say(f"{totals_line(summary.out, manifest)}{kept}, {human_seconds(summary.seconds)}")
     robot, size = manifest.embodiment, manifest.tokenizer.image_size
     _print_cameras(manifest.cameras_line, summary.frame_sizes, robot, size)
 
 
 def _print_sizes(sizes: dict[str, list[int]]) -> None:
     named = [f"{name} {width}×{height}" for name, (height, width) in sizes.items()]
-    print(f"cameras: {', '.join(named)}")
+    say(f"cameras: {', '.join(named)}")
 
 
 def _print_cameras(line: str, sizes: dict[str, tuple[int, int]], robot: Any, size: int) -> None:
     """Print which cameras are stored, and what becomes of their frames."""
     from hma_data.episodes.images import describe_resize
 
-    print(f"cameras: {line}")
+    say(f"cameras: {line}")
     for name, (height, width) in sizes.items():
         print(describe_resize(robot.camera(name), height, width, size))
 
 
 def _print_left_out(count: int) -> None:
     if count:
-        print(f"left out by only and exclude: {human_count(count, 'episode')}")
+        say(f"left out by only and exclude: {human_count(count, 'episode')}")

@@ -7,7 +7,7 @@ import typer
 from typer import Argument
 
 from hma_data.cli.options import Episodes, FailOn, Json, robot_option
-from hma_data.console import human_count, human_number, print_json, print_lines, print_table
+from hma_data.console import human_count, human_number, print_json, print_lines, print_table, say
 
 if TYPE_CHECKING:
     from hma_data.inspection.folder import Found
@@ -60,12 +60,12 @@ def _list(folder: str, found: "list[Found]", json: bool) -> None:
     if json:
         print_json({"folder": folder, "recordings": [one.to_json() for one in found]})
         return
-    print(f"{folder}: {human_count(len(found), 'recording')}; inspect them one by one:")
+    say(f"{folder}: {human_count(len(found), 'recording')}; inspect them one by one:")
     rows = [[one.command, one.format, one.episodes] for one in found]
     print_table(["command", "format", "episodes"], rows)
     for one in found:
         if one.problem:
-            print(f"cannot be counted: {one.problem}")
+            say(f"cannot be counted: {one.problem}")
 
 
 def _print_inspection(report: dict[str, Any]) -> None:
@@ -78,8 +78,8 @@ def _print_inspection(report: dict[str, Any]) -> None:
     if lengths:
         told = "" if len(lengths) == report["episodes"] else f" of the {len(lengths):,} counted"
         middle = lengths[len(lengths) // 2]
-        print(f"episode lengths{told}: min {lengths[0]:,}, median {middle:,}, max {lengths[-1]:,} frames")
-    print(f"sampled: {report['looked_at']:,} of {episodes}")
+        say(f"episode lengths{told}: min {lengths[0]:,}, median {middle:,}, max {lengths[-1]:,} frames")
+    say(f"sampled: {report['looked_at']:,} of {episodes}")
     print_table(COLUMNS, [_row(key) for key in report["keys"]])
     named = {key["key"]: " ".join(key["names"]) for key in report["keys"] if key["names"]}
     print_lines([(f"names of {key}", names) for key, names in named.items()])
@@ -125,7 +125,7 @@ def _print_checks(report: dict[str, Any]) -> None:
         for line in findings.get(check, [result])
     )
     if others := [titles.get(check, check) for check in report["checks"] if check not in done]:
-        print(f"{NOT_CHECKED}: {', '.join(others)}")
+        say(f"{NOT_CHECKED}: {', '.join(others)}")
 
 
 def doctor(

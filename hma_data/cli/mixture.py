@@ -8,7 +8,7 @@ from typer import Argument, Option
 
 from hma_data.cli.options import Json
 from hma_data.cli.shards import refuse_early
-from hma_data.console import print_json, print_table
+from hma_data.console import print_json, print_table, say
 from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def mixture(
         return
     columns = ["windows", "episodes", "too short", "frames", "proportional", f"p at τ = {tau:g}"]
     print_table(["embodiment", *columns, "p uniform", "epochs"], [list(row.values()) for row in rows])
-    print(f"epochs: passes over a set's windows if {planned:,} samples are drawn in total")
+    say(f"epochs: passes over a set's windows if {planned:,} samples are drawn in total")
 
 
 def _rows(

@@ -1,7 +1,6 @@
 """Run `hma registry`: list and show embodiments, check their YAML, write a new robot's YAML, export it."""
 
 import shlex
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from hma_data.cli.options import Json, robots
-from hma_data.console import human_count, print_json, print_table
+from hma_data.console import human_count, print_json, print_table, say
 from hma_data.registry import FORMATS
 
 if TYPE_CHECKING:
@@ -72,7 +71,7 @@ def registry_list(
         print_table(list(LISTED), cells)
         print(human_count(len(rows), "embodiment"))
     for line in broken:
-        print(f"not listed: {line}", file=sys.stderr)
+        say(f"not listed: {line}", err=True)
     raise typer.Exit(1 if broken else 0)
 
 
@@ -136,12 +135,12 @@ def registry_validate(
         print_json({"files": len(judged), "problems": listed, "notes": notes})
     else:
         for entry, problem in found:
-            print(f"{entry.path}: {_line(problem)}")
+            say(f"{entry.path}: {_line(problem)}")
         for path, note in _notes(judged):
-            print(f"{path}: note: {note}")
-        print(f"{human_count(len(judged), 'file')}, {human_count(len(found), 'problem')}")
+            say(f"{path}: note: {note}")
+        say(f"{human_count(len(judged), 'file')}, {human_count(len(found), 'problem')}")
         if len(judged) == 1 and paths and (uri := (judged[0].facts or {}).get("uri")):
-            print(f"then: hma inspect {shlex.quote(uri)} -e {shlex.quote(str(judged[0].path))}")
+            say(f"then: hma inspect {shlex.quote(uri)} -e {shlex.quote(str(judged[0].path))}")
     raise typer.Exit(1 if found else 0)
 
 
@@ -174,8 +173,8 @@ def registry_schema(out: Out = None) -> None:
         print_json(schema())
         return
     _write_json(out, schema())
-    print(f"wrote {out}; editors complete a YAML in the same folder if it starts with the line")
-    print(f"# yaml-language-server: $schema={out.name}")
+    say(f"wrote {out}; editors complete a YAML in the same folder if it starts with the line")
+    say(f"# yaml-language-server: $schema={out.name}")
 
 
 def _write_json(out: Path, values: Any, indent: int = 1) -> None:
@@ -205,7 +204,7 @@ def registry_export(
         print_json(values)
     else:
         _write_json(out, values, indent=4)
-        print(f"wrote {out}")
+        say(f"wrote {out}")
 
 
 @registry_app.command("infer")
@@ -231,7 +230,7 @@ def registry_infer(
         print(text, end="")
         return
     write_atomic(out, f"# yaml-language-server: $schema={_schema_for(out)}\n{text}")
-    print(f"wrote {out}")
+    say(f"wrote {out}")
     values = parse_yaml(text, str(out))
     for line in text.splitlines()[1:2]:
         if line.startswith("# "):
@@ -242,8 +241,8 @@ def registry_infer(
         if measured and f"provenance.{said}" not in dict(asked):
             print(measured)
     for path, question in asked:
-        print(f"answer {path}: {question}")
-    print(f"then: hma registry validate {shlex.quote(str(out))}")
+        say(f"answer {path}: {question}")
+    say(f"then: hma registry validate {shlex.quote(str(out))}")
 
 
 def _schema_for(out: Path) -> str:

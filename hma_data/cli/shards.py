@@ -16,6 +16,7 @@ from hma_data.console import (
     print_json,
     print_table,
     progress,
+    say,
 )
 from hma_data.errors import UsageError
 
@@ -62,26 +63,26 @@ def _print_info(facts: dict[str, Any]) -> None:
     from hma_data.shards.schema import flag_words
 
     robot, totals, episodes = facts["embodiment"], facts["totals"], facts["episodes"]
-    print(f"{facts['folder']}: {robot['id']} × {facts['tokenizer']['name']}, from {facts['source']}")
+    say(f"{facts['folder']}: {robot['id']} × {facts['tokenizer']['name']}, from {facts['source']}")
     lasting = human_seconds(totals["hours"] * 3600)
-    print(
+    say(
         f"{human_count(totals['episodes'], 'episode')}, {totals['frames']:,} frames at "
         f"{robot['rows_hz']:g} Hz ({lasting}), {human_bytes(totals['bytes'])} in "
         f"{human_count(facts['shards'], 'shard')} ({facts['bytes_per_frame']:.0f} bytes a frame)"
     )
-    print(f"cameras: {robot['cameras_line']}")
-    print(
+    say(f"cameras: {robot['cameras_line']}")
+    say(
         f"{robot['action_dim']} action and {robot['state_dim']} state values; stride {robot['stride']}, "
         f"so the model sees {robot['effective_hz']:g} Hz"
     )
-    print(
+    say(
         f"episodes of {episodes['shortest']:,} to {episodes['longest']:,} frames, median "
         f"{episodes['median']:,.0f}; {_instructions(episodes)}; "
         f"{_successes(episodes)}; skew up to {episodes['worst_skew_ms']:.1f} ms"
     )
     for label in ("flags", "quarantine"):
         for name, count in episodes[label].items():
-            print(f"{label}: {count:,} × {flag_words(name) if label == 'flags' else name}")
+            say(f"{label}: {count:,} × {flag_words(name) if label == 'flags' else name}")
     print_table(
         ["split", "episodes", "frames", "rows", "shards", "windows of 12", "episodes too short"],
         [
@@ -143,7 +144,7 @@ def shards_verify(
         for folder_name, problems in found.items():
             for problem in problems:
                 print(problem)
-            print(f"{folder_name}: {human_count(len(problems), 'problem') if problems else 'no problems'}")
+            say(f"{folder_name}: {human_count(len(problems), 'problem') if problems else 'no problems'}")
     raise typer.Exit(1 if any(found.values()) else 0)
 
 
@@ -175,7 +176,7 @@ def shards_preview(
             exclude=exclude or (),
             on_progress=_in(update),
         )
-    print(f"wrote {shown.sheet} and {shown.video} ({human_count(len(shown.episodes), 'episode')})")
+    say(f"wrote {shown.sheet} and {shown.video} ({human_count(len(shown.episodes), 'episode')})")
     for line in shown.resized:
         print(line)
 
@@ -276,4 +277,4 @@ def shards_export(
     with progress(f"export to {to}") as update:
         places = export(folder, out, split=split, camera=camera, on_progress=_in(update))
     for place in places:
-        print(f"wrote {place}")
+        say(f"wrote {place}")

@@ -7,7 +7,7 @@ import typer
 from typer import Argument, Option
 
 from hma_data.cli.options import Json, robot_option, tokenizers
-from hma_data.console import human_bytes, interruptible, print_json, print_table
+from hma_data.console import human_bytes, interruptible, print_json, print_table, say
 from hma_data.errors import MissingDependencyError, RecipeError, UsageError
 
 tokenizer_app = typer.Typer(no_args_is_help=True, help="List, train and measure tokenizers.")
@@ -28,7 +28,7 @@ def tokenizer_list(json: Json = False) -> None:
     else:
         _print_list(found)
     for fault in broken:
-        typer.echo(f"not listed: {fault}", err=True)
+        say(f"not listed: {fault}", err=True)
     raise typer.Exit(1 if broken else 0)
 
 
@@ -71,7 +71,7 @@ def tokenizer_train(
         changes[key] = parse_yaml(value, text, RecipeError)
 
     def report(line: str) -> None:
-        typer.echo(line, err=True)
+        say(line, err=True)
 
     def kept() -> str:
         state = out.with_name(out.name + ".state")
@@ -128,11 +128,11 @@ def tokenizer_eval(
     else:
         print(to_markdown(plain), end="")
     for note in notes:
-        typer.echo(note, err=True)
+        say(note, err=True)
     if out:
         title = f"{tokenizer}, weights {opened.spec.weights_sha256[:12] or 'none'}"
         paths = write_report(out, title, found, notes)
-        typer.echo(f"wrote {', '.join(map(str, paths))}", err=True)
+        say(f"wrote {', '.join(map(str, paths))}", err=True)
 
 
 def _perceptual(wanted: bool | None, device: str) -> tuple[Any, str]:

@@ -18,9 +18,9 @@ from typer.core import TyperGroup
 
 from hma_data import __version__
 from hma_data.cli import mount
-from hma_data.console import fail, interruptible
+from hma_data.console import fail, interruptible, say
 from hma_data.cpu import bound_spinning, take_ordinary_priority
-from hma_data.errors import HMAError, UsageError
+from hma_data.errors import HMAError, UsageError, escaped
 from hma_model.cli import train as cli_train
 from hma_model.cli.benchmark import benchmark
 from hma_model.cli.evaluate import evaluate
@@ -71,7 +71,7 @@ _TAG = re.compile(r"\[(?=[a-z#/@][^\[]*\])")  # the beginning of what rich takes
 
 def _print_version(asked: bool) -> None:
     if asked:
-        print(f"hma {__version__}")
+        say(f"hma {__version__}")
         raise typer.Exit
 
 
@@ -105,7 +105,7 @@ def _one_line(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
 ) -> str:
     """Return a warning as users read it: without the place in the code that gave it."""
-    return f"warning: {' '.join(str(message).split())}\n"
+    return f"warning: {escaped(' '.join(str(message).split()))}\n"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -172,7 +172,7 @@ def demo(
 
     with interruptible(lambda: kept("steps", out)):
         report = run(out, episodes=episodes, steps=steps, seed=seed)
-    print(f"open {report}")
+    say(f"open {report}")
 
 
 app.command("try")(try_recording)
@@ -225,9 +225,9 @@ def generate(
     write_video(out, film)
     commands = Commands.of(model, shards.embodiment.id)
     if outside := commands.outside(film.actions.reshape(-1, len(commands.names))):
-        print(outside, file=sys.stderr)
+        say(outside, err=True)
     about = f"{len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
-    print(f"wrote {out}: {about}")
+    say(f"wrote {out}: {about}")
 
 
 def _opened(checkpoint: str, data: Path, device: str) -> tuple[Any, Any, Any]:

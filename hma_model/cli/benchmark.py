@@ -6,7 +6,7 @@ from typing import Annotated
 from typer import Argument, Option
 
 from hma_data.cli.options import Json
-from hma_data.console import interruptible, print_json, progress
+from hma_data.console import interruptible, print_json, progress, say
 from hma_data.errors import UsageError
 from hma_model.cli.options import Compile, Device, Precision, Temperature, UnmaskSteps, device_name, kept
 
@@ -67,4 +67,4 @@ def benchmark(
     from hma_data.tables import Table
 
     Table(COLUMNS, rows(found)).print()
-    print(f"open {page}")
+    say(f"open {page}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
-from hma_data.console import interruptible, print_lines
+from hma_data.console import interruptible, print_lines, say
 from hma_model.cli.options import (
     Cameras,
     Checkpoint,
@@ -104,7 +104,7 @@ def evaluate(
     else:
         _print(parts)
     if out is not None and not json:
-        print(f"open {page}")
+        say(f"open {page}")
 
 
 def _print(parts: "Sequence[Part]") -> None:
@@ -124,4 +124,4 @@ def _print(parts: "Sequence[Part]") -> None:
         comparison(parts, intervals=False).print()
     print_lines(absences(parts))
     for whose, said in verdicts(parts):
-        print(f"{whose} {said}")
+        say(f"{whose} {said}")

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from hma_data.console import say
 from hma_model.cli.options import Checkpoint, Embodiments, UnmaskSteps, require_checkpoint
 
 
@@ -45,8 +46,8 @@ def export(
     said = f"{robots} robot{'s' * (robots != 1)}, graphs of {size:.1f} MB with weights in {made['weights']}"
     if made["float16_loss_db"] is not None:
         said += f" (float16 costs {made['float16_loss_db']:.2f} dB)"
-    print(f"wrote {out}: {said}")
-    print(f"drive it: python -m http.server --bind 127.0.0.1 -d {quote(str(out))}")
+    say(f"wrote {out}: {said}")
+    say(f"drive it: python -m http.server --bind 127.0.0.1 -d {quote(str(out))}")
 
 
 def export_checkpoint(
@@ -58,7 +59,6 @@ def export_checkpoint(
     **settings: Any,
 ) -> dict[str, Any]:
     """Export robots of a checkpoint; return the manifest."""
-    import sys
 
     from hma_model.export import require_onnx
 
@@ -86,7 +86,7 @@ def export_checkpoint(
     if not chosen:
         raise UsageError("--embodiment", "none has frames to start from", "give shards of one")
     if lacking := [name for name in ids if name not in chosen]:
-        print(f"left out, no frames to start from: {', '.join(lacking)}", file=sys.stderr)
+        say(f"left out, no frames to start from: {', '.join(lacking)}", err=True)
     from hma_model.checkpoint.io import load
     from hma_model.export.folder import export_folder
 
@@ -95,6 +95,6 @@ def export_checkpoint(
     robots = list(chosen.values())
 
     def report(said: str) -> None:
-        print(f"export: {said}", file=sys.stderr)
+        say(f"export: {said}", err=True)
 
     return export_folder(model, tokenizer(), robots, out, name=shown, report=report, **settings)

@@ -1,7 +1,6 @@
 """Define the verbs of `hma hub`: publish and fetch checkpoints and shard sets; convert released ones."""
 
 import shlex
-import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from hma_data.cli.options import Folder, Json
-from hma_data.console import print_json, print_table
+from hma_data.console import print_json, print_table, say
 from hma_model.cli.options import Embodiments
 
 if TYPE_CHECKING:
@@ -66,16 +65,16 @@ def push(
             exported = Path(folder) / "page"
             export_checkpoint(opened.name, [], exported, embodiment, target.rstrip("/").rsplit("/", 1)[-1])
         address = hub.push(opened, target, embodiment, private, exported)
-        print(f"published to {address}")
+        say(f"published to {address}")
         if static and exported:
             cards = opened.cards(embodiment)
-            print(f"the page runs at {static.publish(exported, target, cards.values())}")
+            say(f"the page runs at {static.publish(exported, target, cards.values())}")
     for name, card in opened.cards(embodiment).items():
         judged = card.get("evaluation")
         if judged and not judged["follows"]:
-            print(f"{name} {judged['verdict']}; the model card starts with this verdict")
+            say(f"{name} {judged['verdict']}; the model card starts with this verdict")
     robots = "".join(f" -e {shlex.quote(name)}" for name in embodiment or ())
-    print(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {_folder_for(target)}")
+    say(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {_folder_for(target)}")
 
 
 def _folder_for(target: str) -> str:
@@ -95,7 +94,7 @@ def _add_films(checkpoint: "Checkpoint", sample: list[Path] | None, embodiments:
         try:
             add_samples(checkpoint, [folder])
         except HMAError as fault:  # a film is no condition of publishing
-            print(f"no video: {fault}", file=sys.stderr)
+            say(f"no video: {fault}", err=True)
 
 
 @hub_app.command("pull")
@@ -111,7 +110,7 @@ def pull(
     """
     from hma_model.hub import publish as hub
 
-    print(f"pulled to {hub.pull(source, embodiment, out, revision)}")
+    say(f"pulled to {hub.pull(source, embodiment, out, revision)}")
 
 
 @hub_app.command("list")
@@ -155,7 +154,7 @@ def push_data(
     """
     from hma_model.hub.datasets import push_data as run
 
-    print(f"published to {run(folder, target, private=private)}")
+    say(f"published to {run(folder, target, private=private)}")
 
 
 @hub_app.command("pull-data")
@@ -170,7 +169,7 @@ def pull_data(
     """
     from hma_model.hub.datasets import pull_data as run
 
-    print(f"pulled to {run(source, out, revision=revision)}")
+    say(f"pulled to {run(source, out, revision=revision)}")
 
 
 @hub_app.command("import")
@@ -197,7 +196,7 @@ def import_released(
     if json:
         print_json({"out": str(made.folder), "embodiments": list(made.embodiments)})
     else:
-        print(f"imported to {made.folder}: {len(made.embodiments)} embodiments")
+        say(f"imported to {made.folder}: {len(made.embodiments)} embodiments")
 
 
 @hub_app.command("export")
@@ -212,7 +211,7 @@ def export_released(
     """
     from hma_model import hub
 
-    print(f"exported to {hub.export_released(checkpoint, out, embodiments=embodiment)}")
+    say(f"exported to {hub.export_released(checkpoint, out, embodiments=embodiment)}")
 
 
 def _summary(facts: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ from urllib.parse import quote
 
 from typer import Argument, Option
 
+from hma_data.console import say
 from hma_data.errors import UsageError
 from hma_model.cli.options import Compile, Device, Precision, device_name, embedded_robots, require_checkpoint
 
@@ -73,7 +74,7 @@ def play(
     robots = drivable(opened, sets, tokenizer, images)
     first = opening(robots, embodiment, "images" if images else "recordings" if sets else None)
     if len(opened.embodiments) > 1 and images and embodiment is None:
-        print("every robot can start from the image; -e ROBOT selects yours", file=sys.stderr)
+        say("every robot can start from the image; -e ROBOT selects yours", err=True)
     from hma_model.play.server import LOOPBACK, serve
 
     listener = _listen(host, port)
@@ -85,7 +86,7 @@ def play(
     address = f"http://{shown}:{listener.getsockname()[1]}/{query}"
 
     def ready() -> None:
-        print(f"drive at {address} (Ctrl-C ends)", flush=True)
+        say(f"drive at {address} (Ctrl-C ends)", flush=True)
         if browser and has_display():
             webbrowser.open(address)
 

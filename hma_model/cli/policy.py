@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from hma_data.cli.options import Json
-from hma_data.console import human_count, interruptible, print_json, progress
+from hma_data.console import human_count, interruptible, print_json, progress, say
 from hma_data.errors import UsageError
 from hma_model.cli.options import (
     Compile,
@@ -120,7 +120,7 @@ def policy_eval(
         return
     pages.show(found)
     if page:
-        print(f"open {page}")
+        say(f"open {page}")
 
 
 def augment(
@@ -188,14 +188,14 @@ def augment(
     stored = ShardSet(out).episodes
     begun = len(set(stored["group"].to_pylist()))
     said = f"kept {human_count(count, 'episode')} of {episodes} in {out}"
-    print(f"{before}{said}, from {human_count(begun, 'recorded episode')}; synthetic: true in every file")
+    say(f"{before}{said}, from {human_count(begun, 'recorded episode')}; synthetic: true in every file")
     if keep < 1 and not any("milli" in flags for flags in stored["flags"].to_pylist()):
-        print(f"  --keep {keep:g} was not applied: a model with video_loss: regression has no uncertainty")
+        say(f"  --keep {keep:g} was not applied: a model with video_loss: regression has no uncertainty")
     if lerobot:
-        print(f"also written as a LeRobotDataset: {lerobot}")
+        say(f"also written as a LeRobotDataset: {lerobot}")
         state = Embodiment.load(lerobot / "embodiment.yaml").provenance.get("state")
         few = "none: the shards have no state, or too few episodes to learn it; lerobot's policies need it"
-        print(f"  observation.state: {state or few}")
+        say(f"  observation.state: {state or few}")
 
 
 def label_actions(
@@ -227,12 +227,12 @@ def label_actions(
     if json:
         print_json({"out": str(out), "splits": made.manifest.splits, "plan": made.manifest.plan})
         return
-    print(f"error on {error.commands:,} actions of {error.source} ({error.split}):")
+    say(f"error on {error.commands:,} actions of {error.source} ({error.split}):")
     for name, rmse, share in zip(error.names, error.rmse, error.explained, strict=True):
         said = "does not vary there" if share is None else f"{share:.0%} of the variance explained"
         worse = "; no better than the mean: do not use it" if share is not None and share <= 0 else ""
-        print(f"  {name}: RMSE {rmse:.3g}, {said}{worse}")
+        say(f"  {name}: RMSE {rmse:.3g}, {said}{worse}")
     made_of = human_count(sum(split["episodes"] for split in splits), "episode")
-    print(f"{made_of} in {out}; inferred_actions: true in every file")
+    say(f"{made_of} in {out}; inferred_actions: true in every file")
     if made.manifest.quarantined:
-        print(f"{made.manifest.quarantined} in quarantine; {out / QUARANTINE} has the reasons")
+        say(f"{made.manifest.quarantined} in quarantine; {out / QUARANTINE} has the reasons")

@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from hma_data.cli.options import Json, recipes
 from hma_data.cli.shards import refuse_early
-from hma_data.console import human_seconds, interruptible, print_json, print_table
+from hma_data.console import human_seconds, interruptible, print_json, print_table, say
 from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
@@ -157,18 +157,18 @@ def _tell(result: "TrainResult", json: bool) -> None:
 
 def _print(result: "TrainResult") -> None:
     done = f"step {result.step:,}, {human_seconds(result.seconds)}"
-    print(f"{result.out}: {done}, checkpoint {result.checkpoint}")
+    say(f"{result.out}: {done}, checkpoint {result.checkpoint}")
     found, base = result.masked_val_loss, result.baseline
     if found is not None and base is not None:
         from hma_model.checkpoint.folder import Checkpoint
         from hma_model.config import token_words
 
         unit = token_words(Checkpoint.open(result.checkpoint).config.merge)
-        print(f"held-out loss {found:.4f} nats per {unit}; baseline (token frequencies) {base:.4f}")
+        say(f"held-out loss {found:.4f} nats per {unit}; baseline (token frequencies) {base:.4f}")
     if result.skipped:
-        print(f"{result.skipped} steps were skipped; see skipped in {result.out}/metrics.jsonl")
+        say(f"{result.skipped} steps were skipped; see skipped in {result.out}/metrics.jsonl")
     if (result.out / "report.html").is_file():
-        print(f"open {result.out}/report.html")
+        say(f"open {result.out}/report.html")
 
 
 # -- hma recipe
@@ -211,4 +211,4 @@ def recipe_show(
         print_json(values)
     else:
         print(write_yaml(values), end="")
-        print(f"# change a key on the command line: hma train {name} DATA… steps=10 model.layers=4")
+        say(f"# change a key on the command line: hma train {name} DATA… steps=10 model.layers=4")

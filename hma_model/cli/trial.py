@@ -17,6 +17,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from hma_data.cli.options import choice_option, robot_option
+from hma_data.console import say
 from hma_data.cpu import usable_cores
 from hma_data.errors import Interrupted, RegistryError, UsageError
 from hma_model.cli.options import embedded_robots
@@ -78,12 +79,12 @@ def try_recording(
     frames = ("--prompt", PROMPT, "--frames", _film_frames(shards))
     shown = film.is_file() and film.stat().st_mtime > (run / "checkpoints").stat().st_mtime
     step("generate", run, shards, *frames, "--unmask-steps", 8, "--out", film, there=shown)
-    print(f"open {_write_page(folder, shards, film, done)}")
+    say(f"open {_write_page(folder, shards, film, done)}")
 
 
 def _run(words: list[str]) -> None:
     """Print a command and run it; end with its exit code if it fails."""
-    print(f"$ {shlex.join(['hma', *words])}", flush=True)
+    say(f"$ {shlex.join(['hma', *words])}", flush=True)
     try:
         code = subprocess.run([sys.executable, "-m", "hma_model.cli", *words], check=False).returncode
     except KeyboardInterrupt:  # the step has got the same Ctrl-C, and says what it keeps

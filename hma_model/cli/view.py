@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option
 
 from hma_data.cli.options import robot_option
+from hma_data.console import say
 from hma_data.errors import UsageError
 from hma_model.cli.play import has_display
 
@@ -45,7 +46,7 @@ def view(
         return
     path = out or Path(f"{Path(place).resolve().stem}.rrd")
     made.save(path)
-    print(f"wrote {path}; rerun {path} opens it")
+    say(f"wrote {path}; rerun {path} opens it")
 
 
 def _made(

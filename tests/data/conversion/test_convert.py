@@ -10,12 +10,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from hma_data.cli.convert import _report
 from hma_data.conversion.plan import Settings
 from hma_data.errors import OutputError, RegistryError, SourceError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
+from tests.command import fails, hma
 from tests.conftest import BlockTokenizer, contents, write_toy
 from tests.conftest import convert_toy as run
 
@@ -48,6 +50,15 @@ def test_running_again_does_nothing_and_changes_nothing(toy_arm, toy_recording, 
     again = run(toy_arm, toy_recording, tmp_path / "out")
     assert again.made_shards == 0
     assert contents(tmp_path / "out") == before
+
+
+def test_control_characters_in_a_path_are_escaped(toy_arm, toy_recording, tmp_path, capsys) -> None:
+    out = tmp_path / "two\nlines \x1b[1m"
+    run(toy_arm, toy_recording, out)
+    _report(run(toy_arm, toy_recording, out), [], 0.01, False)
+    (first, *_) = capsys.readouterr().out.splitlines()
+    assert r"two\nlines \x1b[1m: 12 episodes" in first and "were there already" in first
+    fails(hma("inspect", out / "none"), 1, r"two\nlines \x1b[1m/none: ")
 
 
 def test_the_shards_of_one_file_or_another_path_are_the_same(toy_arm, toy_recording, tmp_path) -> None:
