@@ -7,6 +7,8 @@ from typing import Any
 
 from hypothesis import strategies as st
 
+type Edit = Callable[[Path], object]  # what spoils a file or a folder
+
 
 def damage(data: st.DataObject, path: Path) -> bool:
     """Cut a file at any byte, or change any byte of it, as `data` draws it; return whether it was cut."""
@@ -18,6 +20,17 @@ def damage(data: st.DataObject, path: Path) -> bool:
         content[at] ^= data.draw(st.integers(1, 255))
     path.write_bytes(content)
     return cut
+
+
+def flip(at: int, bits: int = 4) -> Edit:
+    """Return an edit that changes bits of one byte."""
+
+    def edit(path: Path) -> None:
+        content = bytearray(path.read_bytes())
+        content[at] ^= bits
+        path.write_bytes(content)
+
+    return edit
 
 
 def at_once(act: Callable[[Any], object], each: Iterable[Any]) -> None:

@@ -1,5 +1,6 @@
 """Run `hma convert`: a conversion, a share of one, or only its plan."""
 
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from hma_data.sources.common.checks import Finding
 
 TOKENIZER = "fsq-16"  # by default
+KEPT_UNREAD = "of the shards that were there only the footers were checked; this checks every byte"
 REASONS_PRINTED = 20  # of quarantine, the most frequent first
 # Options that few people need stand in panels of their own below the others in --help.
 _data = partial(Option, rich_help_panel="Selection and split")
@@ -435,6 +437,8 @@ def _print_made(summary: "Summary") -> None:
         return
     kept = f" ({summary.kept_shards} were there already)" if summary.kept_shards else ""
     say(f"{totals_line(summary.out, manifest)}{kept}, {human_seconds(summary.seconds)}")
+    if summary.kept_shards:
+        say(f"{KEPT_UNREAD}: hma shards verify {shlex.quote(str(summary.out))}")
     robot, size = manifest.embodiment, manifest.tokenizer.image_size
     _print_cameras(manifest.cameras_line, summary.frame_sizes, robot, size)
 

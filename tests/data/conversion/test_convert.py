@@ -20,6 +20,7 @@ from hma_data.shards.verify import verify
 from tests.command import fails, hma
 from tests.conftest import BlockTokenizer, contents, write_toy
 from tests.conftest import convert_toy as run
+from tests.hostile import flip
 
 
 def test_rows_are_the_recording(toy_set, toy_file, block_tokenizer) -> None:
@@ -71,6 +72,15 @@ def test_the_shards_of_one_file_or_another_path_are_the_same(toy_arm, toy_record
     assert {k: v for k, v in first.items() if "shard-" in k} == {
         k: v for k, v in second.items() if "shard-" in k
     }
+
+
+def test_a_repeated_conversion_says_what_it_did_not_check(toy_arm, toy_recording, tmp_path, capsys) -> None:
+    run(toy_arm, toy_recording, tmp_path)
+    flip(20)(tmp_path / "train" / "shard-00000.parquet")
+    _report(run(toy_arm, toy_recording, tmp_path), [], 0.01, False)
+    said = f"only the footers were checked; this checks every byte: hma shards verify {tmp_path}\n"
+    assert said in capsys.readouterr().out
+    assert "sha256 differs" in verify(tmp_path)[0]
 
 
 def test_a_bad_episode_goes_to_quarantine_and_the_rest_goes_on(toy_arm, toy_recording, tmp_path) -> None:
