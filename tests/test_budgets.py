@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_524, 11_400, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 64_953, 513_700
-TEST_LINES = 48_416
+TEST_LINES = 48_417
 DOC_WORDS = 40_357
 
 

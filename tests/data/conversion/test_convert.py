@@ -75,12 +75,13 @@ def test_the_shards_of_one_file_or_another_path_are_the_same(toy_arm, toy_record
 
 
 def test_a_repeated_conversion_says_what_it_did_not_check(toy_arm, toy_recording, tmp_path, capsys) -> None:
-    run(toy_arm, toy_recording, tmp_path)
-    flip(20)(tmp_path / "train" / "shard-00000.parquet")
-    _report(run(toy_arm, toy_recording, tmp_path), [], 0.01, False)
-    said = f"only the footers were checked; this checks every byte: hma shards verify {tmp_path}\n"
+    out = tmp_path / "out"
+    run(toy_arm, toy_recording, out)
+    flip(20)(out / "train" / "shard-00000.parquet")
+    _report(run(toy_arm, toy_recording, out), [], 0.01, False)
+    said = f"only the footers were checked; this checks every byte: hma shards verify {out}\n"
     assert said in capsys.readouterr().out
-    assert "sha256 differs" in verify(tmp_path)[0]
+    assert "sha256 differs" in verify(out)[0]
 
 
 def test_a_bad_episode_goes_to_quarantine_and_the_rest_goes_on(toy_arm, toy_recording, tmp_path) -> None:
