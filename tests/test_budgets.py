@@ -20,7 +20,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/hub": (512, 3_787, 3),
     "hma_data/inspection": (2_151, 20_090, 8),
     "hma_data/lab": (3_327, 30_594, 16),
-    "hma_data/loading": (1_284, 10_984, 6),
+    "hma_data/loading": (1_272, 10_934, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_551, 19_540, 11),
     "hma_data/sources": (12_552, 104_849, 50),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_529, 29_018, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_953, 513_700
+PRODUCT_LINES, PRODUCT_NODES = 64_941, 513_633
 TEST_LINES = 48_417
 DOC_WORDS = 40_357
 

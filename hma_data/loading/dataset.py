@@ -22,7 +22,7 @@ from torch import cuda
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from hma_data.errors import ShardError, UsageError
-from hma_data.loading.mixture import TEMPERATURES, Draw, Mixture
+from hma_data.loading.mixture import TEMPERATURES, Mixture
 from hma_data.loading.pools import UnitAssignment, WindowSequence, pool_size
 from hma_data.loading.rows import MIB, Batch, RowDecoder, as_batch, assemble
 from hma_data.loading.views import FIRST_CAMERA, Cameras, Views, by_number, view_count
@@ -159,8 +159,7 @@ class MixtureDataset(IterableDataset[Batch]):
         data: shard sets, each of another embodiment.
         batch_size: B on this rank.
         frames: T.
-        temperature, weights, groups, caps, max_epochs, samples, draw: of the mixture, see `Mixture.of`; the
-            temperature is 3 for train and 4 for val by default.
+        temperature: of the mixture; by default 3 for train and 4 for val.
         seed: of draws and shuffles.
         rank, world: number of this process, and of all processes that train together; their windows are
             disjoint.
@@ -171,6 +170,7 @@ class MixtureDataset(IterableDataset[Batch]):
         memory_mib: memory for decoded rows in all lanes together, in MiB, about.
         cameras: `first`, `drawn` (a camera for each window), a name, or the names of several cameras, whose
             views are stacked along the height of the token grid.
+        mixture: weights, groups, caps, max_epochs, samples and draw, as in `Mixture.of`.
 
     Raises:
         ShardError: the sets do not fit together, or one has no window.
@@ -184,12 +184,6 @@ class MixtureDataset(IterableDataset[Batch]):
         frames: int = 12,
         *,
         temperature: float | None = None,
-        weights: Mapping[str, float] | None = None,
-        groups: Mapping[str, str] | None = None,
-        caps: Mapping[str, float] | None = None,
-        max_epochs: float | None = None,
-        samples: int | None = None,
-        draw: Draw = "per_sample",
         seed: int = 0,
         rank: int = 0,
         world: int = 1,
@@ -199,6 +193,7 @@ class MixtureDataset(IterableDataset[Batch]):
         lanes: int = 4,
         memory_mib: int = 1024,
         cameras: Cameras = FIRST_CAMERA,
+        **mixture: Any,
     ) -> None:
         if not 0 <= rank < world:
             raise UsageError("rank", f"{rank} is not one of 0 to {world - 1}")
@@ -215,29 +210,10 @@ class MixtureDataset(IterableDataset[Batch]):
             for name, shards in self.sets.items()
         }
         for decoder in self._decoders.values():
-            index = decoder.index
-            if index.count:
-                continue
-            episodes, remedy = "0 episodes", "leave this embodiment out"
-            if index.short_episodes:
-                episodes = f"{index.short_episodes} episodes, all shorter"
-                remedy = "raise target_hz in its YAML and run hma convert again, or use fewer frames"
-            fault = (
-                f"has no window of {frames} frames, {index.row_stride} rows apart, in {split} ({episodes})"
-            )
-            raise ShardError(decoder.shards.folder, fault, remedy)
+            _require_windows(decoder)
         counts = {name: decoder.index.count for name, decoder in self._decoders.items()}
-        self.mixture = Mixture.of(
-            counts,
-            TEMPERATURES.get(split, 3.0) if temperature is None else temperature,
-            weights=weights,
-            groups=groups,
-            caps=caps,
-            max_epochs=max_epochs,
-            samples=samples,
-            draw=draw,
-            seed=seed,
-        )
+        temperature = TEMPERATURES.get(split, 3.0) if temperature is None else temperature
+        self.mixture = Mixture.of(counts, temperature, seed=seed, **mixture)
         self._pools = [pool or pool_size(d, share * 4 / 5 / lanes) for d in self._decoders.values()]
         self._assignments: dict[int, UnitAssignment] = {}
         self._sequences: dict[tuple[int, int], WindowSequence] = {}
@@ -431,6 +407,18 @@ class MixtureDataset(IterableDataset[Batch]):
         self._step, self._taken = step, taken
         self._ahead.clear()  # cut after other windows
         self._origin = state.get("origin") if get_worker_info() else None
+
+
+def _require_windows(decoder: RowDecoder) -> None:
+    """Raise ShardError where no episode of a set is as long as a window."""
+    index, episodes, remedy = decoder.index, "0 episodes", "leave this embodiment out"
+    if index.count:
+        return
+    if index.short_episodes:
+        episodes = f"{index.short_episodes} episodes, all shorter"
+        remedy = "raise target_hz in its YAML and run hma convert again, or use fewer frames"
+    windows = f"no window of {index.frames} frames, {index.row_stride} rows apart"
+    raise ShardError(decoder.shards.folder, f"has {windows}, in {decoder.split} ({episodes})", remedy)
 
 
 def _counted(taken: Ints, lane: int, draws: Ints) -> Ints:
