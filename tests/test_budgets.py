@@ -14,8 +14,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (681, 3_878, 7),
-    "hma_data/cli": (1_550, 11_038, 8),
-    "hma_data/conversion": (4_211, 31_266, 14),
+    "hma_data/cli": (1_519, 10_865, 8),
+    "hma_data/conversion": (4_240, 31_480, 15),
     "hma_data/episodes": (1_671, 14_652, 9),
     "hma_data/hub": (512, 3_787, 3),
     "hma_data/inspection": (2_151, 20_090, 8),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_529, 29_018, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_941, 513_633
+PRODUCT_LINES, PRODUCT_NODES = 64_940, 513_690
 TEST_LINES = 48_417
 DOC_WORDS = 40_357
 

@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
 
-from hma_data.cli.options import Json, choice_option, robot_option, tokenizers
+from hma_data.cli.options import Json, Weights, robot_option, tokenizers, with_settings
 from hma_data.console import (
     human_bytes,
     human_count,
@@ -21,11 +21,13 @@ from hma_data.console import (
     progress,
     say,
 )
+from hma_data.conversion.settings import Options, Settings
 from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
     from hma_data.conversion.job import Conversion
     from hma_data.conversion.output import Share
+    from hma_data.conversion.plan import Plan
     from hma_data.conversion.report import Progress, Summary, UnfinishedShare
     from hma_data.registry.embodiment import Embodiment
     from hma_data.sources.common.checks import Finding
@@ -34,14 +36,10 @@ TOKENIZER = "fsq-16"  # by default
 KEPT_UNREAD = "of the shards that were there only the footers were checked; this checks every byte"
 REASONS_PRINTED = 20  # of quarantine, the most frequent first
 # Options that few people need stand in panels of their own below the others in --help.
-_data = partial(Option, rich_help_panel="Selection and split")
-_bad = partial(Option, rich_help_panel="Bad episodes")
-_existing = partial(Option, rich_help_panel="If --out holds a shard set")
 _jobs = partial(Option, rich_help_panel="Several machines")
-_rare = partial(Option, rich_help_panel="Rarely needed")
-_chosen = partial(choice_option, metavar="ID|GLOB|@FILE", rich_help_panel="Selection and split")
 
 
+@with_settings
 def convert(
     *,
     data: Annotated[
@@ -49,10 +47,7 @@ def convert(
     ] = None,
     embodiment: Annotated[str, robot_option("The robot: an id of the registry, or a YAML file.")],
     out: Annotated[Path, Option(help="Folder of the shard set, or of the LeRobotDataset.")],
-    to: Annotated[
-        Literal["shards", "lerobot"],
-        Option("--to", help="Output format."),
-    ] = "shards",
+    options: Options,
     lerobot: Annotated[
         Path | None,
         Option(help="Also write a LeRobotDataset to this folder, with the shards' cameras and split."),
@@ -61,55 +56,21 @@ def convert(
     tokenizer: Annotated[
         str, Option(help="Name of the tokenizer; see hma tokenizer list.", autocompletion=tokenizers)
     ] = TOKENIZER,
-    weights: Annotated[str | None, _rare(help="Tokenizer weights other than the default.")] = None,
-    device: Annotated[str, Option(help="Device of the tokenizer: cpu, cuda, mps.")] = "cpu",
+    weights: Weights = None,
     workers: Annotated[int, Option(min=0, help="Worker processes; 0: none, without crash protection.")] = 1,
-    engine: Annotated[Literal["local", "ray"], _jobs(help="Engine that runs the workers.")] = "local",
-    worker_cpus: Annotated[float, _jobs(min=0, help="CPUs per Ray worker.")] = 1.0,
-    worker_gpus: Annotated[
-        float | None, _jobs(min=0, help="GPUs per Ray worker; default: 1 with --device cuda.")
-    ] = None,
-    limit: Annotated[int | None, Option(min=1, help="Convert only the first N episodes.")] = None,
-    only: Annotated[list[str] | None, _chosen("Episode to take")] = None,
-    exclude: Annotated[list[str] | None, _chosen("Episode to leave out")] = None,
-    frames: Annotated[
-        Literal["all", "strided"], _data(help="Keep all rows, or only those at the model's rate.")
-    ] = "all",
-    drop_idle: Annotated[
-        bool,
-        _data("--drop-idle", help="With --to lerobot, leave out frames in which nothing moves."),
-    ] = False,
+    settings: Settings,
     frequency_hz: Annotated[
-        float | None, _data(help="Rate of the recording, if unknown in the YAML.")
-    ] = None,
-    cameras: Annotated[
-        list[str] | None,
-        Option(
-            "--cameras",
-            "--camera",
-            metavar="all|NAME[,NAME…]",
-            help="Cameras to store; default: the YAML's first, with --to lerobot all.",
-        ),
-    ] = None,
-    shard_frames: Annotated[int | None, _rare(min=1, help="Approximate frames per shard.")] = None,
-    val_fraction: Annotated[
         float | None,
-        _data(
-            help="Validation share of episodes; default: 5 %, but at least 5 episodes (a quarter if "
-            "fewer than 20); with --to lerobot 0."
-        ),
+        Option(help="Rate of the recording, if unknown in the YAML.", rich_help_panel="Selection and split"),
     ] = None,
-    seed: Annotated[int, _data(help="Seed of the split.")] = 0,
-    max_quarantine: Annotated[
-        float, _bad(min=0, max=1, help="Fail if a larger share of episodes is refused.")
-    ] = 0.01,
     episode_timeout: Annotated[
-        float, _bad(min=0, help="Refuse an episode after this many seconds without progress; 0: never.")
+        float,
+        Option(
+            min=0,
+            help="Refuse an episode after this many seconds without progress; 0: never.",
+            rich_help_panel="Bad episodes",
+        ),
     ] = 300.0,
-    extend: Annotated[
-        bool, _existing("--extend", help="Add the episodes that the set in --out does not have yet.")
-    ] = False,
-    overwrite: Annotated[bool, _existing("--overwrite", help="Delete the shard set in --out first.")] = False,
     shard_index: Annotated[
         int | None, _jobs(min=0, help="Index of this job among --shard-count jobs.")
     ] = None,
@@ -126,33 +87,21 @@ def convert(
     Example: hma convert ./demo.hdf5 -e my_arm.yaml --out shards/my_arm
     """
     from hma_data.conversion.output import Share
-    from hma_data.conversion.plan import Settings
 
     if data is not None and source is not None:
         raise UsageError("--source", f"says {source}, DATA says {data}", "name the recording once")
     source = data if source is None else source
-    if extend and overwrite:
+    if options.extend and options.overwrite:
         raise UsageError("hma convert", "--extend keeps what --overwrite deletes", "give one of them")
-    if to == "lerobot" and (tokenizer != TOKENIZER or weights):
+    if options.to == "lerobot" and (tokenizer != TOKENIZER or weights):
         fault = "a LeRobotDataset holds frames as recorded, not tokens"
         raise UsageError("--to lerobot", fault, "leave out --tokenizer and --weights")
-    settings = Settings(
-        frames=frames,
-        cameras=tuple(name.strip() for word in cameras or () for name in word.split(",") if name.strip()),
-        val_fraction=val_fraction,
-        seed=seed,
-        limit=limit,
-        shard_frames=shard_frames,
-        only=tuple(only or ()),
-        exclude=tuple(exclude or ()),
-        drop_idle=drop_idle,
-    )
     share = None
     if shard_index is not None and shard_count is not None:
         share = Share(shard_index, shard_count)
         if shard_index >= shard_count:
             raise UsageError("--shard-index", f"must be below --shard-count {shard_count}, is {shard_index}")
-        if overwrite or engine == "ray":
+        if options.overwrite or options.engine == "ray":
             raise UsageError("--shard-index", "cannot be combined with --overwrite or --engine ray")
     elif shard_index is not None or shard_count is not None:
         raise UsageError("hma convert", "--shard-index and --shard-count belong together", "give both")
@@ -166,22 +115,15 @@ def convert(
         source,
         tokenizer,
         out,
-        settings=settings,
+        settings,
         workers=workers,
-        engine=engine,
         weights=weights,
-        device=device,
         limits=Limits(quiet_s=episode_timeout or None),
-        max_quarantine=max_quarantine,
-        overwrite=overwrite,
-        extend=extend,
-        worker_cpus=worker_cpus,
-        worker_gpus=worker_gpus,
-        to=to,
         lerobot=lerobot,
+        **vars(options),
     )
     if dry_run:
-        if to == "lerobot":
+        if options.to == "lerobot":
             _print_dataset_plan(conversion, json)
         else:
             _print_plan(conversion, share, json)
@@ -195,9 +137,9 @@ def convert(
     from hma_data.shards.reader import ShardSet
 
     lasting: list[Finding] = []
-    if summary.made_shards and to == "shards":
-        lasting = list(kept_findings(ShardSet(summary.out), weights, device))
-    _report(summary, lasting, max_quarantine, json)
+    if summary.made_shards and options.to == "shards":
+        lasting = list(kept_findings(ShardSet(summary.out), weights, options.device))
+    _report(summary, lasting, options.max_quarantine, json)
     raise typer.Exit(1 if any(one.too_many for one in summary.outputs) else 0)
 
 
@@ -254,7 +196,6 @@ def _shown(name: str) -> "Iterator[Callable[[Progress], None]]":
 
 
 def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> None:
-    from hma_data.conversion.job import plan_conversion
     from hma_data.conversion.lerobot import dataset_plan
     from hma_data.conversion.plan import estimate, idle_workers
     from hma_data.shards.manifest import cameras_line
@@ -263,7 +204,7 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
 
     robot, workers = conversion.embodiment, conversion.workers
     opened = get_tokenizer(str(conversion.tokenizer), weights=conversion.weights, device=conversion.device)
-    plan, uri = plan_conversion(robot, conversion.source, opened.spec, conversion.settings)
+    plan, uri = conversion.plan(opened.spec)
     tasks = share.count if share else 1
     cost = estimate(plan, uri, robot, opened, workers, tasks)
     dataset = None
@@ -289,12 +230,7 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
         )
         return
     print_table(["shard", "episodes", "recorded frames, about"], [list(unit.values()) for unit in units])
-    stride = plan.facts["frame_stride"]
-    kept = f" (1 of {stride} is kept)" if stride > 1 else ""
-    say(
-        f"{uri}: {human_count(plan.episodes, 'episode')}, about {plan.frames:,} recorded frames{kept} into "
-        f"{human_count(len(units), 'shard')}, about {human_bytes(cost.bytes)}"
-    )
+    say(f"{_read(plan, uri)} into {human_count(len(units), 'shard')}, about {human_bytes(cost.bytes)}")
     if dataset:
         say(f"and into a LeRobotDataset v3.0 of {dataset['fps']} fps, {conversion.lerobot}")
     _print_cameras(
@@ -316,24 +252,25 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
 
 def _print_dataset_plan(conversion: "Conversion", json: bool) -> None:
     """Print what a LeRobotDataset would hold; its size depends on its videos, and is not estimated."""
-    from hma_data.conversion.job import plan_conversion
     from hma_data.conversion.lerobot import AS_RECORDED
 
-    robot = conversion.embodiment
-    plan, uri = plan_conversion(robot, conversion.source, AS_RECORDED, conversion.settings, "lerobot")
+    plan, uri = conversion.plan(AS_RECORDED)
     facts = plan.facts["dataset"]
     if json:
         totals = {"episodes": plan.episodes, "left_out": plan.left_out, "frames": plan.frames}
         print_json({"source": uri, "out": str(conversion.out), **totals, **facts, "parts": len(plan.units)})
         return
-    stride = plan.facts["frame_stride"]
-    kept = f" (1 of {stride} is kept)" if stride > 1 else ""
-    say(
-        f"{uri}: {human_count(plan.episodes, 'episode')}, about {plan.frames:,} recorded frames{kept} into a "
-        f"LeRobotDataset v3.0 of {facts['fps']} fps, made in {human_count(len(plan.units), 'part')}"
-    )
+    parts = human_count(len(plan.units), "part")
+    say(f"{_read(plan, uri)} into a LeRobotDataset v3.0 of {facts['fps']} fps, made in {parts}")
     _print_sizes(facts["sizes"])
     _print_left_out(plan.left_out)
+
+
+def _read(plan: "Plan", uri: str) -> str:
+    """Return how much the recording at a URI has, in words."""
+    stride = plan.facts["frame_stride"]
+    kept = f" (1 of {stride} is kept)" if stride > 1 else ""
+    return f"{uri}: {human_count(plan.episodes, 'episode')}, about {plan.frames:,} recorded frames{kept}"
 
 
 # -- the result
@@ -374,9 +311,7 @@ def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float,
             say(f"flags: {', '.join(counts)}")
         if summary.changed:
             print(summary.changed)
-        if summary.warning:
-            say(f"warning: {summary.warning}", err=True)
-        for note in summary.notes:
+        for note in filter(None, (summary.warning, *summary.notes)):
             say(f"warning: {note}", err=True)
         for finding in lasting:
             warns = finding.severity == "warn"

@@ -3,11 +3,15 @@
 The Tab key completes robots, tokenizers and recipes by the functions here; paths are the shell's own work.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import fields, is_dataclass
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_origin
 
 from typer import Argument, Option
+from typer.models import OptionInfo
 
 
 def robots(incomplete: str) -> list[str]:
@@ -44,6 +48,36 @@ def robot_option(text: str) -> Any:
 def choice_option(text: str, **options: Any) -> Any:
     """Return an option that chooses episodes, with its help."""
     return Option(help=f"{text}: id, glob or @FILE of ids; repeat it for more.", **options)
+
+
+def with_settings(verb: Callable[..., None]) -> Callable[..., None]:
+    """Give a verb the fields of dataclasses as options, in place of its parameters of these types."""
+    own = signature(verb, eval_str=True).parameters
+    classes: dict[str, Any] = {
+        name: own[name].annotation for name in own if is_dataclass(own[name].annotation)
+    }
+    options: list[Parameter] = []
+    for name, one in own.items():
+        options += _options(one.annotation) if name in classes else [one]
+
+    @wraps(verb)
+    def run(**given: Any) -> None:
+        for name, settings in classes.items():
+            given[name] = settings(**{one.name: given.pop(one.name) for one in fields(settings)})
+        verb(**given)
+
+    run.__annotations__ = {one.name: one.annotation for one in options}
+    run.__signature__ = Signature(options)  # type: ignore[attr-defined]
+    return run
+
+
+def _options(settings: Any) -> Iterator[Parameter]:
+    """Yield the options of a dataclass; the metadata of its fields are those of `OptionInfo`."""
+    for one in fields(settings):
+        kind: Any = list[str] if get_origin(one.type) is tuple else one.type
+        words = {"param_decls": [f"--{one.name.replace('_', '-')}"], **one.metadata}
+        option = Annotated[kind, OptionInfo(default=..., **words)]
+        yield Parameter(one.name, Parameter.KEYWORD_ONLY, default=one.default, annotation=option)
 
 
 Json = Annotated[bool, Option("--json", help="Print JSON.")]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -22,7 +22,7 @@ from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.extend import content_of, extended
 from hma_data.conversion.lerobot import AS_RECORDED, LeRobotHolder, as_dataset, dataset_plan, with_dataset
 from hma_data.conversion.output import Holder, Made, ShardHolder, Share, known_hashes, refuse_other
-from hma_data.conversion.plan import Plan, Settings, ShardUnit, idle_workers, make_plan
+from hma_data.conversion.plan import Plan, ShardUnit, idle_workers, make_plan
 from hma_data.conversion.publish import HubOutput
 from hma_data.conversion.reading import Job
 from hma_data.conversion.report import (
@@ -35,6 +35,7 @@ from hma_data.conversion.report import (
     refusal_reasons,
     training_notes,
 )
+from hma_data.conversion.settings import Options, Settings
 from hma_data.conversion.worker import MakeWork
 from hma_data.episodes.align import OFF_RATE
 from hma_data.errors import (
@@ -62,47 +63,6 @@ from hma_data.tokenizers.shapes import get_spec
 MERGE = "convert some episodes (--only) into a dataset of their own; lerobot-edit-dataset merges datasets"
 BOTH_ANEW = "choose another --out and another --lerobot, or --overwrite to start both over"
 OnProgress = Callable[[Progress], None]
-Target = Literal["shards", "lerobot"]
-
-
-def plan_conversion(
-    embodiment: Embodiment,
-    source: StrPath | None,
-    tokenizer: TokenizerSpec,
-    settings: Settings,
-    to: Target = "shards",
-) -> tuple[Plan, str]:
-    """Return the plan of a conversion and the URI it reads; see `Conversion`."""
-    if to == "lerobot":
-        settings = as_dataset(settings)
-    uri = embodiment.source.uri if source is None else as_text(source)
-    if source is not None and not (uri or "").strip():
-        raise UsageError("--source", "is empty", "name a recording, or leave it out to take the YAML's")
-    if not uri:
-        raise RegistryError(f"embodiment {embodiment.id}", "names no source.uri", "give --source URI")
-    require_utf8(uri)
-    if embodiment.frequency_hz == "unknown":
-        _ = embodiment.rate_hz  # raises, and says what to do
-    form = embodiment.source.format
-    try:
-        refs = open_source(form).index(uri, embodiment)
-    except StorageAwayError:
-        raise
-    except SourceError as fault:
-        raise of_another_format(uri, form, fault) from fault
-    refs = Records.of(EpisodeRef, refs)
-    chosen, robot = refs, embodiment.source
-    if robot.only or robot.exclude or settings.only or settings.exclude:
-        ids = ids_for_robot(refs.column("id").to_pylist(), embodiment)
-        kept = pa.array(chosen_ids(ids, settings.only, settings.exclude), pa.string())
-        chosen = refs.take(to_numpy(pc.is_in(refs.column("id"), kept)))
-    plan = make_plan(chosen, embodiment, tokenizer, settings, uri)
-    if form == "lerobot":
-        plan = plan.with_origin(origin_of(place(uri)))
-    if to == "lerobot":
-        plan = with_dataset(plan, uri, embodiment)
-    own_split = any(chosen.column("split").unique().to_pylist())
-    return replace(plan, left_out=len(refs) - len(chosen), own_split=own_split), uri
 
 
 def convert(
@@ -122,7 +82,7 @@ def convert(
 
 
 @dataclass(frozen=True)
-class Conversion:
+class Conversion(Options):
     """A conversion of a recording into a shard set, with everything that the user chooses.
 
     Attributes:
@@ -133,17 +93,10 @@ class Conversion:
         settings: what the plan, and so every byte, depends on.
         workers: processes, which may crash or hang without ending the job; 0 works in this one. Each imports
             the script that calls this, so the call must stand under `if __name__ == "__main__":`.
-        engine: what runs the workers: this machine, or a Ray cluster.
-        weights, device: of the tokenizer; the weights as str or path.
+        weights: of the tokenizer, as str or path.
         limits: when a worker counts as hanging, and how often it may be lost.
-        max_quarantine: fraction of episodes that may be refused.
-        overwrite: delete what `out` holds, if it is a shard set.
-        extend: add the episodes that a finished set in `out` does not have yet.
-        to: what is made: a shard set, or a LeRobotDataset, for which there is no tokenizer.
         lerobot: str or path of a LeRobotDataset that is made beside the shards, of the same cameras and
             split, in one pass over the recording.
-        worker_cpus, worker_gpus: what a worker reserves with engine="ray"; fractions let several share a CPU
-            or a GPU. None: one GPU where the tokenizer runs on one.
     """
 
     embodiment: Embodiment
@@ -152,16 +105,8 @@ class Conversion:
     out: StrPath
     settings: Settings = field(default_factory=Settings)
     workers: int = 0
-    engine: Literal["local", "ray"] = "local"
     weights: StrPath | None = None
-    device: str = "cpu"
     limits: Limits = LIMITS
-    max_quarantine: float = 0.01
-    overwrite: bool = False
-    extend: bool = False
-    worker_cpus: float = 1.0
-    worker_gpus: float | None = None
-    to: Target = "shards"
     lerobot: StrPath | None = None
 
     def __post_init__(self) -> None:
@@ -177,6 +122,40 @@ class Conversion:
         if self.to == "shards" and self.settings.drop_idle:
             fault = "is for --to lerobot: frames left out of shards would be pauses, which no window crosses"
             raise UsageError("--drop-idle", fault)
+
+    def plan(self, tokenizer: TokenizerSpec) -> tuple[Plan, str]:
+        """Return the plan of an empty folder, and the URI of the recording."""
+        robot, settings, source = self.embodiment, self.settings, self.source
+        if self.to == "lerobot":
+            settings = as_dataset(settings)
+        uri = robot.source.uri if source is None else as_text(source)
+        if source is not None and not (uri or "").strip():
+            raise UsageError("--source", "is empty", "name a recording, or leave it out to take the YAML's")
+        if not uri:
+            raise RegistryError(f"embodiment {robot.id}", "names no source.uri", "give --source URI")
+        require_utf8(uri)
+        if robot.frequency_hz == "unknown":
+            _ = robot.rate_hz  # raises, and says what to do
+        form = robot.source.format
+        try:
+            refs = open_source(form).index(uri, robot)
+        except StorageAwayError:
+            raise
+        except SourceError as fault:
+            raise of_another_format(uri, form, fault) from fault
+        refs = Records.of(EpisodeRef, refs)
+        chosen = refs
+        if robot.source.only or robot.source.exclude or settings.only or settings.exclude:
+            ids = ids_for_robot(refs.column("id").to_pylist(), robot)
+            kept = pa.array(chosen_ids(ids, settings.only, settings.exclude), pa.string())
+            chosen = refs.take(to_numpy(pc.is_in(refs.column("id"), kept)))
+        plan = make_plan(chosen, robot, tokenizer, settings, uri)
+        if form == "lerobot":
+            plan = plan.with_origin(origin_of(place(uri)))
+        if self.to == "lerobot":
+            plan = with_dataset(plan, uri, robot)
+        own_split = any(chosen.column("split").unique().to_pylist())
+        return replace(plan, left_out=len(refs) - len(chosen), own_split=own_split), uri
 
     def run(self, on_progress: OnProgress = lambda progress: None) -> Summary:
         """Make the shard set; running it again continues.
@@ -265,9 +244,7 @@ class _Run:
             self.uri = shards.uri
             self.whole = dataset_plan(shards.whole, self.uri, given.embodiment)
         else:
-            self.whole, self.uri = plan_conversion(
-                given.embodiment, given.source, self._spec, given.settings, given.to
-            )
+            self.whole, self.uri = given.plan(self._spec)
         if given.to == "lerobot":
             self.holder: Holder = LeRobotHolder(self.out, given.embodiment, self.uri)
         else:

@@ -14,10 +14,9 @@ import json
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
-from pathlib import PurePath
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -25,10 +24,11 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from hma_data.console import human_count
+from hma_data.conversion.settings import Settings
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepare
-from hma_data.errors import EpisodeError, HMAError, SourceError, StorageAwayError, UsageError
+from hma_data.errors import EpisodeError, HMAError, SourceError, StorageAwayError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import SPLITS, digest_of_texts, json_list, plan_hash
 from hma_data.shards.schema import RowLayout, to_numpy
@@ -42,56 +42,6 @@ SHARDS_A_WORKER = 4  # so that the last shards of a job do not leave most worker
 VAL_FRACTION = 0.05
 HELD_OUT = 5  # episodes of a small set: fewer give a verdict on a model no interval to speak of
 SMALLEST_SHARD, LARGEST_SHARD, SHARDS_WANTED = 4_096, 170_000, 32  # frames; 170,000 are about 100 MB
-
-
-@dataclass(frozen=True)
-class Settings:
-    """The settings of a conversion that the user chooses.
-
-    Attributes:
-        frames: all rows at the recording's rate, or only the model's grid with whole action chunks.
-        cameras: names; ("all",) takes all of the YAML; the primary camera by default.
-        val_fraction: fraction of episodes for validation, chosen by hash of their id; None takes
-            VAL_FRACTION, and more of a small set (see `choose_splits`).
-        seed: of that hash.
-        limit: take only so many episodes, from the first on; None takes all.
-        shard_frames: frames a shard, about; None lets the size of the recording decide.
-        only, exclude: episodes to take and to leave out: ids, globs, or @FILE; see `chosen_ids`.
-        drop_idle: leave out frames in which nothing moves, see `hma_data.episodes.idle`.
-    """
-
-    frames: Literal["all", "strided"] = "all"
-    cameras: tuple[str, ...] = ()
-    val_fraction: float | None = None
-    seed: int = 0
-    limit: int | None = None
-    shard_frames: int | None = None
-    only: tuple[str, ...] = ()
-    exclude: tuple[str, ...] = ()
-    drop_idle: bool = False
-
-    def __post_init__(self) -> None:
-        if self.val_fraction is not None and not 0 <= self.val_fraction < 1:
-            raise UsageError("--val-fraction", f"must be at least 0 and below 1, not {self.val_fraction:g}")
-        if self.limit is not None and self.limit < 1:
-            raise UsageError("--limit", f"must be at least 1, is {self.limit}")
-        if self.shard_frames is not None and self.shard_frames < 1:
-            raise UsageError("--shard-frames", f"must be at least 1, is {self.shard_frames}")
-
-    def facts(self, cameras: list[str]) -> dict[str, Any]:
-        """Return the settings as the plan states them, without a choice of episodes that was not made."""
-        values = asdict(self) | {"cameras": cameras}
-        if not self.drop_idle:
-            del values["drop_idle"]
-        for name in ("only", "exclude"):
-            words = values.pop(name)
-            if words:  # the plan's digest of the recording covers the ids in a file
-                values[name] = [f"@{PurePath(word).name}" if word.startswith("@") else word for word in words]
-        return values
-
-    def frame_stride(self, embodiment: Embodiment) -> int:
-        """Return the recorded steps a row; the plan, and with it every shard, states this number."""
-        return embodiment.stride if self.frames == "strided" else 1
 
 
 @dataclass(frozen=True)

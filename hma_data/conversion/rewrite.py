@@ -355,8 +355,7 @@ def _check_alike(first: ShardSet, other: ShardSet) -> None:
 def _settings(shards: ShardSet) -> Settings:
     """Return the settings that the set was made with."""
     said = shards.manifest.plan.get("settings", {})
-    choice = {name: tuple(said.get(name, ())) for name in ("only", "exclude")}
-    return Settings(**{**said, **choice, "cameras": tuple(shards.manifest.cameras)})
+    return Settings(**{**said, "cameras": shards.manifest.cameras})
 
 
 def _rows(shards: ShardSet) -> pa.Table:

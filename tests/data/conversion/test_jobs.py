@@ -41,7 +41,7 @@ def test_only_who_tokenizes_opens_the_tokenizer(
         raise OutputError("plan", "enough")
 
     monkeypatch.setattr("hma_data.conversion.job.get_tokenizer", get)
-    monkeypatch.setattr("hma_data.conversion.job.plan_conversion", stop)
+    monkeypatch.setattr("hma_data.conversion.job.Conversion.plan", stop)
     with pytest.raises(OutputError, match="enough"):
         convert(toy_arm, toy_recording, "fsq-8", tmp_path / "out", device="cuda:7", **options)
     assert opened == devices
