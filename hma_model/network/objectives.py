@@ -84,7 +84,8 @@ class Layout:
         if objective.readout:
             return cls.pairs(model, count, past=count)
         layout = cls.pairs(model, count, past=count - 1)
-        layout.times.wanted = 0 if model.config.kind == "discrete" else count - 1
+        if model.training or model.config.kind == "continuous":  # else the window's first frame is scored
+            layout.times.wanted = layout.past
         return layout
 
     @classmethod

@@ -181,21 +181,28 @@ class TemporalAttention(Attention):
         super().__init__(config)
         self.rotary = not config.released
 
-    def forward(self, x: Tensor, norm: nn.Module, times: TimePositions, cache: Tensor | None) -> Tensor:
-        """Apply `norm` and attention over time to (B, T, N, D); keep the shape."""
+    def forward(
+        self, x: Tensor, norm: nn.Module, times: TimePositions, cache: Tensor | None, first: int = 0
+    ) -> Tensor:
+        """Apply `norm` and attention over time to (B, T, N, D); return frames from `first` on."""
         turned = times if self.rotary else None
         if cache is not None:
             q, k, v = self.project(x, norm, turned, within=True)
-            return self.proj(self._recall(q, times, remember(cache, (k, v), times)))
+            return self.proj(self._recall(q[:, first:], times, remember(cache, (k, v), times)))
         b, t, n, width = x.shape
         q, k, v = self.project(x.transpose(1, 2).reshape(b * n, t, width), norm, turned)
-        mask = None if times.causal else times.allowed
-        return self.merge(q, k, v, mask, times.causal).view(b, n, t, width).transpose(1, 2)
+        causal = times.causal and not first
+        mask = None if causal else times.allowed[..., first:, :]
+        return self.merge(q[:, first:], k, v, mask, causal).view(b, n, t - first, width).transpose(1, 2)
 
     def _recall(self, q: Tensor, times: TimePositions, cache: Tensor) -> Tensor:
-        """Attend from queries (B, T, N, heads, head_dim) to the rows' cache; return (B, T, N, D)."""
+        """Attend from the last T frames' queries (B, T, N, heads, head_dim) to the rows' cache.
+
+        Return (B, T, N, D).
+        """
         b, t, n, heads, size = q.shape
         allowed = times.allowed if times.allowed.dim() == 3 else times.allowed.unsqueeze(0)
+        allowed = allowed[:, -t:]
         exporting = torch.compiler.is_exporting()
         if torch.compiler.is_compiling() and not exporting:
             return self._recall_fused(q, allowed, cache)
@@ -209,7 +216,7 @@ class TemporalAttention(Attention):
         # softmax takes a tenth of the time if its vectors run over places instead of frames.
         rows = q.permute(0, 2, 3, 1, 4).reshape(-1, t, size)
         k, v = cache.flatten(2, 4).transpose(1, 2)  # (B*N*heads, R, head_dim)
-        hidden = times.once("hidden", lambda: self._hidden(allowed, n * heads))
+        hidden = times.once(f"hidden {t}", lambda: self._hidden(allowed, n * heads))
         scores = torch.baddbmm(hidden, rows, k.transpose(1, 2), alpha=self.scale)
         weights = scores.softmax(-1) if exporting else scores.permute(2, 0, 1).softmax(0).permute(1, 2, 0)
         return torch.bmm(weights, v).view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
@@ -302,8 +309,9 @@ class Block(nn.Module):
         layer: int,
         times: TimePositions,
         cache: Sequence[Tensor | None],
+        first: int = 0,
     ) -> Tensor:
-        """Apply the block to tokens (B, T, N, D); keep the shape."""
+        """Apply the block to tokens (B, T, N, D); return those of the frames from `first` on."""
         qkv = self.space.project(x.flatten(0, 1), self.space_norm)
         x = x + self.space.merge(*qkv).view(x.shape)
         if self.adds and conditioning.embedding is not None:
@@ -312,7 +320,7 @@ class Block(nn.Module):
             x = x + recomputed(self.modulation_out, self.modulate, x, conditioning, layer)
         if self.action is not None and conditioning.embedding is not None:
             x = x + self.action(self.action_norm(x), conditioning.embedding, times, cache[1])
-        x = x + self.time(x, self.time_norm, times, cache[0])
+        x = x[:, first:] + self.time(x, self.time_norm, times, cache[0], first)
         return x + self.mlp(x, self.mlp_norm)
 
     def modulate(self, x: Tensor, conditioning: Conditioning, layer: int) -> Tensor:
@@ -395,8 +403,10 @@ class Transformer(nn.Module):
         each = 0 if carried is None else len(carried.memory) // config.layers
         for layer, block in enumerate(self.blocks):
             cache = (None, None) if carried is None else carried.memory[layer * each : (layer + 1) * each]
+            # After the last layer's keys and values, nothing reads the frames before `wanted`.
+            first = times.wanted if layer == config.layers - 1 else 0
             if self.checkpointing and self.training and torch.is_grad_enabled():
-                x = checkpoint(block, x, conditioning, layer, times, cache, use_reentrant=False)
+                x = checkpoint(block, x, conditioning, layer, times, cache, first, use_reentrant=False)
             else:
-                x = block(x, conditioning, layer, times, cache)
-        return self.norm(x)
+                x = block(x, conditioning, layer, times, cache, first)
+        return F.pad(self.norm(x), (0, 0, 0, 0, times.wanted, 0)) if times.wanted else self.norm(x)

@@ -6,11 +6,12 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from hma_data.errors import HMAError
 from hma_model.config import ActionSpace
+from hma_model.network.conditioning import ActionConditioning, Groups
 from hma_model.network.model import HMA
 from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv
 from hma_model.network.stem import Normalizer
 from hma_model.network.trunks import transformer
-from hma_model.network.trunks.contract import TimePositions
+from hma_model.network.trunks.contract import TimePositions, paired_times
 from hma_model.network.trunks.transformer import MLP, TemporalAttention
 from tests.model.network_parts import ARM, HAND, small_batch, small_config, small_model
 
@@ -233,6 +234,26 @@ def test_checkpointed_blocks_give_the_same_gradients() -> None:
         out.loss.backward()
         grads.append(model.trunk.blocks[0].mlp.fc1.weight.grad)
     assert torch.allclose(*grads, atol=1e-7)
+
+
+@pytest.mark.parametrize("conditioning", ["modulation", "cross_attention"])
+def test_frames_that_nobody_reads_change_neither_features_nor_gradients(conditioning) -> None:
+    model = small_model(conditioning=(conditioning,))
+    x, made = torch.randn(2, 7, model.config.tokens_per_frame, model.config.width), []
+    chunks = small_batch(model.config, ["arm"], frames=7).actions[:1].expand(2, -1, -1)
+    for wanted in (0, 3):
+        times = paired_times(model.config, 3, 5, "cpu")
+        times.wanted = wanted
+        given = ActionConditioning(chunks, torch.ones(2, 7, dtype=torch.bool))
+        conditions = model.condition(given, Groups.of("arm", 2), times.positions)
+        model.zero_grad()
+        features = model.trunk(x, conditions, times)
+        features[:, 3:].square().sum().backward()
+        assert features[:, :wanted].eq(0).all()
+        made.append((features[:, 3:], [own.grad for own in model.trunk.parameters() if own.grad is not None]))
+    (all_features, all_grads), (features, grads) = made
+    assert torch.allclose(features, all_features, atol=1e-5)
+    assert all(torch.allclose(a, b, rtol=1e-3, atol=1e-4) for a, b in zip(grads, all_grads, strict=True))
 
 
 @pytest.mark.parametrize("mask", [None, (5, 5), (1, 1, 5, 5), (7, 1, 5, 5)], ids=str)
