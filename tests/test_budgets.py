@@ -36,7 +36,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/generation": (1_670, 13_500, 10),
     "hma_model/hub": (1_060, 8_209, 6),
     "hma_model/lerobot_env": (638, 4_776, 3),
-    "hma_model/network": (3_230, 28_241, 16),
+    "hma_model/network": (3_241, 28_372, 16),
     "hma_model/play": (1_655, 11_950, 8),
     "hma_model/policies": (2_825, 20_100, 14),
     "hma_model/released": (825, 7_100, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_529, 29_018, 18),
     "hma_model/worlds": (1_524, 11_400, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_940, 513_690
-TEST_LINES = 48_417
+PRODUCT_LINES, PRODUCT_NODES = 64_951, 513_821
+TEST_LINES = 48_438
 DOC_WORDS = 40_357
 
 
