@@ -18,6 +18,7 @@ H,W latent grid.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -52,13 +53,13 @@ class Rollout:
             may not reach the rollout.
         embodiment: one id for all, or one a row.
         batch: B.
-        unmask_steps, temperature, order, sample_steps: as in `HMA.generate`.
         generator: of the seeds of rows that get none.
         cache: keep keys and values of past frames.
         compile: compile the passes over one or two frames, on a GPU with CUDA graphs; the first frames then
             take a minute or more. A step of some rows then computes all of them.
         precision: "float32"; "bf16" or "int8" for products in these. In int8 a row's frames depend on the
             rows beside it.
+        decoding: the settings of unmasking: unmask_steps, temperature, order, sample_steps, measure.
 
     Attributes:
         decoding: the settings of unmasking; they may be replaced between steps.
@@ -75,17 +76,14 @@ class Rollout:
         embodiment: str | Sequence[str],
         batch: int = 1,
         *,
-        unmask_steps: int = 2,
-        temperature: float | None = None,
-        order: str = "random",
-        sample_steps: int | None = None,
         generator: torch.Generator | None = None,
         cache: bool = True,
         compile: bool = False,
         precision: str = "float32",
+        **decoding: Any,
     ) -> None:
         self.model, self.config = model, model.config
-        self.decoding = Decoding.of(model.config, unmask_steps, temperature, order, sample_steps)
+        self.decoding = Decoding.of(model.config, **decoding)
         self.batch, self.caching = batch, cache
         self.engine = Engine(model, precision, compile and cache)
         Groups.of(embodiment, batch)  # checks that there are as many ids as rows
@@ -151,8 +149,8 @@ class Rollout:
         other = Rollout(
             self.model, names, len(rows), generator=self.state.shared, cache=self.caching,
             compile=self.engine.compiled is not None, precision=self.engine.precision,
+            **vars(self.decoding),
         )  # fmt: skip
-        other.decoding = self.decoding
         other.restore(range(len(rows)), self._copied(rows))
         return other
 
@@ -371,11 +369,11 @@ def generate(
     embodiment: str | Sequence[str],
     frames: int,
     mask: Tensor | None = None,
-    **decoding: object,
+    **options: Any,
 ) -> Tensor:
     """Continue a prompt by `frames` frames; `HMA.generate` explains the arguments."""
     known = prompt.shape[1]
-    rollout = Rollout(model, embodiment, prompt.shape[0], **decoding)  # type: ignore[arg-type]
+    rollout = Rollout(model, embodiment, prompt.shape[0], **options)
     chunks: Sequence[Tensor | None] = [None] * (known + frames)
     if actions is not None:
         if actions.shape[1] < known + frames - 1:

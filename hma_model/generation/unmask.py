@@ -10,6 +10,7 @@ B batch, S tokens of a frame, k tokens unmasked in a pass, C values of a patch, 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -43,13 +44,11 @@ class Decoding:
     measure: bool = False
 
     @classmethod
-    def of(
-        cls, config: HMAConfig, steps: int, temperature: float | None, order: str, sample_steps: int | None
-    ) -> "Decoding":
+    def of(cls, config: HMAConfig, temperature: float | None = None, **others: Any) -> "Decoding":
         """Return the settings for a model, with its own temperature by default; raise as `check`."""
         if temperature is None:
             temperature = TEMPERATURE if config.kind == "discrete" else 0.0
-        made = cls(steps, temperature, order, sample_steps)
+        made = cls(temperature=temperature, **others)
         check(made, config)
         return made
 

@@ -49,8 +49,7 @@ class World:
     Args:
         model: in eval mode.
         tokenizer: the tokenizer that the model was trained on.
-        unmask_steps, temperature, order, sample_steps: as in `HMA.generate`.
-        compile, precision: as in `Rollout`; compile is for a GPU.
+        compile, precision, decoding: as in `Rollout`; compile is for a GPU.
 
     Attributes:
         decoding: how frames are drawn; it may be replaced between steps, and counts for all sessions. With
@@ -64,19 +63,16 @@ class World:
         model: HMA,
         tokenizer: Tokenizer,
         *,
-        unmask_steps: int = 2,
-        temperature: float | None = None,
-        order: str = "random",
-        sample_steps: int | None = None,
         compile: bool = False,
         precision: str = "float32",
+        **decoding: Any,
     ) -> None:
         require_tokenizer(model.config, tokenizer.spec, "the model")
         self.model = model
         self.tokenizer = tokenizer
         self.compile = compile
         self.precision = precision
-        self.decoding = Decoding.of(model.config, unmask_steps, temperature, order, sample_steps)
+        self.decoding = Decoding.of(model.config, **decoding)
         self.uncertainty = dict[int, float]()
         products_in(precision, model.device, compile)  # checks that the device has them
         self.image_shape = image_shape(model.config)
@@ -243,8 +239,8 @@ class World:
         Its sessions are numbered from 0, those of one side by side.
         """
         ones = [self._at(session) for session in sessions for _ in range(n)]
-        other = World(self.model, self.tokenizer, compile=self.compile, precision=self.precision)
-        other.decoding = self.decoding
+        way: dict[str, Any] = {"compile": self.compile, "precision": self.precision, **vars(self.decoding)}
+        other = World(self.model, self.tokenizer, **way)
         other._rollout = self._running().fork(n, [self._at(session).row for session in sessions])
         other._opened = len(ones)
         other._sessions = {number: replace(one, row=number) for number, one in enumerate(ones)}
