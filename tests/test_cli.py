@@ -135,7 +135,7 @@ def test_infer_writes_a_yaml_whose_questions_validate_lists(toy_yaml: Path, tmp_
     lines = []
     for line in out.read_text().splitlines():
         key = next((k for k in answers if line.startswith(k) and "TODO" in line), None)
-        lines.append(key + answers[key] if key else line.replace("TODO: who says so?", "me"))
+        lines.append(key + answers[key] if key else line.replace("TODO: where is the rate stated?", "me"))
     out.write_text("\n".join(lines))
     assert hma("registry", "validate", str(out)).returncode == 0, out.read_text()
     words = ("--out", tmp_path / "o", "--tokenizer", "fsq-8", "--workers", "0")

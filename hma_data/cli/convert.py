@@ -61,7 +61,9 @@ def convert(
     settings: Settings,
     frequency_hz: Annotated[
         float | None,
-        Option(help="Rate of the recording, if unknown in the YAML.", rich_help_panel="Selection and split"),
+        Option(
+            help="Rate of the recording, if the YAML says unknown.", rich_help_panel="Selection and split"
+        ),
     ] = None,
     episode_timeout: Annotated[
         float,
@@ -290,7 +292,7 @@ def _report_share(done: "UnfinishedShare", share: "Share | None", json: bool) ->
     missing, made = human_count(done.missing, "shard"), human_count(done.made_shards, "shard")
     name = f"share {share.name} " if share else ""
     say(
-        f"{done.out}: {name}made {made} ({done.kept_shards} were there already), "
+        f"{done.out}: {name}made {made} ({done.kept_shards} existed already), "
         f"{human_seconds(done.seconds)}; {missing} left for other shares; the last one writes the manifest"
     )
 
@@ -370,7 +372,7 @@ def _print_made(summary: "Summary") -> None:
         )
         _print_sizes(facts["sizes"])
         return
-    kept = f" ({summary.kept_shards} were there already)" if summary.kept_shards else ""
+    kept = f" ({summary.kept_shards} existed already)" if summary.kept_shards else ""
     say(f"{totals_line(summary.out, manifest)}{kept}, {human_seconds(summary.seconds)}")
     if summary.kept_shards:
         say(f"{KEPT_UNREAD}: hma shards verify {shlex.quote(str(summary.out))}")

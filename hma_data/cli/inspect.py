@@ -107,7 +107,7 @@ def _row(key: dict[str, Any]) -> list[Any]:
 
 
 def _print_checks(report: dict[str, Any]) -> None:
-    """Print the checks with their results, one line for each finding, and one of what was not looked at."""
+    """Print the checks with their results, one line for each finding, and one of what was not checked."""
     from hma_data.inspection.inspect import NOT_CHECKED
     from hma_data.sources.common.survey import CHECKS
 

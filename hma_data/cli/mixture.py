@@ -33,14 +33,14 @@ def mixture(
         Pairs,
         _share(
             metavar="NAME=FACTOR",
-            help="Multiply the probability of an embodiment or group; repeat it for more.",
+            help="Multiply the probability of an embodiment or group; repeatable.",
         ),
     ] = None,
     group: Annotated[
         Pairs, _share(metavar="ID=GROUP", help="Put an embodiment into a group; groups get equal shares.")
     ] = None,
-    cap: Annotated[Pairs, _share(metavar="ID=SHARE", help="Largest probability of an embodiment.")] = None,
-    max_epochs: Annotated[float | None, _share(help="Largest number of passes over one set.")] = None,
+    cap: Annotated[Pairs, _share(metavar="ID=SHARE", help="Maximum probability of an embodiment.")] = None,
+    max_epochs: Annotated[float | None, _share(help="Maximum number of passes over one set.")] = None,
     samples: Annotated[
         int | None, Option(min=1, help="Planned draws; default: the number of windows.")
     ] = None,

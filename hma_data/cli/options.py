@@ -47,7 +47,7 @@ def robot_option(text: str) -> Any:
 
 def choice_option(text: str, **options: Any) -> Any:
     """Return an option that chooses episodes, with its help."""
-    return Option(help=f"{text}: id, glob or @FILE of ids; repeat it for more.", **options)
+    return Option(help=f"{text}: id, glob, or @FILE with one per line; repeatable.", **options)
 
 
 def with_settings(verb: Callable[..., None]) -> Callable[..., None]:

@@ -155,8 +155,8 @@ def shards_preview(
     episodes: Annotated[int, Option(min=1, help="Number of episodes to show.")] = 4,
     camera: Annotated[str | None, Option(help="Camera to show; default: all of the set.")] = None,
     weights: Weights = None,
-    only: Annotated[list[str] | None, choice_option("Episode to show")] = None,
-    exclude: Annotated[list[str] | None, choice_option("Episode not to show")] = None,
+    only: Annotated[list[str] | None, choice_option("Show only this episode")] = None,
+    exclude: Annotated[list[str] | None, choice_option("Do not show this episode")] = None,
 ) -> None:
     """Write a contact sheet and a video decoded from the tokens, with the actions drawn.
 
@@ -234,7 +234,7 @@ def shards_split(
     workers: Workers = None,
     json: Json = False,
 ) -> None:
-    """Split the episodes of a set into train and val again, as a new set.
+    """Write a new set with another split into train and val.
 
     Example: hma shards split shards/my_arm --val-fraction 0.1 --out shards/my_arm_10
     """

@@ -25,7 +25,7 @@ _existing = partial(_option, panel="If --out holds a shard set")
 
 
 def _episodes(what: str) -> Any:
-    return _data((), f"{what}: id, glob or @FILE of ids; repeat it for more.", metavar="ID|GLOB|@FILE")
+    return _data((), f"{what}: id, glob, or @FILE with one per line; repeatable.", metavar="ID|GLOB|@FILE")
 
 
 def _names(words: list[str]) -> list[str]:
@@ -50,14 +50,14 @@ class Settings:
     )
     val_fraction: float | None = _data(
         None,
-        "Validation share of episodes; default: 5 %, but at least 5 episodes (a quarter if fewer than 20); "
+        "Share of episodes for validation; default: 5 %, but at least 5 episodes (a quarter if fewer than 20); "
         "with --to lerobot 0.",
     )
     seed: int = _data(0, "Seed of the split.")
     limit: int | None = _option(None, "Convert only the first N episodes.", min=1)
     shard_frames: int | None = _option(None, "Approximate frames per shard.", "Rarely needed", min=1)
-    only: tuple[str, ...] = _episodes("Episode to take")
-    exclude: tuple[str, ...] = _episodes("Episode to leave out")
+    only: tuple[str, ...] = _episodes("Convert only this episode")
+    exclude: tuple[str, ...] = _episodes("Leave out this episode")
     drop_idle: bool = _data(False, "With --to lerobot, leave out frames in which nothing moves.")
 
     def __post_init__(self) -> None:

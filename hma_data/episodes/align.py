@@ -190,7 +190,7 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     repeated = len(episode.streams[primary].timestamps) - len(frames)
     if repeated > len(frames):
         total = repeated + len(frames)
-        fault = f"{repeated} of {total} frames of {primary} have the same stamp as the frame before"
+        fault = f"{repeated} of {total} frames of {primary} have the same timestamp as the previous frame"
         raise AlignmentError(episode.id, fault, _clock_remedy(embodiment))
     grid, trimmed = _grid(episode.id, frames, embodiment, timed)
 

@@ -10,7 +10,7 @@ from hma_data.storage.fetch import SECRET, causes
 
 TRANSIENT = (408, 429, 500, 502, 503, 504)
 LOG_IN = "log in with hf auth login, or set HF_TOKEN"
-RUN_AGAIN = "run the same command again; it goes on where it stopped"
+RUN_AGAIN = "run the same command again to continue"
 LONGEST_WAIT = 300.0  # seconds; the hub counts requests over five minutes
 
 

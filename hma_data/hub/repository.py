@@ -169,7 +169,7 @@ class Repository:
         """Return the content of a file of at most 16 MB at the commit that `files` listed."""
         if self._entries[name].size > MAX_JSON_BYTES:
             fault = f"is larger than {MAX_JSON_BYTES:,} bytes"
-            raise HubError(f"{self.name}/{name}", fault, "this is not a file of ours")
+            raise HubError(f"{self.name}/{name}", fault, "the toolkit writes no such file")
         return (self.pull([name]) / name).read_bytes()
 
     def warm(self, names: Iterable[str]) -> None:

@@ -356,7 +356,7 @@ class _Draft:
         return instruction(self.found.keys) or facts.get("instruction") or next(iter(outside), None)
 
     def _provenance(self) -> dict[str, str]:
-        said = {"frequency_hz": self._rate_from() if self.hz else f"{TODO}: who says so?"}
+        said = {"frequency_hz": self._rate_from() if self.hz else f"{TODO}: where is the rate stated?"}
         if self._target() != TARGET_HZ or self._short_at_any_rate():
             length = f"{statistics.median(self.found.lengths):g} steps"
             said["stride" if self._short_at_any_rate() else "target_hz"] = (
@@ -374,7 +374,7 @@ class _Draft:
             said["cameras"] = "; ".join([*asked, *self.looks])
         framed = [(key.key, found) for key in self.seen.keys if (found := _framing(key))]
         if told := [
-            f"{key}: {found.fault}; does {found.words} hold all that matters?" for key, found in framed
+            f"{key}: {found.fault}; does {found.words} contain everything relevant?" for key, found in framed
         ]:
             said["crop"] = f"{TODO}: {' '.join(told)}"
         if levels := [key.key for key in self.seen.keys if key.encoding == "mono16"]:
@@ -388,7 +388,7 @@ class _Draft:
                 factor = f"{infer_topics.MARGIN:g} times the longest interval held"
                 said["max_skew_ms"] = f"{factor}; intervals, measured: {gaps}"
             if self.clock.asks:
-                said["stamp"] = f"{TODO}: {self.clock.reason}; is it right to pair by the times of receipt?"
+                said["stamp"] = f"{TODO}: {self.clock.reason}; may streams be aligned by receive times?"
             elif self.clock.reason:
                 said["stamp"] = self.clock.reason
             if pause := self._pause():
@@ -409,7 +409,7 @@ class _Draft:
         camera = self.seen.keys[0]
         moved = [key for key in (*self.action.keys, *self.states) if key.hz]
         rates = dict.fromkeys(f"{key.topic.name if key.topic else key.key} {_hz(key)}" for key in moved)
-        beside = f"; beside it {shown(rates)}" if rates else ""
+        beside = f"; others: {shown(rates)}" if rates else ""
         return f"measured: {camera.key} {_hz(camera)}{beside}"
 
 

@@ -378,14 +378,14 @@ def likely(found: list[KeyInfo]) -> Choice:
     if not chosen:
         return Choice()
     when = ", as measured a step later," if own else ""
-    asked = f"no key is called an action; may {shown([chosen[0].key])}{when} stand for it"
+    asked = f"no key is named like an action; may {shown([chosen[0].key])}{when} be the action"
     return stand_in(chosen[:1], found, asked, bool(own))
 
 
 def next_poses(found: list[KeyInfo]) -> Choice:
     """Choose RH20T's pose and width of the next sample, which stand for an action."""
     chosen = tuple(key for key in found if key.key in ("tcp_base/tcp", "gripper/gripper_info"))
-    asked = f"may {shown(key.key for key in chosen)} of the next sample stand for the action?"
+    asked = f"may {shown(key.key for key in chosen)} of the next sample be the action?"
     return Choice(chosen, asked if chosen else "", measured=True)
 
 

@@ -86,7 +86,7 @@ def measured_topics(found: list[KeyInfo]) -> Choice:
     first = joints[0]
     named = {_name((key,)): key for key in joints}  # one key a topic
     chosen = [key for key in named.values() if key == first or _other_side((key,), (first,))]
-    asked = f"no topic drives the robot; may {shown(key.key for key in chosen)}, as measured, stand for it"
+    asked = f"no topic holds commands; may {shown(key.key for key in chosen)}, as measured, be the action"
     return stand_in(chosen, found, asked, measured=False)
 
 

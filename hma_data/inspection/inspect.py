@@ -39,7 +39,7 @@ from hma_data.sources.detect import detect, of_another_format
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import is_remote, place
 
-NOT_CHECKED = "not looked at"  # the result of a check that the recording does not allow
+NOT_CHECKED = "not checked"  # the result of a check that the recording does not allow
 MAX_TRIED = 20  # episodes tried until one can be read
 TOKENIZER_SIDE = 256  # pixels: the side of most tokenizers' images
 IMAGE_CHECKS = ("blank", "still", "colour", "size")  # they count only for cameras that are used
@@ -93,7 +93,7 @@ def inspect_recording(
 
 
 def _results(made: Iterable[str], found: Iterable[Finding]) -> dict[str, str]:
-    """Return the result of each check: ok, the worst severity found, or "not looked at" where impossible."""
+    """Return the result of each check: ok, the worst severity found, or "not checked" where impossible."""
     told = dict.fromkeys(CHECKS, NOT_CHECKED) | dict.fromkeys(made, "ok")
     for finding in sorted(found, key=lambda one: SEVERITIES.index(one.severity)):
         told[finding.check] = finding.severity
@@ -142,7 +142,7 @@ def _fit(
         facts[f"actions {key}"] = offset.measured
         found += [finding] if finding else []
     if hz and is_off_rate(hz, robot):
-        said = f"{robot.id} says {robot.rate_hz:g} Hz, the recording's grid ticks at {hz:.3g} Hz"
+        said = f"{robot.id} says {robot.rate_hz:g} Hz, the aligned recording has {hz:.3g} Hz"
         numbers = {"hz": hz, "stated_hz": robot.rate_hz}
         found.append(Finding("rate", "error", said, numbers=numbers))
     constant = _constant(clip.actions.std(axis=0), robot)
@@ -176,7 +176,7 @@ def unanswered(inspection: Inspection) -> Iterator[Finding]:
         )
     for topic, seconds in held_actions(inspection).items():
         said = f"{topic}: its last message is {seconds:.3g} s before the first frame, held throughout"
-        yield Finding("offset", "warn", said, "a constant action teaches nothing; name another", topic)
+        yield Finding("offset", "warn", said, "do not train on constant actions: use another key", topic)
     if inspection.format in ONE_INDEX and not inspection.hz:
         yield Finding(
             "rate", "info", "the recording states no rate", "state frequency_hz in the robot's YAML"
@@ -391,10 +391,10 @@ def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
     steps = np.concatenate([np.diff(clip.timestamps) for clip in clips])
     hz = measured_hz(steps)
     if hz and is_off_rate(hz, robot):
-        said = f"the grid ticks at {hz:.3g} Hz, the YAML says {robot.rate_hz:g}"
+        said = f"the aligned frames have {hz:.3g} Hz, the YAML says {robot.rate_hz:g}"
         yield Finding("rate", "error", said, rate_remedy(robot))
     if hz and (steps > 3 / hz).any():
-        said = f"frames pause for up to {steps.max():.3g} s; no window crosses a pause of a model's step"
+        said = f"frames pause for up to {steps.max():.3g} s; windows cross no pause of a model step or longer"
         yield Finding("gaps", "warn", said, pause_remedy(robot, hz))
     needed = WINDOW * robot.stride  # the chunk of the last frame too
     lengths = sorted(len(clip) for clip in clips)

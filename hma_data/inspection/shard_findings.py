@@ -156,7 +156,7 @@ def _finding(camera: Camera, kept: Kept, part: MovingPart) -> Finding:
     numbers = {"moving_share": kept.share, "psnr_moving_db": kept.psnr_db, "change_shown": kept.change_shown}
     if not kept.lost and not (framed and framed.cut_off):
         return Finding("tokens", "info", said, key=camera.key, numbers=numbers)
-    said += "; the tokens lose the robot" if kept.lost else ""
+    said += "; the tokenizer does not reconstruct the robot" if kept.lost else ""
     said += f"; {framed.fault}" if framed else ""
     remedy = f"set {framed.words} in the YAML" if framed else "use another tokenizer, see hma tokenizer list"
     remedy += ", and convert again with --overwrite; hma shards preview shows both"

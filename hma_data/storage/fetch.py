@@ -66,9 +66,7 @@ def retried[T](action: Callable[[], T], where: object, doing: str, waits_s: Sequ
             raise
         text = f"cannot be {doing}: {said(fault)}"
         if not waits_s:
-            remedy = (
-                "the network failed again and again: run the same command again, it continues where it was"
-            )
+            remedy = "the network failed repeatedly: run the same command again to continue"
             if _kinds(fault) & _UNREACHABLE:
                 remedy = "check the network, and the address (AWS_ENDPOINT_URL for s3); " + remedy
             raise StorageAwayError(where, text, remedy) from fault

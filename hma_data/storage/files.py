@@ -220,7 +220,7 @@ def read_json(path: Path, error: type[HMAError] = CheckpointError) -> dict[str, 
     """
     try:
         if path.stat().st_size > MAX_JSON_BYTES:
-            raise error(path, f"is larger than {MAX_JSON_BYTES:,} bytes", "this is not a file of ours")
+            raise error(path, f"is larger than {MAX_JSON_BYTES:,} bytes", "the toolkit writes no such file")
         content = path.read_bytes()
     except OSError as fault:
         raise error(path, f"cannot be read: {fault.strerror}") from fault

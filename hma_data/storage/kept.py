@@ -34,8 +34,10 @@ class KeptParts:
         path, text = folder / SETTINGS, json.dumps(settings, indent=1)
         begun = path.read_bytes() if path.exists() else None
         if any(folder.glob("*.npz")) and begun != text.encode():
-            fault = "was begun with other settings"
-            raise OutputError(folder.parent, fault, f"give the same ones, another folder, or delete {folder}")
+            fault = "was started with other settings"
+            raise OutputError(
+                folder.parent, fault, f"give the same settings or another folder, or delete {folder}"
+            )
         write_atomic(path, text)
 
     def path(self, key: str) -> Path:

@@ -102,7 +102,7 @@ class RemotePath(PosixPath):
     __repr__ = __str__
 
     def __fspath__(self) -> str:
-        raise TypeError(f"{self} is not a file of this machine")
+        raise TypeError(f"{self} is not a local file")
 
     def __reduce__(self) -> Any:
         return RemotePath, (str(self),)

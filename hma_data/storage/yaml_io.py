@@ -121,7 +121,7 @@ def read_bytes(path: Path, error: type[HMAError] = RegistryError) -> bytes:
     except OSError as fault:
         raise error(path, f"cannot be read: {fault.strerror or fault}") from fault
     if len(content) > MAX_BYTES:
-        raise error(path, f"is larger than {MAX_BYTES:,} bytes", "a YAML of ours is a few kilobytes")
+        raise error(path, f"is larger than {MAX_BYTES:,} bytes", "the toolkit's YAMLs have a few kilobytes")
     return content
 
 

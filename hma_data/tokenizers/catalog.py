@@ -135,7 +135,7 @@ _ROWS = (
     _MAGVIT2,
     replace(
         _MAGVIT2, name="magvit2-plain", arguments={"averaged": False},
-        description="the same checkpoint without averaging: the ids that the paper's own code makes of it",
+        description="the same checkpoint without averaged weights: the same ids as the paper's code",
     ),
     Entry(
         "svd-vae", "continuous", 256, (32, 32),
@@ -173,12 +173,12 @@ _ROWS = (
     ),
     Entry(
         "raw", "continuous", 256, (256, 256),
-        "pixels as they are, for baselines and for models with a tokenizer of their own",
+        "raw pixels, for baselines and for models with their own tokenizer",
         "none", "hma_data.tokenizers.raw", imports=(),
     ),
     Entry(
         "raw-128", "continuous", 128, (128, 128),
-        "small pixels as they are: what moves loses nothing, and nothing is decoded",
+        "raw pixels of small images: no tokenizer error, no decoding",
         "none", "hma_data.tokenizers.raw", {"image_size": 128}, imports=(),
     ),
     Entry(

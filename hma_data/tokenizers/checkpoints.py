@@ -136,7 +136,7 @@ def pair_of(path: Path) -> list[Path]:
     files = [path.with_name(path.name[:start] + half + path.name[end:]) for half in HALVES]
     for file in files:
         if not file.is_file():
-            raise TokenizerError(file, f"is not there, but belongs with {path.name}", "put it there")
+            raise TokenizerError(file, f"is missing, but belongs with {path.name}", "put it there")
     return files
 
 

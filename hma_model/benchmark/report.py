@@ -28,10 +28,10 @@ PLAIN = (  # key of a robot's figures, measure, key or text of the reference, it
         "inverse.true_return_px",
         "simulator",
     ),
-    ("inverse.return_psnr", "PSNR of that frame, dB", "inverse.turn_psnr", "before turning back"),
+    ("inverse.return_psnr", "PSNR after actions and inverses, dB", "inverse.turn_psnr", "before inverses"),
     ("planning.truth", "goals reached by planning in the simulator", "planning.random", "random actions"),
     ("planning.model", "goals reached by planning in the model", "planning.random", "random actions"),
-    ("planning.gap", "planning gap: simulator minus model", "planning.verdict", "limit: {}"),
+    ("planning.gap", "planning gap: simulator minus model", "planning.verdict", "limited by: {}"),
     ("calibration.gap_px", "calibration gap of the state error, px", "", ""),
     (
         "calibration.half_px",
@@ -39,8 +39,8 @@ PLAIN = (  # key of a robot's figures, measure, key or text of the reference, it
         "calibration.all_px",
         "of all",
     ),
-    ("calibration.right", "rollouts warned in time", "calibration.clock", "by a clock"),
-    ("calibration.misses", "misses: no warning by the time the error doubles", "", ""),
+    ("calibration.right", "share of right warning decisions", "calibration.clock", "by a clock"),
+    ("calibration.misses", "misses: the error doubles without a prior warning", "", ""),
     ("calibration.false_alarms", "false alarms: no doubling soon after a warning", "", ""),
     ("frames_per_second", "frames per second, one rollout", "frames_per_cpu_second", "per CPU second"),
 )

@@ -157,7 +157,7 @@ def read_results(path: Path) -> dict[str, Any]:
         raise OutputError(path, "holds no results of the benchmark", REMEDY) from None
     digest = found.pop("sha256", None)  # results of older versions have none
     if digest not in (None, _digest(found)):
-        raise OutputError(path, "is damaged or edited: its SHA-256 is another one", REMEDY)
+        raise OutputError(path, "is damaged or edited: its SHA-256 does not match", REMEDY)
     return found
 
 

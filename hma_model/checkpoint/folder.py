@@ -40,8 +40,8 @@ SAMPLE, FILM = "sample.png", "sample.gif"
 PICTURES = (SAMPLE, FILM)  # optional, shown in the model card
 EMBEDDED, EMBEDDED_NAME = Path(__file__).parents[1] / "embedded", "embedded"  # bundled with the package
 _OTHER_TRUNK = "pull the embodiment and its trunk together, or finetune it on this trunk"
-_CUT_SHORT = "a push or pull was cut short: do it again"
-_OTHER_YAML = "put the one back that it was trained with; facts for readers can be changed in the card"
+_CUT_SHORT = "a push or pull was interrupted: run it again"
+_OTHER_YAML = "restore the one that it was trained with; change descriptions in the card instead"
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,7 @@ def read_metadata(path: Path) -> dict[str, str]:
         with safe_open(path, framework="np") as file:  # the header alone needs no torch
             return file.metadata() or {}
     except (SafetensorError, OSError) as fault:
-        reason = unreadable(path, f"is not whole safetensors: {fault}", "pull or save it again")
+        reason = unreadable(path, f"is not a complete safetensors file: {fault}", "pull or save it again")
         raise CheckpointError(path, *reason) from fault
 
 

@@ -25,7 +25,7 @@ _COUNTS = (
     *("layers", "width", "heads", "frames", "channels", "patch", "action_tokens", "grid", "views"),
     *("levels", "factored", "diffusion_depth", "diffusion_width", "diffusion_sample_steps"),
 )
-_REMEDY = "pull the checkpoint again; if it stays so, do not use it"
+_REMEDY = "pull the checkpoint again; if the error stays, do not use it"
 
 
 # -- safetensors files
@@ -39,7 +39,7 @@ def read_tensors(path: Path) -> State:
     try:
         return load_file(path)
     except (SafetensorError, OSError) as fault:
-        reason = unreadable(path, f"is not whole safetensors: {fault}", "pull or save it again")
+        reason = unreadable(path, f"is not a complete safetensors file: {fault}", "pull or save it again")
         raise CheckpointError(path, *reason) from fault
 
 
@@ -58,7 +58,7 @@ def write_tensors(
         if half and tensor.is_floating_point() and not name.startswith(STATISTICS):
             plain[name] = tensor.half()
             if tensor.isfinite().all() and not plain[name].isfinite().all():
-                fault = f"{name} holds {float(tensor.abs().max()):.3g}, which float16 has no number for"
+                fault = f"{name} holds {float(tensor.abs().max()):.3g}, which float16 cannot represent"
                 raise CheckpointError(path, fault, "store it in float32")
     save_file(plain, path, metadata)
     with path.open("r+b") as file:  # safetensors writes the metadata in a different order each time
@@ -115,7 +115,7 @@ def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: 
         value = getattr(config, key)
         for count in value if isinstance(value, tuple) else (value,):
             if not isinstance(count, int) or count > LARGEST_COUNT:
-                raise CheckpointError(where, f"model.{key} is {value!r}: no size of a network", _REMEDY)
+                raise CheckpointError(where, f"model.{key} is {value!r}, not a valid network size", _REMEDY)
     values = sum(tensor.numel() for tensor in state.values())
     width, hidden = config.width, config.mlp_ratio * config.width
     needed: dict[str, float] = {}

@@ -32,9 +32,7 @@ if TYPE_CHECKING:
 def evaluate(
     checkpoint: Checkpoint,
     data: Annotated[list[Path], Argument(help="Shard sets.")],
-    compare: Annotated[
-        list[str] | None, Option(help="Another checkpoint to compare; repeat it for more.")
-    ] = None,
+    compare: Annotated[list[str] | None, Option(help="Another checkpoint to compare; repeatable.")] = None,
     split: Split = "val",
     windows: Annotated[int, Option(min=1, help="Number of windows, evenly spaced.")] = 64,
     frames: Annotated[int | None, Option(min=2, help="Frames per window; default: the model's.")] = None,

@@ -15,7 +15,7 @@ def export(
     checkpoint: Checkpoint,
     out: Annotated[Path, Option(help="Folder to write; an older export there is replaced.")],
     data: Annotated[
-        list[Path] | None, Argument(help="Shard sets, whose held-out episodes give frames to start from.")
+        list[Path] | None, Argument(help="Shard sets whose held-out episodes provide first frames.")
     ] = None,
     embodiment: Embodiments = None,
     starts: Annotated[int, Option(min=1, max=20, help="Start scenes per robot.")] = 3,

@@ -119,7 +119,7 @@ def listing(
     revision: Revision = None,
     json: Json = False,
 ) -> None:
-    """List checkpoints and their robots, and whether they can be used here.
+    """List checkpoints and their robots, and whether this machine can use them.
 
     Example: hma hub list ./my-hub
     """

@@ -17,9 +17,7 @@ def embedded_robots(incomplete: str) -> list[str]:
 Checkpoint = Annotated[
     str, Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
 ]
-Embodiments = Annotated[
-    list[str] | None, Option("--embodiment", "-e", help="Only this robot; repeat it for more.")
-]
+Embodiments = Annotated[list[str] | None, Option("--embodiment", "-e", help="Only this robot; repeatable.")]
 OfCheckpoint = Annotated[str, Option("--checkpoint", help="A checkpoint, a run's folder, or a hub repo.")]
 Data = Annotated[Path, Argument(help="A shard set.")]
 Split = Annotated[Literal["train", "val"], Option("--split", help="Split of the windows.")]
@@ -41,7 +39,7 @@ Precision = Annotated[
     ),
 ]
 Compile = Annotated[
-    bool, Option("--compile", help="Compile the trunk for rollouts: takes a minute, then faster on a GPU.")
+    bool, Option("--compile", help="Compile the trunk: takes a minute, speeds up rollouts on a GPU.")
 ]
 Device = Annotated[
     str,

@@ -22,21 +22,14 @@ from hma_model.cli.options import (
     kept,
 )
 
-MaxError = Annotated[
-    float | None,
-    Option(
-        min=0,
-        help="Expected state error (px of 128) above which augment drops episodes, and policy-eval also "
-        "reports the judge without them.",
-    ),
-]
+LIMIT = "whose expected state error (px of 128) is at most this."
 
 
 def policy_eval(
     embodiment: Annotated[
         str,
         Argument(
-            help="A robot of the checkpoint; without a reward model as --judge, a simulated one.",
+            help="A robot of the checkpoint; must be simulated unless --judge is a reward model.",
             autocompletion=embedded_robots,
         ),
     ],
@@ -65,7 +58,9 @@ def policy_eval(
             help="Shards with success labels, for a reward model; default: those of the training run.",
         ),
     ] = None,
-    max_error: MaxError = None,
+    max_error: Annotated[
+        float | None, Option(min=0, help=f"Also report the judge for episodes {LIMIT}")
+    ] = None,
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
     precision: Precision = "float32",
@@ -128,7 +123,8 @@ def augment(
     out: Annotated[Path, Argument(help="Folder for the shard set.")],
     checkpoint: OfCheckpoint = "embedded",
     source: Annotated[
-        Path | None, Option("--from", help="Shard set of first frames and actions; default: the simulator.")
+        Path | None,
+        Option("--from", help="Shard set that provides first frames and actions; default: the simulator."),
     ] = None,
     episodes: Annotated[int, Option(min=1, help="Episodes to generate.")] = 64,
     frames: Annotated[
@@ -138,7 +134,7 @@ def augment(
         str, Option(help="Actions: replay, perturb=SIGMA (noise, in std), or a policy of hma policy-eval.")
     ] = "replay",
     keep: Annotated[float, Option(help="Share of episodes to keep, lowest uncertainty first.")] = 0.5,
-    max_error: MaxError = None,
+    max_error: Annotated[float | None, Option(min=0, help=f"Keep only episodes {LIMIT}")] = None,
     judge: Annotated[
         str, Option(help="Keep only successes of a judge: moved, moved=PX, reached, placed, a reward model.")
     ] = "",

@@ -102,7 +102,7 @@ def finetune(
         str, Option("--from", help="A checkpoint, a run's folder, a URI, or ORG/NAME[@REVISION].")
     ],
     words: Words = None,
-    data: Annotated[list[str] | None, Option(help="One shard set, as in DATA; repeat it for more.")] = None,
+    data: Annotated[list[str] | None, Option(help="One shard set, as in DATA; repeatable.")] = None,
     freeze_trunk: Annotated[
         bool, Option("--freeze-trunk", help="Train only stems and heads; keep the trunk as it is.")
     ] = False,

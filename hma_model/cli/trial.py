@@ -35,9 +35,9 @@ def try_recording(
     ] = None,
     answer: Annotated[
         list[str] | None,
-        Option(metavar="KEY=VALUE", help="Answer a question of the robot's YAML; repeat it for more."),
+        Option(metavar="KEY=VALUE", help="Answer a question of the robot's YAML; repeatable."),
     ] = None,
-    only: Annotated[list[str] | None, choice_option("Episode to take")] = None,
+    only: Annotated[list[str] | None, choice_option("Use only this episode")] = None,
     minutes: Annotated[float, Option(min=0.1, help="Minutes of training.")] = 5.0,
     out: Annotated[Path | None, Option(help="Output folder; default: hma-try-NAME.")] = None,
 ) -> None:

@@ -30,7 +30,7 @@ MIN_SCENES = 8
 BINS, KNOTS = 10, 20  # equally many frames in each
 LIMITS = 100  # quantiles of the stated uncertainty that are tried as a limit
 COVERAGES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
-NO_UNCERTAINTY = "the model states no uncertainty: video_loss: regression draws nothing"
+NO_UNCERTAINTY = "the model has no uncertainty: with video_loss: regression, nothing is sampled"
 
 
 @dataclass(frozen=True)
@@ -112,10 +112,10 @@ def meter_of(
     try:
         meter = Meter.of(card["meter"])
     except (KeyError, TypeError, ValueError):
-        return None, "the card's calibration of uncertainty is damaged: hma benchmark writes it anew"
+        return None, "the card's calibration of uncertainty is damaged: hma benchmark rebuilds it"
     if (meter.unmask_steps, meter.temperature, "random") != (unmask_steps, temperature, order):
         way = f"{meter.unmask_steps} passes at temperature {meter.temperature:g} in random order"
-        return None, f"uncertainty is calibrated for {way} alone"
+        return None, f"uncertainty is calibrated only for {way}"
     return meter, ""
 
 

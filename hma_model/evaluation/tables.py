@@ -63,7 +63,7 @@ FIGURES = (
     Figure("loss, frequencies", "baseline_loss", 3, "the same from token frequencies alone", detail=True),
     Figure(
         "perplexity", "perplexity", 2,
-        "of fully masked frames, given the recorded past; per square if the model takes squares",
+        "of fully masked frames, given the recorded past; per square if the model merges tokens",
         by_window="loss", within=NATURAL, exponential=True,
     ),
     Figure("nats/token", "stored_loss", 3, "loss per stored token, comparable between models of a tokenizer"),

@@ -69,7 +69,7 @@ def _checkpoint(store: Store, files: Mapping[str, int], root: str) -> dict[str, 
     if not weights or not {"num_layers", "d_model"} <= values.keys():
         return None
     facts |= {"format": "released", "trunk_bytes": weights[0]}
-    facts["problems"] = ["in the release's layout: bring it in with hma hub import"]
+    facts["problems"] = ["in the release's layout: convert it with hma hub import"]
     facts["model"] = {"layers": values["num_layers"], "width": values["d_model"]}
     domains, dims = values.get("action_domains"), values.get("d_actions")
     if isinstance(domains, list) and isinstance(dims, list):

@@ -155,7 +155,7 @@ def _changes(
     files = store.files()
     changes: dict[str, Content | None] = {}
     if CONFIG in files:
-        there, own_place = _config(store, files), "push to a hub of its own"
+        there, own_place = _config(store, files), "push to another address"
         if there.get("trunk_sha256") != source.trunk_sha256:
             theirs, ours = str(there.get("trunk_sha256"))[:16], source.trunk_sha256[:16]
             fault = f"has another trunk: {theirs}, this checkpoint's is {ours}"

@@ -72,7 +72,7 @@ class FolderStore:
         with _explained(f"{self.name}/{name}", "read"):
             if (self._root / name).stat().st_size > MAX_JSON_BYTES:
                 fault = f"is larger than {MAX_JSON_BYTES:,} bytes"
-                raise HubError(f"{self.name}/{name}", fault, "this is not a file of ours")
+                raise HubError(f"{self.name}/{name}", fault, "the toolkit writes no such file")
             return (self._root / name).read_bytes()
 
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
@@ -210,7 +210,7 @@ def open_published(source: StrPath, revision: str | None) -> tuple[Store, dict[s
             raise
         if revision:
             raise HubError(f"{name}@{revision}", fault.fault, fault.remedy) from fault
-        both = f"is no folder here; as a repository of the hub: {fault.fault}"
+        both = f"is not a local folder; as a repository of the hub: {fault.fault}"
         remedy = f"give the path of a checkpoint or run, or: {fault.remedy}"
         raise HubError(name, both, remedy) from fault
 
@@ -224,7 +224,7 @@ def embodiment_ids(files: Iterable[str]) -> list[str]:
 @contextmanager
 def _explained(where: object, doing: str) -> Iterator[None]:
     """Raise what a file system raises as a HubError."""
-    remedy = "free space, check the address and your access, and do it again"
+    remedy = "free space, check the address and your access, and try again"
     try:
         yield
     except (OSError, ValueError) as fault:  # ValueError: a name with a zero byte

@@ -106,7 +106,7 @@ class Stepper:
             now = time.monotonic()
             left = [one for one in self.sessions.values() if one.viewer is None or self._idle(one, now)]
             if not left:
-                fault = f"all {self.most} places are taken"
+                fault = f"all {self.most} sessions are in use"
                 raise UsageError("sessions", fault, "close another page, or try again in a few minutes")
             said = "Closed after a while without input: another page needed the session."
             self.close(min(left, key=lambda one: (one.viewer is not None, one.touched)).name, said)

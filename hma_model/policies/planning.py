@@ -174,7 +174,7 @@ class Planning:
         temperature: float = 0.0,
     ) -> None:
         if min(horizon, samples, steps, receding) < 1 or receding > horizon:
-            fault = "has a number below 1, or looks less often than it plans ahead"
+            fault = "has a number below 1, or receding above horizon"
             remedy = "give numbers of at least 1, and receding up to horizon"
             raise UsageError(f"policy plan:{solver}", fault, remedy)
         own = World(world.model, world.tokenizer, unmask_steps=unmask_steps, temperature=temperature)

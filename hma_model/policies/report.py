@@ -71,7 +71,7 @@ def sentences(found: PolicyEvaluation) -> list[str]:
         f"judge on held-out recorded episodes: {found.judge.held_out}",
         f"judge on generated frames, vs the simulator under the same actions: {found.generated}",
         f"precision: the simulator confirms {_share(found.precision)} of the model's successes ({guessed} by "
-        f"chance); recall: the model shows {_share(found.recall)} of the simulator's, same actions",
+        f"chance); recall: the model shows {_share(found.recall)} of the simulator's successes, same actions",
         f"per-episode scores under the same actions: correlation {found.followed}, AUROC {found.auroc}",
         f"model vs simulator, each under its own actions: precision {_share(paired['precision'])}, "
         f"recall {_share(paired['recall'])}, AUROC of scores {paired['auroc']}",

@@ -329,7 +329,7 @@ def choosing_meter(world: World, embodiment: str) -> Meter:
     """
     meter, reason = world.meter(embodiment)
     if meter is not None and not meter.chooses:
-        reason = f"the surest half of {embodiment}'s rollouts has no smaller error than all of them"
+        reason = f"the least uncertain half of {embodiment}'s rollouts has no smaller error than all of them"
     if meter is None or reason:
         raise UsageError("--max-error", reason, "leave it out")
     return meter

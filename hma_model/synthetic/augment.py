@@ -435,7 +435,7 @@ class _Maker:
             window = self._seen.window(row, at)
             if np.isfinite(window.chunks[:needed]).all():
                 return row, window
-        fault = f"has hardly a window of {length} frames whose actions are all known"
+        fault = f"has too few windows of {length} frames whose actions are all known"
         raise UsageError(shards.folder, fault, "give fewer --frames, or shards with more of the actions")
 
 
@@ -462,7 +462,7 @@ def _chosen(
             fault = f"leaves no episode: the smallest expected error at the end is {expected.min():.1f} px"
             raise HMAError("--max-error", fault, "give more px, or fewer --frames")
     if not (chosen & success).any():
-        fault = f"none of the {chosen.sum()} surest of {len(unsure)} episodes is judged a success"
+        fault = f"none of the {chosen.sum()} least uncertain of {len(unsure)} episodes is judged a success"
         raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")
     chosen &= success
     judged = True if settings.judge else None

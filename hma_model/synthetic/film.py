@@ -70,7 +70,7 @@ def find_film(place: StrPath) -> ShardSet | list[Path]:
     files = sorted(path.rglob("*")) if path.is_dir() else []
     videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
     if not videos:
-        fault = "is no shard set and no folder with video files" if path.exists() else "does not exist"
+        fault = "is neither a shard set nor a folder with video files" if path.exists() else "does not exist"
         raise UsageError(path, fault, f"give a folder of {', '.join(VIDEO_SUFFIXES)}, or a shard set")
     return videos
 

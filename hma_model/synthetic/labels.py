@@ -191,7 +191,7 @@ def measure(
     misses = list[Float32s]()
     true = list[Float32s]()
     for done, number in enumerate(numbers):
-        on_progress(done, "checking on labelled film", len(numbers))
+        on_progress(done, "checking on labelled video", len(numbers))
         stored, actions, known = film.labelled(number)
         if len(stored) < 2:
             continue

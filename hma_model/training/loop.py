@@ -78,7 +78,7 @@ def train(
         raise UsageError("out", "is not given", "name the run's folder with --out or out=DIR")
     folder = as_text(chosen)
     if "://" in folder:
-        raise UsageError("out", f"is {folder!r}, no folder of this machine", "train here, then hma hub push")
+        raise UsageError("out", f"is {folder!r}, not a local folder", "train here, then hma hub push")
     device = choose_device(recipe.device)
     cuda = [device] if device.type == "cuda" else []
     if cuda:

@@ -342,8 +342,8 @@ def drivable(
             imaged = ImageRobot(embodiment, stats, shown, cameras)
             found[imaged.key] = imaged
     if not found:
-        remedy = "give shards of it, hma play CHECKPOINT SHARDS, or an image of it, --prompt PICTURE"
-        raise UsageError(checkpoint.folder, "no robot of it has a simulator to begin from", remedy)
+        remedy = "give shards of it, hma play CHECKPOINT SHARDS, or an image of it, --prompt IMAGE"
+        raise UsageError(checkpoint.folder, "none of its robots has a simulator to start from", remedy)
     return found
 
 

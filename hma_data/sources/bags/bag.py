@@ -202,7 +202,7 @@ def _unpack_file(packed: BinaryIO, plain: BinaryIO, limit: int) -> None:
 def _require_space(path: Path, folder: Path) -> None:
     """Raise OutputError where a folder has no space for the copy of a file."""
     size, free = path.stat().st_size, shutil.disk_usage(folder).free
-    log.info("%s: sqlite3 needs a file of this machine; %s bytes are copied to %s", path, f"{size:,}", folder)
+    log.info("%s: sqlite3 needs a local file; %s bytes are copied to %s", path, f"{size:,}", folder)
     if size > free:
         fault = f"must be copied here to be read: it has {size:,} bytes, and {folder} has {free:,} free"
         raise OutputError(path, fault, "set TMPDIR to a larger disk, or write it as MCAP (ros2 bag convert)")

@@ -92,9 +92,9 @@ class Clock:
     def __str__(self) -> str:
         """Return how the stamps lie beside receipt."""
         if not self.by_header:
-            return f"{self.topic} is timed by receipt"
+            return f"{self.topic} has only receive times"
         if abs(self.delay_s) > DAY_S:
-            return f"header stamps of {self.topic} are not of the recorder's clock (simulated time?)"
+            return f"header stamps of {self.topic} do not come from the recorder's clock (simulated time?)"
         side = "ahead of" if self.delay_s < 0 else "behind"
         said = f"header stamps of {self.topic} are {abs(self.delay_s):.3g} s {side} receipt"
         if abs(self.drift_s) > AHEAD_S:
@@ -165,18 +165,18 @@ class MessageTimes:
         at = int(np.argmin(steps)) + 1
         seconds = -float(steps[at - 1]) / SECOND_NS
         usable = self.stamps is not None and self.order("receive" if by_header else "header") is not None
-        remedy = "cut the file there, and keep the parts in folders of their own"
+        remedy = "cut the file there, and put the parts into separate folders"
         if by_header:
             fault = f"header stamps go back by {seconds:.3g} s at message {at}: their clock was set back"
             fault += ", or a simulation was restarted"
             if usable:
-                remedy = "sync: {stamp: receive} reads on by the times of receipt"
+                remedy = "sync: {stamp: receive} uses receive times instead"
                 if seconds > 1:  # segments divide where a clock jumps back as far as they state
                     remedy = f"source.segments: {{gap_s: 1}} makes the parts episodes of their own; {remedy}"
         else:
-            fault = f"times of receipt go back by {seconds:.3g} s at message {at}: "
+            fault = f"receive times go back by {seconds:.3g} s at message {at}: "
             fault += "the recorder's clock was set back"
-            remedy = "sync: {stamp: header} takes the header stamps, which are in order" if usable else remedy
+            remedy = "sync: {stamp: header} uses the header stamps, which are in order" if usable else remedy
         return EpisodeError(where, fault, remedy)
 
     def clock(self, clock: str = "header") -> Clock:

@@ -91,7 +91,7 @@ class Field:
                     ) from fault
                 continue
             if not is_list(here):
-                raise EpisodeError(where, f"{self.key}: what is before [ is not a list")
+                raise EpisodeError(where, f"{self.key}: the value before [ is not a list")
             if (step + 1 if isinstance(step, int) else step.stop or 0) > len(here):
                 fault_of = f"{self.key}: the list has {len(here)} values in one of the messages"
                 raise EpisodeError(where, fault_of)
@@ -179,7 +179,7 @@ class Column:
             known = ", ".join(field_names(value))
             raise EpisodeError(
                 self._where,
-                f"{self.field.key} holds {fault}, not numbers alone",
+                f"{self.field.key} holds {fault}, not only numbers",
                 f"name a field of it: {known}" if known else "",
             ) from fault
         if self._selects:

@@ -180,9 +180,9 @@ def time_findings(key: str, times: StreamTimes, camera: bool = False, episode: s
     if times.infinite:
         yield found("finite", f"{times.infinite} times are not finite", count=times.infinite)
     if times.repeated:
-        yield found("repeated", f"{times.repeated} stamps equal the stamp before", count=times.repeated)
+        yield found("repeated", f"{times.repeated} timestamps equal the previous one", count=times.repeated)
     if times.back:
-        yield found("back", f"{times.back} stamps go back in time", count=times.back)
+        yield found("back", f"{times.back} timestamps go back in time", count=times.back)
     if times.regular >= STREAM and times.gap_s > pause_s(times.period_s):
         said = f"pauses for {times.gap_s:.3g} s after {times.gap_at_s:.3g} s"
         yield found("gaps", said, gap_s=times.gap_s, at_s=times.gap_at_s)
@@ -334,8 +334,8 @@ class CameraLook:
             if straight is not None and turned is not None:
                 if turned >= SURE and straight <= CHANCE:
                     return "sure", (
-                        f"{turned:.0%} of its colours are what decoding JPEG gives with the two swapped, "
-                        f"{straight:.0%} as they stand"
+                        f"{turned:.0%} of its colours are those of a decoded JPEG with the two swapped, "
+                        f"{straight:.0%} as stored"
                     )
                 if straight >= SURE and turned <= CHANCE:
                     return "no", ""  # even where the scene is blue

@@ -373,12 +373,12 @@ class Survey:
         shown = any(look.images for look in self.looks.values())
         told = bool(groups) and severity == "error"  # no episode could be read at all
         if (faulty or missing) and not shown and not told and any(key.kind == "camera" for key in keys):
-            yield Finding("readable", "error", "not one image of the sampled episodes can be read")
+            yield Finding("readable", "error", "no image of the sampled episodes can be read")
 
     def _finite(self) -> Iterator[Finding]:
         for key, held in self._numbers.items():
             if held.infinite:
-                said = f"{held.first} ({held.infinite:,} of {held.values:,} values looked at"
+                said = f"{held.first} ({held.infinite:,} of {held.values:,} values checked"
                 said += f", in {held.episodes} episodes)" if held.episodes > 1 else ")"
                 numbers = {"count": held.infinite, "values": held.values}
                 yield Finding("finite", "warn", said, key=key, numbers=numbers)

@@ -133,7 +133,7 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
     try:
         facts |= _hands_in(videos, chosen[:MAX_VIDEOS], survey)
     except HMAError as fault:
-        said = f"hands were not looked for: {fault.where} {fault.fault}"
+        said = f"hands were not detected: {fault.where} {fault.fault}"
         survey.note(Finding("hands", "warn", said, fault.remedy, "video"))
     first = next(iter(headers.values()), Header(0, 0.0, 0, 0, ""))
     hz, size = first.hz or None, (first.height, first.width, 3)
@@ -179,10 +179,10 @@ def _hands_in(videos: dict[str, Video], chosen: list[str], survey: Survey) -> di
         sides["right hand"] += sum("right" in each for each in seen)
         sides["both"] += sum(len(each) == 2 for each in seen)
         if not any(seen):
-            said = f"{name}: no hand in {len(seen)} frames looked at"
+            said = f"{name}: no hand in {len(seen)} sampled frames"
             survey.note(Finding("hands", "warn", said, key="video", numbers={"frames": len(seen)}))
     return {
-        f"frames with {side}": f"{sides[side] / looked:.0%} of {looked} looked at"
+        f"frames with {side}": f"{sides[side] / looked:.0%} of {looked} sampled"
         for side in ("left hand", "right hand", "both")
         if looked
     }

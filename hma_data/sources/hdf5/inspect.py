@@ -108,7 +108,7 @@ def inspect(
         demos = {place.group.rsplit("/", 1)[-1] for place in found.values() if place.file == file}
         for mask, names in masks.items():
             if absent := sorted(names - demos):
-                said = f"mask/{mask} names {listed(absent)}, which {file.name} has not"
+                said = f"mask/{mask} names {listed(absent)}, which {file.name} does not have"
                 survey.note(Finding("keys", "warn", said, numbers={"demos": len(absent)}))
     lacking = [key for key, count in held.items() if key not in first.keys and 2 * count >= len(lengths)]
     if lacking:
@@ -143,7 +143,7 @@ def _end_to_end(name: str, group: h5py.Group, place: EpisodeGroup, survey: Surve
         ends = item[()].astype(bool)  # a run of True counts once
         count = len(item) if last.startswith("episode") else int(np.diff(ends, prepend=False)[ends].sum())
         if count > 1:
-            said = f"{name} is read as one episode, but {key} tells of {count:,}"
+            said = f"{name} is read as one episode, but {key} marks {count:,}"
             remedy = (
                 "write each as a group of its own, data/demo_0, data/demo_1, …, or windows cross their ends"
             )

@@ -224,7 +224,7 @@ def _check_length(
                 "if the last was observed after the last action, set source.layout.last_observation: drop"
             )
         elif key.lower().endswith(VIDEO_SUFFIXES) and length < actions:
-            remedy = "if the video was stopped first, set source.layout.frames_missing to how many may lack"
+            remedy = "if the video stopped early, set source.layout.frames_missing to the missing frames"
         raise EpisodeError(where, f"its series differ in length: actions {actions}, {key} {length}", remedy)
 
 

@@ -65,7 +65,7 @@ def fit(clock: Floats, spans: Sequence[Span], fps: float) -> Fit:
         fault = f"would show {episode_name(before.index)} ({before.rows} rows from {before.start:.3f} s) and "
         fault += f"{episode_name(after.index)} (from {after.start:.3f} s) at the same time"
         return Fit(fault=fault, remedy="their spans in meta/episodes overlap: merge the datasets again")
-    # Stamps are believed wherever they fit. A video that begins later or earlier than its metadata say is
+    # Stamps are believed wherever they fit. A video that begins later or earlier than its metadata says is
     # moved as a whole, but only if every episode then has exactly its number of frames.
     for shift in dict.fromkeys((0.0, float(clock[0] - starts[0]), float(clock[0]))):
         parts = _Parts(clock - shift, spans, starts, ends, fps)
@@ -136,7 +136,7 @@ def _misfit(clock: Floats, spans: Sequence[Span]) -> str:
     said = f"has {len(clock):,} frames for {rows:,} rows{episodes}"
     late = clock[0] - spans[0].start
     if abs(late) > 1e-3:
-        said += f", and begins at {clock[0]:.3f} s, its metadata say {spans[0].start:.3f} s"
+        said += f", and begins at {clock[0]:.3f} s, its metadata says {spans[0].start:.3f} s"
     elif len(clock) == rows:
         said += ", but not at the times that meta/episodes says"
     return said

@@ -104,7 +104,7 @@ def write_language(folder: Path, by_episode: Mapping[int, Items]) -> None:
     try:
         LanguageColumnsWriter().write_all(records, staging, folder)
     except ValueError as fault:
-        said = f"says what lerobot's writer of language does not take: {fault}"
+        said = f"has language data that lerobot's writer rejects: {fault}"
         raise SourceError("the recording", said, "correct it with lerobot-annotate") from fault
     for path in sorted(staging.rglob("*"), reverse=True):
         path.unlink() if path.is_file() else path.rmdir()

@@ -338,7 +338,7 @@ class _Looking:
         self._whole_video(key, span.path, file, found)
         if span.index in found.unused:
             count = found.unused[span.index]
-            said = f"{span.path} has {count:,} frames after the last row of {name} that no row asks for"
+            said = f"{span.path} has {count:,} frames after the last row of {name} that belong to no row"
             self._survey.note(Finding("frames", "warn", said, key=key, numbers={"frames": count}))
         times = times_of(rows_of(meta, index), meta.fps)
         codec, keys = file.table.codec, file.table.keys
@@ -365,7 +365,7 @@ class _Looking:
             said = f"{path} {found.fault}"
             self._survey.note(Finding("frames", "warn", said, found.remedy, key, numbers))
         elif found.shift:
-            said = f"{path} begins {found.shift:+.3f} s from where its metadata say, with one frame a row"
+            said = f"{path} begins {found.shift:+.3f} s from where its metadata says, with one frame a row"
             self._survey.note(Finding("frames", "info", said, key=key, numbers=numbers))
 
 

@@ -306,7 +306,7 @@ def _stated_shards(
             shards[split.name] = present
             problems += _missing(split.name, len(present), len(items))
         elif sum(counts):
-            absent.append(f"split {split.name} of {sum(counts):,} episodes is not there")
+            absent.append(f"split {split.name} of {sum(counts):,} episodes is missing")
     return shards, problems + absent if shards else problems
 
 
@@ -337,7 +337,7 @@ def _named_shards(
 
 
 def _missing(split: str, present: int, shards: int) -> list[str]:
-    said = f"{shards - present} of {shards} shards of split {split} are not there"
+    said = f"{shards - present} of {shards} shards of split {split} are missing"
     return [said] if present < shards else []
 
 

@@ -58,7 +58,7 @@ def test_control_characters_in_a_path_are_escaped(toy_arm, toy_recording, tmp_pa
     run(toy_arm, toy_recording, out)
     _report(run(toy_arm, toy_recording, out), [], 0.01, False)
     (first, *_) = capsys.readouterr().out.splitlines()
-    assert r"two\nlines \x1b[1m: 12 episodes" in first and "were there already" in first
+    assert r"two\nlines \x1b[1m: 12 episodes" in first and "existed already" in first
     fails(hma("inspect", out / "none"), 1, r"two\nlines \x1b[1m/none: ")
 
 

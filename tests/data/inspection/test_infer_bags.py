@@ -94,7 +94,7 @@ CHOICES = {  # topics; keys of the action; what the question about the action na
     "without a commanding topic joint states are proposed": (
         {"/pose": (pose(), 10)},
         ["/joint_states.position"],
-        "no topic drives the robot",
+        "no topic holds commands",
     ),
 }
 

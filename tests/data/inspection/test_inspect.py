@@ -72,10 +72,10 @@ def test_every_format_answers_the_same_checks(name: str, tmp_path: Path) -> None
     assert report["format"] == name and list(report["checks"]) == list(CHECKS)
     assert report["looked_at"] >= 1
     said = " ".join(report["problems"])
-    assert said.startswith("hands were not looked for: hand models are not given" if name == "hands" else "")
+    assert said.startswith("hands were not detected: hand models are not given" if name == "hands" else "")
     assert name == "hands" or not said
     assert {"readable", "size", "blank", "colour"} <= {
-        check for check, result in report["checks"].items() if result != "not looked at"
+        check for check, result in report["checks"].items() if result != "not checked"
     }
     assert json.loads(json.dumps(report)) == json.loads(json.dumps(report, default=str))
 
@@ -127,7 +127,7 @@ def test_values_that_are_not_finite_are_counted_over_the_episodes(tmp_path: Path
         file["data/demo_2/actions"][1] = np.inf
 
     (said,) = damaged(tmp_path, spoil)["finite"]
-    assert said == "demo_0: actions is not finite at step 4 (4 of 198 values looked at, in 2 episodes)"
+    assert said == "demo_0: actions is not finite at step 4 (4 of 198 values checked, in 2 episodes)"
 
 
 def test_only_so_many_episodes_are_looked_into(tmp_path: Path) -> None:
@@ -189,8 +189,10 @@ def test_stamps_of_hdf5_are_checked_against_the_stated_rate(tmp_path: Path) -> N
             demo["timestamps"] = times
 
     said = damaged(tmp_path, stamp)
-    assert "demo_0: timestamps: 1 stamps equal the stamp before (and in 2 more episodes)" in said["repeated"]
-    assert "demo_0: timestamps: 1 stamps go back in time (and in 2 more episodes)" in said["back"]
+    assert (
+        "demo_0: timestamps: 1 timestamps equal the previous one (and in 2 more episodes)" in said["repeated"]
+    )
+    assert "demo_0: timestamps: 1 timestamps go back in time (and in 2 more episodes)" in said["back"]
     assert "timestamps: runs at 20 Hz, the recording states 30" in said["rate"][0]
 
 
@@ -226,7 +228,7 @@ def test_episodes_end_to_end_in_one_file_are_told(tmp_path, key, values, count) 
         file["images"] = np.random.default_rng(0).integers(0, 256, (30, 16, 16, 3), np.uint8)
         file["actions"], file[key] = np.random.default_rng(0).normal(size=(30, 3)), values
     told = found(open_source("hdf5").inspect(str(tmp_path / "flat.hdf5"))).get("rows", [])
-    assert any(f"{key} tells of {count} — write" in said for said in told) == (count is not None)
+    assert any(f"{key} marks {count} — write" in said for said in told) == (count is not None)
 
 
 def test_a_bag_tells_skew_and_lost_frames(tmp_path: Path) -> None:

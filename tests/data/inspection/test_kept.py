@@ -62,7 +62,7 @@ def test_a_small_robot_is_given_a_square_crop_that_holds_it(tmp_path: Path) -> N
     x, y, wide, tall = values["cameras"][0]["crop"]
     assert wide == tall <= 100
     assert x <= 200 - 5 and x + wide >= 200 + LINK + 5 and y <= 100 and y + tall >= 100 + LINK + 5
-    assert f"crop: {[x, y, wide, tall]} hold all that matters?" in values["provenance"]["crop"]
+    assert f"crop: {[x, y, wide, tall]} contain everything relevant?" in values["provenance"]["crop"]
 
 
 def test_no_crop_is_proposed_where_the_whole_image_changes_or_nothing_does() -> None:
@@ -105,7 +105,7 @@ def test_tokens_that_lose_the_robot_are_a_warning_and_with_the_crop_they_keep_it
         return hma("convert", "-e", robot(recording, camera), "--tokenizer", "fsq-lab", *out)
 
     lost = convert("")
-    assert "the tokens lose the robot" in lost.stderr and not lost.returncode
+    assert "the tokenizer does not reconstruct the robot" in lost.stderr and not lost.returncode
     (found,) = (one for one in examine(tmp_path / "set") if one.check == "tokens")
     assert found.severity == "warn" and found.numbers["change_shown"] < 0.5
     crop = found.remedy.removeprefix("set ").partition(" in the YAML")[0]

@@ -37,5 +37,5 @@ def test_parts_without_their_settings_are_not_taken(tmp_path: Path, damaged: byt
     (tmp_path / "parts" / SETTINGS).unlink()
     if damaged is not None:
         (tmp_path / "parts" / SETTINGS).write_bytes(damaged)
-    with pytest.raises(OutputError, match="begun with other settings — .* or delete .*parts"):
+    with pytest.raises(OutputError, match="started with other settings — .* or delete .*parts"):
         KeptParts(tmp_path / "parts", {"seed": 0})

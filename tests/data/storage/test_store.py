@@ -83,7 +83,7 @@ def test_a_scheme_that_no_store_has_is_refused() -> None:
 
 
 def test_a_remote_path_is_never_taken_for_one_of_this_machine(bucket: RemotePath) -> None:
-    with pytest.raises(TypeError, match="is not a file of this machine"):
+    with pytest.raises(TypeError, match="is not a local file"):
         open(bucket / "x")  # noqa: PTH123, SIM115
     with pytest.raises(StorageError, match="written as a whole"):
         (bucket / "x").open("w")

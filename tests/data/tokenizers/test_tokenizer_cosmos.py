@@ -144,7 +144,7 @@ def test_files_that_are_no_programs_are_refused(discrete, tmp_path):
 
 def test_a_missing_half_is_named(discrete, tmp_path):
     (tmp_path / "encoder.jit").write_bytes((discrete / "encoder.jit").read_bytes())
-    with pytest.raises(TokenizerError, match=r"decoder\.jit: is not there"):
+    with pytest.raises(TokenizerError, match=r"decoder\.jit: is missing"):
         get_tokenizer("cosmos-di16", weights=str(tmp_path))
     whole = tmp_path / "autoencoder.jit"
     whole.write_bytes((discrete / "encoder.jit").read_bytes())

@@ -221,9 +221,9 @@ def test_latents_of_another_width_are_refused(tmp_path):
 def test_half_a_pair_is_refused(tmp_path):
     write_tiny_pair(tmp_path)
     (tmp_path / "taesd_decoder.pth").unlink()
-    with pytest.raises(TokenizerError, match=r"taesd_decoder\.pth: is not there"):
+    with pytest.raises(TokenizerError, match=r"taesd_decoder\.pth: is missing"):
         get_tokenizer("taesd", weights=str(tmp_path / "taesd_encoder.pth"))
-    with pytest.raises(TokenizerError, match=r"taesd_decoder\.pth: is not there"):
+    with pytest.raises(TokenizerError, match=r"taesd_decoder\.pth: is missing"):
         get_tokenizer("taesd", weights=str(tmp_path))
     with pytest.raises(TokenizerError, match="holds none of"):
         get_tokenizer("taef2", weights=str(tmp_path))

@@ -213,7 +213,7 @@ def test_a_benchmark_stopped_at_every_part_ends_with_the_same_figures(
                 patch.setattr(running, name, stop)
             benchmark("it", out, TINY, world=world_of(FlawlessWorld))
         assert len(list((out / WORK).glob("*.npz"))) == number
-    with pytest.raises(OutputError, match="begun with other settings"):
+    with pytest.raises(OutputError, match="started with other settings"):
         benchmark("it", out, TINY, seed=1, world=world_of(FlawlessWorld))
     found = benchmark("it", out, TINY, world=world_of(FlawlessWorld))
     monkeypatch.setattr(running, "choose", stop)

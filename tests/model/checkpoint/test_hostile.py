@@ -124,11 +124,11 @@ HOSTILE: dict[str, tuple[str, Edit, str]] = {  # the file, what is done to it, a
     "a bit of the head": (HEAD, flip(), r"head\.safetensors: is not the file that card\.json names"),
     "no head": (HEAD, Path.unlink, r"head\.safetensors.*again"),
     "a bit of the stem": (STEM, flip(), r"stem\.safetensors: is not the file that card\.json names"),
-    "a bit of the stem's header": (STEM, flip(12), r"stem\.safetensors: is not whole safetensors"),
-    "a bit of the header's length": (STEM, flip(6), r"stem\.safetensors: is not whole safetensors"),
-    "a stem cut short": (STEM, cut(-100), r"stem\.safetensors: is not whole safetensors"),
+    "a bit of the stem's header": (STEM, flip(12), r"stem\.safetensors: is not a complete safetensors file"),
+    "a bit of the header's length": (STEM, flip(6), r"stem\.safetensors: is not a complete safetensors file"),
+    "a stem cut short": (STEM, cut(-100), r"stem\.safetensors: is not a complete safetensors file"),
     "the stem of another trunk": (STEM, of_another_trunk, r"stem\.safetensors: belongs to another trunk"),
-    "a pickle": (STEM, whole(b"cos\nsystem\n(S'touch ran'\ntR."), "is not whole safetensors"),
+    "a pickle": (STEM, whole(b"cos\nsystem\n(S'touch ran'\ntR."), "is not a complete safetensors file"),
     "a bit of the statistics": (STATS, flip(), r"with other statistics than stats\.json"),
     "a pickle of statistics": (STATS, whole(b"cos\nsystem\n(S'touch ran'\ntR."), r"stats\.json"),
     "an empty card": (CARD, cut(0), r"card\.json: is not valid JSON"),
@@ -154,7 +154,10 @@ HOSTILE: dict[str, tuple[str, Edit, str]] = {  # the file, what is done to it, a
         f"format {found!r}": (CONFIG, values(format_version=found), f"format_version {found!r}.*update.*save")
         for found in (2, 0, None, "1")
     },
-    **{name: (STEM, whole(head + bytes(16)), "is not whole safetensors") for name, head in HEADS.items()},
+    **{
+        name: (STEM, whole(head + bytes(16)), "is not a complete safetensors file")
+        for name, head in HEADS.items()
+    },
     **{
         f"a model with {' and '.join(change)} {i}": (CONFIG, values("model", **change), "model")
         for i, change in enumerate(MODEL)

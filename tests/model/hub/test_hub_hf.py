@@ -59,7 +59,7 @@ def test_two_pushes_at_once_both_land(server, source):
 def test_two_first_pushes_of_different_trunks_leave_one(server, source, tmp_path):
     save(tmp_path / "other", ROBOTS, seed=1)
     server.before_commit = [lambda: hub.push(tmp_path / "other", REPO)]
-    with pytest.raises(HubError, match=r"has another trunk.*push to a hub of its own, or finetune"):
+    with pytest.raises(HubError, match=r"has another trunk.*push to another address, or finetune"):
         hub.push(source, REPO)
     there = server.model(REPO).files["trunk.safetensors"]
     assert there == (tmp_path / "other/trunk.safetensors").read_bytes()
@@ -265,7 +265,7 @@ def test_without_a_token_nothing_is_pushed(server, source, monkeypatch):
 
 REFUSALS = {  # what the hub answers, or which address is asked for, and what the error says
     "a wrong token": ({"status": 401}, REPO, r"answered 401|token is not valid.*hf auth login"),
-    "no repository": ({}, "team/none", r"^team/none: is no folder here; .* no such repository.*check"),
+    "no repository": ({}, "team/none", r"^team/none: is not a local folder; .* no such repository.*check"),
     "no revision": ({}, f"{REPO}@v9", r"no such revision.*branch, tag or commit"),
     "a gated one": (
         {"status": 403, "headers": {"X-Error-Code": "GatedRepo"}}, REPO, r"is gated.*ask for access on",

@@ -96,7 +96,7 @@ def test_the_command_prints_a_table_and_the_same_as_json(shelf):
     for word in (
         "hma-toolkit",
         "released",
-        "bring it in with hma hub import",
+        "convert it with hma hub import",
         "arm",
         "an arm",
         "1.5",

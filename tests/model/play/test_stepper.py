@@ -216,7 +216,7 @@ def test_an_idle_session_gives_its_place_to_a_new_page() -> None:
 def test_a_full_engine_refuses_and_gives_the_places_of_those_who_left() -> None:
     bench = Bench(most=2)
     (first, viewer), _ = bench.open(), bench.open()
-    with pytest.raises(UsageError, match="all 2 places are taken"):
+    with pytest.raises(UsageError, match="all 2 sessions are in use"):
         bench.stepper.open("mover_04", 0)
     bench.stepper.detach(first.name, viewer)
     bench.open()

@@ -166,7 +166,7 @@ def test_an_interrupted_evaluation_continues_after_its_last_finished_policy(
     monkeypatch.setattr(scores, "score_policy", score)
     with pytest.raises(KeyboardInterrupt):
         run(out)
-    with pytest.raises(OutputError, match="was begun with other settings"):
+    with pytest.raises(OutputError, match="was started with other settings"):
         run(out, frames=5)
     found = run(out)
     assert begun == ["random", "still", "still"]

@@ -133,7 +133,7 @@ def test_a_stopped_run_continues_and_gives_the_same_bytes(kind, request, tmp_pat
     with pytest.raises(KeyboardInterrupt):
         augment(tmp_path / "cut", asked(), world=world, on_progress=stop)
     assert [path.name for path in sorted((tmp_path / "cut/.augment").glob("*.npz"))] == ["batch-000000.npz"]
-    with pytest.raises(OutputError, match="was begun with other settings"):
+    with pytest.raises(OutputError, match="was started with other settings"):
         augment(tmp_path / "cut", asked(seed=1), world=world)
     told: list[float] = []
     cut = augment(tmp_path / "cut", asked(), world=world, on_progress=lambda done, words: told.append(done))

@@ -161,7 +161,7 @@ def test_what_cannot_be_labelled_is_refused(world: World, tmp_path: Path) -> Non
     with pytest.raises(UsageError, match="it has no labelled recordings here — .*--check SHARDS"):
         run()
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UsageError, match="empty: is no shard set and no folder with video files"):
+    with pytest.raises(UsageError, match="empty: is neither a shard set nor a folder with video files"):
         run(tmp_path / "empty")
     with pytest.raises(UsageError, match="nothing: does not exist — give a folder of .mp4"):
         run(tmp_path / "nothing", world=None, checkpoint="no such checkpoint")  # the film is looked at first

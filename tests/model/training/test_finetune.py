@@ -236,5 +236,5 @@ def test_a_path_that_looks_like_a_repository_is_told_to_be_neither(leg, tmp_path
         raise HubError(f"hf://{source}", "is out of reach, and not in the cache", "go online and pull again")
 
     monkeypatch.setattr(hub, "open_store", away)
-    with pytest.raises(HubError, match=r"^runs/base: is no folder here; as a repository .* path of"):
+    with pytest.raises(HubError, match=r"^runs/base: is not a local folder; as a repository .* path of"):
         tune("runs/base", leg, tmp_path / "run")

@@ -231,7 +231,7 @@ def test_a_folder_that_was_there_stays_and_a_run_in_it_is_not_harmed(recipe, tmp
 
 
 def test_a_store_is_no_folder_for_a_run(recipe):
-    with pytest.raises(UsageError, match="no folder of this machine"):
+    with pytest.raises(UsageError, match="not a local folder"):
         train(recipe(), out="s3://bucket/run", show=False)
 
 

@@ -71,7 +71,7 @@ IN_ORDER = [(i, i) for i in range(FRAMES)]
 @pytest.mark.parametrize(
     ("header", "says"),
     [
-        (lambda i: at(i) - 500_000_000, r"/cam are 0\.5 s behind receipt, /cmd is timed by receipt"),
+        (lambda i: at(i) - 500_000_000, r"/cam are 0\.5 s behind receipt, /cmd has only receive times"),
         (lambda i: at(i) - 400_000_000, r"pairs would be off by 0\.4 s"),
         (lambda i: at(i) - 200_000_000, r"/cam are 0\.2 s behind receipt"),
         (lambda i: at(i) + 300_000_000, r"/cam are 0\.3 s ahead of receipt"),
@@ -167,7 +167,7 @@ def test_no_receipt_is_advised_where_both_clocks_were_set_back(step_s: float, tm
     with pytest.raises(EpisodeError, match="header stamps go back") as error:
         pairs(path, robot())
     assert "receive" not in str(error.value)
-    with pytest.raises(EpisodeError, match="times of receipt go back"):
+    with pytest.raises(EpisodeError, match="receive times go back"):
         pairs(path, robot(sync=", stamp: receive"))
 
 

@@ -342,7 +342,7 @@ def test_inspect_tells_of_stamps_that_repeat_pause_or_go_back(tmp_path: Path) ->
     shift[6:] = 5_000_000_000
     path = write_ros1(tmp_path / "bad.bag", replace(make_recording(), stamp_shift_ns=shift))
     problems = "\n".join(SOURCE.inspect(str(path)).problems)
-    for fault in ("1 stamps equal the stamp before", "1 stamps go back in time", "pauses for 5.25"):
+    for fault in ("1 timestamps equal the previous one", "1 timestamps go back in time", "pauses for 5.25"):
         assert fault in problems
     with pytest.raises(EpisodeError, match=r"header stamps go back by 0\.05 s at message 5"):
         to_clip(read(path, arm()), arm())

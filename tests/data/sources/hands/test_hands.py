@@ -320,7 +320,7 @@ def test_a_folder_of_videos_is_recognised_and_inspected(folder: Path, monkeypatc
     assert (
         found.episodes == 2 and found.frames == LENGTH and {key.key for key in found.keys[1:]} == set(POINTS)
     )
-    assert "broken.mp4" in found.problems[0] and "hands were not looked for" in found.problems[-1]
+    assert "broken.mp4" in found.problems[0] and "hands were not detected" in found.problems[-1]
 
 
 def test_a_rate_that_nothing_states_is_called_measured(folder: Path, monkeypatch) -> None:

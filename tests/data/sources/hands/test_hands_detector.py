@@ -315,7 +315,7 @@ def test_videos_without_hands_and_cut_off_ones_are_refused(short: Path, models: 
 def test_inspection_tells_the_share_of_frames_with_hands(short, models, monkeypatch) -> None:
     monkeypatch.setenv("HMA_HAND_MODELS", str(models))
     facts = open_source("hands").inspect(str(short)).facts
-    assert facts["frames with left hand"] == facts["frames with both"] == "100% of 12 looked at"
+    assert facts["frames with left hand"] == facts["frames with both"] == "100% of 12 sampled"
 
 
 # -- models that are missing or wrong

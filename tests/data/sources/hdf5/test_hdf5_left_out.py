@@ -98,7 +98,7 @@ def test_a_mask_that_names_an_absent_demo_is_named(tmp_path: Path) -> None:
     path = linked(tmp_path, h5py.SoftLink("/store/x"))
     with h5py.File(path, "a") as file:
         del file["data/demo_1"]
-    assert "mask/train names demo_1, which demo.hdf5 has not" in problems(path)
+    assert "mask/train names demo_1, which demo.hdf5 does not have" in problems(path)
 
 
 @pytest.mark.parametrize("stated", ["num_samples", "episode_length"])

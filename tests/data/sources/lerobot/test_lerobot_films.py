@@ -118,7 +118,7 @@ def test_one_frame_too_many_or_too_few_refuses_every_episode_of_the_video(shared
 
 def test_one_too_many_in_a_late_video_is_refused_with_its_start(shared: Path) -> None:
     film(shared, [*SHOWN[:9], 8, *SHOWN[9:]], 1 + np.arange(37))
-    said = "has 37 frames for 36 rows of 3 episodes, and begins at 0.100 s, its metadata say 0.000 s"
+    said = "has 37 frames for 36 rows of 3 episodes, and begins at 0.100 s, its metadata says 0.000 s"
     assert [said in text for text in outcome(shared)] == [True] * 3, outcome(shared)
 
 
@@ -137,7 +137,7 @@ def test_frames_of_removed_episodes_are_no_ones(shared: Path) -> None:
     ]
     assert flags == [{}, {"frames_without_row:cam": 12}, {"frames_without_row:cam": 20}]
     assert sum(
-        "that no row asks for" in text for text in open_source("lerobot").inspect(str(shared)).problems
+        "that belong to no row" in text for text in open_source("lerobot").inspect(str(shared)).problems
     )
 
 

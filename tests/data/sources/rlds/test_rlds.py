@@ -290,7 +290,7 @@ def test_a_split_without_its_files_is_told(tmp_path):
     names = [f"toy-{split}.tfrecord-00000-of-00001" for split in ("train", "test")]
     folder = write(tmp_path / "d", {name: [record(0, 2)] for name in names})
     (folder / names[1]).unlink()
-    assert "split test of 1 episodes is not there" in RLDS.inspect(str(folder)).problems
+    assert "split test of 1 episodes is missing" in RLDS.inspect(str(folder)).problems
     assert not RLDS.inspect(str(folder / names[0])).problems  # named by itself, the rest is not missed
 
 

@@ -136,7 +136,7 @@ def test_what_passes_by_itself_is_tried_again_and_what_does_not_is_one_error(ser
     handler.fail[0] = 2
     assert number(uri, "train/000002") == 2
     handler.fail[0] = 1000
-    with pytest.raises(SourceError, match=r"cannot be read.*503.*network failed again and again"):
+    with pytest.raises(SourceError, match=r"cannot be read.*503.*network failed repeatedly"):
         number(uri, "train/000003")
     assert handler.fail[0] >= 1000 - 2 * (len(fetching.WAITS_S) + 1)
     handler.fail[0] = 0
