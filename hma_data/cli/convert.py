@@ -61,9 +61,7 @@ def convert(
     settings: Settings,
     frequency_hz: Annotated[
         float | None,
-        Option(
-            help="Rate of the recording, if the YAML says unknown.", rich_help_panel="Selection and split"
-        ),
+        Option(help="Rate of the recording, if the YAML states none.", rich_help_panel="Selection and split"),
     ] = None,
     episode_timeout: Annotated[
         float,

@@ -50,8 +50,8 @@ class Settings:
     )
     val_fraction: float | None = _data(
         None,
-        "Share of episodes for validation; default: 5 %, but at least 5 episodes (a quarter if fewer than 20); "
-        "with --to lerobot 0.",
+        "Share of episodes for validation; default: 5 %, but at least 5 episodes (a quarter if fewer than "
+        "20); with --to lerobot 0.",
     )
     seed: int = _data(0, "Seed of the split.")
     limit: int | None = _option(None, "Convert only the first N episodes.", min=1)
