@@ -331,8 +331,8 @@ class _EpisodeReading:
         for clock in clocks[1:]:
             if fault := apart(clocks[0], clock, period_s):
                 remedy = (
-                    "sync: {stamp: receive} pairs them by the times of receipt; "
-                    f"stamp: header at camera {primary.name} keeps the stamps, if they are right"
+                    "sync: {stamp: receive} uses receive times; "
+                    f"stamp: header at camera {primary.name} keeps its header stamps, if they are right"
                 )
                 raise EpisodeError(self._where, fault, remedy)
 

@@ -161,8 +161,8 @@ def test_a_card_gives_a_meter_for_the_frames_that_it_was_measured_on_or_says_why
     meter, reason = meter_of(tokens, card, 2, 0.5, "random")
     assert meter is not None and reason == "" and meter.better
     for way, said in (
-        ((1, 0.5, "random"), "calibrated for 2 passes at temperature 0.5 in random order alone"),
-        ((2, 0.5, "confidence"), "in random order alone"),
+        ((1, 0.5, "random"), "calibrated only for 2 passes at temperature 0.5 in random order"),
+        ((2, 0.5, "confidence"), "in random order"),
     ):
         assert said in meter_of(tokens, card, *way)[1]
     assert "hma benchmark calibrates it" in meter_of(tokens, {}, *way)[1]

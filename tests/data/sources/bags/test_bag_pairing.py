@@ -78,8 +78,8 @@ IN_ORDER = [(i, i) for i in range(FRAMES)]
         (lambda i: at(i) + 80_000_000, r"/cam are 0\.08 s ahead of receipt"),
         (lambda i: at(i) - i * 5_000_000, r"/cam .*drift by 0\.203 s over the recording"),
         (lambda i: at(i) + i * 5_000_000, r"/cam .*drift by 0\.203 s over the recording"),
-        (lambda i: 5 * SECOND_NS + i * PERIOD_NS, r"/cam are not of the recorder's clock"),
-        (lambda i: 5 * SECOND_NS + i * PERIOD_NS // 2, r"/cam are not of the recorder's clock"),
+        (lambda i: 5 * SECOND_NS + i * PERIOD_NS, r"/cam do not come from the recorder's clock"),
+        (lambda i: 5 * SECOND_NS + i * PERIOD_NS // 2, r"/cam do not come from the recorder's clock"),
     ],
 )  # fmt: skip
 def test_clocks_that_differ_are_named_and_a_choice_is_asked(header, says, tmp_path) -> None:
