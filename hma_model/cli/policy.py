@@ -22,7 +22,14 @@ from hma_model.cli.options import (
     kept,
 )
 
-LIMIT = "whose expected state error (px of 128) is at most this."
+MaxError = Annotated[
+    float | None,
+    Option(
+        min=0,
+        help="Maximum expected state error (px of 128): augment keeps only episodes up to it; policy-eval "
+        "reports the judge also for these alone.",
+    ),
+]
 
 
 def policy_eval(
@@ -58,9 +65,7 @@ def policy_eval(
             help="Shards with success labels, for a reward model; default: those of the training run.",
         ),
     ] = None,
-    max_error: Annotated[
-        float | None, Option(min=0, help=f"Also report the judge for episodes {LIMIT}")
-    ] = None,
+    max_error: MaxError = None,
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
     precision: Precision = "float32",
@@ -134,7 +139,7 @@ def augment(
         str, Option(help="Actions: replay, perturb=SIGMA (noise, in std), or a policy of hma policy-eval.")
     ] = "replay",
     keep: Annotated[float, Option(help="Share of episodes to keep, lowest uncertainty first.")] = 0.5,
-    max_error: Annotated[float | None, Option(min=0, help=f"Keep only episodes {LIMIT}")] = None,
+    max_error: MaxError = None,
     judge: Annotated[
         str, Option(help="Keep only successes of a judge: moved, moved=PX, reached, placed, a reward model.")
     ] = "",
