@@ -154,10 +154,7 @@ HOSTILE: dict[str, tuple[str, Edit, str]] = {  # the file, what is done to it, a
         f"format {found!r}": (CONFIG, values(format_version=found), f"format_version {found!r}.*update.*save")
         for found in (2, 0, None, "1")
     },
-    **{
-        name: (STEM, whole(head + bytes(16)), "is not a complete safetensors file")
-        for name, head in HEADS.items()
-    },
+    **{name: (STEM, whole(head + bytes(16)), "is not a complete safetens") for name, head in HEADS.items()},
     **{
         f"a model with {' and '.join(change)} {i}": (CONFIG, values("model", **change), "model")
         for i, change in enumerate(MODEL)

@@ -215,9 +215,7 @@ def test_a_robot_without_simulator_and_shards_of_another_model_are_refused(shard
 def test_a_robot_without_simulator_begins_from_its_sample_or_from_images(tmp_path: Path) -> None:
     save(tmp_path / "model", {"arm_a": 2, "arm_b": 2})
     opened = Checkpoint.open(tmp_path / "model")
-    with pytest.raises(
-        UsageError, match="none of its robots has a simulator to start from — give shards of it"
-    ):
+    with pytest.raises(UsageError, match="none of its robots has a simulator .* — give shards of it"):
         drivable(opened, (), pytest.fail)
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (6, 16, 16, 3), dtype=np.uint8)
