@@ -189,7 +189,7 @@ def test_stamps_of_hdf5_are_checked_against_the_stated_rate(tmp_path: Path) -> N
             demo["timestamps"] = times
 
     said = damaged(tmp_path, stamp)
-    assert "demo_0: timestamps: 1 timestamps equal the previous one (and in 2 more" in said["repeated"]
+    assert "demo_0: timestamps: 1 timestamps equal the previous one (and in 2 more" in said["repeated"][0]
     assert "demo_0: timestamps: 1 timestamps go back in time (and in 2 more episodes)" in said["back"]
     assert "timestamps: runs at 20 Hz, the recording states 30" in said["rate"][0]
 
