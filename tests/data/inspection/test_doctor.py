@@ -14,6 +14,7 @@ from hma_data.conversion.job import convert
 from hma_data.inspection.inspect import Finding, examine
 from hma_model.cli import app
 from tests.conftest import ARM_YAML
+from tests.hostile import flip
 
 LENGTHS = (40, 45, 50)
 
@@ -168,9 +169,7 @@ def test_a_shard_set_with_changed_bytes_is_an_error(
     convert(toy_arm, str(toy_recording), block_tokenizer, tmp_path / "shards")
     assert not [finding for finding in examine(str(tmp_path / "shards")) if finding.severity == "error"]
     shard = next((tmp_path / "shards" / "train").iterdir())
-    content = bytearray(shard.read_bytes())
-    content[len(content) // 2] ^= 1
-    shard.write_bytes(content)
+    flip(20)(shard)
     first = examine(str(tmp_path / "shards"))[0]
     assert first.check == "integrity"
     assert str(first).count(" — ") <= 1  # verify's line says what to do, and nothing else does

@@ -168,17 +168,6 @@ def test_pictures_that_claim_more_than_any_have_are_not_read(tmp_path: Path, sha
     assert peak < 100 << 20
 
 
-def test_a_damaged_episode_is_named_and_the_others_are_told(tmp_path: Path) -> None:
-    folder = tmp_path / "set"
-    folder.mkdir()
-    for i in range(3):
-        with h5py.File(folder / f"episode_{i}.hdf5", "w") as file:
-            file["action"] = np.random.default_rng(i).normal(size=(9, 2))
-    (folder / "episode_1.hdf5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(50))
-    inspection = open_source("hdf5").inspect(str(folder))
-    assert inspection.lengths == (9, 9) and "episode_1.hdf5" in found(inspection)["readable"][0]
-
-
 def test_stamps_of_hdf5_are_checked_against_the_stated_rate(tmp_path: Path) -> None:
     def stamp(file: h5py.File) -> None:
         file["data"].attrs["fps"] = 30

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from hma_data.errors import ShardError
 from hma_data.shards.manifest import EMBODIMENT, MANIFEST, Manifest, derive, plan_hash, seal_problem
 from hma_data.shards.verify import verify
 from tests.conftest import toy_shards, write_toy
+from tests.hostile import Edit, cut, flip, whole
 
 SMALL = Settings(val_fraction=0.3, shard_frames=40)
 
@@ -61,18 +63,18 @@ def test_a_sound_set_has_no_problems_however_it_is_verified(made: Path) -> None:
 @given(st.data())
 def test_a_flipped_bit_in_any_byte_of_any_file_is_found(made: Path, data: st.DataObject) -> None:
     path = data.draw(st.sampled_from(files(made)))
-    whole = path.read_bytes()
-    if not whole:
+    content = path.read_bytes()
+    if not content:
         return
-    place = data.draw(st.integers(0, len(whole) - 1))
+    place = data.draw(st.integers(0, len(content) - 1))
     bit = data.draw(st.integers(0, 7))
     try:
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
+        flip(place, 1 << bit)(path)
         problems = verify(made)
         assert any(path.name in problem for problem in problems)
         assert all("\n" not in problem for problem in problems)
     finally:
-        path.write_bytes(whole)
+        path.write_bytes(content)
 
 
 def test_every_bit_of_the_manifest_is_sealed(made: Path) -> None:
@@ -82,14 +84,6 @@ def test_every_bit_of_the_manifest_is_sealed(made: Path) -> None:
         changed = bytearray(text)
         changed[place] ^= 1 << place % 8
         assert seal_problem(bytes(changed))
-
-
-@pytest.mark.parametrize("kept", [0, 3, 4, 100, -20, -1])
-def test_a_truncated_shard_is_found(sound: Path, kept: int) -> None:
-    shard = sound / "train" / "shard-00001.parquet"
-    shard.write_bytes(shard.read_bytes()[:kept])
-    one(verify(sound), "shard-00001.parquet", "bytes", "hma convert")
-    one(verify(sound, quick=True), "shard-00001.parquet", "bytes", "hma convert")
 
 
 @pytest.mark.parametrize("name", ["episodes.parquet", "quarantine.jsonl", "embodiment.yaml"])
@@ -102,21 +96,25 @@ def test_a_missing_file_is_found_and_restat_brings_it_back(sound: Path, made: Pa
     assert (sound / name).read_bytes() == (made / name).read_bytes()
 
 
-def test_a_missing_shard_is_found(sound: Path) -> None:
-    (sound / "val" / "shard-00000.parquet").unlink()
-    one(verify(sound), "val/shard-00000.parquet", "missing", "hma convert")
+SHARD, FOREIGN = "train/shard-00001.parquet", "not in the manifest"
+DAMAGE: dict[str, tuple[str, Edit, tuple[str, ...]]] = {  # the file, what is done to it, and what is said
+    "no shard": ("val/shard-00000.parquet", Path.unlink, ("val/shard-00000.parquet", "missing", "convert")),
+    "killed": ("train/.shard-00000.parquet.12.part", whole("?"), (".part", "killed")),
+    **{f"cut at {kept}": (SHARD, cut(kept), (SHARD, "bytes", "convert")) for kept in (0, 3, 4, 100, -20, -1)},
+    "a foreign folder": ("extra", Path.mkdir, ("extra", FOREIGN)),
+    **{
+        name: (name, whole("?"), (name, FOREIGN))
+        for name in ("train/shard-00099.parquet", "val/x.txt", "a.txt")
+    },
+}
 
 
-@pytest.mark.parametrize("place", ["train/shard-00099.parquet", "val/x.txt", "notes.txt", "extra/a.bin"])
-def test_a_foreign_file_is_found(sound: Path, place: str) -> None:
-    (sound / place).parent.mkdir(exist_ok=True)
-    (sound / place).write_bytes(b"?")
-    assert any(place in problem and "not in the manifest" in problem for problem in verify(sound))
-
-
-def test_what_a_killed_job_leaves_is_told_apart(sound: Path) -> None:
-    (sound / "train" / ".shard-00000.parquet.12.part").write_bytes(b"?")
-    one(verify(sound), ".part", "killed")
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_file_that_is_missing_cut_or_foreign_is_one_problem(sound: Path, case: str) -> None:
+    name, spoil, said = DAMAGE[case]
+    spoil(sound / name)
+    one(verify(sound), *said)
+    one(verify(sound, quick=True), *said)
 
 
 # -- the manifest
@@ -225,37 +223,32 @@ def with_values(table: pa.Table, column: str, change) -> pa.Table:
     return table.set_column(place, table.schema.field(column), new)
 
 
+def narrow(table: pa.Table) -> pa.Table:
+    flat = pa.array(np.zeros(len(table) * 2, np.float32))
+    place = table.schema.get_field_index("action")
+    return table.set_column(place, "action", pa.FixedSizeListArray.from_arrays(flat, 2))
+
+
+def put(column: str, place: int, value: float) -> Callable[[pa.Table], pa.Table]:
+    return lambda table: with_values(table, column, lambda values: values.__setitem__(place, value))
+
+
 WRONG = {
-    "vocabulary": ("tokens", lambda v: v.__setitem__(5, 4096)),
-    "not finite": ("action", lambda v: v.__setitem__(4, np.nan)),
-    "statistics": ("action", lambda v: v.__setitem__(4, 99)),
-    "frame_index": ("frame_index", lambda v: v.__setitem__(3, 9)),
-    "episode_index": ("episode_index", lambda v: v.__setitem__(0, 3)),
-    "go back": ("timestamp", lambda v: v.__setitem__(3, 0.0)),
+    "vocabulary": put("tokens", 5, 4096),
+    "not finite": put("action", 4, np.nan),
+    "statistics": put("action", 4, 99),
+    "frame_index": put("frame_index", 3, 9),
+    "episode_index": put("episode_index", 0, 3),
+    "go back": put("timestamp", 3, 0.0),
+    "row by row": lambda table: table.slice(1),
+    "columns": narrow,
 }
 
 
 @pytest.mark.parametrize("said", WRONG)
 def test_rows_that_are_wrong_are_found(sound: Path, said: str) -> None:
-    column, change = WRONG[said]
-    problems = rewritten(sound, lambda table: with_values(table, column, change))
+    problems = rewritten(sound, WRONG[said])
     assert any(said in problem and "shard-00000" in problem for problem in problems), problems
-
-
-def test_rows_that_are_missing_are_found(sound: Path) -> None:
-    problems = rewritten(sound, lambda table: table.slice(1))
-    assert any("shard-00000" in problem for problem in problems)
-
-
-def test_a_column_of_another_width_is_found(sound: Path) -> None:
-    def narrow(table: pa.Table) -> pa.Table:
-        rows = len(table)
-        flat = pa.array(np.zeros(rows * 2, np.float32))
-        return table.set_column(
-            table.schema.get_field_index("action"), "action", pa.FixedSizeListArray.from_arrays(flat, 2)
-        )
-
-    assert any("action" in problem and "columns" in problem for problem in rewritten(sound, narrow))
 
 
 def test_episodes_of_one_recording_in_both_splits_are_found(sound: Path) -> None:
@@ -302,7 +295,7 @@ def test_the_command_that_helps_names_a_folder_with_a_space_as_a_shell_takes_it(
 
 def test_restat_refuses_a_damaged_shard(sound: Path) -> None:
     shard = sound / "train" / "shard-00001.parquet"
-    shard.write_bytes(shard.read_bytes()[:-30])
+    cut(-30)(shard)
     with pytest.raises(ShardError, match="shard-00001"):
         restat(sound)
 
@@ -316,9 +309,7 @@ def test_a_damaged_page_is_known_where_the_manifest_is_lost(sound: Path) -> None
         for i in range(columns.num_columns)
         if columns.column(i).path_in_schema.startswith("tokens")
     )
-    data = bytearray(shard.read_bytes())
-    data[tokens.data_page_offset + tokens.total_compressed_size - 1] ^= 4
-    shard.write_bytes(data)
+    flip(tokens.data_page_offset + tokens.total_compressed_size - 1)(shard)
     with pytest.raises(ShardError, match="shard-00001"):
         restat(sound)
     assert not (sound / MANIFEST).exists()

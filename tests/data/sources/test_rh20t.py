@@ -2,22 +2,24 @@
 
 import json
 import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
-from hma_data.conversion.job import convert
 from hma_data.conversion.plan import read_clip
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, RegistryError, SourceError
 from hma_data.inspection.infer import infer
 from hma_data.registry.embodiment import find
-from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
 from hma_data.sources.detect import detect
 from tests.data.rh20t_files import CAMERAS, LATE_MS, pose, robot, stamps, tables, write_scene
 from tests.data.videos import encode
+from tests.hostile import Edit, Row, check_refused, cut, linked_away, of, whole
 
 SCENE = "task_0001_user_0001_scene_0001_cfg_0001"
 
@@ -94,52 +96,71 @@ def test_a_film_with_fewer_frames_than_times_is_counted_and_one_with_more_refuse
         read(tmp_path, SCENE.replace("0001", "0002", 1))
 
 
-def changed(change):
-    content = tables(12)
-    change(content)
-    return content
+# -- hostile scenes
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda t: t.pop("joint"), r"has no transformed/joint\.npy — transformed has gripper, tcp_base"),
-        (lambda t: t["tcp_base"].pop(CAMERAS[0]), "no samples of camera 750612070851 — it has 043322070878"),
-        (lambda t: t["tcp_base"][CAMERAS[0]][3].pop("tcp"), "no 'tcp' — it has timestamp, robot_ft"),
-        (lambda t: t["tcp_base"][CAMERAS[0]][3].update(tcp=np.zeros(6)), "changes its number of values"),
-        (lambda t: t["tcp_base"][CAMERAS[0]][3].update(tcp=[[1], [2]]), "holds list values, not numbers"),
-        (lambda t: t["tcp_base"][CAMERAS[0]][3].update(timestamp="x"), "no timestamps in whole milliseconds"),
-        (lambda t: t["tcp_base"].update({CAMERAS[0]: []}), "no timestamps in whole milliseconds"),
-        (lambda t: t["joint"][CAMERAS[0]].update(dict.fromkeys(stamps(0, 12), np.zeros(9000))), "more than"),
-    ],
-)  # fmt: skip
-def test_a_defect_of_a_table_is_named(change, said, tmp_path):
-    write_scene(tmp_path, content=changed(change))
-    with pytest.raises(EpisodeError, match=said):
-        read(tmp_path)
+def table(name: str, change: Callable[[Any], object]) -> Edit:
+    """Return an edit of the first camera's samples in a table of the first scene."""
+
+    def edit(path: Path) -> None:
+        content = tables(12)[name]
+        change(content)
+        np.save(path, content)
+
+    return of(f"{SCENE}/transformed/{name}.npy", edit)
 
 
-@pytest.mark.parametrize(
-    ("spoil", "said"),
-    [
-        (lambda s: (s / f"cam_{CAMERAS[1]}/color.mp4").unlink(), r"has no cam_043322070878/color\.mp4"),
-        (lambda s: (s / f"cam_{CAMERAS[1]}/timestamps.npy").unlink(), "there is no such file"),
-        (lambda s: np.save(s / f"cam_{CAMERAS[0]}/timestamps.npy", {"depth": [1]}), "color holds NoneType"),
-        (lambda s: (s / "metadata.json").write_text("{"), "is not valid JSON.* copy it again"),
-    ],
-)  # fmt: skip
-def test_a_missing_or_damaged_file_is_named(spoil, said, recording):
-    spoil(recording / SCENE)
-    with pytest.raises(EpisodeError, match=said):
-        read(recording)
+def tcp(row: int, **values: Any) -> Edit:
+    return table("tcp_base", lambda content: content[CAMERAS[0]][row].update(values))
 
 
-def test_links_out_of_a_scene_are_refused(recording, tmp_path):
-    film = recording / SCENE / f"cam_{CAMERAS[0]}" / "color.mp4"
-    shutil.move(film, tmp_path / "elsewhere.mp4")
-    film.symlink_to(tmp_path / "elsewhere.mp4")
-    with pytest.raises(EpisodeError, match="outside its folder"):
-        read(recording)
+FAR = dict.fromkeys(stamps(0, 12), np.zeros(9000))
+JOINT, TCP = f"{SCENE}/transformed/joint.npy", f"{SCENE}/transformed/tcp_base.npy"
+FILM, TIMES = (f"{SCENE}/cam_{CAMERAS[0]}/{name}" for name in ("color.mp4", "timestamps.npy"))
+FEW = r"no timestamps in whole milliseconds"
+ONE: dict[str, Row] = {
+    "no joints": (
+        of(JOINT, Path.unlink),
+        r"has no transformed/joint\.npy — transformed has",
+    ),
+    "no camera": (
+        table("tcp_base", lambda t: t.pop(CAMERAS[0])),
+        "no samples of camera .* — it has",
+    ),
+    "no pose": (
+        table("tcp_base", lambda t: t[CAMERAS[0]][3].pop("tcp")),
+        "no 'tcp' — it has timestamp",
+    ),
+    "another width": (tcp(3, tcp=np.zeros(6)), "changes its number of values"),
+    "lists for numbers": (tcp(3, tcp=[[1], [2]]), "holds list values, not numbers"),
+    "words for times": (tcp(3, timestamp="x"), FEW),
+    "no samples": (table("tcp_base", lambda t: t.update({CAMERAS[0]: []})), FEW),
+    "many values": (table("joint", lambda t: t[CAMERAS[0]].update(FAR)), "more than"),
+    "a spoilt table": (of(TCP, whole("spoilt")), r"tcp_base\.npy: "),
+    "no film": (of(FILM, Path.unlink), rf"has no cam_{CAMERAS[0]}/color\.mp4"),
+    "a film that is a link": (of(FILM, linked_away), "outside its folder"),
+    "a film cut short": (of(FILM, cut(900)), r"color\.mp4: .* cut off"),
+    "no times": (of(TIMES, Path.unlink), "there is no such file"),
+    "times of depth": (of(TIMES, lambda path: np.save(path, {"depth": [1]})), "color holds NoneType"),
+    "metadata cut short": (of(f"{SCENE}/metadata.json", cut(1)), "is not valid JSON.* copy it again"),
+}
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes")
+    for task in (1, 2):
+        write_scene(folder, task)
+    return folder
+
+
+@pytest.mark.parametrize("case", ONE)
+def test_a_hostile_scene_goes_to_quarantine_and_the_other_becomes_shards(case, scenes, tmp_path):
+    folder = shutil.copytree(scenes, tmp_path / "set")
+    check_refused(ONE[case], folder, robot(), tmp_path / "out", one=True)
+
+
+# -- what is told
 
 
 def test_every_file_that_is_used_changes_the_fingerprint(recording):
@@ -154,15 +175,6 @@ def test_every_file_that_is_used_changes_the_fingerprint(recording):
     assert len(seen) == 4 and told() == told()
     (recording / SCENE / "audio").mkdir()
     assert told() in seen
-
-
-def test_a_bad_scene_goes_to_quarantine_and_the_others_become_shards(recording, tmp_path):
-    write_scene(recording, 2)
-    (recording / SCENE / "transformed/tcp_base.npy").write_bytes(b"spoilt")
-    convert(robot(), recording, "fsq-8", tmp_path / "out", max_quarantine=1)
-    shards = ShardSet(tmp_path / "out")
-    assert shards.manifest.quarantined == 1
-    assert sum(split["episodes"] for split in shards.manifest.splits.values()) == 1
 
 
 def test_inspection_measures_the_cameras_and_lists_the_tables(recording):

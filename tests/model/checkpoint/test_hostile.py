@@ -4,7 +4,6 @@ Each row of HOSTILE spoils one file of a checkpoint. Loading, pushing and pullin
 that names the fault and a remedy, and nothing is made.
 """
 
-import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -19,43 +18,8 @@ from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import read_metadata
 from hma_model.hub import publish as hub
 from hma_model.network.model import HMA
+from tests.hostile import Edit, cut, flip, swap, values, whole
 from tests.model.robots import SPEC, save
-
-type Edit = Callable[[Path], object]
-
-
-def flip(at: int = -5) -> Edit:
-    """Change one bit."""
-
-    def edit(path: Path) -> None:
-        content = bytearray(path.read_bytes())
-        content[at] ^= 4
-        path.write_bytes(content)
-
-    return edit
-
-
-def cut(size: int) -> Edit:
-    return lambda path: path.write_bytes(path.read_bytes()[:size])
-
-
-def whole(content: bytes) -> Edit:
-    return lambda path: path.write_bytes(content)
-
-
-def replace(old: str, new: str) -> Edit:
-    return lambda path: path.write_text(path.read_text().replace(old, new, 1))
-
-
-def values(part: str = "", **changes: object) -> Edit:
-    """Change keys of a JSON file, or of an object in it."""
-
-    def edit(path: Path) -> None:
-        found = json.loads(path.read_text())
-        (found[part] if part else found).update(changes)
-        path.write_text(json.dumps(found))
-
-    return edit
 
 
 def weights(change: Callable[[torch.Tensor], torch.Tensor]) -> Edit:
@@ -134,14 +98,26 @@ HOSTILE: dict[str, tuple[str, Edit, str]] = {  # the file, what is done to it, a
     "an empty card": (CARD, cut(0), r"card\.json: is not valid JSON"),
     "the card of another robot": (CARD, values(id="x"), r"card\.json: is the card of 'x'"),
     "the card of another trunk": (CARD, values(trunk_sha256="0" * 64), "belongs to another trunk"),
-    "a card with a key twice": (CARD, replace("{", '{"files": {},'), r"card\.json: .*'files' is given twice"),
+    "a card with a key twice": (
+        CARD,
+        swap("{", '{"files": {},'),
+        r"card\.json: .*'files' is given twice",
+    ),
     "YAML that is none": (YAML, fitted(whole(b"a: [1")), r"embodiment\.yaml"),
-    "YAML with a tag": (YAML, fitted(whole(b"id: !!python/object/apply:os.system ['touch ran']\n")), "yaml"),
-    "the YAML of another robot": (YAML, replace("id: arm", "id: hand"), r"embodiment\.yaml: is not the file"),
-    "YAML with another rate": (YAML, replace("hz: 10", "hz: 12"), r"embodiment\.yaml: is not the file"),
-    "a huge stride": (YAML, fitted(replace("stride: 2", "stride: 100000000")), "too small for chunks"),
+    "YAML with a tag": (
+        YAML,
+        fitted(whole(b"id: !!python/object/apply:os.system ['touch ran']\n")),
+        "yaml",
+    ),
+    "the YAML of another robot": (
+        YAML,
+        swap("id: arm", "id: hand"),
+        r"embodiment\.yaml: is not the file",
+    ),
+    "YAML with another rate": (YAML, swap("hz: 10", "hz: 12"), r"embodiment\.yaml: is not the file"),
+    "a huge stride": (YAML, fitted(swap("stride: 2", "stride: 100000000")), "too small for chunks"),
     "a config cut short": (CONFIG, cut(50), r"config\.json: is not valid JSON"),
-    "a config with a key twice": (CONFIG, replace("{", '{"library": 1,'), "key 'library' is given twice"),
+    "a config with a key twice": (CONFIG, swap("{", '{"library": 1,'), "key 'library' is given twice"),
     "a long key twice": (CONFIG, whole(f'{{"{LONG}": 1, "{LONG}": 2}}'.encode()), "is given twice"),
     "another tokenizer": (CONFIG, values(tokenizer=OWN), "was trained on another tokenizer"),
     "another library": (CONFIG, values(library="diffusers"), "is not of hma-toolkit: .*'diffusers'"),

@@ -1,7 +1,6 @@
 """Places that cannot be used, cards of strangers, and robots of different people on one trunk."""
 
 import json
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,14 +11,11 @@ from hma_model.hub import publish as hub
 from hma_model.hub.datasets import pull_data, push_data
 from hma_model.hub.listing import list_embodiments, survey
 from hma_model.network.model import HMA
+from tests.hostile import cut, values
 from tests.model.robots import make_model, save
 from tests.model.shards import make_shards
 
 pytest_plugins = ["tests.hub_fixtures"]
-
-
-def cut(path: Path, size: int) -> None:
-    path.write_bytes(path.read_bytes()[:size])
 
 
 @pytest.mark.parametrize("place", ["my hub/チーム/mö del", "a\nb", "%20 #x?y=1&z"])
@@ -82,15 +78,9 @@ def test_a_trunk_that_nobody_could_load_is_not_published(tmp_path):
 
 def test_a_damaged_manifest_is_named_where_it_is(tmp_path):
     shards = make_shards(tmp_path / "shards", "arm")
-    cut(shards / "manifest.json", 300)
+    cut(300)(shards / "manifest.json")
     with pytest.raises(HMAError, match=rf"{shards}/manifest\.json: is damaged.*push it again"):
         pull_data(shards, tmp_path / "out")
-
-
-def edit(path: Path, change) -> None:
-    values = json.loads(path.read_text())
-    change(values)
-    path.write_text(json.dumps(values))
 
 
 HOSTILE = (
@@ -99,12 +89,9 @@ HOSTILE = (
 
 
 def test_a_hostile_card_stays_text_in_its_cell(folder):
-    for key in ("robot", "license", "description"):
-        edit(folder / "embodiments/arm/card.json", lambda values, key=key: values.update({key: HOSTILE}))
-    edit(
-        folder / "embodiments/arm/card.json",
-        lambda v: v.update(metrics={HOSTILE: 1}, data=[HOSTILE], stride={}),
-    )
+    changes = dict.fromkeys(("robot", "license", "description"), HOSTILE)
+    changes |= {"metrics": {HOSTILE: 1}, "data": [HOSTILE], "stride": {}}
+    values(**changes)(folder / "embodiments/arm/card.json")
     checkpoint.write_readme(folder)
     page = (folder / "README.md").read_text()
     rows = [row for row in page.splitlines() if row.startswith("| `arm`")]
@@ -115,11 +102,11 @@ def test_a_hostile_card_stays_text_in_its_cell(folder):
 
 
 @pytest.mark.parametrize(
-    "values", [[], 7, {"metrics": [1], "data": 3, "files": "x", "license": {"a": []}}, {}]
+    "content", [[], 7, {"metrics": [1], "data": 3, "files": "x", "license": {"a": []}}, {}]
 )
-def test_a_broken_card_of_somebody_else_stops_neither_list_nor_push(folder, tmp_path, values):
+def test_a_broken_card_of_somebody_else_stops_neither_list_nor_push(folder, tmp_path, content):
     hub.push(folder, tmp_path / "hub", ["arm"])
-    (tmp_path / "hub/embodiments/arm/card.json").write_text(json.dumps(values))
+    (tmp_path / "hub/embodiments/arm/card.json").write_text(json.dumps(content))
     hub.push(folder, tmp_path / "hub", ["hand"])
     (facts,) = survey(tmp_path / "hub")
     rows = {row["embodiment"]: row["problems"] for row in facts["embodiments"]}

@@ -11,6 +11,7 @@ from hma_data.episodes.sheets import write_png
 from hma_data.lab import record
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.cli import main
+from tests.hostile import flip
 from tests.hub_server import Hub
 from tests.hub_state import REPO, ROBOTS
 from tests.model.robots import save
@@ -48,9 +49,7 @@ def test_a_published_checkpoint_is_fetched(published, served, image, address) ->
 def test_a_damaged_trunk_is_refused(tmp_path, served, image, capsys) -> None:
     save(tmp_path / "model", {"arm": 2})
     trunk = tmp_path / "model/trunk.safetensors"
-    data = bytearray(trunk.read_bytes())
-    data[len(data) // 2] ^= 1
-    trunk.write_bytes(data)
+    flip(-9)(trunk)
     assert main(["play", str(tmp_path / "model"), "--prompt", image, "--no-browser"]) == 1
     assert "is another trunk than config.json names — pull" in capsys.readouterr().err and not served
 

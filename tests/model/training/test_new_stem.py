@@ -20,6 +20,7 @@ from hma_model.network.stem import Stem
 from hma_model.training import new_stem
 from hma_model.training.loop import TrainResult, finetune, train
 from hma_model.training.recipe import make_recipe
+from tests.hostile import flip
 from tests.model.robots import CONFIG
 from tests.model.runs import TINY, weights
 from tests.model.shards import make_shards
@@ -100,9 +101,7 @@ def test_a_new_robot_begins_with_it_and_the_card_says_so(base, twin, tmp_path):
 def test_a_damaged_like_robot_is_named_with_the_way_without_it(base, twin, tmp_path):
     damaged = shutil.copytree(base.checkpoint, tmp_path / "damaged one")
     stem = damaged / "embodiments/arm/stem.safetensors"
-    content = bytearray(stem.read_bytes())
-    content[-9] ^= 4
-    stem.write_bytes(content)
+    flip(-9)(stem)
     with pytest.raises(CheckpointError, match=r"embodiments/arm/stem\.safetensors: .*new_stem=fresh"):
         tune(damaged, twin, tmp_path / "run", freeze=False)
     assert tune(damaged, twin, tmp_path / "run", "new_stem=fresh", freeze=False).step == 1

@@ -10,11 +10,9 @@ import pytest
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from hma_data.errors import EpisodeError
 from hma_data.inspection.inspect import examine, inspect_recording
 from hma_data.sources.bags.container import Channel
 from hma_data.sources.bags.messages import decode
-from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.training.frames import recording_films
 from tests.data import bag_parts
@@ -178,21 +176,6 @@ def test_an_image_that_says_it_is_big_endian_has_the_same_bytes(tmp_path: Path) 
     how[CAMERA] = how[CAMERA]._replace(encode=encode)
     stream = read(write_mcap(tmp_path / "run.mcap", recording, how), arm()).streams["front"]
     np.testing.assert_array_equal(stream.frames(range(3)), recording.pictures)
-
-
-@pytest.mark.parametrize("left", [0.2, 0.5, 0.9])
-def test_a_bag_that_a_killed_recorder_left_is_refused_with_what_mends_it(tmp_path: Path, left: float) -> None:
-    """Its last chunk is cut off; of such a recording no episode is taken for whole."""
-    path = bag_parts.ros1_without_index(tmp_path, bag_parts.make_run(40, pause_after=(20,)))
-    data = path.read_bytes()
-    path.unlink()
-    active = tmp_path / "run.bag.active"
-    active.write_bytes(data[: int(len(data) * left) - 7])
-    robot = bag_parts.parted("{gap_s: 1}")
-    refs = open_source("rosbag").index(str(tmp_path), robot)
-    assert [(ref.id, ref.frames) for ref in refs] == [("run.bag", 0)]
-    with pytest.raises(EpisodeError, match=r"run\.bag\.active.*cut off.*rosbag reindex"):
-        SOURCE.read(str(tmp_path), "run.bag", robot)
 
 
 def test_inspect_doctor_and_eval_look_at_the_embodiments_episodes(tmp_path, monkeypatch) -> None:

@@ -20,7 +20,7 @@ from hma_data.registry.components import Camera
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from tests.data.fresh import run_fresh
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture, turn
-from tests.hostile import damage
+from tests.hostile import Row, damage, untouched, whole
 
 LENGTH = 40
 
@@ -105,33 +105,35 @@ def test_a_file_filmed_upright_is_turned(tmp_path: Path) -> None:
     assert frame[:12, :12].mean() < 200
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(EpisodeError, match=r"nowhere\.mp4: no such video"):
-        VideoFile(tmp_path / "nowhere.mp4")
-
-
-def test_sound_alone_is_no_video(tmp_path: Path) -> None:
-    path = tmp_path / "sound.mp4"
+def sound(path: Path) -> None:
     with av.open(str(path), "w") as container:
         stream = container.add_stream("aac", rate=16000, layout="mono")
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
         frame.sample_rate = 16000
         container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    with pytest.raises(EpisodeError, match="no video"):
-        frame_table(path)
 
 
-def test_a_playlist_named_mp4_opens_nothing_else(tmp_path: Path, video: Path) -> None:
+HLS = "#EXTM3U\n#EXT-X-TARGETDURATION:4\n#EXTINF:4,\ninner.mp4\n#EXT-X-ENDLIST\n"
+NO_VIDEO = "cannot be decoded as video: Invalid data found when processing input — it may be cut off"
+HOSTILE: dict[str, Row] = {
+    "no file": (untouched, r"v\.mp4: no such video file — copy the recording again, whole"),
+    "empty": (whole(b""), r"v\.mp4: is empty — copy it again"),
+    "zeros": (whole(bytes(5000)), rf"v\.mp4: {NO_VIDEO}"),
+    "sound alone": (sound, r"v\.mp4: has no video in it"),
+    "a playlist": (whole(HLS), r"v\.mp4: cannot be decoded"),  # and does not open the other file
+    "a list of files": (whole("ffconcat version 1.0\nfile inner.mp4\n"), r"v\.mp4: cannot be decoded"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_file_that_is_no_video_is_told_in_words(case: str, video: Path, tmp_path: Path) -> None:
     shutil.copy(video, tmp_path / "inner.mp4")
-    lists = {
-        "hls": "#EXTM3U\n#EXT-X-TARGETDURATION:4\n#EXTINF:4,\ninner.mp4\n#EXT-X-ENDLIST\n",
-        "concat": "ffconcat version 1.0\nfile inner.mp4\n",
-    }
-    for name, text in lists.items():
-        (tmp_path / f"{name}.mp4").write_text(text)
-        with pytest.raises(EpisodeError, match="cannot be decoded"):
-            frame_table(tmp_path / f"{name}.mp4")
+    spoil, said, *_ = HOSTILE[case]
+    spoil(tmp_path / "v.mp4")
+    with pytest.raises(EpisodeError, match=said) as found:
+        VideoFile(tmp_path / "v.mp4")
+    assert "\n" not in str(found.value)
 
 
 @given(data=st.data())

@@ -1,6 +1,5 @@
 """Hand videos with annotations: every published form, runs, values and times."""
 
-import json
 import pickle
 from pathlib import Path
 
@@ -261,12 +260,6 @@ def test_a_grid_of_its_own_resamples_pictures_and_hands(folder: Path) -> None:
     assert set(shown) == set(range(LENGTH - 1)) and shown == sorted(shown)
 
 
-def test_another_rate_than_the_embodiments_is_refused(folder: Path) -> None:
-    made.write_table(folder / "hands.csv", made.rows("a", LENGTH))
-    with pytest.raises(EpisodeError, match="labelled at 10 Hz, embodiment test_hands says frequency_hz 30"):
-        open_source("hands").read(str(folder), "a.mp4", made.hand_video("landmarks", hz=30))
-
-
 # -- the whole road
 
 
@@ -278,21 +271,6 @@ def test_a_conversion_makes_the_same_shards_twice(folder: Path, tmp_path: Path, 
     shards = [sorted((tmp_path / f"out{i}").glob("*/*.parquet")) for i in (0, 1)]
     assert sum(split["episodes"] for split in done[0].manifest.splits.values()) == 2
     assert [path.read_bytes() for path in shards[0]] == [path.read_bytes() for path in shards[1]]
-
-
-def test_a_damaged_video_or_label_file_is_refused_and_the_rest_goes_on(
-    folder: Path, clip: Path, tmp_path: Path, block_tokenizer
-) -> None:
-    for name in ("b", "c", "d"):
-        (folder / f"{name}.mp4").write_bytes(clip.read_bytes()[: 600 if name == "b" else None])
-    for name in ("a", "b", "c", "d"):
-        (folder / f"{name}.pkl").write_bytes(pickle.dumps(made.epic_messages(LENGTH)))
-    (folder / "c.pkl").write_bytes((folder / "c.pkl").read_bytes()[:500])
-    robot = made.hand_video("epic_kitchens_hand_objects")
-    done = convert(robot, str(folder), block_tokenizer, tmp_path / "out", max_quarantine=1.0)
-    assert sum(split["episodes"] for split in done.manifest.splits.values()) == 2
-    lines = [json.loads(line) for line in (tmp_path / "out/quarantine.jsonl").read_text().splitlines()]
-    assert sorted(line["id"] for line in lines) == ["b.mp4", "c.mp4"]
 
 
 def test_the_human_embodiments_that_come_along_have_known_keys_and_layouts() -> None:

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.episodes.align import to_clip
-from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 from hma_data.sources.detect import detect
@@ -23,7 +23,6 @@ from hma_data.sources.hdf5.file import OPEN_FILES, rows
 from tests.data.fresh import run_fresh
 from tests.data.hdf5_files import H, T, W, embodiment, fill
 from tests.data.hub_cache import as_snapshot
-from tests.hostile import damage
 
 
 @pytest.fixture
@@ -283,89 +282,7 @@ def test_the_fingerprint_follows_the_bytes(demos: Path) -> None:
     assert open_source("hdf5").index(str(demos))[0].fingerprint != before[0].fingerprint
 
 
-# -- what is refused
-
-
-def refused(path: Path, episode_id: str = "demo_0", **changes: Any) -> str:
-    """The one line of the EpisodeError."""
-    with pytest.raises(EpisodeError) as found:
-        to_clip(open_source("hdf5").read(str(path), episode_id, embodiment(**changes)), embodiment(**changes))
-    assert "\n" not in str(found.value)
-    return str(found.value)
-
-
-def test_a_missing_key_names_the_nearest(demos: Path) -> None:
-    line = refused(demos, cameras=[{"name": "front", "key": "obs/agentview_rgb"}])
-    assert "has no 'obs/agentview_rgb'" in line and "did you mean obs/agentview_image" in line
-    assert f"{demos}:data/demo_0" in line
-
-
-def test_a_wrong_width_is_told_with_both_numbers(demos: Path) -> None:
-    wide = {"space": "mixed", "components": [{"key": "actions", "dims": 7}]}
-    assert "actions has 3 values, the embodiment says 7" in refused(demos, action=wide)
-
-
-def test_streams_of_different_length_are_refused(demos: Path) -> None:
-    with h5py.File(demos, "a") as file:
-        file["data/demo_0/short"] = np.zeros((T - 1, 2))
-    both = [{"key": "actions", "dims": 3}, {"key": "short", "dims": 2}]
-    line = refused(demos, action={"space": "mixed", "components": both})
-    assert "differ in length: actions 9, short 8" in line
-    assert "differ in length" in refused(demos, state={"components": [{"key": "short", "dims": 2}]})
-
-
-@pytest.mark.parametrize(
-    ("value", "said"),
-    [
-        (np.zeros((0, 3)), "is empty"),
-        (3.0, "is a single value"),
-        (np.full((T, 3), np.nan), "not finite"),
-        (np.array([b"a"] * T), "not numbers"),
-    ],
-)
-def test_actions_that_are_none_are_refused(demos: Path, value: Any, said: str) -> None:
-    with h5py.File(demos, "a") as file:
-        del file["data/demo_0/actions"]
-        file["data/demo_0/actions"] = value
-    assert said in refused(demos)
-
-
-def test_depth_is_not_a_colour_camera(demos: Path) -> None:
-    with h5py.File(demos, "a") as file:
-        file["data/demo_0/obs/depth"] = np.zeros((T, H, W, 1), np.float32)
-    line = refused(demos, cameras=[{"name": "front", "key": "obs/depth"}])
-    assert "float32, not colour images" in line
-
-
-def test_a_group_is_not_a_dataset(demos: Path) -> None:
-    line = refused(demos, cameras=[{"name": "front", "key": "obs"}])
-    assert "'obs' is a group" in line and "obs/agentview_image" in line
-
-
-def test_values_kept_in_other_files_are_refused(demos: Path, tmp_path: Path) -> None:
-    secret = tmp_path / "secret.h5"
-    with h5py.File(secret, "w") as file:
-        file["actions"] = np.zeros((T, 3))
-    with h5py.File(demos, "a") as file:
-        for i in range(3):
-            del file[f"data/demo_{i}/actions"]
-        file["data/demo_0/actions"] = h5py.ExternalLink(str(secret), "actions")
-        file["data/demo_1"].create_dataset("actions", (T, 3), "f8", external=[(str(secret), 0, T * 24)])
-        layout = h5py.VirtualLayout((T, 3), "f8")
-        layout[:] = h5py.VirtualSource(str(secret), "actions", (T, 3))
-        file["data/demo_2"].create_virtual_dataset("actions", layout)
-    assert "keeps its values in other files" in refused(demos)
-    assert "keeps its values in other files" in refused(demos, "demo_1")
-    assert "keeps its values in other files" in refused(demos, "demo_2")
-
-
-def test_a_chunk_too_large_to_inflate_is_refused(demos: Path) -> None:
-    with h5py.File(demos, "a") as file:
-        file["data/demo_0"].create_dataset(
-            "bomb", (T, 1 << 28), "f8", chunks=(1, 1 << 28), compression="gzip"
-        )
-    bomb = {"space": "mixed", "components": [{"key": "bomb", "dims": 1, "slice": [0, 1]}]}
-    assert "too large to read" in refused(demos, action=bomb)
+# -- places
 
 
 def test_a_snapshot_in_the_hubs_cache_is_read_where_it_lies(demos: Path, tmp_path: Path) -> None:
@@ -392,47 +309,9 @@ def test_indexing_opens_each_of_many_files_once(tmp_path: Path, monkeypatch: pyt
     assert len(open_source("hdf5").index(str(tmp_path))) == len(opened) == 2 * OPEN_FILES
 
 
-def test_two_files_of_one_name_are_told_apart(tmp_path: Path) -> None:
-    for name in ("a.h5", "a.hdf5"):
-        with h5py.File(tmp_path / name, "w") as file:
-            fill(file.create_group("data/demo_0"))
-    with pytest.raises(SourceError, match=r"differs from a\.h5 in its suffix"):
-        open_source("hdf5").index(str(tmp_path))
-
-
-def test_a_file_without_demos_has_no_episodes(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "none.hdf5", "w") as file:
-        file.create_group("data")
-    with pytest.raises(SourceError, match="holds no episodes"):
-        open_source("hdf5").index(str(tmp_path / "none.hdf5"))
-
-
 def test_an_unknown_episode_is_a_source_error(demos: Path) -> None:
     with pytest.raises(SourceError, match="no episode 'demo_99'"):
         open_source("hdf5").read(str(demos), "demo_99", embodiment())
-
-
-def test_a_damaged_file_among_others_is_one_refused_episode(demos: Path) -> None:
-    (demos.parent / "broken.hdf5").write_bytes(demos.read_bytes()[:5000])
-    source = open_source("hdf5")
-    refs = source.index(str(demos.parent), embodiment())
-    assert len(refs) == 13 and refs[0].id == "broken" and refs[0].frames == 0
-    with pytest.raises(EpisodeError, match=r"broken\.hdf5: cannot be read as HDF5"):
-        source.read(str(demos.parent), "broken", embodiment())
-    assert source.read(str(demos.parent), "demos/demo_0", embodiment()).id == "demos/demo_0"
-
-
-@given(data=st.data())
-def test_a_cut_or_flipped_file_gives_only_our_errors(demos: Path, data: st.DataObject) -> None:
-    path = Path(shutil.copyfile(demos, demos.with_name("bad.hdf5")))
-    damage(data, path)
-    source = open_source("hdf5")
-    try:
-        source.inspect(str(path))
-        for ref in source.index(str(path), embodiment())[:3]:
-            source.read(str(path), ref.id, embodiment()).streams["front"].frames([0, 5])
-    except HMAError as fault:
-        assert "bad.hdf5" in str(fault)
 
 
 # -- inspect

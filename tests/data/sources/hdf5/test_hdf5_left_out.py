@@ -7,7 +7,6 @@ import h5py
 import numpy as np
 import pytest
 
-from hma_data.errors import EpisodeError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 
@@ -63,35 +62,6 @@ def test_a_link_within_the_file_is_an_episode(tmp_path: Path) -> None:
     ]
     assert source.read(str(path), "demo_1", robot()).actions[0].values[:, 0].tolist() == [*range(40, 52)]
     assert source.inspect(str(path)).problems == ()
-
-
-@pytest.mark.parametrize(
-    ("link", "said"),
-    [
-        (h5py.ExternalLink("other.part", "/x"), "is a link to other.part:/x"),
-        (h5py.SoftLink("/nowhere"), "is a link to /nowhere"),
-    ],
-    ids=["external", "dangling"],
-)
-def test_a_link_out_of_the_file_or_to_nothing_is_an_episode_that_is_refused(tmp_path, link, said) -> None:
-    path, source = linked(tmp_path, link), open_source("hdf5")
-    assert [ref.id for ref in source.index(str(path), robot())] == ["demo_0", "demo_1", "demo_2"]
-    with pytest.raises(EpisodeError, match=f"{said}, which is not in this file"):
-        source.read(str(path), "demo_1", robot())
-    assert said in problems(path)
-
-
-def test_a_demo_whose_header_is_damaged_is_an_episode_that_is_refused(tmp_path: Path) -> None:
-    path, source = linked(tmp_path, h5py.SoftLink("/store/x")), open_source("hdf5")
-    with h5py.File(path) as file:
-        at = h5py.h5o.get_info(file["data/demo_2"].id).addr
-    content = bytearray(path.read_bytes())
-    content[at] ^= 0x10  # the version of its header
-    path.write_bytes(content)
-    assert [ref.id for ref in source.index(str(path), robot())] == ["demo_0", "demo_1", "demo_2"]
-    with pytest.raises(EpisodeError, match="demo.hdf5:data/demo_2: cannot be read — the file is damaged"):
-        source.read(str(path), "demo_2", robot())
-    assert "data/demo_2: cannot be read" in problems(path)
 
 
 def test_a_mask_that_names_an_absent_demo_is_named(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """HDF5 whose images are in video files beside it, as in DROID's raw recordings."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,6 @@ import pytest
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.episodes.align import to_clip
-from hma_data.errors import EpisodeError
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
@@ -19,6 +19,7 @@ from hma_data.sources.detect import detect
 from tests.conftest import BlockTokenizer
 from tests.data.inferring import answered, inferred
 from tests.data.videos import encode, number_of
+from tests.hostile import Edit, Row, check_refused, cut, linked_away, of, values, whole
 
 T = 12
 SERIALS = {"wrist": "11", "ext1": "22", "ext2": "33"}
@@ -49,10 +50,14 @@ def droid(root: Path, name: str, frames: int = T, **record: Any) -> Path:
         numbers = range(FIRST[camera], FIRST[camera] + frames)
         encode(folder / "recordings" / "MP4" / f"{serial}.mp4", numbers, fps=60)
         encode(folder / "recordings" / "MP4" / f"{serial}-stereo.mp4", [0], fps=60)
-    values = {f"{camera}_cam_serial": serial for camera, serial in SERIALS.items()}
-    values |= {"wrist_mp4_path": f"success/2023-07-07/{name}/recordings/MP4/11.mp4", "scene_id": 3}
-    (folder / f"metadata_LAB+ab12+{name}.json").write_text(json.dumps(values | record))
+    facts = {f"{camera}_cam_serial": serial for camera, serial in SERIALS.items()}
+    facts |= {"wrist_mp4_path": f"success/2023-07-07/{name}/recordings/MP4/11.mp4", "scene_id": 3}
+    (folder / f"metadata_LAB+ab12+{name}.json").write_text(json.dumps(facts | record))
     return folder
+
+
+def frames(count: int) -> Edit:
+    return lambda path: encode(path, range(count), fps=60)
 
 
 @pytest.fixture
@@ -88,13 +93,6 @@ def test_the_shipped_yaml_converts_a_folder_of_episodes(robot, tmp_path: Path) -
     assert all(name.endswith("/trajectory") for name in shards.episodes["id"].to_pylist())
 
 
-@pytest.mark.parametrize(("frames", "said"), [(T - 2, "frames_missing"), (T + 1, "last_observation")])
-def test_other_numbers_of_frames_are_refused_with_the_remedy(robot, tmp_path, frames, said) -> None:
-    droid(tmp_path, "a", frames)
-    with pytest.raises(EpisodeError, match=rf"actions {T}, .*serial.*\.mp4 {frames} — .*{said}"):
-        HDF5.read(str(tmp_path), "success/2023-07-07/a/trajectory", robot)
-
-
 def test_another_video_is_another_recording(robot, tmp_path) -> None:
     folder = droid(tmp_path, "a")
     before = HDF5.index(str(tmp_path), robot)[0].fingerprint
@@ -119,46 +117,25 @@ def test_a_yaml_is_inferred_from_numbers_with_a_video_beside_them(tmp_path: Path
         assert number_of(first) == (10 if "10" in name else 1)
 
 
-def spoil(folder: Path, how: str) -> None:
-    [metadata] = folder.glob("metadata_*.json")
-    if how == "no video":
-        (folder / "recordings" / "MP4" / "33.mp4").unlink()
-    elif how == "no metadata":
-        metadata.unlink()
-    elif how == "two metadata":
-        (folder / "metadata_2.json").write_text("{}")
-    elif how == "no serial":
-        metadata.write_text('{"wrist_cam_serial": "11"}')
-    elif how == "no json":
-        metadata.write_text("{")
-    elif how == "outside":
-        metadata.write_text('{"ext1_cam_serial": "../../../../other"}')
-    elif how == "link":
-        (folder.parent / "elsewhere.mp4").write_bytes((folder / "recordings/MP4/22.mp4").read_bytes())
-        (folder / "recordings" / "MP4" / "22.mp4").unlink()
-        (folder / "recordings" / "MP4" / "22.mp4").symlink_to(folder.parent / "elsewhere.mp4")
-    elif how == "damaged":
-        (folder / "recordings" / "MP4" / "22.mp4").write_bytes(b"\0" * 900)
+MP4, FACTS = "**/MP4/22.mp4", "**/metadata_*.json"
+HOSTILE: dict[str, Row] = {
+    "no video": (of(MP4, Path.unlink), r"is no recordings/MP4/22\.mp4 — next to it are .*33\.mp4"),
+    "no metadata": (of(FACTS, Path.unlink), r"there is no metadata_\*\.json"),
+    "two metadata": (of(FACTS, lambda path: shutil.copy(path, f"{path}_2.json")), "2 files match metadata_"),
+    "no serial": (of(FACTS, whole('{"wrist_cam_serial": "1"}')), "has no 'ext1_cam_serial' for .* — it has"),
+    "metadata cut short": (of(FACTS, cut(1)), "cannot be read as JSON"),
+    "a serial outside": (of(FACTS, values(ext1_cam_serial="../../../../other")), "leads out of its folder"),
+    "a link": (of(MP4, linked_away), "is a link to a file outside"),
+    "zeros": (of(MP4, whole(bytes(900))), r"22\.mp4: cannot be decoded as video"),
+    "few frames": (of(MP4, frames(T - 2)), rf"actions {T}, .*serial.*\.mp4 {T - 2} — .*frames_missing"),
+    "many frames": (of(MP4, frames(T + 1)), rf"actions {T}, .*serial.*\.mp4 {T + 1} — .*last_observation"),
+}
 
 
-@pytest.mark.parametrize(
-    ("how", "said"),
-    [
-        ("no video", r"exterior_2: there is no recordings/MP4/33.mp4 — next to it are .*22.mp4"),
-        ("no metadata", r"there is no metadata_\*.json"),
-        ("two metadata", r"2 files match metadata_\*.json"),
-        ("no serial", r"has no 'ext1_cam_serial' for .* — it has wrist_cam_serial"),
-        ("no json", "cannot be read as JSON"),
-        ("outside", "leads out of its folder"),
-        ("link", "is a link to a file outside"),
-        ("damaged", "22.mp4: cannot be decoded as video"),
-    ],
-)
-def test_what_is_missing_is_named(robot, tmp_path, how: str, said: str) -> None:
-    spoil(droid(tmp_path, "a"), how)
-    with pytest.raises(EpisodeError, match=said):
-        HDF5.read(str(tmp_path), "success/2023-07-07/a/trajectory", robot)
-    assert HDF5.index(str(tmp_path), robot)  # quarantined later, by name
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_hostile_recording_is_one_line(case: str, robot: Embodiment, tmp_path: Path) -> None:
+    droid(tmp_path / "set", "a")
+    check_refused(HOSTILE[case], tmp_path / "set", robot, tmp_path / "out", one=False)
 
 
 def test_inspect_names_the_videos_as_a_key_would(tmp_path) -> None:

@@ -10,18 +10,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from hma_data.episodes.align import to_clip
-from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.detect import detect
-from hma_data.sources.lerobot.metadata import fill
 from hma_data.sources.lerobot.writer import origin_of
-from tests.command import fails, hma
 from tests.data.hub_cache import as_snapshot
 from tests.data.videos import (
     CAMERA,
@@ -30,12 +26,10 @@ from tests.data.videos import (
     TASKS,
     WIDTH,
     actions_of,
-    encode,
     make_v2,
     make_v3,
     number_of,
 )
-from tests.hostile import damage
 
 LENGTHS = (12, 9, 15)
 
@@ -171,166 +165,15 @@ def test_pictures_named_by_path_are_read(copy: Callable[[str], Path]) -> None:
     pq.write_table(table.set_column(column, STILL, pa.array(named)), path)
     still = open_source("lerobot").read(str(folder), "episode_000000", embodiment()).streams["still"]
     assert [number_of(frame) for frame in still.frames([2, 11])] == [2, 11]
-    pq.write_table(
-        table.set_column(column, STILL, pa.array([{"path": "../../etc/passwd"}] * len(rows))), path
-    )
-    with pytest.raises(EpisodeError, match="outside the dataset"):
-        open_source("lerobot").read(str(folder), "episode_000000", embodiment()).streams["still"].frames([0])
 
 
 # -- what is refused
-
-
-def test_another_rate_names_both_numbers(originals: dict[str, Path]) -> None:
-    for call in ("index", "read"):
-        arguments = [str(originals["v2"]), *(["episode_000000"] if call == "read" else [])]
-        with pytest.raises(SourceError, match=r"runs at 10 fps.*frequency_hz 30"):
-            getattr(open_source("lerobot"), call)(*arguments, embodiment(frequency_hz=30))
 
 
 @pytest.mark.parametrize("rate", [10.05, "unknown", None])
 def test_a_rate_within_a_hundredth_or_not_stated_is_accepted(originals: dict[str, Path], rate: Any) -> None:
     robot = embodiment(frequency_hz=rate, stride=5)
     assert len(open_source("lerobot").index(str(originals["v2"]), robot)) == 3
-
-
-@pytest.mark.parametrize("name", ["v2", "v3"])
-def test_a_missing_video_is_one_refused_episode(copy: Callable[[str], Path], name: str) -> None:
-    folder, source = copy(name), open_source("lerobot")
-    videos = sorted(folder.rglob("*.mp4"))
-    videos[0].unlink()
-    assert len(source.index(str(folder), embodiment())) == 3
-    with pytest.raises(EpisodeError, match=rf"{videos[0].name}: no such video"):
-        source.read(str(folder), "episode_000000", embodiment())
-    (said,) = (one for one in source.inspect(str(folder)).problems if "missing" in one)
-    assert f"1 of {len(videos)} videos of {CAMERA} are missing" in said and videos[0].name in said
-
-
-ROWS, FILM = "data/chunk-000/episode_000000.parquet", f"videos/chunk-000/{CAMERA}/episode_000000.mp4"
-MISMATCHES = {
-    "short video": (lambda folder: encode(folder / FILM, range(11)), "has 11 frames for 12 rows"),
-    "long video": (lambda folder: encode(folder / FILM, range(13)), "has 13 frames for 12 rows"),
-    "another rate": (lambda folder: encode(folder / FILM, range(12), fps=15), "disagree on time"),
-    "a row less": (
-        lambda folder: pq.write_table(pq.read_table(folder / ROWS).slice(1), folder / ROWS),
-        "has 11 rows of episode_000000, its metadata says 12",
-    ),
-    "too many rows": (
-        lambda folder: pq.write_table(pa.table({"episode_index": [0] * 1001}), folder / ROWS),
-        r"'episode_index' claims 1,001 values of 1,001 rows",
-    ),
-}
-
-
-@pytest.mark.parametrize("mismatch", MISMATCHES)
-def test_a_film_or_rows_that_do_not_fit_are_refused(copy, monkeypatch, mismatch: str) -> None:
-    folder, source = copy("v2"), open_source("lerobot")
-    change, said = MISMATCHES[mismatch]
-    monkeypatch.setattr("hma_data.sources.lerobot.rows.MAX_VALUES", 1000)
-    change(folder)
-    with pytest.raises(EpisodeError, match=said):
-        source.read(str(folder), "episode_000000", embodiment())
-    if "video" in mismatch:
-        assert said in source.inspect(str(folder)).problems[0]
-
-
-def test_a_key_that_is_no_feature_names_the_nearest(originals: dict[str, Path]) -> None:
-    arm = embodiment(cameras=[{"name": "cam", "key": "observation.images.camera"}])
-    with pytest.raises(SourceError, match=rf"is not a feature.*did you mean {CAMERA}"):
-        open_source("lerobot").read(str(originals["v2"]), "episode_000000", arm)
-    arm = embodiment(cameras=[{"name": "cam", "key": "action"}])
-    with pytest.raises(SourceError, match=rf"'action' is float32, not colour images.*{CAMERA}, {STILL}"):
-        open_source("lerobot").read(str(originals["v2"]), "episode_000000", arm)
-
-
-def test_a_wrong_width_is_told_with_both_numbers(originals: dict[str, Path]) -> None:
-    arm = embodiment(action__components=[{"key": "action", "dims": 6}])
-    with pytest.raises(EpisodeError, match="action has 2 values, the embodiment says 6"):
-        open_source("lerobot").read(str(originals["v3"]), "episode_000000", arm)
-
-
-@pytest.mark.parametrize(
-    ("column", "said"),
-    [
-        (pa.array([[1.0, 2.0]] * 11 + [[1.0]]), "holds lists of"),
-        (pa.array([[1.0, 2.0]] * 11 + [None]), "1 missing values"),
-        (pa.array([[1.0, None]] * 12), "12 missing values"),
-        (pa.array([["a", "b"]] * 12), "not numbers"),
-        (pa.array([[1.0, float("nan")]] * 12), "not finite at frame 0"),
-    ],
-)
-def test_actions_that_are_none_are_refused(copy: Callable[[str], Path], column: pa.Array, said: str) -> None:
-    folder = copy("v2")
-    path = folder / "data/chunk-000/episode_000000.parquet"
-    table = pq.read_table(path)
-    pq.write_table(table.set_column(table.column_names.index("action"), "action", column), path)
-    with pytest.raises(EpisodeError, match=said):
-        to_clip(open_source("lerobot").read(str(folder), "episode_000000", embodiment()), embodiment())
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"codebase_version": "v1.6"}, r"version 'v1\.6'; v2\.0, v2\.1, v3\.0 are read"),
-        ({"codebase_version": None}, "version None"),
-        ({"fps": 0}, "fps is 0: Input should be greater than 0"),
-        ({"fps": "fast"}, "fps is 'fast'"),
-        ({"features": {}}, "features is {}"),
-        ({"features": {"action": {"dtype": "float32"}}}, r"lacks features\.action\.shape"),
-    ],
-)
-def test_metadata_out_of_bounds_is_one_clear_line(copy, change, said) -> None:
-    folder = copy("v2")
-    change_info(folder, **change)
-    with pytest.raises(SourceError, match=said) as found:
-        open_source("lerobot").index(str(folder))
-    assert "info.json" in str(found.value) and "\n" not in str(found.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "said"),
-    [
-        ("info.json", "{", r"info\.json: Invalid JSON"),
-        ("info.json", "[1]", "Input should be an object"),
-        ("info.json", '{"codebase_version": "v2.1", "robot_type": "so100"}', r"info\.json: lacks fps —"),
-        ("info.json", "[" * 100_000, "Invalid JSON"),
-        (
-            "episodes.jsonl",
-            '{"episode_index": 0, "length": 3}\n{"epi',
-            r"episodes\.jsonl line 2: is not JSON",
-        ),
-        ("episodes.jsonl", '{"episode_index": -1, "length": 3}', "whole number from 0, is -1"),
-        ("episodes.jsonl", '{"episode_index": 0, "length": 3}\n' * 2, "lists episode 0 a second time"),
-        ("episodes.jsonl", "", "has no episodes"),
-        ("tasks.jsonl", "3", r"tasks\.jsonl: holds 3, not an object"),
-    ],
-)
-def test_damaged_metadata_is_one_clear_line(copy, name, text, said) -> None:
-    folder = copy("v2")
-    path = folder / "meta" / name
-    path.unlink() if text is None else path.write_text(text)
-    with pytest.raises(SourceError, match=said) as found:
-        open_source("lerobot").index(str(folder))
-    assert "\n" not in str(found.value)
-
-
-@pytest.mark.parametrize(
-    "template",
-    ["{episode_index.__class__}", "{episode_index!r}", "{episode_index:>999999999d}", "{other}", "{"],
-)
-def test_a_template_that_is_more_than_names_and_widths_is_refused(template: str) -> None:
-    with pytest.raises(SourceError, match=r"info\.json"):
-        fill(template, {"episode_index": 1, "video_key": "cam"}, "info.json")
-
-
-@pytest.mark.parametrize(
-    "template", ["../{episode_index:06d}.parquet", "/etc/{episode_index}.parquet", "a/../../x"]
-)
-def test_a_template_that_leaves_the_folder_is_refused(copy: Callable[[str], Path], template: str) -> None:
-    folder = copy("v2")
-    change_info(folder, data_path=template)
-    with pytest.raises(EpisodeError, match="outside the dataset"):
-        open_source("lerobot").read(str(folder), "episode_000000", embodiment())
 
 
 def test_a_snapshot_in_the_hubs_cache_is_read_where_it_lies(originals, tmp_path) -> None:
@@ -348,35 +191,6 @@ def test_a_folder_that_is_none_says_so(tmp_path: Path) -> None:
     ):  # fmt: skip
         with pytest.raises(SourceError, match=said):
             open_source("lerobot").index(str(uri))
-
-
-@pytest.mark.parametrize("name", ["v2", "v3"])
-def test_a_dataset_without_its_info_is_known_as_one(copy: Callable[[str], Path], name: str) -> None:
-    folder = copy(name)
-    (folder / "meta/info.json").unlink()
-    fails(hma("inspect", folder), 1, "has no meta/info.json — give the folder of a whole LeRobotDataset")
-    shutil.rmtree(folder / "meta")
-    assert detect(folder) == "lerobot"
-
-
-@pytest.mark.slow
-@settings(max_examples=12)
-@given(data=st.data())
-def test_a_cut_or_flipped_file_gives_only_our_errors(originals, tmp_path_factory, data) -> None:
-    folder = tmp_path_factory.mktemp("bad") / "set"
-    shutil.copytree(originals[data.draw(st.sampled_from(["v2", "v3"]))], folder)
-    files = sorted(path for path in folder.rglob("*.*") if path.is_file())
-    path = data.draw(st.sampled_from(files))
-    damage(data, path)
-    source = open_source("lerobot")
-    try:
-        source.inspect(str(folder))
-        for ref in source.index(str(folder), embodiment()):
-            episode = source.read(str(folder), ref.id, embodiment())
-            for stream in episode.streams.values():
-                stream.frames([0, len(stream.timestamps) - 1])
-    except HMAError as fault:
-        assert "\n" not in str(fault)
 
 
 # -- real recordings (test_lerobot_own.py compares with lerobot)

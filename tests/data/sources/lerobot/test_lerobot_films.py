@@ -18,6 +18,7 @@ from hma_data.errors import EpisodeError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 from tests.data.videos import CAMERA, TASKS, encode, make_v2, make_v3, number_of
+from tests.hostile import Edit, Row
 
 LENGTHS = (12, 9, 15)
 SHOWN = [10 * episode + i for episode, length in enumerate(LENGTHS) for i in range(length)]
@@ -97,29 +98,48 @@ def test_an_offset_that_was_never_reset_for_a_new_video_does_no_harm(tmp_path: P
     assert outcome(starts(make_v3(tmp_path / "v3", LENGTHS), 4.0, 5.2, 6.1)) == ["right"] * 3
 
 
-@pytest.mark.parametrize(
-    ("shown", "said"),
-    [
-        ([*SHOWN[:9], 8, *SHOWN[9:]], "has 37 frames for 36 rows of 3 episodes"),
-        ([*SHOWN[:9], 8, 8, 8, *SHOWN[9:]], "has 39 frames for 36 rows of 3 episodes"),
-        ([0, *SHOWN], "has 37 frames for 36 rows"),
-        ([*SHOWN, 34], "has 37 frames for 36 rows"),
-        ([*SHOWN[:4], *SHOWN[5:]], "has 35 frames for 36 rows"),
-        (SHOWN[:-1], "has 35 frames for 36 rows"),
-    ],
-    ids=["twice", "four times", "first twice", "last twice", "one missing", "end missing"],
-)
-def test_one_frame_too_many_or_too_few_refuses_every_episode_of_the_video(shared, shown, said) -> None:
-    film(shared, shown)
-    assert all(said in text for text in outcome(shared))
-    problems = open_source("lerobot").inspect(str(shared)).problems
-    assert sum(said in problem for problem in problems) == 1
+def shows(shown: Sequence[int], stamps: Sequence[float] | None = None) -> Edit:
+    return lambda folder: film(folder, shown, stamps)
 
 
-def test_one_too_many_in_a_late_video_is_refused_with_its_start(shared: Path) -> None:
-    film(shared, [*SHOWN[:9], 8, *SHOWN[9:]], 1 + np.arange(37))
-    said = "has 37 frames for 36 rows of 3 episodes, and begins at 0.100 s, its metadata says 0.000 s"
-    assert [said in text for text in outcome(shared)] == [True] * 3, outcome(shared)
+def starting(*seconds: float) -> Edit:
+    return lambda folder: starts(folder, *seconds)
+
+
+def times_go_back(folder: Path) -> None:
+    change_column(data(folder), "timestamp", lambda value, row: 0.3 if row["frame_index"] == 5 else value)
+
+
+MORE, FEWER = "has 37 frames for 36 rows of 3 episodes", "has 35 frames for 36 rows"
+TOGETHER = "at the same time — their spans in meta/episodes overlap"
+DRIFT = "has 36 frames for 36 rows of 3 episodes, but not at the times that meta/episodes says"
+LATE = f"{MORE}, and begins at 0.100 s, its metadata says 0.000 s"
+TWICE = [*SHOWN[:9], 8, *SHOWN[9:]]
+HOSTILE: dict[str, Row] = {  # every episode of the video is refused
+    "a frame twice": (shows(TWICE), MORE),
+    "a frame four times": (shows([*SHOWN[:9], 8, 8, 8, *SHOWN[9:]]), "has 39 frames for 36 rows"),
+    "the first twice": (shows([0, *SHOWN]), MORE),
+    "the last twice": (shows([*SHOWN, 34]), MORE),
+    "a frame missing": (shows([*SHOWN[:4], *SHOWN[5:]]), FEWER),
+    "the end missing": (shows(SHOWN[:-1]), FEWER),
+    "late, a frame twice": (shows(TWICE, 1 + np.arange(37)), LATE),
+    "not advanced": (starting(0.0, 1.2, 1.2), TOGETHER),
+    "early": (starting(0.0, 1.1, 2.0), TOGETHER),
+    "one late": (starting(0.0, 1.3, 2.1), TOGETHER),
+    "all at the start": (starting(0.0, 0.0, 0.0), TOGETHER),
+    "a frame late": (starting(0.0, 1.3, 2.2), DRIFT),
+    "half a frame late": (starting(0.0, 1.26, 2.16), DRIFT),
+    "times that go back": (times_go_back, "timestamps do not rise after row 4: 0.4 s, then 0.3 s"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_video_that_does_not_fit_is_refused(case: str, shared: Path) -> None:
+    spoil, said, *_ = HOSTILE[case]
+    spoil(shared)
+    assert all(said in text for text in outcome(shared)), outcome(shared)
+    if said in (MORE, FEWER):
+        assert sum(said in found for found in open_source("lerobot").inspect(str(shared)).problems) == 1
 
 
 def test_stamps_that_tell_which_frame_is_missing_refuse_one_episode(shared: Path) -> None:
@@ -144,24 +164,6 @@ def test_frames_of_removed_episodes_are_no_ones(shared: Path) -> None:
 def test_a_recorder_that_adds_a_frame_to_each_episode_is_understood(shared: Path) -> None:
     film(shared, [*SHOWN[:12], 11, *SHOWN[12:21], 18, *SHOWN[21:], 34])
     assert outcome(starts(shared, 0.0, 1.3, 2.3)) == ["right"] * 3
-
-
-@pytest.mark.parametrize(
-    "seconds",
-    [(0.0, 1.2, 1.2), (0.0, 1.1, 2.0), (0.0, 1.3, 2.1), (0.0, 0.0, 0.0)],
-    ids=["not advanced", "early", "one late", "all at the start"],
-)
-def test_episodes_whose_spans_overlap_are_refused(shared: Path, seconds: tuple[float, ...]) -> None:
-    assert all(
-        "at the same time — their spans in meta/episodes overlap" in text
-        for text in outcome(starts(shared, *seconds))
-    )
-
-
-@pytest.mark.parametrize("seconds", [(0.0, 1.3, 2.2), (0.0, 1.26, 2.16)], ids=["a frame", "half a frame"])
-def test_episodes_that_drift_from_their_video_are_refused(shared: Path, seconds: tuple[float, ...]) -> None:
-    said = "has 36 frames for 36 rows of 3 episodes, but not at the times that meta/episodes says"
-    assert all(said in text for text in outcome(starts(shared, *seconds)))
 
 
 def test_pairing_says_what_is_known(shared: Path) -> None:
@@ -194,11 +196,6 @@ def test_a_row_that_is_there_twice_or_not_at_all_is_named(shared: Path) -> None:
     assert "has row 4 of episode 0 twice, by frame_index" in outcome(shared)[0]
     change_column(data(shared), "frame_index", lambda value, row: value + (value > 6))
     assert "lacks rows of episode 1 after row 6" in outcome(shared)[1]
-
-
-def test_times_that_do_not_rise_are_refused(shared: Path) -> None:
-    change_column(data(shared), "timestamp", lambda value, row: 0.3 if row["frame_index"] == 5 else value)
-    assert all("timestamps do not rise after row 4: 0.4 s, then 0.3 s" in text for text in outcome(shared))
 
 
 # -- tasks
