@@ -54,13 +54,13 @@ NAN = np.array([0.0, 1.0, float("nan"), 0.0, 0.0, 0.0], np.float32)
 WIDE = acts("observation/state", 7)
 BOMB = [zlib.compress(bytes(50_000_000))] * 3
 ONE: dict[str, Row] = {  # one episode is refused
-    "an action too many": (first(action__move=np.zeros(8, np.float32)), "8 values|differ"),
+    "an action too many": (first(action__move=np.zeros(8, np.float32)), "8 values"),
     "a value too many": (first(action__move=np.zeros(7, np.float32)), "7 values"),
     "an image for three steps": (first(observation__image=[png(pictures(0, 1)[0])]), "1 entries for 3 steps"),
-    "junk for images": (first(observation__image=[b"junk"] * 3), "observation/image|image"),
+    "junk for images": (first(observation__image=[b"junk"] * 3), "observation/image"),
     "no steps": (first(**EMPTY), "no steps"),
     "none of the features": (first(), "none of the features"),
-    "actions of NaN": (first(action__move=NAN), "action/move is not finite at step 1|not finite"),
+    "actions of NaN": (first(action__move=NAN), "not finite"),
     "a bomb": (first(zipped=BOMB), r"is not float32 \(3\)", acts("zipped", 3)),
     "a record cut short": (of(SHARD, cut(-9)), "cut off at byte"),
     "a changed byte": (of(SHARD, flip(40)), "checksum"),
