@@ -197,6 +197,9 @@ def human_seconds(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02} min"
 
 
+CONTINUE = "run the same command again to continue"
+
+
 @contextmanager
 def interruptible(words: Callable[[], str]) -> Iterator[None]:
     """Convert a Ctrl-C in the block to an error that says what is kept and how to go on.

@@ -13,9 +13,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (681, 3_878, 7),
-    "hma_data/cli": (1_519, 10_865, 8),
-    "hma_data/conversion": (4_240, 31_480, 15),
+    "hma_data": (684, 3_882, 7),
+    "hma_data/cli": (1_523, 10_881, 8),
+    "hma_data/conversion": (4_258, 31_626, 15),
     "hma_data/episodes": (1_671, 14_652, 9),
     "hma_data/hub": (512, 3_787, 3),
     "hma_data/inspection": (2_151, 20_090, 8),
@@ -24,12 +24,12 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_551, 19_540, 11),
     "hma_data/sources": (12_552, 104_849, 50),
-    "hma_data/storage": (1_660, 10_897, 11),
-    "hma_data/tokenizers": (3_274, 23_695, 17),
+    "hma_data/storage": (1_664, 10_939, 11),
+    "hma_data/tokenizers": (3_291, 23_875, 17),
     "hma_model": (505, 3_000, 4),
     "hma_model/benchmark": (845, 7_250, 5),
     "hma_model/checkpoint": (885, 6_600, 5),
-    "hma_model/cli": (1_723, 10_700, 12),
+    "hma_model/cli": (1_725, 10_738, 12),
     "hma_model/demo": (485, 4_100, 4),
     "hma_model/evaluation": (4_465, 35_950, 23),
     "hma_model/export": (1_189, 9_410, 9),
@@ -41,11 +41,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_825, 20_100, 14),
     "hma_model/released": (825, 7_100, 4),
     "hma_model/synthetic": (1_205, 9_100, 5),
-    "hma_model/training": (3_529, 29_018, 18),
+    "hma_model/training": (3_530, 29_036, 18),
     "hma_model/worlds": (1_520, 11_387, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 64_944, 513_781
-TEST_LINES = 48_285
+PRODUCT_LINES, PRODUCT_NODES = 64_993, 514_256
+TEST_LINES = 48_175
 DOC_WORDS = 40_357
 
 

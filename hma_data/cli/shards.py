@@ -9,10 +9,12 @@ from typer import Argument, Option
 
 from hma_data.cli.options import Folder, Json, Weights, choice_option
 from hma_data.console import (
+    CONTINUE,
     Update,
     human_bytes,
     human_count,
     human_seconds,
+    interruptible,
     print_json,
     print_table,
     progress,
@@ -199,6 +201,7 @@ def _report(out: Path, manifest: "Manifest", json: bool) -> None:
 
 
 @shards_app.command("merge")
+@interruptible(lambda: CONTINUE)
 def shards_merge(
     folders: Annotated[list[Path], Argument(help="Shard sets of one embodiment and tokenizer.")],
     out: Out,
@@ -221,6 +224,7 @@ def shards_merge(
 
 
 @shards_app.command("split")
+@interruptible(lambda: CONTINUE)
 def shards_split(
     folder: Folder,
     out: Out,

@@ -41,6 +41,7 @@ from hma_data.shards.manifest import (
     SPLITS,
     Manifest,
     damaged_files,
+    derive,
     digest_of_texts,
     restat_remedy,
     shard_sizes,
@@ -78,12 +79,18 @@ def extended(
     Returns:
         a plan whose units are the new shards alone; where there are none, its facts are those of `base`.
     """
-    _refuse_damaged(out, base)
+    killed = _is_killed_extension(out, base)
     if ways(plan.facts) != ways(base.plan):
         fault = f"cannot be extended; different: {differences(plan.facts, base.plan)}"
         raise OutputError(out, fault, "convert with the same settings, or choose another --out")
-    known = parquet_file(out / EPISODES).read(columns=["id", "fingerprint", "content"])
-    lines = (out / QUARANTINE).read_text("utf-8").splitlines()
+    columns = ["id", "fingerprint", "content"]
+    if killed:
+        hashes = {shard.path: shard.sha256 for shard in base.shards}
+        there = derive(out, list(hashes), base.embodiment, base.tokenizer, base.plan, base.source, hashes)
+        known, lines = there.episodes.select(columns), there.quarantine.splitlines()
+    else:
+        known = parquet_file(out / EPISODES).read(columns=columns)
+        lines = (out / QUARANTINE).read_text("utf-8").splitlines()
     refused = pa.array([json.loads(line)["id"] for line in lines], pa.string())
     now = plan.table()
     place = pc.index_in(now["id"], known["id"])  # null for episodes that the set does not have
@@ -103,8 +110,12 @@ def _contents(known: pa.Table, ids: pa.ChunkedArray) -> dict[str, str]:
     return dict(zip(some["id"].to_pylist(), some["content"].to_pylist()))
 
 
-def _refuse_damaged(out: Path, base: Manifest) -> None:
-    """Raise OutputError unless all shards have their size and the derived files have their bytes."""
+def _is_killed_extension(out: Path, base: Manifest) -> bool:
+    """Check whether an extension wrote derived files and was killed before the manifest.
+
+    Raises:
+        OutputError: a shard does not have its size, or derived files without an extension not their bytes.
+    """
     sizes = shard_sizes(out)
     for shard in base.shards:
         if sizes.get(shard.path) != shard.bytes:
@@ -112,9 +123,12 @@ def _refuse_damaged(out: Path, base: Manifest) -> None:
             raise OutputError(
                 out / shard.path, fault, "restore it from a copy, or start over with --overwrite"
             )
-    if damaged := damaged_files(out, base):
+    damaged = damaged_files(out, base)
+    killed = len(sizes) > len(base.shards)
+    if damaged and not killed:
         fault = "is missing, or changed since the manifest was written"
         raise OutputError(damaged[0], fault, restat_remedy(out))
+    return bool(damaged)
 
 
 def _refuse_changed(

@@ -43,7 +43,7 @@ from hma_data.conversion.reading import (
 )
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepare, upright
-from hma_data.errors import EpisodeError, HMAError, OutputError, SourceError, UsageError
+from hma_data.errors import EpisodeError, HMAError, OutputError, ShardError, SourceError, UsageError
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment
 from hma_data.registry.export import lerobot_features, packed_components
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, QUARANTINE, Derived, Manifest, ShardFile
@@ -451,7 +451,11 @@ class LeRobotHolder:
         whole = self.folder / DATASET
         shutil.rmtree(whole, ignore_errors=True)
         parts = [part_folder(self.folder, unit.name) / DATASET for unit in plan.units]
-        join_datasets([part for part in parts if part.is_dir()], whole, self._robot.id)
+        try:
+            join_datasets([part for part in parts if part.is_dir()], whole, self._robot.id)
+        except ValueError as fault:  # of PyAV, pyarrow and JSON alike
+            remedy = "delete that folder and run the same command again"
+            raise ShardError(self.folder, f"holds a damaged part: {fault}", remedy) from fault
         manifest = replace(derived.manifest, shards=())
         episodes = _numbered(derived.episodes)
         held_out = manifest.splits["val"]["episodes"]

@@ -342,7 +342,7 @@ def known_hashes(out: Path) -> dict[str, str]:
     found: dict[str, str] = {}
     sizes = shard_sizes(out)
     for path in sorted(out.glob(f"{JOURNAL}*")):
-        for line in path.read_text(encoding="utf-8").splitlines():
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
             with suppress(ValueError, TypeError):  # a line cut short by a kill
                 made = Made(**json.loads(line))
                 if sizes.get(made.name) == made.bytes:

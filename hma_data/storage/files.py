@@ -98,8 +98,8 @@ def remove_parts(folder: Path) -> None:
 
 
 def remove_dead_parts(folder: Path) -> None:
-    """Delete the unfinished files that ended processes of this machine left in a folder."""
-    for part in folder.glob(f".*{PART}"):
+    """Delete what ended processes of this machine left unfinished in a folder and in those directly below."""
+    for part in [*folder.glob(f".*{PART}"), *folder.glob(f"*/.*{PART}")]:
         pid = part.name.removesuffix(PART).rpartition(".")[2].partition("-")[0]
         if pid.isdecimal() and not _is_running(int(pid)):
             part.unlink(missing_ok=True)

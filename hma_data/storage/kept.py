@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import OutputError
-from hma_data.storage.files import write_atomic
+from hma_data.storage.files import remove_dead_parts, write_atomic
 
 SETTINGS = "settings.json"
 DIGEST_BYTES = 32  # of the SHA-256 behind the arrays of a part
@@ -39,6 +39,7 @@ class KeptParts:
                 folder.parent, fault, f"give the same settings or another folder, or delete {folder}"
             )
         write_atomic(path, text)
+        remove_dead_parts(folder.parent)  # of a job that was killed
 
     def path(self, key: str) -> Path:
         """Return the file of a part."""
@@ -52,9 +53,12 @@ class KeptParts:
             keep_arrays(self.path(key), found)
         return found
 
-    def remove(self) -> None:
-        """Delete all parts: the job's result is written."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+
+def remove_kept(folder: Path) -> None:
+    """Delete the parts in a folder, then their settings: after a kill in between, no part is without them."""
+    for part in folder.glob("*.npz"):
+        part.unlink(missing_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def keep_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

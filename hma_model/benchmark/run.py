@@ -9,7 +9,6 @@ version may be compared.
 
 import hashlib
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -20,8 +19,8 @@ import numpy as np
 
 from hma_data.errors import HMAError, OutputError, UsageError
 from hma_data.lab import FAMILY
-from hma_data.storage.files import write_atomic
-from hma_data.storage.kept import KeptParts
+from hma_data.storage.files import remove_dead_parts, write_atomic
+from hma_data.storage.kept import KeptParts, remove_kept
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Bools
@@ -107,6 +106,7 @@ def benchmark(
     """
     folder = as_path(out)
     with locked(folder):
+        remove_dead_parts(folder)
         world = world or load_world(checkpoint, **settings)
         robots = [robot for robot in protocol.robots if robot in world.model.embodiments]
         if not robots:
@@ -136,7 +136,7 @@ def benchmark(
             found = facts | {"checkpoint": str(checkpoint), "measures": made, "by_scene": by_scene}
             found["by_frame"] = by_frame
             write_atomic(folder / RESULTS, json.dumps(found | {"sha256": _digest(found)}, indent=1))
-        shutil.rmtree(folder / WORK, ignore_errors=True)  # of a job killed here, too
+        remove_kept(folder / WORK)  # of a job killed here, too
         for robot, measured in found["measures"].items():
             if meter := measured["calibration"].get("meter"):  # for other commands
                 record_locally(checkpoint, world.model.source, robot, meter, "meter")

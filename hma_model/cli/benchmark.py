@@ -60,7 +60,7 @@ def benchmark(
             checkpoint, out, protocol, seed=seed, unmask_steps=unmask_steps, temperature=temperature,
             device=there, precision=precision, compile=compile, on_progress=update,
         )  # fmt: skip
-    page = write_report(found, out)
+        page = write_report(found, out)
     if json:
         print_json(found)
         return

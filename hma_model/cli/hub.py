@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from hma_data.cli.options import Folder, Json
-from hma_data.console import print_json, print_table, say
+from hma_data.console import CONTINUE, interruptible, print_json, print_table, say
 from hma_model.cli.options import Embodiments
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ hub_app = typer.Typer(no_args_is_help=True, help="Publish and pull checkpoints, 
 
 
 @hub_app.command("push")
+@interruptible(lambda: CONTINUE)
 def push(
     checkpoint: Saved,
     target: Annotated[str, Argument(help="A folder, or org/name on the hub.")],
@@ -98,6 +99,7 @@ def _add_films(checkpoint: "Checkpoint", sample: list[Path] | None, embodiments:
 
 
 @hub_app.command("pull")
+@interruptible(lambda: CONTINUE)
 def pull(
     source: Annotated[str, Argument(help="A folder, or org/name on the hub.")],
     embodiment: Embodiments = None,
@@ -143,6 +145,7 @@ def listing(
 
 
 @hub_app.command("push-data")
+@interruptible(lambda: CONTINUE)
 def push_data(
     folder: Folder,
     target: Annotated[str, Argument(help="org/name of a dataset on the hub, or a folder.")],
@@ -158,6 +161,7 @@ def push_data(
 
 
 @hub_app.command("pull-data")
+@interruptible(lambda: CONTINUE)
 def pull_data(
     source: Annotated[str, Argument(help="org/name of a dataset on the hub, or a folder.")],
     out: Annotated[Path, Option(help="Folder of the shard set.")],

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from typer import Argument, Option
 
+from hma_data.console import CONTINUE
 from hma_data.errors import HMAError, UsageError
 
 
@@ -58,7 +59,7 @@ def kept(what: str, out: Path | None) -> str:
     """Return what a Ctrl-C leaves in the folder of --out, and how to go on."""
     if out is None:
         return f"nothing is kept; use --out to keep finished {what}"
-    return f"finished {what} are kept in {out}; run the same command again to continue"
+    return f"finished {what} are kept in {out}; {CONTINUE}"
 
 
 def device_name(device: str) -> str:

@@ -114,7 +114,7 @@ def policy_eval(
             compile=compile,
             on_progress=update,
         )
-    page = pages.write_report(found, out) if out else None
+        page = pages.write_report(found, out) if out else None
     if json:
         print_json(found.to_json())
         return
@@ -216,10 +216,10 @@ def label_actions(
 
     Example: hma label-actions film --checkpoint runs/inverse -e mover_04 --out labelled/mover_04
     """
-    from hma_data.shards.manifest import QUARANTINE
+    from hma_data.shards.manifest import MANIFEST, QUARANTINE
     from hma_model.synthetic.labels import label_actions as run
 
-    there = device_name(device)
+    there, before = device_name(device), "finished already: " if (out / MANIFEST).is_file() else ""
     with interruptible(lambda: kept("episodes", out)), progress("film", unit="episodes") as update:
         made = run(
             film, out, embodiment, checkpoint=checkpoint, check=check, device=there, on_progress=update
@@ -234,6 +234,6 @@ def label_actions(
         worse = "; no better than the mean: do not use it" if share is not None and share <= 0 else ""
         say(f"  {name}: RMSE {rmse:.3g}, {said}{worse}")
     made_of = human_count(sum(split["episodes"] for split in splits), "episode")
-    say(f"{made_of} in {out}; inferred_actions: true in every file")
+    say(f"{before}{made_of} in {out}; inferred_actions: true in every file")
     if made.manifest.quarantined:
         say(f"{made.manifest.quarantined} in quarantine; {out / QUARANTINE} has the reasons")

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from hma_data.cli.options import choice_option, robot_option
-from hma_data.console import say
+from hma_data.console import CONTINUE, say
 from hma_data.cpu import usable_cores
 from hma_data.errors import Interrupted, RegistryError, UsageError
 from hma_model.cli.options import embedded_robots
@@ -88,7 +88,7 @@ def _run(words: list[str]) -> None:
     try:
         code = subprocess.run([sys.executable, "-m", "hma_model.cli", *words], check=False).returncode
     except KeyboardInterrupt:  # the step has got the same Ctrl-C, and says what it keeps
-        raise Interrupted("", "interrupted: run the same command again to continue") from None
+        raise Interrupted("", f"interrupted: {CONTINUE}") from None
     if code:
         raise SystemExit(code)
 

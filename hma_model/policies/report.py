@@ -1,7 +1,6 @@
 """Show an evaluation of policies: as a table on a terminal, and as a page with images of episodes."""
 
 import json
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from hma_data.console import print_lines, print_table, short_paths
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.storage.files import write_atomic
+from hma_data.storage.kept import remove_kept
 from hma_model.evaluation.agreement import Estimate
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
@@ -147,7 +147,7 @@ def write_files(folder: Path, results: dict[str, Any], page: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     write_atomic(folder / "results.json", json.dumps(results, indent=1))
     write_atomic(folder / "report.html", page)
-    shutil.rmtree(folder / WORK, ignore_errors=True)
+    remove_kept(folder / WORK)
     return folder / "report.html"
 
 

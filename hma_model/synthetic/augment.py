@@ -26,7 +26,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
-from hma_data.storage.kept import KeptParts
+from hma_data.storage.kept import KeptParts, remove_kept
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Bools, Float32s, Floats
@@ -218,7 +218,7 @@ def augment(
             spec = world.tokenizer.spec
             chosen = _chosen(batches, settings, UNCERTAINTY_FLAGS[spec.kind], meter)
             found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
-            kept.remove()
+        remove_kept(folder / WORK)  # a job may have been killed here
         if dataset is not None and not done:
             made = settings.episodes * settings.frames
             total = sum(split["frames"] for split in found.splits.values()) * found.frame_stride

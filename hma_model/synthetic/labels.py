@@ -23,7 +23,7 @@ from hma_data.errors import EpisodeError, HMAError, OutputError, UsageError
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import Refused
-from hma_data.storage.kept import KeptParts
+from hma_data.storage.kept import KeptParts, remove_kept
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Float32s
@@ -145,7 +145,7 @@ def label_actions(
             cameras = seen_cameras(trained_cameras(card(model, embodiment)), recorded_cameras(robot))
             tokens = world.tokenizer.spec
             manifest = write_shards(folder, labelled, tokens, robot, of_film, ORIGIN, refused, cameras)
-            kept.remove()
+        remove_kept(folder / WORK)  # a job may have been killed here
     return Labelled(manifest, error)
 
 

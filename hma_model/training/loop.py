@@ -149,8 +149,8 @@ def _loop(
 ) -> None:
     recipe, stopped = run.recipe, False
     _show_notes(run, log)
-    if run.step and run.done < 1:
-        log.note(f"continues after step {run.step:,}")  # the next line may take minutes
+    if run.step:  # the next line may take minutes
+        log.note(f"continues after step {run.step:,}" if run.done < 1 else "the run is finished already")
     while run.done < 1 and not stopped:
         facts = run.advance()
         log.step(facts)

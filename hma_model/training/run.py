@@ -20,7 +20,7 @@ from torch import Tensor
 from hma_data.errors import CheckpointError, RecipeError, TrainingError, UsageError
 from hma_data.loading.dataset import Batch, open_sets
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import read_json, remove_partial, to_json, write_atomic
+from hma_data.storage.files import read_json, remove_partial, remove_parts, to_json, write_atomic
 from hma_data.storage.paths import addressed, is_repository
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import Checkpoint, action_stats, training_checkpoints
@@ -425,6 +425,7 @@ class Run:
             OtherVersionError: the newest checkpoint is of another format version.
             CheckpointError: there are checkpoints, and none can be read.
         """
+        self.ranks.once(lambda: remove_parts(self.out))
         self.ranks.once(lambda: remove_partial(self.out / "checkpoints"))
         kept, paths = None, training_checkpoints(self.out)
         for path in reversed(paths):

@@ -11,6 +11,7 @@ B crops, S side of a crop, C latent channels.
 """
 
 import hashlib
+import json
 import math
 import platform
 import time
@@ -29,7 +30,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hma_data.errors import RecipeError, TokenizerError
-from hma_data.storage.files import write_atomic
+from hma_data.storage.files import remove_dead_parts, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.checkpoints import fill, read_weights, save_weights
@@ -311,10 +312,7 @@ def train(
     torch.set_num_threads(recipe.training.threads)
     pools, corpus_sha256 = load_pools(recipe.sources, Path(recipe.corpus).expanduser())
     report("pictures: " + ", ".join(f"{pool.name} {len(pool.pictures)}" for pool in pools))
-    run, state = TokenizerTraining(recipe, pools, place), out.with_name(out.name + ".state")
-    if state.exists():
-        run.resume(state)
-        report(f"resuming from step {run.step}")
+    state = out.with_name(out.name + ".state")
     threads = recipe.training.threads
     processor = torch.cuda.get_device_name(place) if place.type == "cuda" else f"{threads} thread"
     facts: dict[str, Any] = {
@@ -324,6 +322,14 @@ def train(
         "seed": recipe.seed,
         "machine": f"{platform.machine()}, {processor}, torch {torch.__version__}",
     }
+    remove_dead_parts(out.parent)  # of a run that was killed
+    if not state.exists() and (told := _finished(out, facts, recipe.training.steps)):
+        report(f"finished already after step {recipe.training.steps}")
+        return told
+    run = TokenizerTraining(recipe, pools, place)
+    if state.exists():
+        run.resume(state)
+        report(f"resuming from step {run.step}")
     # Far below zero the slope of silu is a denormal number; denormal numbers make a step seven times slower.
     torch.set_flush_denormal(True)
     errors: list[float] = []
@@ -344,6 +350,17 @@ def train(
         torch.set_flush_denormal(False)
     state.unlink(missing_ok=True)
     return facts
+
+
+def _finished(out: Path, facts: dict[str, Any], steps: int) -> dict[str, Any] | None:
+    """Return what the weights' file says of its training, if that is this one to its last step."""
+    try:
+        with safe_open(out, "pt") as file:
+            told: dict[str, Any] = json.loads((file.metadata() or {}).get("training", "{}"))
+    except (SafetensorError, OSError, ValueError):
+        return None
+    asked = {key: facts[key] for key in ("recipe_sha256", "corpus_sha256", "seed")} | {"steps": steps}
+    return told if asked.items() <= told.items() else None
 
 
 def _crops(run: TokenizerTraining, workers: int) -> Iterator[Tensor]:
