@@ -232,19 +232,6 @@ def toy_shards(
     return folder
 
 
-class StoppingTokenizer(BlockTokenizer):
-    """A block tokenizer that stands for Ctrl-C after some batches."""
-
-    def __init__(self, batches: int) -> None:
-        self.left = batches
-
-    def encode(self, frames):
-        self.left -= 1
-        if self.left < 0:
-            raise KeyboardInterrupt
-        return super().encode(frames)
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     """Return the bytes of every file in a folder, by path."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())

@@ -62,18 +62,6 @@ for words in (
     assert done.stderr.count("error: ") == len(done.stderr.splitlines()) == 15
 
 
-def test_a_ctrl_c_says_what_is_kept(toy_yaml: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stopped(*arguments: object, **options: object) -> None:
-        (tmp_path / "o" / "train").mkdir(parents=True)
-        (tmp_path / "o" / "train" / "shard-00000.parquet").touch()
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("hma_data.conversion.job.Conversion.run", stopped)
-    source, out = str(tmp_path / "toy.hdf5"), str(tmp_path / "o")
-    done = hma("convert", "-e", toy_yaml, "--source", source, "--out", out)
-    fails(done, 130, "interrupted: 1 finished shard", "run the same command again to continue")
-
-
 def test_light_verbs_import_nothing_heavy() -> None:
     code = """
 import sys

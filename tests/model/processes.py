@@ -112,21 +112,6 @@ def command(*words: str, out: Path | None = None, env: dict[str, str] | None = N
     sys.exit(main())
 
 
-def kill_at_write(number: int, place: str, work: Callable[[], Any]) -> None:
-    """Run `work`; kill this process before it writes, moves or deletes its n-th path with `place` in it."""
-    left = [number]
-
-    def watch(event: str, given: tuple[Any, ...]) -> None:
-        opens = event == "open" and isinstance(given[2], int) and given[2] & (os.O_WRONLY | os.O_RDWR)
-        if (opens or event in ("os.rename", "os.remove", "os.mkdir", "os.rmdir")) and place in str(given[0]):
-            left[0] -= 1
-            if not left[0]:
-                os.kill(os.getpid(), signal.SIGKILL)
-
-    sys.addaudithook(watch)
-    work()
-
-
 def run_ranks(work: Callable[[int], Any], said: Path, codes: Sequence[int] = (0, 0)) -> str:
     """Run work(rank) on a rank for each exit code, which it must end with; returns what the ranks said."""
     store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)  # torchrun's, outlives ranks

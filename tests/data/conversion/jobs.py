@@ -17,17 +17,13 @@ from hma_data.conversion import worker
 from hma_data.conversion.engines import Limits
 from hma_data.conversion.plan import Settings
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import shard_sizes
 from hma_data.sources.hdf5.source import Hdf5Source
-from hma_data.storage.remote import place
 from tests.conftest import ARM_YAML, BlockTokenizer
 
-source, out, trouble, workers, seed, quiet_s, stop_at = sys.argv[1:]
+source, out, trouble, workers, seed, quiet_s = sys.argv[1:]
 read = Hdf5Source.read
 def troubled(self, uri, episode_id, embodiment):
     time.sleep(0.02)
-    if stop_at and len(shard_sizes(place(out))) >= int(stop_at):
-        time.sleep(600)
     said = Path(trouble) / episode_id
     if said.exists():
         kind = said.read_text()
@@ -55,22 +51,19 @@ def start(
     workers: int = 2,
     seed: int = 0,
     quiet_s: float = 120,
-    stop_at: int | None = None,
     **trouble: str,
 ) -> subprocess.Popen[str]:
     """Start a conversion as `convert_toy` makes it.
 
     Args:
         folder: for its script and its troubles.
-        stop_at: it waits once so many shards are there: whoever wants to kill it then is never too late.
         trouble: episode -> what its reader does: "hang", or the name of a signal that ends the process.
     """
     (folder / "trouble").mkdir(exist_ok=True)
     for episode, kind in trouble.items():
         (folder / "trouble" / episode).write_text(kind)
     (folder / "job.py").write_text(SCRIPT)
-    stop = "" if stop_at is None else stop_at
-    words = [folder / "job.py", recording, out, folder / "trouble", workers, seed, quiet_s, stop]
+    words = [folder / "job.py", recording, out, folder / "trouble", workers, seed, quiet_s]
     return subprocess.Popen(
         [sys.executable, *map(str, words)],
         env={**os.environ, "PYTHONPATH": str(ROOT)},

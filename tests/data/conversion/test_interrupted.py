@@ -12,21 +12,20 @@ from pathlib import Path
 
 import pytest
 
-from hma_data.conversion.job import Conversion, convert
+from hma_data.conversion.job import Conversion
 from hma_data.conversion.output import PLAN, Share
 from hma_data.conversion.report import Summary
 from hma_data.shards.manifest import Manifest, shard_sizes
 from hma_data.shards.verify import verify
 from hma_data.storage.files import cache_folder
-from hma_data.storage.remote import is_remote, place
-from tests.conftest import SMALL, BlockTokenizer, StoppingTokenizer, write_toy
+from hma_data.storage.remote import place
+from tests.conftest import SMALL, BlockTokenizer
 from tests.conftest import convert_toy as run
 from tests.data.conversion.jobs import ends, files, start
 from tests.hostile import at_once
 
 S3 = pytest.param("s3", marks=pytest.mark.slow)
 IN_PROCESS = pytest.mark.parametrize("out", ["folder", "memory"], indirect=True)
-KILLED = pytest.mark.parametrize("out", [pytest.param("folder", marks=pytest.mark.slow), S3], indirect=True)
 
 
 @pytest.fixture
@@ -36,42 +35,6 @@ def out(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Monk
     if request.param == "s3":
         return request.getfixturevalue("s3_out")
     return tmp_path / "out" if request.param == "folder" else place(f"memory://{uuid.uuid4().hex}/set")
-
-
-# -- stopped in this process
-
-
-@IN_PROCESS
-@pytest.mark.parametrize("stop_at", [1, 9])
-def test_a_job_stopped_anywhere_goes_on_where_it_was(stop_at, toy_arm, toy_file, out, whole) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        convert(toy_arm, toy_file, StoppingTokenizer(stop_at), out, settings=SMALL)
-    there = shard_sizes(out)
-    left = files(out).keys() - there.keys()
-    assert "manifest.json" not in left and not [name for name in left if name.endswith(".part")]
-    if not is_remote(out):  # a kill would leave it
-        (out / "train").mkdir(exist_ok=True)
-        (out / "train" / ".shard-00000.parquet.1.part").write_bytes(b"left by a kill")
-    assert run(toy_arm, toy_file, out).kept_shards == len(there)
-    assert files(out) == whole
-    assert not [path for path in cache_folder().rglob("*") if path.is_file()]
-
-
-@pytest.mark.parametrize(("out", "stop_at"), [("folder", 0), ("memory", 2)], indirect=["out"])
-def test_an_extension_stopped_anywhere_ends_with_the_same_bytes(stop_at, toy_arm, out, tmp_path) -> None:
-    recording = tmp_path / "recorded"
-    recording.mkdir()
-    write_toy(recording / "a.hdf5", [20, 21, 22])
-    for folder in (out, tmp_path / "undisturbed"):
-        run(toy_arm, recording, folder)
-    write_toy(recording / "b.hdf5", [40, 41, 42])
-    run(toy_arm, recording, tmp_path / "undisturbed", extend=True)
-    with pytest.raises(KeyboardInterrupt):
-        convert(toy_arm, recording, StoppingTokenizer(stop_at), out, settings=SMALL, extend=True)
-    assert Manifest.load(out).splits["train"]["episodes"] <= 3
-    run(toy_arm, recording, out, extend=True)
-    assert verify(out) == []
-    assert files(out) == files(tmp_path / "undisturbed")
 
 
 # -- shares
@@ -98,17 +61,21 @@ def test_shares_run_side_by_side_and_one_of_them_finishes(toy_arm, toy_file, out
 # -- killed
 
 
-@KILLED
-def test_a_killed_job_is_continued_by_the_same_command(toy_file, out, whole, tmp_path) -> None:
-    for wanted in (1, 3):
-        process = start(tmp_path, toy_file, out, workers=0, stop_at=wanted)
-        while process.poll() is None:
-            if len(shard_sizes(out)) >= wanted:
-                process.kill()
-            time.sleep(0.02)
-        _, errors = process.communicate()
+@pytest.mark.parametrize("out", [S3], indirect=True)
+def test_a_job_killed_while_a_shard_goes_to_s3_is_continued(toy_file, out, whole, tmp_path, proxy) -> None:
+    def kill(method: str, path: str, number: int) -> str | None:
+        if method != "PUT" or f"shard-0000{wanted}" not in path:
+            return None
+        process.kill()
+        return "drop"
+
+    proxy.trouble = kill
+    for wanted in (1, 2):  # noqa: B007
+        process = start(tmp_path, toy_file, out, workers=0)
+        _, errors = process.communicate(timeout=200)
         assert process.returncode == -signal.SIGKILL, errors
     assert "manifest.json" not in files(out)
+    proxy.trouble = lambda *asked: None
     ends(start(tmp_path, toy_file, out))
     assert files(out) == whole
     assert not list(cache_folder().rglob("*.part"))

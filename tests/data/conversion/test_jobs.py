@@ -16,7 +16,7 @@ from hma_data.errors import HMAError, OutputError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.verify import verify
 from hma_data.sources.hdf5.source import Hdf5Source
-from hma_data.storage.locks import LOCK, locked
+from hma_data.storage.locks import locked
 from tests.command import hma
 from tests.conftest import BlockTokenizer, contents, write_toy
 from tests.conftest import convert_toy as run
@@ -134,14 +134,6 @@ def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(
         with pytest.raises(OutputError, match="another job is writing it"):
             run(toy_arm, toy_recording, out)
     assert not out.exists()
-
-
-def test_a_lock_left_by_a_killed_job_is_no_lock(toy_arm, toy_file, tmp_path, whole) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / LOCK).touch()
-    run(toy_arm, toy_file, out)
-    assert contents(out) == whole
 
 
 # -- faults

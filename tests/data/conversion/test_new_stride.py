@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from hma_data.conversion import output
 from hma_data.conversion.job import Conversion
 from hma_data.conversion.output import Share
 from hma_data.conversion.report import Summary
@@ -150,20 +149,3 @@ def test_an_extended_set_takes_the_stride_with_and_without_new_episodes(tmp_path
     before = shards(out)
     assert run(robot(10), recording, out).changed.startswith("stride 2 → 1")
     assert shards(out) == before and verify(out) == []
-
-
-def test_an_extension_killed_before_its_manifest_is_finished_by_the_next_run(tmp_path, monkeypatch) -> None:
-    recording, out = first_day(tmp_path), tmp_path / "out"
-    run(robot(), recording, out)
-    write_toy(recording / "tuesday.hdf5", range(20, 26))
-
-    def killed(*arguments: object, **options: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(output, "derive", killed)
-        with pytest.raises(KeyboardInterrupt):
-            run(robot(), recording, out, extend=True)
-    summary = run(robot(), recording, out, extend=True)
-    assert sum(split["episodes"] for split in summary.manifest.splits.values()) == 12
-    assert summary.made_shards == 0 and verify(out) == []

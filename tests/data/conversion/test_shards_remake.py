@@ -74,16 +74,6 @@ def test_split_gives_the_same_bytes_for_any_number_of_workers(made, tmp_path, wo
     assert episodes(tmp_path / "a") == episodes(made)
 
 
-def test_split_goes_on_where_it_was_killed(made: Path, tmp_path: Path) -> None:
-    split(made, tmp_path / "a", seed=5)
-    whole = contents(tmp_path / "a")
-    (tmp_path / "a" / "manifest.json").unlink()
-    (tmp_path / "a" / "train" / "shard-00001.parquet").unlink()
-    (tmp_path / "a" / "train" / ".shard-00001.parquet.7.part").write_bytes(b"half")
-    split(made, tmp_path / "a", seed=5)
-    assert contents(tmp_path / "a") == whole
-
-
 def test_split_by_instruction_keeps_equal_instructions_together(made: Path, tmp_path: Path) -> None:
     split(made, tmp_path / "a", by="instruction", val_fraction=0.4)
     assert verify(tmp_path / "a") == []

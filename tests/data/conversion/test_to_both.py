@@ -1,9 +1,5 @@
 """`hma convert --lerobot`: one pass over a recording writes the shards and the dataset of two runs."""
 
-import os
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +13,6 @@ from hma_data.conversion.plan import Settings
 from hma_data.errors import OutputError, SourceError, UsageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.hdf5 import images
-from tests.command import ROOT, hma_process
 from tests.conftest import contents
 from tests.data.conversion.test_to_lerobot import RECORDINGS, hdf5
 
@@ -85,33 +80,6 @@ def test_each_output_refuses_its_own_episodes(tmp_path: Path) -> None:
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
     refused = [(tmp_path / "one" / out / "quarantine.jsonl").read_text() for out in ("shards", "set")]
     assert [text.count("\n") for text in refused] == [1, 2]
-
-
-@pytest.mark.slow
-def test_a_killed_pass_goes_on_and_ends_with_the_bytes_of_two_runs(tmp_path: Path) -> None:
-    data, robot = hdf5(tmp_path)
-    (tmp_path / "arm.yaml").write_text(robot.to_yaml())
-    words = ["convert", data, "-e", tmp_path / "arm.yaml", "--shard-frames", "9", "--cameras", "all"]
-    words += ["--val-fraction", "0.3", "--tokenizer", "fsq-8", "--out", tmp_path / "one" / "shards"]
-    words += ["--lerobot", tmp_path / "one" / "set"]
-    (tmp_path / "one").mkdir()
-    for wanted in (1, 2):
-        job = subprocess.Popen(
-            [sys.executable, "-m", "hma_model.cli", *map(str, words)],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            stderr=subprocess.DEVNULL,
-        )
-        while job.poll() is None and len(list(tmp_path.glob("one/shards/*/shard-*.parquet"))) < wanted:
-            time.sleep(0.005)
-        job.kill()
-        job.wait()
-        assert not (tmp_path / "one" / "set").exists()
-    done = hma_process(*words, "--workers", "2")
-    assert done.returncode == 0, done.stderr
-    assert "LeRobotDataset v3.0, 3 episodes" in done.stdout
-    two_runs(robot, data, tmp_path / "two", replace(BOTH, shard_frames=9))
-    assert contents(tmp_path / "one") == contents(tmp_path / "two")
-    assert not list((tmp_path / "one").glob(".*"))
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from hma_data.conversion import lerobot, reading
+from hma_data.conversion import reading
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.report import Summary
@@ -27,8 +27,6 @@ from hma_data.shards.reader import ShardSet
 from hma_data.sources.hdf5.source import Hdf5Source
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.cli import main
-from tests.command import ROOT, hma_process
-from tests.conftest import contents
 from tests.data import bag_files, rlds_files
 from tests.data.cameras import arm as three_cameras
 from tests.data.cameras import write_hdf5
@@ -186,67 +184,6 @@ def test_the_dataset_converts_to_the_shards_of_its_recording(tmp_path: Path) -> 
 
 
 # -- stopped, killed, refused
-
-
-@pytest.mark.slow
-def test_a_stopped_conversion_goes_on_and_ends_with_the_same_bytes(tmp_path: Path, monkeypatch) -> None:
-    data, robot = hdf5(tmp_path)
-    to_lerobot(robot, data, tmp_path / "whole")
-    make, join = lerobot.LeRobotOutput.make, lerobot.join_datasets
-    stops = iter(["second part", "join", "never"])
-    made = []
-
-    def part(self, unit, items, report):
-        if at == "second part" and made:
-            next(items)
-            raise KeyboardInterrupt
-        made.append(unit.name)
-        return make(self, unit, items, report)
-
-    def joined(parts, folder, name):
-        join(parts, folder, name)
-        if at == "join":
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(lerobot.LeRobotOutput, "make", part)
-    monkeypatch.setattr(lerobot, "join_datasets", joined)
-    for at in stops:
-        if at == "never":
-            to_lerobot(robot, data, tmp_path / "out")
-            break
-        with pytest.raises(KeyboardInterrupt):
-            to_lerobot(robot, data, tmp_path / "out")
-        assert not (tmp_path / "out").exists()
-    assert len(made) == len(set(made)) == 2
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
-    assert not list(tmp_path.glob(".*"))
-    before = contents(tmp_path / "out")
-    assert to_lerobot(robot, data, tmp_path / "out").made_shards == 0
-    assert contents(tmp_path / "out") == before
-
-
-@pytest.mark.slow
-def test_a_killed_command_goes_on_and_ends_with_the_same_bytes(tmp_path: Path) -> None:
-    data, robot = hdf5(tmp_path)
-    (tmp_path / "arm.yaml").write_text(robot.to_yaml())
-    words = ["convert", data, "-e", tmp_path / "arm.yaml", "--to", "lerobot", "--shard-frames", "9"]
-    parts = tmp_path / ".out.parts"
-    for wanted in (1, 2):
-        job = subprocess.Popen(
-            [sys.executable, "-m", "hma_model.cli", *map(str, words), "--out", tmp_path / "out"],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            stderr=subprocess.DEVNULL,
-        )
-        while job.poll() is None and len(list(parts.glob("train-*"))) < wanted:
-            time.sleep(0.02)
-        job.kill()
-        job.wait()
-        assert not (tmp_path / "out").exists()
-    for out, workers in (("out", "2"), ("whole", "0")):
-        done = hma_process(*words, "--out", tmp_path / out, "--workers", workers)
-        assert done.returncode == 0, done.stderr
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
-    assert not list(tmp_path.glob(".*"))
 
 
 @pytest.mark.slow

@@ -78,26 +78,6 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_read(tmp_path)
         train(tmp_path / "gone.yaml", tmp_path / "w", device="abacus")
 
 
-SMALL_VAE = {"width": 8, "hidden": 8, "encoder_blocks": 1, "decoder_blocks": [1, 1], "fine_width": 4}
-FALL = {"steps": 8, "weight_decay": 0.1, "fall": [[2, 1], [8, 0]]}  # the noise of the latents differs by step
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("network", "training", "step"),
-    [(SMALL.model_dump(), {"fall": [[4, 1], [6, 0]]}, 4), (SMALL_VAE, FALL, 5)],
-    ids=["fsq", "vae"],
-)
-def test_a_stopped_training_goes_on_as_if_it_had_not_been(tmp_path, network, training, step):
-    recipe = tokenizer_files.write_recipe(tmp_path, network, **training)
-    train(recipe, tmp_path / "whole", report=lambda _: None)
-    with pytest.raises(Stopped):
-        train(recipe, tmp_path / "parts", report=stop_at(step), report_every=1)
-    train(recipe, tmp_path / "parts", report=lambda _: None)
-    whole, parts = load_file(tmp_path / "whole"), load_file(tmp_path / "parts")
-    assert all(torch.equal(whole[name], parts[name]) for name in whole)
-
-
 @pytest.mark.slow
 def test_a_stopped_training_may_be_given_another_end_but_no_other_past(tmp_path):
     recipe, out = write_recipe(tmp_path, fall=[[2, 1], [6, 0]]), tmp_path / "w"

@@ -197,33 +197,9 @@ def test_a_planning_gap_with_its_interval_and_verdict(truth: int, model: int, wo
     assert verdict(figures) == words
 
 
-@pytest.mark.slow
-def test_a_benchmark_stopped_at_every_part_ends_with_the_same_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stop(*given: Any, **named: Any) -> None:
-        raise KeyboardInterrupt
-
-    whole = benchmark("it", tmp_path / "whole", TINY, world=world_of(FlawlessWorld))
-    out = tmp_path / "out"
-    parts = ("choose", "turn_back", "reached", "evaluate_policies", "speed")
-    for number, part in enumerate(parts):
-        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            for name in (part, *parts[: max(number - 1, 0)]):  # what is finished is not done again
-                patch.setattr(running, name, stop)
-            benchmark("it", out, TINY, world=world_of(FlawlessWorld))
-        assert len(list((out / WORK).glob("*.npz"))) == number
-    with pytest.raises(OutputError, match="started with other settings"):
-        benchmark("it", out, TINY, seed=1, world=world_of(FlawlessWorld))
-    found = benchmark("it", out, TINY, world=world_of(FlawlessWorld))
-    monkeypatch.setattr(running, "choose", stop)
-    assert benchmark("it", out, TINY, world=world_of(FlawlessWorld)) == found  # is read
-    for one in (found, whole):
-        for name in ("frames_per_second", "frames_per_cpu_second"):
-            one["measures"][ROBOT].pop(name)
-    assert found == whole and not (out / WORK).exists()
+def test_the_results_of_other_settings_are_refused(folders: tuple[Path, Path]) -> None:
     with pytest.raises(OutputError, match="holds the results of other settings"):
-        benchmark("it", out, TINY, seed=1, world=world_of(FlawlessWorld))
+        benchmark("it", folders[0], TINY, seed=1, world=world_of(FlawlessWorld))
 
 
 def test_the_card_the_page_and_a_comparison(

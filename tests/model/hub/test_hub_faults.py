@@ -1,9 +1,6 @@
 """Hubs that differ, that are hostile, or that fail in the middle: the client's side of it."""
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,7 +9,6 @@ import pytest
 from huggingface_hub import constants
 
 from hma_data.errors import HubError
-from hma_data.storage.files import part_of
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.io import PARTS
 from hma_model.hub import publish as hub
@@ -224,41 +220,6 @@ def test_an_embodiment_that_is_not_whole_is_told_before_anything_is_fetched(publ
 def folder(tmp_path: Path, source: Path) -> Path:
     hub.push(source, tmp_path / "hub", ["arm"])
     return tmp_path / "hub"
-
-
-def ended_process() -> int:
-    with subprocess.Popen([sys.executable, "-c", ""]) as child:
-        child.wait(30)
-    return child.pid
-
-
-@pytest.fixture
-def dead(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], Path]:
-    """Write an unfinished file as a process that has ended left it."""
-
-    def left(final: Path) -> Path:
-        with monkeypatch.context() as patched:
-            patched.setattr(os, "getpid", ended_process)
-            path = part_of(final)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(b"x")
-        return path
-
-    return left
-
-
-def test_what_a_killed_push_staged_is_deleted_by_the_next(folder, source, dead):
-    left = dead(folder / "embodiments/arm/stem.safetensors")
-    strange = folder / "embodiments/arm/notes.part-of-mine"
-    strange.write_bytes(b"x")
-    hub.push(source, folder, ["hand"])
-    assert strange.exists() and not left.exists()
-
-
-def test_what_a_killed_pull_left_is_deleted_by_the_next(folder, tmp_path, dead):
-    left = dead(tmp_path / "out/trunk.safetensors")
-    hub.pull(folder, ["arm"], tmp_path / "out")
-    assert not left.exists()
 
 
 def test_an_update_keeps_what_else_is_in_an_embodiments_folder(folder, source):

@@ -148,33 +148,6 @@ def test_a_model_is_scored_and_the_report_written(world: World, judge: StateJudg
     assert json.loads((tmp_path / "out" / "results.json").read_text())["policies"][0]["policy"] == "random"
 
 
-@pytest.mark.slow
-def test_an_interrupted_evaluation_continues_after_its_last_finished_policy(
-    world: World, judge: StateJudge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def run(out: Path | None, frames: int = 4) -> PolicyEvaluation:
-        given: Any = {"world": world, "judge": judge, "episodes": 4, "seed": 3, "out": out}
-        return evaluate_policies(ROBOT, ["random", "still"], frames=frames, **given)
-
-    def score(name: str, **given: Any) -> dict[str, Any]:
-        begun.append(name)
-        if begun == ["random", "still"]:
-            raise KeyboardInterrupt
-        return score_policy(name, **given)
-
-    whole, begun, out = run(None), list[str](), tmp_path / "out"
-    monkeypatch.setattr(scores, "score_policy", score)
-    with pytest.raises(KeyboardInterrupt):
-        run(out)
-    with pytest.raises(OutputError, match="was started with other settings"):
-        run(out, frames=5)
-    found = run(out)
-    assert begun == ["random", "still", "still"]
-    assert html(found) == html(whole) and found.to_json() == whole.to_json()
-    write_report(found, out)
-    assert sorted(path.name for path in out.iterdir()) == ["report.html", "results.json"]
-
-
 def test_shares_have_exact_intervals_and_too_few_successes_are_said(still: PolicyEvaluation) -> None:
     found = still
     (row,) = found.rows()

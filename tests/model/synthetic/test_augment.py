@@ -24,7 +24,6 @@ from hma_model.policies.arenas import Scenes, TrueArena
 from hma_model.policies.scripted import Still
 from hma_model.simulate import World, load_world
 from hma_model.synthetic import augment as augment_module
-from hma_model.synthetic import recorder
 from hma_model.synthetic.augment import Augmentation, augment
 from hma_model.synthetic.recorder import SyntheticEpisode, write_shards
 from hma_model.worlds.images import Prompt
@@ -121,28 +120,11 @@ def test_perturbed_actions_lie_around_the_recorded_ones(world: World, tmp_path: 
     assert {len(one["action"]) for one in still} == {FRAMES}
 
 
-@pytest.mark.parametrize("kind", ["world", "latents"])
-def test_a_stopped_run_continues_and_gives_the_same_bytes(kind, request, tmp_path) -> None:
-    world = request.getfixturevalue(kind)
-    whole = augment(tmp_path / "whole", asked(), world=world)
-
-    def stop(done: float, words: str) -> None:
-        if done > 2 * FRAMES:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        augment(tmp_path / "cut", asked(), world=world, on_progress=stop)
-    assert [path.name for path in sorted((tmp_path / "cut/.augment").glob("*.npz"))] == ["batch-000000.npz"]
-    with pytest.raises(OutputError, match="was started with other settings"):
-        augment(tmp_path / "cut", asked(seed=1), world=world)
-    told: list[float] = []
-    cut = augment(tmp_path / "cut", asked(), world=world, on_progress=lambda done, words: told.append(done))
-    assert told[0] == 2 * FRAMES  # the first batch was not made again
-    assert [shard.sha256 for shard in cut.shards] == [shard.sha256 for shard in whole.shards]
-    assert not (tmp_path / "cut/.augment").exists()
-    assert augment(tmp_path / "cut", asked(), world=world) == cut
+def test_latents_come_out_the_same_and_other_settings_are_refused(latents, tmp_path) -> None:
+    one, other = (augment(tmp_path / name, asked(), world=latents) for name in ("one", "other"))
+    assert [shard.sha256 for shard in one.shards] == [shard.sha256 for shard in other.shards]
     with pytest.raises(OutputError, match="holds another shard set"):
-        augment(tmp_path / "cut", asked(seed=1), world=world)
+        augment(tmp_path / "one", asked(seed=1), world=latents)
 
 
 def test_the_first_frames_of_latents_are_the_simulators_at_their_own_size(latents, tmp_path) -> None:
@@ -433,36 +415,6 @@ def test_a_policy_of_lerobot_trains_on_the_dataset_with_the_state_in_its_images(
         optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < losses[0]
-
-
-def test_the_same_call_keeps_a_finished_dataset_and_finishes_one_that_was_cut_off(
-    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stopped, written, dataset = [True], list[Path](), tmp_path / "rails"
-    (tmp_path / ".rails.part").mkdir()  # of a process that was killed
-
-    def write(folder: Path, *given: Any) -> None:
-        folder.mkdir()
-        (folder / "meta").mkdir()
-        (folder / "synthetic.json").write_text(json.dumps(given[-1]))
-        if stopped.pop():
-            raise KeyboardInterrupt
-        written.append(folder)
-
-    monkeypatch.setattr(recorder, "write_lerobot", write)
-    monkeypatch.setattr(augment_module, "_stated", lambda *_: None)
-    given: Any = {"world": world, "lerobot": dataset}
-    with pytest.raises(KeyboardInterrupt):
-        augment(tmp_path / "out", asked(episodes=2), **given)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
-    stopped.append(False)
-    made = augment(tmp_path / "out", asked(episodes=2), **given)
-    before = {path: path.stat().st_mtime_ns for path in dataset.rglob("*")}
-    assert augment(tmp_path / "out", asked(episodes=2), **given) == made and len(written) == 1
-    assert before == {path: path.stat().st_mtime_ns for path in dataset.rglob("*")}
-    (dataset / "synthetic.json").unlink()
-    with pytest.raises(OutputError, match="rails: holds something else — remove it or choose another"):
-        augment(tmp_path / "out", asked(episodes=2), **given)
 
 
 @pytest.fixture

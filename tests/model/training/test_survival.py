@@ -1,11 +1,7 @@
 """What a run survives: kills at any moment, full disks, other hands in its folder. Each fault in one line."""
 
 import errno
-import json
-import random
 import resource
-import signal
-import time
 from functools import partial
 from pathlib import Path
 
@@ -14,10 +10,9 @@ import pytest
 from hma_data.errors import CheckpointError, HMAError, OutputError, RecipeError, ShardError
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import resolve
-from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
-from tests.model.processes import command, end, kill_at_write, run, start
-from tests.model.runs import TINY, same
+from tests.model.processes import run
+from tests.model.runs import TINY
 from tests.model.shards import make_shards
 
 
@@ -28,45 +23,6 @@ def data(arm_shards: Path) -> list[str]:
 
 def train_quietly(recipe, out: Path) -> None:
     train(recipe, out=out, show=False)
-
-
-@pytest.mark.slow
-def test_a_run_killed_while_it_writes_a_checkpoint_goes_on_bit_for_bit(recipe, tmp_path):
-    whole = train(recipe(), out=tmp_path / "whole", show=False)
-    work = partial(train_quietly, recipe(), tmp_path / "cut")
-    killed = partial(kill_at_write, 10, "step-00000004", work)
-    run(killed, tmp_path / "said.txt", code=-signal.SIGKILL)
-    assert resolve(tmp_path / "cut").name == "step-00000002"
-    assert {line["step"] for line in read_metrics(tmp_path / "cut")} == {1, 2, 3, 4}
-    again = train(recipe(), out=tmp_path / "cut", show=False)
-    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
-
-
-@pytest.mark.slow
-def test_a_run_killed_again_and_again_goes_on_bit_for_bit(recipe, tmp_path):
-    long = recipe(steps=60, checkpoint_every=3, eval_every=20, keep_last=2)
-    whole = train(long, out=tmp_path / "whole", show=False)
-    work, writes = partial(train_quietly, long, tmp_path / "cut"), random.Random(7)
-    for _ in range(12):
-        killed = partial(kill_at_write, writes.randint(1, 80), "cut", work)
-        run(killed, tmp_path / "said.txt", code=-signal.SIGKILL)
-    again = train(long, out=tmp_path / "cut", show=False)
-    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
-    assert sorted(p.name for p in (again.out / "checkpoints").iterdir()) == ["step-00000057", "step-00000060"]
-
-
-@pytest.mark.slow
-def test_the_command_saves_on_sigterm_and_says_how_to_go_on(recipe, tmp_path):
-    path, said = tmp_path / "recipe.yaml", tmp_path / "said.txt"
-    path.write_text(json.dumps(recipe(steps=100_000, checkpoint_every=0, eval_every=0).values()))
-    process = start(partial(command, "train", str(path), "--out", str(tmp_path / "run")), said)
-    while not read_metrics(tmp_path / "run") and process.is_alive():
-        time.sleep(0.05)
-    process.terminate()
-    assert end([process], said) == [130]
-    assert "run the same command to continue" in said.read_text() and "Traceback" not in said.read_text()
-    step = int(resolve(tmp_path / "run").name.removeprefix("step-"))
-    assert step == read_metrics(tmp_path / "run")[-1]["step"] > 0
 
 
 @pytest.fixture
