@@ -148,7 +148,7 @@ def test_an_extension_is_that_of_plain_loops(base: Path, data: st.DataObject, re
         return ref.id
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(extend, "_refuse_damaged", lambda out, base: None)
+        patch.setattr(extend, "_is_killed_extension", lambda out, base: False)
         made = extend.extended(base, manifest, plan, 100, content)  # type: ignore[arg-type]
     assert asked == ids["c"]
     splits = {ref.id: unit.split for unit in plan.units for _, ref in unit.episodes}
