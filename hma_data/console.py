@@ -84,7 +84,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: st
     from rich.table import Table
     from rich.text import Text
 
-    cells = [[cell_text(value) for value in row] for row in rows]
+    cells = [[escaped(cell_text(value)) for value in row] for row in rows]
     widths = [max(map(len, [name, *(row[i] for row in cells)])) for i, name in enumerate(columns)]
     if len(rows) > MANY_ROWS:
         for row in [list(columns), *cells]:
@@ -136,7 +136,7 @@ def cell_text(value: Any, digits: int = 4) -> str:
         return f"{value:,.{digits}g}" if abs(value) < 10**digits else f"{value:,.0f}"
     if isinstance(value, int) and not isinstance(value, bool):
         return f"{value:,}"
-    return escaped(str(value))
+    return str(value)
 
 
 def print_lines(lines: Iterable[tuple[str, str]]) -> None:
