@@ -4,6 +4,7 @@ import gc
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Generator, Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -69,6 +70,14 @@ def pytest_runtest_call() -> Generator[None, Any, Any]:
         return (yield)
     finally:
         take_ordinary_priority()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Give all processes of this run a cache folder of their own, empty at first."""
+    if not hasattr(config, "workerinput"):
+        folder = tempfile.mkdtemp(prefix="hma-tests-")
+        os.environ["HMA_CACHE"] = folder
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 
 # Why a test may be skipped, by the words of its reason; any other skip fails a run of CI.

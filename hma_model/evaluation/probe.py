@@ -19,6 +19,7 @@ from hma_data.lab import pusht, simulator, truth
 from hma_data.lab.pusher import Tee, rotation
 from hma_data.tokenizers.base import Tokenizer
 from hma_model.arrays import Bools, Floats, Images, Ints
+from hma_model.evaluation.kept import Arrays, filled, kept, weights_of
 from hma_model.evaluation.state_reader import (
     INPUT_SIDE,
     UNREADABLE_SHARE,
@@ -38,6 +39,7 @@ ANGLES = 48  # of a T that are tried
 FARTHEST_PX = 20.0  # px of the arena; a pixel farther out of the T counts as that far
 FIRST_STEP, LAST_STEP = 8.0, 0.4  # px of the arena, of the search
 TURN_RADIUS = 50.0  # px of the arena by which an angle is as long as a step
+PROBE_VALUES = ("error", "spread", "background", "colors")  # of a probe, all arrays
 LEAST_AREA = 0.3  # share of the T's area; of fewer pixels no pose is found
 
 
@@ -199,7 +201,9 @@ def train_probe(
     seed: int = 0,
     tell: Callable[[str], None] = lambda words: None,
 ) -> Probe:
-    """Train a probe on simulated episodes of a laboratory robot; it takes some 15 CPU seconds.
+    """Train a probe on simulated episodes of a laboratory robot; it takes some 15 CPU seconds, once.
+
+    It is kept on disk for later calls (`hma_model.evaluation.kept`).
 
     Args:
         robot: a laboratory robot.
@@ -208,11 +212,19 @@ def train_probe(
         seed: of the episodes and the training; the same seed gives the same probe.
         tell: called with how far it is.
     """
-    pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
-    places, driven = np.concatenate([one.parts for one in made]), made[0].driven
-    return fit(
-        pictures, places, driven, HELD_OUT_EPISODES / EPISODES, seed, tee=TeeFinder.of(robot), tell=tell
-    )
+    tee = TeeFinder.of(robot)
+
+    def make() -> Arrays:
+        pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
+        places, driven = np.concatenate([one.parts for one in made]), made[0].driven
+        probe = fit(pictures, places, driven, HELD_OUT_EPISODES / EPISODES, seed, tee=tee, tell=tell)
+        values = {name: getattr(probe, name) for name in PROBE_VALUES}
+        return weights_of(probe.network) | values | {"driven": np.array(probe.driven)}
+
+    found = kept("probe", tokenizer, {"robot": robot, "stride": stride, "seed": seed}, make)
+    network = filled(PlaceNetwork(len(found["error"])), found)
+    values = {name: found[name] for name in PROBE_VALUES}
+    return Probe(network, found["driven"].item(), tee=tee, **values)
 
 
 def shown_episodes(

@@ -12,6 +12,7 @@ The states of robots of the laboratory are simulated instead (`hma_model.evaluat
 N pictures or windows, T frames, P predicted frames, S values of a state.
 """
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -22,11 +23,13 @@ from torch import Tensor, nn
 
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import Cameras
+from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns
 from hma_data.tokenizers.base import Tokenizer
 from hma_model.arrays import Floats, Images, Ints
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded
+from hma_model.evaluation.kept import Arrays, filled, kept, weights_of
 from hma_model.evaluation.losses import episodes_of
 from hma_model.evaluation.probe import shown_episodes
 from hma_model.evaluation.state_reader import UNREADABLE_SHARE, StateNetwork, outputs, resized, trained
@@ -37,6 +40,7 @@ Tell = Callable[[str], None]
 TRAINING_STEPS, LEARNING_RATE = 600, 4e-3
 IMAGE_LIMIT, EPISODES_NEEDED = 1500, 5  # most pictures to learn from, fewest episodes
 HELD_OUT_SHARE = 0.2  # share of the pictures, the last ones, on which the reader's error is measured
+READER_VALUES = ("mean", "std", "low", "high", "error", "spread")  # of a reader, beside its network
 LEAST_STD = 1e-6  # a value whose standard deviation is smaller never changes
 
 
@@ -203,7 +207,12 @@ def recorded_reader(
     known = np.isfinite(wanted).all(axis=1)
     if not known.any():
         return None
-    return learn(decode(tokenizer, _stored(seen))[known, 0], wanted[known], seed, tell=tell)
+
+    def make() -> Reader:
+        return learn(decode(tokenizer, _stored(seen))[known, 0], wanted[known], seed, tell=tell)
+
+    told = hashlib.sha256((shards.folder / MANIFEST).read_bytes()).hexdigest()
+    return _kept("recorded", tokenizer, {"manifest": told, "cameras": cameras, "seed": seed}, make)
 
 
 _kept_reader = lru_cache(maxsize=16)(recorded_reader)  # several checkpoints share it
@@ -213,8 +222,25 @@ def simulated_reader(
     robot: str, tokenizer: Tokenizer, stride: int, seed: int, tell: Tell = lambda words: None
 ) -> Reader:
     """Train the reader of a laboratory robot on simulated episodes; arguments as of `train_probe`."""
-    pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
-    return learn(pictures, np.concatenate([one.states for one in made]).astype(np.float64), seed, tell=tell)
+
+    def make() -> Reader:
+        pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
+        states = np.concatenate([one.states for one in made]).astype(np.float64)
+        return learn(pictures, states, seed, tell=tell)
+
+    return _kept("simulated", tokenizer, {"robot": robot, "stride": stride, "seed": seed}, make)
+
+
+def _kept(kind: str, tokenizer: Tokenizer, facts: Mapping[str, Any], make: Callable[[], Reader]) -> Reader:
+    """Return a reader, trained only if none is kept on disk (`hma_model.evaluation.kept`)."""
+
+    def arrays() -> Arrays:
+        reader = make()
+        return weights_of(reader.network) | {name: getattr(reader, name) for name in READER_VALUES}
+
+    found = kept(f"{kind}_reader", tokenizer, facts, arrays)
+    network = filled(StateNetwork(len(found["mean"])), found)
+    return Reader(network, *(found[name] for name in READER_VALUES))
 
 
 def _values(shards: ShardSet, reader: Reader, own: Ints, errors: dict[str, Floats]) -> list[dict[str, Any]]:

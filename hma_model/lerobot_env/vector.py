@@ -148,7 +148,7 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         """Train the reader of the state, and say what its error is."""
         if self._train_reader is None:
             return None
-        log.warning("%s: training a reader of the state; this takes minutes", self.embodiment)
+        log.warning("%s: a reader of the state is trained once, in minutes, and kept", self.embodiment)
         reader = self._train_reader(self.world, progress_log(self.embodiment))
         if reader is None:
             raise UsageError(self.embodiment, "has no episode whose states are all known", "give state=false")
@@ -169,7 +169,7 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
             found = measured_judge(self._judged_by, self.world, self.embodiment, shards, tell)
             log.warning("%s: success is what %s says; %s", self.embodiment, found.source, found.sentence)
             return found.model
-        log.warning("%s: training the judge; this takes minutes", self.embodiment)
+        log.warning("%s: the judge is trained once, in minutes, and kept", self.embodiment)
         spec = self.envs[0].action_spec
         frames = self._max_episode_steps // spec.stride + 1
         judge = train_judge(

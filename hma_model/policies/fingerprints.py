@@ -12,11 +12,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from hma_data.errors import HMAError
 from hma_data.storage.files import file_sha256
 from hma_model.checkpoint.folder import HEAD, STATS, STEM, YAML, Checkpoint
+from hma_model.evaluation.kept import weights_sha256
 from hma_model.network.model import HMA
 from hma_model.policies.acting import OPTIONS
 from hma_model.policies.base import split_options
@@ -53,7 +52,7 @@ def world_facts(world: World) -> dict[str, Any]:
     way = world.decoding
     facts = {"order": way.order, "sample_steps": way.sample_steps, "precision": world.precision}
     if world.model.source is None:
-        facts["weights"] = _weights_sha256(world.model)
+        facts["weights"] = weights_sha256(world.model)
     return facts
 
 
@@ -63,15 +62,6 @@ def object_sha256(value: Any) -> str:
         return hashlib.sha256(pickle.dumps(value, protocol=5)).hexdigest()
     except Exception:  # an object's own methods may raise anything
         return uuid.uuid4().hex
-
-
-def _weights_sha256(model: HMA) -> str:
-    digest = hashlib.sha256()
-    for name, tensor in model.state_dict().items():
-        values = tensor.detach().cpu().contiguous()
-        digest.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
-        digest.update(values.reshape(-1).view(torch.uint8).numpy())
-    return digest.hexdigest()
 
 
 def world_digests(world: World, embodiment: str) -> dict[str, str]:

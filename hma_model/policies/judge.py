@@ -20,6 +20,7 @@ from hma_data.lab import truth
 from hma_data.tokenizers.base import Tokenizer
 from hma_model.arrays import Bools, Floats, Images
 from hma_model.evaluation.agreement import Accuracy, accuracy
+from hma_model.evaluation.kept import Arrays, kept, weights_sha256
 from hma_model.evaluation.probe import EPISODES, FIRST_EPISODE, Probe, as_seen, as_shown, train_probe
 from hma_model.worlds.env import Judge
 
@@ -202,16 +203,21 @@ def train_judge(
     looked = (
         set(range(frames)) if task.name == "reached" else {0, *range(max(frames - END_FRAMES, 1), frames)}
     )
-    numbers = range(FIRST_EPISODE + EPISODES, FIRST_EPISODE + EPISODES + examples)
     judge = StateJudge(robot, task, probe, task.limit, accuracy(np.ones(1, bool), np.ones(1, bool)))
-    true = np.empty(examples)
-    read = np.empty(examples)
-    for row, number in enumerate(numbers):
-        made = truth.episode(robot, frames, stride, seed, number, looked, wander=task.name != "placed")
-        shown = as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures))
-        true[row] = judge.true_score(made.parts[None])[0]
-        read[row] = judge.score(shown[None])[0]
-        tell(f"training the judge: episode {row + 1} of {examples}")
+
+    def make() -> Arrays:
+        scores = np.empty((2, examples))
+        for row in range(examples):
+            number, wander = FIRST_EPISODE + EPISODES + row, task.name != "placed"
+            made = truth.episode(robot, frames, stride, seed, number, looked, wander=wander)
+            shown = as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures))
+            scores[:, row] = judge.true_score(made.parts[None])[0], judge.score(shown[None])[0]
+            tell(f"training the judge: episode {row + 1} of {examples}")
+        return {"scores": scores}
+
+    facts = {"robot": robot, "task": task.name, "stride": stride, "frames": frames, "seed": seed}
+    facts |= {"examples": examples, "probe": weights_sha256(probe.network)}
+    true, read = kept("judge", tokenizer, facts, make)["scores"]
     half = examples // 2
     success = true >= task.limit
     limit = best_limit(read[:half], success[:half], task.limit)

@@ -99,7 +99,7 @@ def test_errors_are_of_the_recorded_steps(disc: ShardSet, monkeypatch: pytest.Mo
 
 def exact(*_: Any, **__: Any) -> Reader:
     one = np.ones(4)
-    return Reader(torch.nn.Module(), one, one, one, one, 0 * one, one)
+    return Reader(recorded_state.StateNetwork(len(one)), one, one, one, one, 0 * one, one)
 
 
 def test_a_prediction_that_is_not_finite_has_no_error(disc, monkeypatch) -> None:

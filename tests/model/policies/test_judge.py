@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from torch import nn
 
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import truth
@@ -17,7 +18,7 @@ SIDE = 8
 class WrittenPlaces:
     """A probe of images that hold the places of the parts in their first pixels."""
 
-    driven, own, loose = 1, np.array([0]), np.array([1, 2])
+    driven, own, loose, network = 1, np.array([0]), np.array([1, 2]), nn.Identity()
 
     def __init__(self, blind: bool = False) -> None:
         self.rng = np.random.default_rng(0) if blind else None

@@ -1,0 +1,97 @@
+"""Keep trained readers of images on disk, so that the next command does not train them again.
+
+A kept file has the digest of all that it was made of in its name: the simulator and the training as code, the
+tokenizer's weights, and what the caller names. It lies in `$HMA_CACHE/readers` and may be deleted.
+"""
+
+import hashlib
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+from torch import nn
+
+import hma_data
+import hma_model
+from hma_data.errors import HMAError
+from hma_data.storage.files import atomic_path, cache_folder
+from hma_data.tokenizers.base import Tokenizer
+
+Arrays = dict[str, NDArray[Any]]
+
+NETWORK = "network."  # begins the names of a network's weights
+CODE = (  # the modules on which readers depend
+    (hma_data, "lab/**/*.py"),
+    (hma_data, "episodes/images.py"),
+    (hma_model, "evaluation/*.py"),
+    (hma_model, "policies/judge.py"),
+)
+
+
+def kept(kind: str, tokenizer: Tokenizer, facts: Mapping[str, Any], make: Callable[[], Arrays]) -> Arrays:
+    """Return named arrays, which are made only if no earlier command has kept them.
+
+    Those of a tokenizer without a network are not kept: nothing tells what it shows.
+
+    Args:
+        kind: of the arrays; part of the file's name.
+        tokenizer: of the images that they were learned from.
+        facts: all else that they depend on, as values whose `repr` tells them apart.
+        make: makes the arrays.
+    """
+    if not isinstance(network := getattr(tokenizer, "network", None), nn.Module):
+        return make()
+    told = f"{kind} {sorted(facts.items())} {tokenizer.spec.digest} {_code()} {torch.__version__}"
+    digest = hashlib.sha256(f"{told} {weights_sha256(network)}".encode()).hexdigest()
+    path = cache_folder() / "readers" / f"{kind}-{digest[:32]}.safetensors"
+    try:
+        return load_file(path)
+    except (OSError, SafetensorError):  # none yet, or a damaged one
+        made = make()
+    try:
+        with atomic_path(path) as part:
+            save_file({name: np.ascontiguousarray(value) for name, value in made.items()}, part)
+    except HMAError:
+        pass  # a full disk or a folder that cannot be written costs the time alone
+    return made
+
+
+def weights_of(network: nn.Module) -> Arrays:
+    """Return a network's weights as arrays to keep."""
+    return {NETWORK + name: value.numpy() for name, value in network.state_dict().items()}
+
+
+def filled[Network: nn.Module](network: Network, arrays: Arrays) -> Network:
+    """Return a network with the weights that `weights_of` gave."""
+    own = {
+        name.removeprefix(NETWORK): torch.from_numpy(value)
+        for name, value in arrays.items()
+        if name.startswith(NETWORK)
+    }
+    network.load_state_dict(own)
+    return network.eval()
+
+
+def weights_sha256(network: nn.Module) -> str:
+    """Return the SHA-256 of a network's weights and their names."""
+    digest = hashlib.sha256()
+    for name, tensor in network.state_dict().items():
+        values = tensor.detach().cpu().contiguous()
+        digest.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
+        digest.update(values.reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+@cache
+def _code() -> str:
+    digest = hashlib.sha256()
+    for package, pattern in CODE:
+        for path in sorted(Path(package.__path__[0]).glob(pattern)):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
