@@ -17,8 +17,6 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 from torch import nn
 
-import hma_data
-import hma_model
 from hma_data.errors import HMAError
 from hma_data.storage.files import atomic_path, cache_folder
 from hma_data.tokenizers.base import Tokenizer
@@ -27,10 +25,10 @@ Arrays = dict[str, NDArray[Any]]
 
 NETWORK = "network."  # begins the names of a network's weights
 CODE = (  # the modules on which readers depend
-    (hma_data, "lab/**/*.py"),
-    (hma_data, "episodes/images.py"),
-    (hma_model, "evaluation/*.py"),
-    (hma_model, "policies/judge.py"),
+    "hma_data/lab/**/*.py",
+    "hma_data/episodes/images.py",
+    "hma_model/evaluation/*.py",
+    "hma_model/policies/judge.py",
 )
 
 
@@ -91,7 +89,7 @@ def weights_sha256(network: nn.Module) -> str:
 @cache
 def _code() -> str:
     digest = hashlib.sha256()
-    for package, pattern in CODE:
-        for path in sorted(Path(package.__path__[0]).glob(pattern)):
+    for pattern in CODE:
+        for path in sorted(Path(__file__).parents[2].glob(pattern)):
             digest.update(path.read_bytes())
     return digest.hexdigest()
