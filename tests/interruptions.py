@@ -45,7 +45,7 @@ CHANGES = ("rename", "replace", "link", "mkdir", "remove", "unlink", "rmdir")
 ENDED = 1 << 22  # a process id above the highest
 ROBOT = "rails_03"
 # What no two runs have in common: the time they took, and the hash of a training's state, which has it.
-TIMES = re.compile(rb'"(\w*seconds|memory_mib)": [\d.e-]+|"sha256": "\w+"\n}\n$')
+TIMES = re.compile(rb'"(\w*seconds|memory_mib)\\?": [\d.e-]+|"sha256": "\w+"\n}\n$')
 
 
 @dataclass(frozen=True)
@@ -315,7 +315,7 @@ WEIGHTS = "nothing is saved before step 100|same command continues from there"
 AUGMENT = f"augment {ROBOT} out --checkpoint {{data}}/rails --episodes 4 --frames 4 --keep 1"
 TOKENIZER = "tokenizer train {data}/recipe.yaml --out w"
 DONE = "finished already"
-LOG, MADE, FACTS = "run/(metrics.jsonl|.*README.md)", "out/[^.]", r"out/\w+\."
+LOG, MADE, FACTS = "run/(metrics.jsonl|.*README.md|checkpoints/step-00000001)", "out/[^.]", r"out/\w+\."
 QUICK = {
     "convert": Command(f"{CONVERT} --out out", toy, again="3 existed already"),
     "convert to a store": Command(
