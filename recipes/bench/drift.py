@@ -23,7 +23,7 @@ import inspect
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,6 +54,7 @@ LEAST_PIXELS = 3  # of a part that is seen
 WHOLE = 0.8  # of the wholeness at the end over the copy's
 OTHER_ARGUMENTS = (
     "model",
+    "decoding",  # its settings are named one by one
     "embodiment",
     "batch",
     "generator",
@@ -126,8 +127,10 @@ def opened(checkpoint: str, robots: list[str], device: str) -> "tuple[HMA, Token
 def _samplings(text: str) -> dict[str, dict[str, Any]]:
     """Return the options of each way of sampling, by those of its words that not all have, or by all."""
     from hma_model.generation.rollout import Rollout
+    from hma_model.generation.unmask import Decoding
 
-    known = [name for name in inspect.signature(Rollout.__init__).parameters if name not in OTHER_ARGUMENTS]
+    own = [name for name in inspect.signature(Rollout).parameters if name not in OTHER_ARGUMENTS]
+    known = [*own, *(setting.name for setting in fields(Decoding))]
     ways: dict[str, dict[str, Any]] = {}
     worded = [[word.strip() for word in way.split(",")] for way in text.split("/")]
     for words in worded:

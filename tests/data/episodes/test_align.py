@@ -371,7 +371,8 @@ def test_a_camera_that_stamps_two_pictures_alike_gives_one_frame_of_them_and_it_
 
 def test_a_camera_with_one_stamp_for_most_of_its_pictures_is_refused() -> None:
     coarse = np.floor(STEADY)
-    with pytest.raises(AlignmentError, match="18 of 20 frames of front have the same stamp.*stamp: receive"):
+    said = "18 of 20 frames of front have the same timestamp.*stamp: receive"
+    with pytest.raises(AlignmentError, match=said):
         to_clip(episode(coarse, STEADY, STEADY, STEADY, STEADY), embodiment())
 
 
