@@ -16,7 +16,7 @@ from tests.interruptions import QUICK, SLOW, Disk, disk, put, result, watched
 from tests.model.processes import run
 
 ALL = QUICK | SLOW
-MOST = 40  # points of a command in a sweep
+MOST = 40 if os.environ.get("HMA_FUZZ") else 12  # points of a command in a sweep
 
 
 class Case:
@@ -109,7 +109,7 @@ def test_a_process_killed_again_and_again_ends_with_the_same_bytes(name, cases, 
     case.goes_on(disk(case.place), name)
 
 
-@each(1, 12)
+@each(1, 4)
 def test_ctrl_c_says_how_to_go_on(name, most, cases) -> None:
     case = cases(name)
     for at in spread(range(1, len(case.moments) + 1), most):
@@ -126,7 +126,7 @@ def test_ctrl_c_says_how_to_go_on(name, most, cases) -> None:
 DAMAGES = (lambda data: b"", lambda data: data[: len(data) // 2], lambda data: b"\xff" * 99)
 
 
-@each(1, 6)
+@each(1, 4)
 def test_a_file_that_was_damaged_in_between_is_made_again_or_one_error(name, most, cases) -> None:
     case = cases(name)
     for at in spread(range(len(case.moments) - 1), most):
