@@ -253,7 +253,7 @@ def test_windows_with_unknown_actions_are_left_out(world, real, tmp_path, monkey
         return Prompt(frames, chunks)
 
     monkeypatch.setattr(SeenShards, "window", gaps)
-    with pytest.raises(UsageError, match="hardly a window of 6 frames whose actions are all known"):
+    with pytest.raises(UsageError, match="has too few windows of 6 frames whose actions are all known"):
         augment(tmp_path / "none", asked(source="real"), world=world, shards=real)
     unknown.append(False)
     augment(tmp_path / "out", asked(source="real"), world=world, shards=real)
