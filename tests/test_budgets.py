@@ -31,7 +31,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/checkpoint": (885, 6_600, 5),
     "hma_model/cli": (1_725, 10_738, 12),
     "hma_model/demo": (485, 4_100, 4),
-    "hma_model/evaluation": (4_599, 36_858, 24),
+    "hma_model/evaluation": (4_601, 36_893, 24),
     "hma_model/export": (1_189, 9_410, 9),
     "hma_model/generation": (1_665, 13_435, 10),
     "hma_model/hub": (1_060, 8_209, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_530, 29_036, 18),
     "hma_model/worlds": (1_520, 11_387, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_124, 515_139
-TEST_LINES = 48_309
+PRODUCT_LINES, PRODUCT_NODES = 65_126, 515_174
+TEST_LINES = 48_324
 DOC_WORDS = 40_357
 
 

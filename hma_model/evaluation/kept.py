@@ -1,7 +1,8 @@
 """Keep trained readers of images on disk, so that the next command does not train them again.
 
 A kept file has the digest of all that it was made of in its name: the simulator and the training as code, the
-tokenizer's weights, and what the caller names. It lies in `$HMA_CACHE/readers` and may be deleted.
+tokenizer's weights, and what the caller names. It begins with the digest of its bytes: a damaged one is made
+again. It lies in `$HMA_CACHE/readers` and may be deleted.
 """
 
 import hashlib
@@ -13,8 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load, save
 from torch import nn
 
 from hma_data.errors import HMAError
@@ -47,14 +47,18 @@ def kept(kind: str, tokenizer: Tokenizer, facts: Mapping[str, Any], make: Callab
         return make()
     told = f"{kind} {sorted(facts.items())} {tokenizer.spec.digest} {_code()} {torch.__version__}"
     digest = hashlib.sha256(f"{told} {weights_sha256(network)}".encode()).hexdigest()
-    path = cache_folder() / "readers" / f"{kind}-{digest[:32]}.safetensors"
+    path = cache_folder() / "readers" / f"{kind}-{digest[:32]}"
     try:
-        return load_file(path)
-    except (OSError, SafetensorError):  # none yet, or a damaged one
-        made = make()
+        stated, data = path.read_bytes().split(b"\n", 1)
+        if stated == hashlib.sha256(data).hexdigest().encode():
+            return load(data)
+    except (OSError, ValueError):  # none yet, or an empty one
+        pass
+    made = make()
+    data = save({name: np.ascontiguousarray(value) for name, value in made.items()})
     try:
         with atomic_path(path) as part:
-            save_file({name: np.ascontiguousarray(value) for name, value in made.items()}, part)
+            part.write_bytes(hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
     except HMAError:
         pass  # a full disk or a folder that cannot be written costs the time alone
     return made
