@@ -21,7 +21,7 @@ PLAIN = (  # key of a robot's figures, measure, key or text of the reference, it
     ("psnr_last", "PSNR of the last frame, dB", "copy_psnr_last", "first frame repeated"),
     ("error_px", "state error, px of 128", "", ""),
     ("error_px_last", "state error of the last frame, px", "", ""),
-    ("decision", "decision fidelity, right choices of 5", "chance", "by chance"),
+    ("decision", "decision fidelity, share of right choices among 5", "chance", "by chance"),
     (
         "inverse.return_px",
         "distance from the start after actions and their inverses, px",

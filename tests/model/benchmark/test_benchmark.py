@@ -210,7 +210,7 @@ def test_the_card_the_page_and_a_comparison(
         (page,) = folder.glob("*.html")
         assert "hma-benchmark 2, quick" in page.read_text()
         card = (folder / "benchmark.md").read_text()
-        assert card.count("\n| ") == len(rows(found)) + 2 and "decision fidelity, right choices of 5" in card
+        assert card.count("\n| ") == len(rows(found)) + 2 and "share of right choices among 5" in card
         assert "not measured: 3 of at least 8 episodes" in card
     one, other = map(read_results, folders)
     table = {row[1]: row[2:] for row in compared(one, other).rows}
