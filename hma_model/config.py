@@ -162,6 +162,7 @@ class HMAConfig:
     # "pairs": the recorded frames, and masked copies from the second on that attend to earlier recorded ones.
     training_pass: str = "window"
     whole_share: float = 0.5  # pairs: the share of fully masked copies
+    crop: int = 0  # U-Net: side in tokens of the squares of frames that are trained on; 0: whole frames
     # The input embedding of a masked token. "learned": one vector (paper). "previous": that vector plus the
     # embedding of the same position in the previous frame.
     masked_input: str = "learned"
@@ -213,6 +214,12 @@ class HMAConfig:
         """Return the shape of a frame: (views · h, w) of tokens, or (c, views · H, W) of latents."""
         grid = (self.views * self.grid[0], self.grid[1])
         return grid if self.kind == "discrete" else (self.channels, *grid)
+
+    @property
+    def crop_shape(self) -> tuple[int, ...]:
+        """Return the shape of a frame that is cut to a square of `crop` tokens, as `frame_shape`."""
+        side = self.crop * (self.patch if self.kind == "continuous" else self.merge)
+        return (*self.frame_shape[:-2], self.views * side, side)
 
     @property
     def tokens_per_frame(self) -> int:
@@ -349,11 +356,12 @@ def _rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
     yield "copy_previous", config.copy_previous or not regression, change
     if config.trunk == "unet":
         yield from _unet_rules(config)
+    else:
+        yield "crop", config.crop == 0, "0: only a unet is trained on parts of frames"
     yield "layout", not (config.shared_modulation and config.released), "ours, as shared_modulation is on"
 
 
 def _unet_rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
-    yield "trunk", config.kind != "discrete", "transformer, or a continuous tokenizer"
     for name, value in (
         ("conditioning", ("modulation",)),
         ("shared_modulation", True),
@@ -366,6 +374,12 @@ def _unet_rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
     side = 2 ** (len(levels) - 1)
     fits = not any(size % side for size in (config.token_grid[0] // config.views, config.token_grid[1]))
     yield "levels", fits, f"fewer: tokens lie on {config.token_grid}, not multiples of {side}"
+    most = min(config.token_grid[0] // config.views, config.token_grid[1])
+    fits = 0 <= config.crop <= most and not config.crop % side
+    yield "crop", fits, f"0, or a multiple of {side} of at most {most}"
+    whole = config.whole_frames and not config.trained_readouts
+    needs = "0: parts of frames need training_pass pairs, whole_share 1 and no objective that reads actions"
+    yield "crop", not config.crop or whole, needs
 
 
 @dataclass(frozen=True)

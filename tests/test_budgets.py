@@ -14,39 +14,39 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (684, 3_882, 7),
-    "hma_data/cli": (1_523, 10_881, 8),
+    "hma_data/cli": (1_553, 11_132, 8),
     "hma_data/conversion": (4_258, 31_626, 15),
     "hma_data/episodes": (1_671, 14_652, 9),
     "hma_data/hub": (512, 3_787, 3),
     "hma_data/inspection": (2_151, 20_090, 8),
     "hma_data/lab": (3_327, 30_594, 16),
-    "hma_data/loading": (1_272, 10_934, 6),
+    "hma_data/loading": (1_274, 10_943, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_551, 19_540, 11),
     "hma_data/sources": (12_552, 104_849, 50),
     "hma_data/storage": (1_664, 10_939, 11),
-    "hma_data/tokenizers": (3_291, 23_875, 17),
-    "hma_model": (505, 3_000, 4),
+    "hma_data/tokenizers": (3_426, 25_130, 18),
+    "hma_model": (518, 3_161, 4),
     "hma_model/benchmark": (845, 7_250, 5),
     "hma_model/checkpoint": (885, 6_600, 5),
     "hma_model/cli": (1_725, 10_738, 12),
     "hma_model/demo": (485, 4_100, 4),
     "hma_model/evaluation": (4_601, 36_893, 24),
     "hma_model/export": (1_189, 9_410, 9),
-    "hma_model/generation": (1_665, 13_435, 10),
+    "hma_model/generation": (1_666, 13_448, 10),
     "hma_model/hub": (1_060, 8_209, 6),
     "hma_model/lerobot_env": (638, 4_776, 3),
-    "hma_model/network": (3_241, 28_372, 16),
+    "hma_model/network": (3_273, 28_792, 16),
     "hma_model/play": (1_655, 11_950, 8),
     "hma_model/policies": (2_825, 20_100, 14),
     "hma_model/released": (825, 7_100, 4),
     "hma_model/synthetic": (1_205, 9_100, 5),
-    "hma_model/training": (3_530, 29_036, 18),
+    "hma_model/training": (3_621, 30_120, 19),
     "hma_model/worlds": (1_520, 11_387, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_126, 515_174
-TEST_LINES = 48_324
-DOC_WORDS = 40_357
+PRODUCT_LINES, PRODUCT_NODES = 65_431, 518_381
+TEST_LINES = 48_513
+DOC_WORDS = 40_640
 
 
 @cache

@@ -245,6 +245,7 @@ class Batch:
             episodes are not padded.
         context: like `tokens` or `latents`, the frames that the model sees in their place; the loss is of the
             true ones. None for these.
+        places: (B, S) int64, the places in the trunk's grid of one view that the frames show; None for all.
     """
 
     embodiment: list[str]
@@ -257,6 +258,7 @@ class Batch:
     camera: Tensor | None = None
     frame_mask: Tensor | None = None
     context: Tensor | None = None
+    places: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.embodiment)

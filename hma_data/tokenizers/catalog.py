@@ -128,6 +128,11 @@ _ROWS = (
         "embedded", "hma_data.tokenizers.embedded", {"image_size": 128}, file="fsq-lab.safetensors",
     ),
     Entry(
+        "palette-64", "discrete", 64, (32, 32),
+        "a colour per pixel of a short list, 2×2 pixels a token: sharp edges for a convolutional world model",
+        "embedded", "hma_data.tokenizers.palette", {"image_size": 64}, file="palette.safetensors",
+    ),
+    Entry(
         "vae-8", "continuous", 256, (32, 32),
         "continuous without a download: 4 channels at 1/8 of the side, fast on a CPU",
         "embedded", "hma_data.tokenizers.embedded", {"image_size": 256}, file="vae.safetensors",

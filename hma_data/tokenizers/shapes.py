@@ -24,6 +24,8 @@ from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 
 VERSION = 1
 PATCH = 8
+CELL = 2  # pixels a side of the square that is a token of a palette
+MOST_COLORS = 255  # four of them fit 32 bits
 Width = Annotated[int, Field(ge=1, le=4096)]
 Blocks = Annotated[int, Field(ge=0, le=256)]
 
@@ -108,6 +110,24 @@ class VaeConfig(BaseModel):
         return TokenizerSpec.continuous(name, VERSION, image_size, PATCH, self.channels, **facts)
 
 
+class PaletteConfig(BaseModel):
+    """The number of colours of a palette, stored in its file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    format: ClassVar = "hma-palette-1"
+
+    colors: Annotated[int, Field(ge=2, le=MOST_COLORS)]
+
+    def spec(self, name: str, image_size: int, sha256: str) -> TokenizerSpec:
+        """Return the spec of the tokenizer with these colours."""
+        digits = (self.colors,) * CELL**2
+        return TokenizerSpec.discrete(name, VERSION, image_size, CELL, digits, weights_sha256=sha256)
+
+
+type Config = FsqConfig | VaeConfig | PaletteConfig
+_CONFIGS: dict[str, type[Config]] = {"fsq": FsqConfig, "vae": VaeConfig, "palette": PaletteConfig}
+
+
 def read_shape[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[C, str]:
     """Read the network's shape from a weights' file; return it and its tokens' digest.
 
@@ -145,7 +165,7 @@ def get_spec(name_or_path: StrPath, *, weights: StrPath | None = None) -> Tokeni
     """
     entry = usable_entry(as_text(name_or_path))
     if entry.weights == "embedded" and weights is None and entry.name in CATALOG:
-        kind: type[FsqConfig | VaeConfig] = FsqConfig if entry.name.startswith("fsq") else VaeConfig
+        kind = _CONFIGS[entry.name.partition("-")[0]]
         shape, sha256 = read_shape(EMBEDDED / entry.file, kind.format, kind)
         return filtered(shape.spec(entry.name, entry.image_size, sha256), as_text(name_or_path))
     if "torch" in entry.imports and "torch" not in sys.modules:

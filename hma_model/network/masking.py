@@ -31,7 +31,12 @@ class VideoMask:
 
 
 def draw_pairs_mask(
-    config: HMAConfig, batch: int, frames: int, past: int, generator: torch.Generator | None
+    config: HMAConfig,
+    batch: int,
+    frames: int,
+    past: int,
+    generator: torch.Generator | None,
+    tokens: int | None = None,
 ) -> VideoMask:
     """Mask the copies of the frames from the second on, and corrupt the `past` frames before them.
 
@@ -43,7 +48,8 @@ def draw_pairs_mask(
     whole = uniform((batch, frames - 1), generator, where) < config.whole_share
     ratio = torch.cos(uniform((batch, frames - 1), generator, where) * (math.pi / 2))
     ratio = torch.where(whole, 1.0, ratio).unsqueeze(-1)
-    copies = uniform((batch, frames - 1, config.tokens_per_frame), generator, where) < ratio
+    tokens = tokens or config.tokens_per_frame
+    copies = uniform((batch, frames - 1, tokens), generator, where) < ratio
     masked = torch.cat([copies.new_zeros(batch, past, copies.shape[2]), copies], dim=1)
     return VideoMask(masked, F.pad(corruption, (0, frames - 1)))
 

@@ -189,7 +189,7 @@ class Network(nn.Module):
             HMAError: the frames have another shape.
         """
         config, shape = self.config, tuple(frames.shape[2:])
-        if shape != config.frame_shape:
+        if shape not in (config.frame_shape, config.crop_shape):
             fault = f"a frame has the shape {shape}, but the model takes {config.frame_shape}"
             raise HMAError("frames", fault, "use the model's tokenizer")
         if config.kind == "discrete":

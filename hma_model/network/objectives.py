@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from hma_data.loading.rows import Batch
 
 ACTION_LOSS_WEIGHT = 0.5  # relative to the video loss
+EDGE = 2  # places from a cut edge that have no loss, as they lack what lies beyond it
 
 
 @dataclass
@@ -120,6 +121,8 @@ def compute(
         raise HMAError("batch", f"has no frames for a {config.kind} model", "use the model's tokenizer")
     frames, groups = model.frame_values(stored), Groups.of(batch.embodiment, len(batch.actions))
     layout = Layout.of(model, batch.actions.shape[1], chosen)
+    places = _optional(batch, "places")
+    layout.times.places = None if places is None else groups.sort(places)
 
     video = _hide_tokens(config, batch, chosen, layout, generator)
     dropped = torch.zeros_like(batch.action_mask)  # what the model must predict, and so does not see
@@ -142,7 +145,7 @@ def compute(
         )
     if chosen.predicts_video:
         masked = masked[:, layout.predicted]
-        own, before = _readout_inputs(model, features, shown, video, layout, groups)
+        own, before = readout_inputs(model, features, shown, video, layout, groups)
         targets = frames[:, 1:] if layout.paired else frames
         if config.video_loss == "regression":  # the motion that weighs is that of the true frames
             before = frames[:, :-1] if layout.paired else torch.cat([frames[:, :1], frames[:, :-1]], dim=1)
@@ -155,11 +158,12 @@ def compute(
     loss = torch.zeros((), device=features.device)
     loss = loss if video_loss is None else loss + video_loss
     loss = loss if action_loss is None else loss + ACTION_LOSS_WEIGHT * action_loss
-    masked = masked.to(features.device).unflatten(2, config.token_grid)
+    grid = config.token_grid if places is None else (-1, config.crop)
+    masked = masked.to(features.device).unflatten(2, grid)
     return Output(loss, video_loss, action_loss, per_sample.detach(), masked, name, logits)
 
 
-def _readout_inputs(
+def readout_inputs(
     model: Network, features: Tensor, shown: Tensor, video: VideoMask, layout: Layout, groups: Groups
 ) -> tuple[Tensor, Tensor | None]:
     """Return what the readout takes of frames that predict video: features or conditions, and digits before.
@@ -220,7 +224,11 @@ def _hide_tokens(
     """Draw the masked tokens of a pass and the corruption of the others; mask none without a video loss."""
     size, count = batch.action_mask.shape
     if layout.paired:
-        video = draw_pairs_mask(config, size, count, layout.past, generator)
+        places = _optional(batch, "places")
+        tokens = None if places is None else config.views * places.shape[1]
+        video = draw_pairs_mask(config, size, count, layout.past, generator, tokens)
+        if places is not None:
+            video.masked &= surrounded(config, places).unsqueeze(1).to(video.masked.device)
     else:
         video = draw_video_mask(config, size, count, generator, drift=objective.predicts_video)
     inside = _optional(batch, "frame_mask")
@@ -229,6 +237,19 @@ def _hide_tokens(
     if not objective.predicts_video:
         video.masked = torch.zeros_like(video.masked)
     return video
+
+
+def surrounded(config: HMAConfig, places: Tensor) -> Tensor:
+    """Return the places (B, S) of squares that lie EDGE or more from a cut edge; a frame's own is none."""
+    side, (rows, across) = config.crop, config.token_grid
+    inside = torch.arange(side, device=places.device)
+    first = places[:, :1]
+    kept = []
+    for begin, size in ((first // across, rows // config.views), (first % across, across)):
+        near, far = (inside >= EDGE) | (begin == 0), (inside < side - EDGE) | (begin == size - side)
+        kept.append(near & far)
+    square = (kept[0].unsqueeze(2) & kept[1].unsqueeze(1)).flatten(1)
+    return square.repeat(1, config.views)
 
 
 def _embed(

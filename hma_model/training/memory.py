@@ -70,7 +70,7 @@ def _unet_bytes(config: HMAConfig, recipe: Recipe, predicted: int) -> float:
 
     A block keeps the same number of values for each of its result; most lie at the finest resolution.
     """
-    places = config.tokens_per_frame // config.views
+    places = config.crop**2 or config.tokens_per_frame // config.views
     sizes = [channels * places / 4**level for level, channels in enumerate(config.levels)]
     down_and_up = sum(sizes) + sum(sizes[:-1])
     blocks = UNET_VALUES * config.layers * down_and_up
@@ -80,9 +80,10 @@ def _unet_bytes(config: HMAConfig, recipe: Recipe, predicted: int) -> float:
     computed = predicted + (
         config.frames if every else 0
     )  # frames before the predicted ones are not computed
-    embedded = 2 * config.frames * config.tokens_per_frame * config.width
+    embedded = 2 * config.frames * places * config.views * config.width
     share = UNET_BF16_SHARE if recipe.precision == "bf16" else 1.0
-    return 4.0 * share * computed * (blocks + embedded)
+    scores = SCORE_COPIES * sum(config.digits) * places * config.views if config.kind == "discrete" else 0
+    return 4.0 * (share * computed * (blocks + embedded) + predicted * scores)
 
 
 def needed_bytes(

@@ -30,6 +30,7 @@ from hma_model.evaluation.rollout_video import newest_sheets
 from hma_model.generation.engine import compiler_fault
 from hma_model.network.model import HMA
 from hma_model.training import guards, new_stem, optim
+from hma_model.training.crops import cropped
 from hma_model.training.data import TrainData
 from hma_model.training.held_out import HeldOut
 from hma_model.training.memory import require_memory
@@ -237,7 +238,7 @@ class Run:
             self.notes.append(fault)
         elif self.recipe.compile:
             for block in self.model.trunk.blocks:
-                block.compile()
+                block.compile(dynamic=False)  # symbolic sizes fail for convolutions, and sizes do not vary
         self.parallel_model = ParallelModel(self.model, self.ranks, self.recipe.parallel)
         self.optimizer = optim.make_optimizer(self.model, self.recipe)
         self.average = optim.Average(self.model, self.recipe.ema) if self.recipe.ema else None
@@ -301,6 +302,7 @@ class Run:
             with self._autocast():
                 # not compiled: each number of windows would be compiled anew
                 with torch.compiler.set_stance("force_eager") if recipe.compile else nullcontext():
+                    batch = self._cropped(number, batch)
                     batch = self._with_own_past(number, batch)
                 output = self.parallel_model(batch, generator=generator)
             if not output.loss.requires_grad:
@@ -308,6 +310,13 @@ class Run:
                 raise RecipeError("recipe: freeze", fault, "use freeze=nothing, or another objective")
             (output.loss / len(self.train_data.own)).backward()
         return output
+
+    def _cropped(self, number: int, batch: Batch) -> Batch:
+        """Return the batch, cut to squares if the model is trained on parts of frames."""
+        if not self.model.config.crop:
+            return batch
+        draws = torch.Generator().manual_seed(seed_for(self.recipe.seed, "crops", self.step, number))
+        return cropped(self.model.config, batch, draws)
 
     def _with_own_past(self, number: int, batch: Batch) -> Batch:
         """Return the batch, in which the past of some windows is the model's own, as the recipe has it."""

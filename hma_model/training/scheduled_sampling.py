@@ -17,8 +17,9 @@ from hma_data.loading.dataset import Batch
 from hma_model.config import OBJECTIVES
 from hma_model.network.conditioning import Groups, align
 from hma_model.network.head import uniform
+from hma_model.network.masking import VideoMask
 from hma_model.network.model import HMA
-from hma_model.network.objectives import Layout
+from hma_model.network.objectives import Layout, readout_inputs
 from hma_model.network.stem import from_digits, split_tokens, unpatchify
 
 type Given = tuple[Tensor | None, Tensor, list[str]]  # chunks, which are known, the robot of each window
@@ -37,7 +38,7 @@ def forwarded(
         batch: a batch on the model's device.
         share: the probability that a window gets predicted frames.
         depth: D, the frames that are replaced, from a drawn start on; the first and the last stay true. A
-            model of whole latent frames replaces all later ones too, by at most D predictions in a row.
+            model of whole frames replaces all later ones too, by at most D predictions in a row.
 
     Returns:
         The batch with `context`; the same batch if no window was drawn.
@@ -57,11 +58,13 @@ def forwarded(
     training = model.training
     model.eval()
     given = batch.actions[chosen] if model.config.sees_actions else None, batch.action_mask[chosen], names
-    if model.config.whole_frames and model.config.kind == "continuous":
+    if model.config.whole_frames:
+        places = None if batch.places is None else batch.places[chosen]
         known = torch.arange(frames, device=true.device) < first[chosen].unsqueeze(1)
+        known = known.view(*known.shape, *[1] * (true.dim() - 2))
         for _ in range(depth):
-            made = _all_predicted(model, context, given, generator)
-            context = torch.where(known.view(*known.shape, 1, 1, 1), context, made.to(context.dtype))
+            made = _all_predicted(model, context, given, generator, places)
+            context = torch.where(known, context, made.to(context.dtype))
     else:
         for offset in range(depth):
             at = first[chosen] + offset
@@ -77,6 +80,7 @@ def _all_predicted(
     context: Tensor,
     given: Given,
     generator: torch.Generator | None,
+    places: Tensor | None,
 ) -> Tensor:
     """Predict every frame from the frames before it in one pass; the first stays.
 
@@ -85,22 +89,32 @@ def _all_predicted(
     config, (actions, known, names) = model.config, given
     groups = Groups.of(names, len(context))
     layout = Layout.of(model, context.shape[1], OBJECTIVES["forward" if config.sees_actions else "passive"])
+    grid = config.token_grid
+    if places is not None:
+        layout.times.places = groups.sort(places)
+        grid = (config.views * config.crop, config.crop)
     chunks = None
     if actions is not None:
         chunks = align(config, actions, known, context.shape[1]).frames(layout.frames)
     frames = model.frame_values(context)
-    values = torch.cat([frames[:, : layout.past], frames[:, 1:]], dim=1)
-    masked = torch.zeros_like(values[..., :1], dtype=torch.bool)
+    shown = groups.sort(torch.cat([frames[:, : layout.past], frames[:, 1:]], dim=1))
+    masked = torch.zeros(shown.shape[:3], dtype=torch.bool, device=shown.device)
     masked[:, layout.past :] = True
-    x = model.embed(groups.sort(values), masked, layout.previous)
+    if config.kind == "discrete":
+        shown = shown.masked_fill(masked, config.mask_id)
+    x = model.embed(shown, masked.unsqueeze(-1), layout.previous)
     features = model.trunk(x, model.condition(chunks, groups, layout.times.positions), layout.times)
-    conditions = model.latent_readout(
-        features[:, layout.predicted], layout.times.positions[layout.predicted], groups.sort(frames[:, :-1])
-    )
-    patches = model.latent_readout.sample(conditions.flatten(0, 2), SAMPLE_STEPS, generator=generator)
-    whole = groups.unsort(patches.view(*conditions.shape[:3], config.patch_dim))
-    latents = unpatchify(whole, config.patch, config.token_grid) / config.latent_scale
-    return torch.cat([context[:, :1].to(latents.dtype), latents], dim=1)
+    video = VideoMask(groups.unsort(masked), torch.zeros(masked.shape[:2], device=masked.device))
+    own, before = readout_inputs(model, features, shown, video, layout, groups)
+    if config.kind == "discrete":
+        scores = model.token_readout.split(model.token_readout(own, None, before))
+        tokens = groups.unsort(from_digits(scores.argmax(-1), config.digits))
+        made = split_tokens(tokens, config.merge, config.vocab_size, grid)
+    else:
+        patches = model.latent_readout.sample(own.flatten(0, 2), SAMPLE_STEPS, generator=generator)
+        whole = groups.unsort(patches.view(*own.shape[:3], config.patch_dim))
+        made = unpatchify(whole, config.patch, grid) / config.latent_scale
+    return torch.cat([context[:, :1].to(made.dtype), made], dim=1)
 
 
 def _predicted(

@@ -18,14 +18,14 @@ mkdir -p "$out"
 sed 's/target_hz: 2.5/target_hz: 5/' "$here/registry/lab/pusht_fast.yaml" > "$out/pusht_fast.yaml"
 
 # shellcheck disable=SC2086
-python "$here/recipes/world/record.py" "$out" --episodes "$episodes" --workers "$workers" --tokenizer raw-128 \
+python "$here/recipes/world/record.py" "$out" --episodes "$episodes" --workers "$workers" --tokenizer palette-64 \
     --seed 300 --robots $robots
 parts=$(((contact + 999) / 1000))
 push() { # a thousand episodes; the recording goes when its shards are complete
     [ -e "$out/push/$1/manifest.json" ] && return
     python "$here/recipes/lab/pushes.py" "$out/record/$1" --planned 0 --noisy 0 \
         --contact $((contact / parts)) --seed $((200 + $1))
-    hma convert "$out/record/$1/contact/pusht_fast.hdf5" -e "$out/pusht_fast.yaml" --tokenizer raw-128 \
+    hma convert "$out/record/$1/contact/pusht_fast.hdf5" -e "$out/pusht_fast.yaml" --tokenizer palette-64 \
         --frames strided --out "$out/push/$1"
     rm -r "$out/record/$1"
 }

@@ -66,6 +66,7 @@ class TimePositions:
             where nothing is carried.
         rows: the samples' rows of what is carried; None for all.
         wanted: the first frame whose features are read; a trunk may leave out those before it.
+        places: (B, S of a view) int64, which places of the grid the frames show; None for all.
         shared: what `once` keeps.
     """
 
@@ -76,6 +77,7 @@ class TimePositions:
     slots: Tensor | None = None
     rows: slice | Tensor | None = None
     wanted: int = 0
+    places: Tensor | None = None
     shared: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
     def once(self, name: str, make: Callable[[], Tensor]) -> Tensor:

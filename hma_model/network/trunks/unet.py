@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
-from hma_model.network.stem import LatentEmbedding, NoiseEmbedding
+from hma_model.network.stem import LatentEmbedding, NoiseEmbedding, TokenEmbedding
 from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions
 
 CONDITIONING = 192  # E
@@ -91,7 +91,7 @@ class UNet(nn.Module):
         self.checkpointing = False
         self.modulation = None  # the blocks have their own
         width, ages, views = config.width, config.frames, config.views
-        self.embed = LatentEmbedding(config)
+        self.embed = TokenEmbedding(config) if config.kind == "discrete" else LatentEmbedding(config)
         self.noise = NoiseEmbedding(config) if config.told_noise else None
         self.absent = nn.Parameter(torch.randn(1, width) * 0.02)
         self.unseen = nn.Parameter(torch.zeros(ages, width))  # added where an age repeats the oldest frame
@@ -119,7 +119,6 @@ class UNet(nn.Module):
         self, frames: Tensor, masked: Tensor | None, previous: Sequence[int], corruption: Tensor | None
     ) -> Tensor:
         """Embed frames, as `Trunk.embed_frames` says."""
-        assert masked is not None
         x: Tensor = self.embed(frames, masked, previous)
         return x if corruption is None or self.noise is None else x + self.noise(corruption)
 
@@ -153,8 +152,12 @@ class UNet(nn.Module):
         if torch.is_autocast_enabled(x.device.type):  # else the products alone would be in less precision
             frames = frames.to(torch.get_autocast_dtype(x.device.type))
         unseen = (self.unseen * ~seen.unsqueeze(-1)).expand(b, -1, -1, -1).flatten(0, 1)
-        x = self.ages(frames, index.flatten(0, 1), unseen) + self.position.flatten(1).t().to(frames.dtype)
-        features = self._spread(x.unflatten(1, self.grid), condition).unflatten(0, (b, t))
+        position, grid = self.position.flatten(1).t(), self.grid
+        if times.places is not None:
+            side = math.isqrt(times.places.shape[1])
+            position, grid = position[times.places].repeat_interleave(t, 0), (side, side)
+        x = self.ages(frames, index.flatten(0, 1), unseen) + position.to(frames.dtype)
+        features = self._spread(x.unflatten(1, grid), condition).unflatten(0, (b, t))
         if not times.wanted:
             return features
         return torch.cat([features.new_zeros(b, times.wanted, *features.shape[2:]), features], dim=1)

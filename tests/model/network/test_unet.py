@@ -1,5 +1,6 @@
 """The U-Net trunk: the same frames with and without a carried past, and pixels that stay what they are."""
 
+from functools import partial
 from typing import Any
 
 import pytest
@@ -10,7 +11,9 @@ from hma_data.errors import RecipeError
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model import HMA
 from hma_model.config import HMAConfig
+from hma_model.network.objectives import surrounded
 from hma_model.network.trunks.contract import Conditioning, TimePositions, paired_times
+from hma_model.training.crops import cropped
 from hma_model.training.scheduled_sampling import forwarded
 from tests.model.network_parts import ARM, HAND, small_batch
 
@@ -22,6 +25,10 @@ PIXELS: dict[str, Any] = {
     "training_pass": "pairs", "whole_share": 1.0, "video_loss": "regression", "copy_previous": True,
     "told_noise": True, "latent_noise": 0.1, "corrupt_max": 1.0, "action_waves": 2,
     "tokenizer": SPEC.to_json(),
+}  # fmt: skip
+COLORS: dict[str, Any] = {
+    **PIXELS, "kind": "discrete", "grid": (8, 8), "factored": (5,) * 4, "video_loss": "diffusion",
+    "told_noise": False, "corrupt_max": 0.0, "tokenizer": {},
 }  # fmt: skip
 LATENTS = {**PIXELS, "grid": (8, 8), "channels": 4, "patch": 2, "latent_scale": 0.5, "tokenizer": {}}
 
@@ -42,6 +49,8 @@ def unet(moving: bool = True, **changes: Any) -> HMA:
 def stored(model: HMA, batch: int, frames: int, seed: int = 0) -> Tensor:
     draws = torch.Generator().manual_seed(seed)
     shape = batch, frames, *model.config.frame_shape
+    if model.config.kind == "discrete":
+        return torch.randint(0, model.config.vocab_size, shape, generator=draws)
     if model.config.pixels:
         return torch.randint(0, 256, shape, generator=draws).float()
     return torch.randn(shape, generator=draws)
@@ -58,6 +67,17 @@ def test_a_rollout_makes_the_frames_of_a_model_that_computes_everything_anew(
     made, anew = (model.generate(frames, actions, names, 7, cache=cache) for cache in (True, False))
     torch.testing.assert_close(made, anew, rtol=0, atol=1.0 if model.config.pixels else 1e-4)
     assert (made[:, -1] - frames[:, -1]).abs().mean() > 0.05  # it moves
+
+
+@pytest.mark.parametrize("merge", [1, 2])
+def test_a_rollout_of_tokens_makes_the_frames_of_a_model_that_computes_everything_anew(merge: int) -> None:
+    model = unet(**{**COLORS, "merge": merge})
+    frames = stored(model, 2, 3)
+    actions = torch.randn(2, 10, 6, generator=torch.Generator().manual_seed(1))
+    make = partial(model.generate, frames, actions, "arm", 7, unmask_steps=1, temperature=0.0)
+    made, anew = make(cache=True), make(cache=False)
+    assert torch.equal(made, anew)
+    assert (made[:, -1] != frames[:, -1]).float().mean() > 0.05  # it moves
 
 
 def test_a_frame_is_that_of_the_training_pass() -> None:
@@ -122,10 +142,91 @@ def test_each_pass_makes_one_more_frame_of_the_past_that_of_a_rollout() -> None:
     torch.testing.assert_close(seen[:, first : first + 3], rolled[:, : 6 - first], rtol=0, atol=1e-4)
 
 
+def test_each_pass_makes_one_more_frame_of_tokens_that_of_a_rollout() -> None:
+    model = unet(**{**COLORS, "frames": 6})
+    batch = small_batch(model.config, ["arm"])
+    batch.tokens = stored(model, 1, 6)
+    seen = forwarded(model, batch, 1.0, 3, torch.Generator().manual_seed(0)).context
+    assert seen is not None
+    first = (seen != batch.tokens).flatten(2).any(-1)[0].nonzero().flatten().tolist()[0]
+    known = batch.tokens[:, :first]
+    rolled = model.generate(known, batch.actions, "arm", 3, unmask_steps=1, temperature=0.0)
+    assert torch.equal(seen[:, first : first + 3], rolled[:, : 6 - first])
+
+
+CROP: dict[str, Any] = {"levels": (8,), "crop": 4}
+
+
+@pytest.mark.parametrize("base", [{**PIXELS, "grid": (32, 32)}, {**COLORS, "grid": (8, 8)}])
+@pytest.mark.parametrize("views", [1, 2])
+def test_a_square_shows_what_the_frame_shows_there(base: dict[str, Any], views: int) -> None:
+    model = unet(**{**base, **CROP, "views": views})
+    batch = small_batch(model.config, ["arm", "hand.v1"])
+    true = stored(model, 2, model.config.frames)
+    name = "tokens" if model.config.kind == "discrete" else "latents"
+    batch.tokens, batch.latents = None, None
+    setattr(batch, name, true)
+    cut = cropped(model.config, batch, torch.Generator().manual_seed(0))
+    assert cut.places is not None and cut.places.shape == (2, 16)
+    whole, part = model.frame_values(true), model.frame_values(getattr(cut, name))
+    for sample in range(2):
+        for view in range(views):
+            expected = whole[sample, :, cut.places[sample] + 64 * view]
+            assert torch.equal(part[sample, :, 16 * view : 16 * (view + 1)], expected)
+
+
+def test_inside_a_square_the_network_computes_what_it_would_of_the_frame() -> None:
+    model = unet(**{**COLORS, "levels": (8,), "crop": 10, "grid": (16, 16)})  # it reaches three places far
+    batch = small_batch(model.config, ["arm"])
+    batch.tokens = stored(model, 1, 4)
+    cut = cropped(model.config, batch, torch.Generator().manual_seed(2))
+    assert cut.tokens is not None and cut.places is not None
+    under, order = Conditioning(torch.randn(1, 4, 16)), [-1, 0, 1, 2]
+    features = []
+    for tokens, places in ((batch.tokens, None), (cut.tokens, cut.places)):
+        times = model.time_positions(4)
+        times.places = places
+        features.append(model.trunk(model.embed(model.frame_values(tokens), None, order), under, times))
+    inner = torch.arange(100).view(10, 10)[3:-3, 3:-3].flatten()
+    torch.testing.assert_close(features[1][:, :, inner], features[0][:, :, cut.places[0, inner]])
+
+
+def test_squares_lie_where_something_moves_and_have_no_loss_at_their_cut_edges() -> None:
+    model = unet(**{**COLORS, "crop": 8, "grid": (32, 32)})
+    batch = small_batch(model.config, ["arm"] * 200)
+    still = stored(model, 1, 1).expand(200, model.config.frames, -1, -1).clone()
+    still[:, 2, 20, 11] = (still[:, 2, 20, 11] + 1) % model.config.vocab_size
+    batch.tokens = still
+    places = cropped(model.config, batch, torch.Generator().manual_seed(0)).places
+    assert places is not None
+    hit = (places == 20 * 32 + 11).any(1)
+    assert 0.8 < hit.float().mean() < 0.95  # the others lie anywhere
+    loses = surrounded(model.config, places).view(-1, 8, 8)
+    assert loses[hit].flatten(1).float().mean() == 0.25  # four of eight rows and columns
+    corner = surrounded(model.config, (torch.arange(8).view(-1, 1) * 32 + torch.arange(8)).view(1, -1))
+    assert torch.equal(corner.view(8, 8), (torch.arange(8) < 6).view(-1, 1) & (torch.arange(8) < 6))
+
+
+def test_a_model_is_trained_on_squares() -> None:
+    model = unet(**{**COLORS, "crop": 4}).train()
+    batch = small_batch(model.config, ["arm", "hand.v1"])
+    batch.tokens = stored(model, 2, model.config.frames)
+    cut = cropped(model.config, batch, torch.Generator().manual_seed(0))
+    seen = forwarded(model, cut, 1.0, 2, torch.Generator().manual_seed(0))
+    assert seen.context is not None and seen.context.shape == cut.tokens.shape  # type: ignore[union-attr]
+    output = model(seen, generator=torch.Generator().manual_seed(0))
+    output.loss.backward()
+    assert torch.isfinite(output.loss) and output.masked.shape == (2, model.config.frames, 4, 4)
+
+
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"kind": "discrete", "video_loss": "diffusion"}, "trunk"),
+        ({"crop": 3}, "crop"),
+        ({"crop": 8}, "crop"),
+        ({"crop": 2, "whole_share": 0.5}, "crop"),
+        ({"crop": 2, "objectives": {"full": 1.0}}, "crop"),
+        ({"crop": 2, "trunk": "transformer"}, "crop"),
         ({"levels": (8, 16, 32, 64)}, "levels"),
         ({"shared_modulation": False}, "shared_modulation"),
         ({"conditioning": ("concat",)}, "conditioning"),

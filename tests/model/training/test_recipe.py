@@ -9,6 +9,7 @@ import torch
 from hma_data.errors import RecipeError, UsageError
 from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer
+from hma_data.tokenizers.shapes import get_spec
 from hma_model.training.recipe import differences, load_recipe, make_recipe, parse_overrides
 from tests.model.robots import SPEC
 
@@ -239,8 +240,16 @@ SHIPPED = sorted(path.stem for path in (shipped("recipes") / "train").glob("*.ya
 
 def test_every_kind_of_recipe_is_shipped():
     sizes = {f"{kind}_{size}" for kind in ("discrete", "continuous") for size in ("tiny", "base", "xl")}
-    others = {"pretrain40", "finetune", "finetune_tiny", "unet_tiny", "world", "world_unet"}
+    others = {"pretrain40", "finetune", "finetune_tiny", "unet_colors", "unet_tiny", "world", "world_unet"}
     assert set(SHIPPED) == sizes | others
+
+
+TOKENIZERS = {
+    "world": "fsq-lab",
+    "unet_tiny": "raw-128",
+    "unet_colors": "palette-64",
+    "world_unet": "palette-64",
+}
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -252,8 +261,8 @@ def test_every_shipped_recipe_validates_and_makes_a_network(name):
             name="svd-vae", version=1, kind="continuous", image_size=256, grid=(32, 32), channels=4,
             dtype="float16", latent_scale=0.18215,
         )  # fmt: skip
-    elif name in ("world", "unet_tiny", "world_unet"):
-        spec = get_tokenizer("fsq-lab" if name == "world" else "raw-128").spec
+    elif (tokenizer := TOKENIZERS.get(name)) is not None:
+        spec = get_spec(tokenizer)
     config = recipe.network(spec)
     assert config.kind == spec.kind and config.frames == recipe.frames
 

@@ -1,0 +1,110 @@
+"""`palette-64`: a token is the colours of 2×2 pixels, each the nearest one of a short list.
+
+Edges stay as sharp as the pixels, and a model that chooses among colours cannot mix two: in a long rollout a
+guess does not fade to grey. The list is for clean images of few colours, as simulators draw them, not for
+photographs; `fit` makes one of other images. The embedded list is that of the laboratory's robots.
+
+B images, S pixels a side, h·w grid, K colours. Pixels inside the network are in [-1, 1].
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.numpy import save
+from torch import Tensor, nn
+
+from hma_data.errors import TokenizerError
+from hma_data.storage.files import write_atomic
+from hma_data.tokenizers.base import OTHER
+from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
+from hma_data.tokenizers.checkpoints import find_weights, read_weights
+from hma_data.tokenizers.network import NetworkTokenizer, open_device
+from hma_data.tokenizers.shapes import CELL, MOST_COLORS, PaletteConfig
+
+BITS = 5  # of a channel in the table of nearest colours
+ROUNDS = 40  # of k-means
+
+
+class Nearest(nn.Module):
+    """The encoder: pixels (B, 3, S, S) -> ids (B, h, w), by a table of colours in steps of 8."""
+
+    table: Tensor
+    worth: Tensor
+
+    def __init__(self, colors: Tensor) -> None:
+        super().__init__()
+        steps = (torch.arange(2**BITS) + 0.5) * 2 ** (8 - BITS)
+        places = torch.cartesian_prod(steps, steps, steps)
+        self.register_buffer("table", torch.cdist(places, colors.float()).argmin(1))
+        self.register_buffer("worth", len(colors) ** torch.arange(CELL**2))
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        steps = pixels.add(1).mul(127.5).round().long() >> (8 - BITS)
+        digits = self.table[(steps[:, 0] << 2 * BITS) | (steps[:, 1] << BITS) | steps[:, 2]]
+        squares = digits.unflatten(2, (-1, CELL)).unflatten(1, (-1, CELL)).transpose(2, 3)
+        return (squares.flatten(3) * self.worth).sum(-1)
+
+
+class Shown(nn.Module):
+    """The decoder: ids (B, h, w) -> pixels (B, 3, S, S)."""
+
+    colors: Tensor
+    worth: Tensor
+
+    def __init__(self, colors: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("colors", colors.float() / 127.5 - 1)
+        self.register_buffer("worth", len(colors) ** torch.arange(CELL**2))
+
+    def forward(self, ids: Tensor) -> Tensor:
+        digits = ids.unsqueeze(-1) // self.worth % len(self.colors)
+        squares = digits.unflatten(3, (CELL, CELL)).transpose(2, 3)
+        return self.colors[squares.flatten(3, 4).flatten(1, 2)].permute(0, 3, 1, 2)
+
+
+def load(name: str, *, weights: str | None, device: str, image_size: int) -> NetworkTokenizer:
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors."""
+    place = open_device(name, device)
+    path = find_weights(name, weights) if weights else EMBEDDED / CATALOG[name].file
+    config, tensors, sha256 = read_weights(path, PaletteConfig.format, PaletteConfig)
+    colors = tensors.get("colors")
+    if colors is None or colors.dtype != torch.uint8 or tuple(colors.shape) != (config.colors, 3):
+        raise TokenizerError(path, f"does not hold {config.colors} colours (uint8, (K, 3))", OTHER)
+    network = nn.Module()
+    network.encoder, network.decoder = Nearest(colors), Shown(colors)
+    spec = config.spec(name, image_size, sha256)
+    return NetworkTokenizer(spec, network, place, network.encoder, network.decoder, light=True)
+
+
+def write(path: Path, colors: NDArray[np.uint8]) -> None:
+    """Write colours (K, 3) as a file that `weights=` takes."""
+    metadata = {"format": PaletteConfig.format, "config": json.dumps({"colors": len(colors)})}
+    write_atomic(path, save({"colors": colors}, metadata=metadata))
+
+
+def fit(films: Sequence[NDArray[np.uint8]], count: int = MOST_COLORS) -> NDArray[np.uint8]:
+    """Return at most `count` colours (K, 3) for films (N, S, S, 3), by k-means.
+
+    Each different colour counts by the fourth root of its pixels, so that small objects keep theirs. The
+    search begins at the commonest colour, and at those that are far from the ones before.
+    """
+    packed = np.concatenate(films).reshape(-1, 3).astype(np.uint32) @ np.array(
+        [1 << 16, 1 << 8, 1], np.uint32
+    )
+    values, counts = np.unique(packed, return_counts=True)
+    colors = np.stack([values >> 16, values >> 8 & 255, values & 255], axis=1).astype(np.float32)
+    weights, centres = counts**0.25, colors[counts.argmax()][None]
+    nearest = ((colors - centres) ** 2).sum(1)
+    while len(centres) < min(count, len(colors)):
+        centres = np.concatenate([centres, colors[[(nearest * weights).argmax()]]])
+        nearest = np.minimum(nearest, ((colors - centres[-1]) ** 2).sum(1))
+    for _ in range(ROUNDS):
+        own = torch.cdist(torch.from_numpy(colors), torch.from_numpy(centres)).argmin(1).numpy()
+        total = np.bincount(own, weights, len(centres))[:, None]
+        sums = np.stack([np.bincount(own, weights * colors[:, axis], len(centres)) for axis in range(3)], 1)
+        centres = np.where(total > 0, sums / np.maximum(total, 1e-9), centres).astype(np.float32)
+    return np.unique(centres.round().astype(np.uint8), axis=0)

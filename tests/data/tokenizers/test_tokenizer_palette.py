@@ -1,0 +1,68 @@
+"""Colours as tokens: the nearest colour of each pixel, exact where the list has it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from safetensors.numpy import save_file
+
+from hma_data.errors import TokenizerError
+from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.palette import Nearest, Shown, fit, load, write
+from hma_data.tokenizers.shapes import get_spec
+
+Colors = NDArray[np.uint8]
+
+
+@given(seed=st.integers(0, 10**6), count=st.integers(2, 255))
+def test_an_image_in_colours_of_the_list_comes_back_exactly(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    steps = rng.choice(32**3, count, replace=False)  # one a cell of the table of nearest colours
+    colors = torch.from_numpy(np.stack([steps >> 10, steps >> 5 & 31, steps & 31], axis=1) * 8 + 4)
+    frames = colors[rng.integers(0, count, (2, 8, 12))].permute(0, 3, 1, 2) / 127.5 - 1
+    ids = Nearest(colors)(frames)
+    assert ids.shape == (2, 4, 6) and int(ids.min()) >= 0 and int(ids.max()) < count**4
+    assert torch.equal(Shown(colors)(ids), frames)
+
+
+def test_other_colours_become_the_nearest_of_the_list() -> None:
+    tokenizer = get_tokenizer("palette-64")
+    frames = np.random.default_rng(0).integers(0, 256, (1, 64, 64, 3)).astype(np.uint8)
+    shown = tokenizer.decode(tokenizer.encode(frames)).astype(float)
+    colors = np.unique(shown.reshape(-1, 3), axis=0)
+    least = np.linalg.norm(frames[..., None, :] - colors, axis=-1).min(-1)
+    assert (np.linalg.norm(frames - shown, axis=-1) <= least + 8 * 3**0.5).all()  # a table of steps of 8
+
+
+def test_fitted_colours_keep_a_small_object_apart() -> None:
+    frames = np.full((4, 64, 64, 3), 250, np.uint8)
+    frames[:, :20] = 90
+    frames[:, 40:42, 30:32] = (200, 30, 40)
+    colors = fit([frames[:2], frames[2:]], 3)
+    assert sorted(map(tuple, colors.tolist())) == [(90, 90, 90), (200, 30, 40), (250, 250, 250)]
+
+
+def test_colours_of_ones_own(tmp_path: Path) -> None:
+    path = tmp_path / "own.safetensors"
+    write(path, np.array([[0, 0, 0], [255, 255, 255], [200, 0, 0]], np.uint8))
+    tokenizer = get_tokenizer("palette-64", weights=path)
+    assert tokenizer.spec.factored == (3,) * 4
+    assert tokenizer.spec == get_spec("palette-64", weights=path)
+    assert tokenizer.spec.weights_sha256 != get_spec("palette-64").weights_sha256
+    assert get_spec("palette-64") == get_tokenizer("palette-64").spec
+
+
+@pytest.mark.parametrize("colors", [np.zeros((9, 4), np.uint8), np.zeros((9, 3)), np.zeros((8, 3), np.uint8)])
+def test_a_file_of_other_colours_is_refused(tmp_path: Path, colors: Colors) -> None:
+    path = tmp_path / "own.safetensors"
+    metadata = {"format": "hma-palette-1", "config": '{"colors": 9}'}
+    save_file({"colors": colors}, path, metadata)
+    with pytest.raises(TokenizerError, match=r"own.safetensors: does not hold 9 colours"):
+        load("palette-64", weights=str(path), device="cpu", image_size=64)
+    save_file({"colors": colors}, path, metadata | {"config": '{"colors": 1}'})
+    with pytest.raises(TokenizerError, match="greater than or equal to 2"):
+        get_spec("palette-64", weights=path)
