@@ -137,7 +137,9 @@ def tokenizer_of(shards: ShardSet, weights: StrPath | None = None, device: str =
     Raises:
         TokenizerError: the tokenizer on this machine would give other tokens.
     """
-    tokenizer = get_tokenizer(full_name(shards.spec.to_json()), weights=weights, device=device)
+    tokenizer = get_tokenizer(
+        full_name(shards.spec.to_json()), weights=weights or shards.spec.colors or None, device=device
+    )
     if tokenizer.spec != shards.spec:
         made, here = shards.spec.weights_sha256[:12], tokenizer.spec.weights_sha256[:12]
         fault = f"was made by {shards.spec.name} with weights {made}, and the weights here are {here}"

@@ -44,6 +44,7 @@ class TokenizerSpec:
             changes the tokens.
         weights_sha256: SHA-256 of the weights' file, or of the file whose encoder it kept; empty when there
             are no weights.
+        colors: of a palette, six hex digits each, in the order of the digits' values; else empty.
     """
 
     name: str
@@ -58,6 +59,7 @@ class TokenizerSpec:
     dtype: str = "uint32"
     resize_filter: Filter = "area"
     weights_sha256: str = ""
+    colors: str = ""
 
     @classmethod
     def discrete(
@@ -76,8 +78,9 @@ class TokenizerSpec:
         return cls(name, version, "continuous", size, grid, channels=channels, **values)
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values, as the manifest and the checkpoint hold them."""
-        return json.loads(json.dumps(asdict(self)))
+        """Return plain values, as the manifest and the checkpoint hold them, with the colours if any."""
+        values = json.loads(json.dumps(asdict(self)))
+        return values if self.colors else {key: one for key, one in values.items() if key != "colors"}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "TokenizerSpec":
@@ -141,6 +144,11 @@ def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, devi
         tokenizer = copy(tokenizer)
         tokenizer.spec = spec
     return tokenizer
+
+
+def reopened(spec: Mapping[str, Any], device: str = "cpu") -> Tokenizer:
+    """Return the tokenizer of a spec's values, as in a checkpoint; raise as `get_tokenizer`."""
+    return get_tokenizer(full_name(spec), weights=spec.get("colors") or None, device=device)
 
 
 def filtered(spec: TokenizerSpec, name: str) -> TokenizerSpec:

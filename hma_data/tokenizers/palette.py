@@ -7,7 +7,7 @@ photographs; `fit` makes one of other images. The embedded list is that of the l
 B images, S pixels a side, h·w grid, K colours. Pixels inside the network are in [-1, 1].
 """
 
-import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,13 +17,11 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 from torch import Tensor, nn
 
-from hma_data.errors import TokenizerError
 from hma_data.storage.files import write_atomic
-from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
-from hma_data.tokenizers.checkpoints import find_weights, read_weights
+from hma_data.tokenizers.checkpoints import find_weights
 from hma_data.tokenizers.network import NetworkTokenizer, open_device
-from hma_data.tokenizers.shapes import CELL, MOST_COLORS, PaletteConfig
+from hma_data.tokenizers.shapes import CELL, MOST_COLORS, palette_spec, read_colors
 
 BITS = 5  # of a channel in the table of nearest colours
 ROUNDS = 40  # of k-means
@@ -67,23 +65,25 @@ class Shown(nn.Module):
 
 
 def load(name: str, *, weights: str | None, device: str, image_size: int) -> NetworkTokenizer:
-    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors."""
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors.
+
+    Args:
+        weights: a file of `write`, or the colours themselves as `TokenizerSpec.colors` has them.
+    """
     place = open_device(name, device)
-    path = find_weights(name, weights) if weights else EMBEDDED / CATALOG[name].file
-    config, tensors, sha256 = read_weights(path, PaletteConfig.format, PaletteConfig)
-    colors = tensors.get("colors")
-    if colors is None or colors.dtype != torch.uint8 or tuple(colors.shape) != (config.colors, 3):
-        raise TokenizerError(path, f"does not hold {config.colors} colours (uint8, (K, 3))", OTHER)
+    if weights and re.fullmatch("([0-9a-f]{6})+", weights):
+        colors: NDArray[np.uint8] = np.frombuffer(bytes.fromhex(weights), np.uint8).reshape(-1, 3)
+    else:
+        colors = read_colors(find_weights(name, weights) if weights else EMBEDDED / CATALOG[name].file)
+    spec, values = palette_spec(name, image_size, colors), torch.from_numpy(colors.copy())
     network = nn.Module()
-    network.encoder, network.decoder = Nearest(colors), Shown(colors)
-    spec = config.spec(name, image_size, sha256)
+    network.encoder, network.decoder = Nearest(values), Shown(values)
     return NetworkTokenizer(spec, network, place, network.encoder, network.decoder, light=True)
 
 
 def write(path: Path, colors: NDArray[np.uint8]) -> None:
     """Write colours (K, 3) as a file that `weights=` takes."""
-    metadata = {"format": PaletteConfig.format, "config": json.dumps({"colors": len(colors)})}
-    write_atomic(path, save({"colors": colors}, metadata=metadata))
+    write_atomic(path, save({"colors": colors}))
 
 
 def fit(films: Sequence[NDArray[np.uint8]], count: int = MOST_COLORS) -> NDArray[np.uint8]:

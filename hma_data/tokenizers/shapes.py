@@ -12,6 +12,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from safetensors import SafetensorError, safe_open
 
@@ -110,24 +112,6 @@ class VaeConfig(BaseModel):
         return TokenizerSpec.continuous(name, VERSION, image_size, PATCH, self.channels, **facts)
 
 
-class PaletteConfig(BaseModel):
-    """The number of colours of a palette, stored in its file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    format: ClassVar = "hma-palette-1"
-
-    colors: Annotated[int, Field(ge=2, le=MOST_COLORS)]
-
-    def spec(self, name: str, image_size: int, sha256: str) -> TokenizerSpec:
-        """Return the spec of the tokenizer with these colours."""
-        digits = (self.colors,) * CELL**2
-        return TokenizerSpec.discrete(name, VERSION, image_size, CELL, digits, weights_sha256=sha256)
-
-
-type Config = FsqConfig | VaeConfig | PaletteConfig
-_CONFIGS: dict[str, type[Config]] = {"fsq": FsqConfig, "vae": VaeConfig, "palette": PaletteConfig}
-
-
 def read_shape[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[C, str]:
     """Read the network's shape from a weights' file; return it and its tokens' digest.
 
@@ -157,6 +141,27 @@ def read_shape[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[C,
     return shape, metadata.get("tokens_sha256") or file_sha256(path)
 
 
+def read_colors(path: Path) -> NDArray[np.uint8]:
+    """Return the colours (K, 3) of a palette's file; raise TokenizerError if it holds something else."""
+    remedy = "name a file that `hma tokenizer fit` wrote"
+    try:
+        with safe_open(path, "np") as file:
+            colors = file.get_tensor("colors")
+    except (SafetensorError, OSError) as fault:
+        text = f"holds no colours: {' '.join(str(fault).split())[:160]}"
+        raise TokenizerError(path, *unreadable(path, text, remedy)) from fault
+    if colors.dtype != np.uint8 or colors.shape[1:] != (3,) or not 2 <= len(colors) <= MOST_COLORS:
+        text = f"its colours are {colors.dtype} {colors.shape}, not uint8 (2 to {MOST_COLORS}, 3)"
+        raise TokenizerError(path, text, remedy)
+    return colors
+
+
+def palette_spec(name: str, image_size: int, colors: NDArray[np.uint8]) -> TokenizerSpec:
+    """Return the spec of the tokenizer of these colours (K, 3)."""
+    digits = (len(colors),) * CELL**2
+    return TokenizerSpec.discrete(name, VERSION, image_size, CELL, digits, colors=colors.tobytes().hex())
+
+
 def get_spec(name_or_path: StrPath, *, weights: StrPath | None = None) -> TokenizerSpec:
     """Return the spec of the tokenizer that `get_tokenizer` makes of the same arguments.
 
@@ -165,7 +170,10 @@ def get_spec(name_or_path: StrPath, *, weights: StrPath | None = None) -> Tokeni
     """
     entry = usable_entry(as_text(name_or_path))
     if entry.weights == "embedded" and weights is None and entry.name in CATALOG:
-        kind = _CONFIGS[entry.name.partition("-")[0]]
+        if entry.name.startswith("palette"):
+            colors = read_colors(EMBEDDED / entry.file)
+            return filtered(palette_spec(entry.name, entry.image_size, colors), as_text(name_or_path))
+        kind: type[FsqConfig | VaeConfig] = FsqConfig if entry.name.startswith("fsq") else VaeConfig
         shape, sha256 = read_shape(EMBEDDED / entry.file, kind.format, kind)
         return filtered(shape.spec(entry.name, entry.image_size, sha256), as_text(name_or_path))
     if "torch" in entry.imports and "torch" not in sys.modules:

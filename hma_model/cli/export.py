@@ -74,9 +74,9 @@ def export_checkpoint(
 
     @cache
     def tokenizer() -> Any:
-        from hma_data.tokenizers.base import get_tokenizer
+        from hma_data.tokenizers.base import reopened
 
-        return get_tokenizer(opened.config.tokenizer["name"])
+        return reopened(opened.config.tokenizer)
 
     chosen: dict[str, Drivable] = {}
     offered = drivable(opened, sets or trained_on(opened), tokenizer).values()

@@ -66,9 +66,9 @@ def play(
 
     @cache
     def tokenizer() -> Any:
-        from hma_data.tokenizers.base import full_name, get_tokenizer
+        from hma_data.tokenizers.base import reopened
 
-        return get_tokenizer(full_name(opened.config.tokenizer), device=device)
+        return reopened(opened.config.tokenizer, device)
 
     sets = sets or trained_on(opened)
     robots = drivable(opened, sets, tokenizer, images)

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hma_data.errors import HMAError
 from hma_data.storage.paths import StrPath
-from hma_data.tokenizers.base import Tokenizer, full_name, get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, reopened
 from hma_model.arrays import Float32s, Images
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.calibration import Meter, meter_of
@@ -337,4 +337,4 @@ def load_world(checkpoint: StrPath = "embedded", *, device: str = "cpu", **setti
     from hma_model.network.model import HMA
 
     model = HMA.from_pretrained(checkpoint, device=device)
-    return World(model, get_tokenizer(full_name(model.config.tokenizer), device=device), **settings)
+    return World(model, reopened(model.config.tokenizer, device), **settings)

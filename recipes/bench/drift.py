@@ -112,14 +112,14 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 def opened(checkpoint: str, robots: list[str], device: str) -> "tuple[HMA, Tokenizer]":
     """Return the model of a checkpoint with some robots, and its tokenizer."""
-    from hma_data.tokenizers.base import get_tokenizer
+    from hma_data.tokenizers.base import reopened
     from hma_model.checkpoint.folder import require_tokenizer
     from hma_model.network.model import HMA
     from hma_model.training.runtime import choose_device
 
     place = str(choose_device(device))
     model = HMA.from_pretrained(checkpoint, embodiments=robots, device=place).eval()
-    tokenizer = get_tokenizer(str(model.config.tokenizer["name"]), device=place)
+    tokenizer = reopened(model.config.tokenizer, place)
     require_tokenizer(model.config, tokenizer.spec, checkpoint)
     return model, tokenizer
 

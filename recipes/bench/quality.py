@@ -175,7 +175,7 @@ def measure(name: str, data: Path, budget: dict[str, Any], seed: int) -> dict[st
     Raises:
         UsageError: the training was stopped by a signal.
     """
-    from hma_data.tokenizers.base import get_tokenizer
+    from hma_data.tokenizers.base import reopened
     from hma_data.tokenizers.network import one_thread
     from hma_model.evaluation import evaluate as evaluation
     from hma_model.evaluation.evaluate import EvaluationSettings
@@ -185,7 +185,7 @@ def measure(name: str, data: Path, budget: dict[str, Any], seed: int) -> dict[st
 
     case, shards = CASES[name], ShardSet(data)
     robot = shards.embodiment.id
-    tokenizer = get_tokenizer(shards.spec.name)
+    tokenizer = reopened(shards.spec.to_json())
     with one_thread(), tempfile.TemporaryDirectory() as folder:
         _tell(f"{name}, seed {seed}: {budget['steps']} steps")
         result = train(recipe_of(case, data, budget["steps"], seed), out=Path(folder) / "run", show=False)

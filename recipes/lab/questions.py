@@ -207,14 +207,14 @@ def _baseline(shards: ShardSet, cpu_seconds: float, seed: int) -> tuple[Any, int
 
 def _scores(model: Any, shards: ShardSet, row: Row) -> dict[str, Any]:
     """Return the figures of a trained model; None where one is not measured."""
-    from hma_data.tokenizers.base import get_tokenizer
+    from hma_data.tokenizers.base import reopened
     from hma_model.evaluation.losses import masked_val_loss, windows
     from hma_model.evaluation.perceptual import FeatureCollector, Networks
     from hma_model.evaluation.rollouts import rollout
     from hma_model.evaluation.scores import Rolled, Scores
     from hma_model.evaluation.simulated import measure_state
 
-    tokenizer = get_tokenizer(shards.spec.name)
+    tokenizer = reopened(shards.spec.to_json())
     batches = list(windows(shards, "val", FRAMES, WINDOWS))
     rolled = Rolled(PROMPT, FeatureCollector(Networks()))
     for number, batch in enumerate(batches):

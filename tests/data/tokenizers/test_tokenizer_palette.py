@@ -1,5 +1,6 @@
 """Colours as tokens: the nearest colour of each pixel, exact where the list has it."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
 from hma_data.errors import TokenizerError
-from hma_data.tokenizers.base import get_tokenizer
-from hma_data.tokenizers.palette import Nearest, Shown, fit, load, write
+from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer, reopened
+from hma_data.tokenizers.palette import Nearest, Shown, fit, write
 from hma_data.tokenizers.shapes import get_spec
 
 Colors = NDArray[np.uint8]
@@ -52,17 +53,23 @@ def test_colours_of_ones_own(tmp_path: Path) -> None:
     tokenizer = get_tokenizer("palette-64", weights=path)
     assert tokenizer.spec.factored == (3,) * 4
     assert tokenizer.spec == get_spec("palette-64", weights=path)
-    assert tokenizer.spec.weights_sha256 != get_spec("palette-64").weights_sha256
+    assert tokenizer.spec.digest != get_spec("palette-64").digest
     assert get_spec("palette-64") == get_tokenizer("palette-64").spec
+    kept = json.loads(json.dumps(tokenizer.spec.to_json()))  # as in a checkpoint: the file is not needed
+    path.unlink()
+    again = reopened(kept)
+    assert again.spec == tokenizer.spec == TokenizerSpec.from_json(kept)
+    frames = np.random.default_rng(0).integers(0, 256, (1, 64, 64, 3)).astype(np.uint8)
+    assert np.array_equal(again.encode(frames), tokenizer.encode(frames))
+    assert "colors" not in get_spec("fsq-16").to_json()  # specs of before keep their digests
 
 
-@pytest.mark.parametrize("colors", [np.zeros((9, 4), np.uint8), np.zeros((9, 3)), np.zeros((8, 3), np.uint8)])
-def test_a_file_of_other_colours_is_refused(tmp_path: Path, colors: Colors) -> None:
+@pytest.mark.parametrize("colors", [np.zeros((9, 4), np.uint8), np.zeros((9, 3)), np.zeros((1, 3), np.uint8)])
+def test_a_file_of_other_values_is_refused(tmp_path: Path, colors: Colors) -> None:
     path = tmp_path / "own.safetensors"
-    metadata = {"format": "hma-palette-1", "config": '{"colors": 9}'}
-    save_file({"colors": colors}, path, metadata)
-    with pytest.raises(TokenizerError, match=r"own.safetensors: does not hold 9 colours"):
-        load("palette-64", weights=str(path), device="cpu", image_size=64)
-    save_file({"colors": colors}, path, metadata | {"config": '{"colors": 1}'})
-    with pytest.raises(TokenizerError, match="greater than or equal to 2"):
+    save_file({"colors": colors}, path)
+    with pytest.raises(TokenizerError, match=r"own.safetensors: its colours are .* — name a file"):
+        get_tokenizer("palette-64", weights=path)
+    path.write_bytes(b"no")
+    with pytest.raises(TokenizerError, match=r"own.safetensors: "):
         get_spec("palette-64", weights=path)

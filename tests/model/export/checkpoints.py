@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 
 from hma_data.lab import family
-from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.shapes import get_spec, palette_spec
 from hma_model.checkpoint import io as checkpoint
 from hma_model.config import HMAConfig
 from hma_model.generation.unmask import masked_after
 from hma_model.network.model import HMA
-from tests.model.network.test_unet import PIXELS
+from tests.model.network.test_unet import COLORS, PIXELS
 from tests.model.true_world import _of_robot, tiny_model
 
 ROBOT = "rails_03"
@@ -30,8 +30,18 @@ def save_tokens(folder: Path) -> Path:
 
 def save_pixels(folder: Path) -> Path:
     """Save a U-Net of pixels whose frames move."""
-    spec = get_tokenizer("raw-64").spec
-    values = {**PIXELS, "grid": spec.grid, "patch": 8, "tokenizer": spec.to_json()}
+    spec = get_spec("raw-64")
+    return _save_unet(folder, {**PIXELS, "grid": spec.grid, "patch": 8, "tokenizer": spec.to_json()})
+
+
+def save_colors(folder: Path) -> Path:
+    """Save a U-Net of colours whose frames move."""
+    spec = palette_spec("palette-64", 64, np.eye(3, dtype=np.uint8) * 255)
+    values = {**COLORS, "grid": spec.grid, "factored": spec.factored, "tokenizer": spec.to_json()}
+    return _save_unet(folder, values)
+
+
+def _save_unet(folder: Path, values: dict[str, Any]) -> Path:
     torch.manual_seed(0)
     model = _of_robot(HMA(HMAConfig(**values)), family.embodiment(ROBOT), False)
     for name, parameter in model.named_parameters():

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hma_model.cli.export import export_checkpoint
-from tests.model.export.checkpoints import save_pixels, save_tokens
+from tests.model.export.checkpoints import save_colors, save_pixels, save_tokens
 
 
 def exported(folder: Path, save: Callable[[Path], object]) -> Path:
@@ -20,6 +20,12 @@ def exported(folder: Path, save: Callable[[Path], object]) -> Path:
 def tokens(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A discrete transformer, exported."""
     return exported(tmp_path_factory.mktemp("tokens"), save_tokens)
+
+
+@pytest.fixture(scope="session")
+def colors(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A U-Net of colours, exported."""
+    return exported(tmp_path_factory.mktemp("colors"), save_colors)
 
 
 @pytest.fixture(scope="session")

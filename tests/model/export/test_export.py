@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from hma_data.errors import CheckpointError, OutputError, UsageError
-from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.base import reopened
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.checkpoint.io import load
 from hma_model.cli.export import export_checkpoint
@@ -38,7 +38,7 @@ FRAMES, EXACT = 100, 40
 def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[Any, Any, float]]:
     """Return the frames that onnxruntime and torch make of the same actions, and the images' PSNR."""
     model = rounded(load(checkpoint, [robot], "cpu").eval())
-    tokenizer = get_tokenizer(model.config.tokenizer["name"])
+    tokenizer = reopened(model.config.tokenizer)
     driver = Driver(page, robot)
     rollout = Rollout(model, robot, temperature=0.0)
     rollout.decoding = replace(rollout.decoding, measure=True)
@@ -62,6 +62,13 @@ def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[An
 def test_a_u_net_makes_the_pixels_of_torch(pixels: Path) -> None:
     made = closed_loop(pixels, Checkpoint.open(pixels.with_name("model")), ROBOT)
     assert min(score for *_, score in made) > 45
+    assert len({own.tobytes() for own, *_ in made}) > FRAMES / 2
+
+
+def test_a_u_net_makes_the_colours_of_torch(colors: Path) -> None:
+    made = closed_loop(colors, Checkpoint.open(colors.with_name("model")), ROBOT)
+    equal = [float((own == expected).mean()) for own, expected, _ in made]
+    assert equal[0] > 0.99, equal  # of an untrained model many scores are nearly equal, and may swap
     assert len({own.tobytes() for own, *_ in made}) > FRAMES / 2
 
 
@@ -106,16 +113,16 @@ def test_replays_hold_recorded_commands_and_the_page_begins_where_they_do(tokens
         assert all(np.array_equal(scene.advance(None)[0], command) for command in commands)
 
 
-def test_shapes_are_fixed_and_no_operator_depends_on_data(tokens: Path, pixels: Path) -> None:
-    for page in (tokens, pixels):
+def test_shapes_are_fixed_and_no_operator_depends_on_data(tokens: Path, pixels: Path, colors: Path) -> None:
+    for page in (tokens, pixels, colors):
         graph = onnx.load(page / "step.onnx").graph
         assert not {"Loop", "If", "Scan", "NonZero"} & {node.op_type for node in graph.node}
         shapes = [port.type.tensor_type.shape.dim for port in (*graph.input, *graph.output)]
         assert all(side.HasField("dim_value") for shape in shapes for side in shape)
 
 
-def test_the_graphs_of_the_page_make_what_the_step_makes(tokens: Path, pixels: Path) -> None:
-    for page in (tokens, pixels):
+def test_the_graphs_of_the_page_make_what_the_step_makes(tokens: Path, pixels: Path, colors: Path) -> None:
+    for page in (tokens, pixels, colors):
         driver = Driver(page, ROBOT)
         parts = driver.about["page"]
         step, image, gpu_image = (

@@ -28,7 +28,7 @@ PIXELS: dict[str, Any] = {
 }  # fmt: skip
 COLORS: dict[str, Any] = {
     **PIXELS, "kind": "discrete", "grid": (8, 8), "factored": (5,) * 4, "video_loss": "diffusion",
-    "told_noise": False, "corrupt_max": 0.0, "tokenizer": {},
+    "told_noise": False, "corrupt_max": 0.0, "latent_scale": 1.0, "tokenizer": {},
 }  # fmt: skip
 LATENTS = {**PIXELS, "grid": (8, 8), "channels": 4, "patch": 2, "latent_scale": 0.5, "tokenizer": {}}
 

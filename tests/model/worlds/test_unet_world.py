@@ -15,7 +15,7 @@ from hma_model.policies.arenas import Scenes, TrueArena
 from hma_model.policies.planning import Cost
 from hma_model.simulate import World, WorldModelEnv
 from hma_model.synthetic.augment import Augmentation, augment
-from tests.model.network.test_unet import PIXELS
+from tests.model.network.test_unet import COLORS, PIXELS
 from tests.model.true_world import _of_robot, family
 
 ROBOT = "rails_03"
@@ -26,6 +26,14 @@ def world() -> World:
     raw = get_tokenizer("raw-64")
     values = {**PIXELS, "grid": (64, 64), "patch": 8, "tokenizer": raw.spec.to_json()}
     return World(_of_robot(HMA(HMAConfig(**values)), family.embodiment(ROBOT), False), raw)
+
+
+@pytest.fixture
+def colored() -> World:
+    palette = get_tokenizer("palette-64")
+    spec = palette.spec
+    values = {**COLORS, "grid": spec.grid, "factored": spec.factored, "tokenizer": spec.to_json()}
+    return World(_of_robot(HMA(HMAConfig(**values)), family.embodiment(ROBOT), False), palette)
 
 
 def test_an_environment_steps_and_resets(world: World, tmp_path: Path) -> None:
@@ -54,6 +62,16 @@ def test_how_unsure_it_is_is_not_measured_rather_than_nothing(world: World) -> N
     with world.drawing(measure=True):
         world.step({session: np.zeros(world.model.embodiments[ROBOT].chunk_dim, np.float32)})
     assert np.isnan(world.uncertainty[session])
+
+
+def test_how_unsure_a_model_of_colours_is_is_measured(colored: World) -> None:
+    arena = TrueArena(Scenes.of(colored, ROBOT, 1, 0), 64)
+    session = colored.open(ROBOT, arena.prompts[0].frames, arena.prompts[0].chunks)
+    with colored.drawing(measure=True):
+        made = colored.step({session: np.zeros(colored.model.embodiments[ROBOT].chunk_dim, np.float32)})
+    assert colored.uncertainty[session] > 0
+    colors = np.frombuffer(bytes.fromhex(colored.tokenizer.spec.colors), np.uint8).reshape(-1, 3)
+    assert {*map(tuple, made[session].reshape(-1, 3))} <= {*map(tuple, colors)}
 
 
 def test_synthetic_episodes_are_all_kept_without_an_uncertainty(world: World, tmp_path: Path) -> None:
