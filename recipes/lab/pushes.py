@@ -16,8 +16,10 @@ ours was trained.
 """
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ from hma_data.console import run_script
 from hma_data.errors import UsageError
 from hma_data.lab import pusht
 from hma_data.lab.pusher import Planned, Wandering
-from hma_data.lab.tee_table import TICK_S
+from hma_data.lab.tee_table import SIDE, TICK_S
 from hma_data.lab.truth import TrueEpisode
 from hma_data.lab.writers import Demo
 from hma_data.storage.files import part_of
@@ -110,9 +112,31 @@ def contact_episode(frames: int, stride: int, seed: int, episode: int) -> TrueEp
     return TrueEpisode(demo.observations["image"][rows], chunks, parts, demo.states[rows], driven=1)
 
 
-def record_contact(part: Path, episodes: Iterable[int], seed: int) -> None:
-    """Record `contact_demo`."""
-    pusht.write_fast(part, (contact_demo(seed, episode) for episode in episodes))
+MIRRORS = tuple(product((False, True), repeat=3))
+
+
+def mirrored(demo: Demo, transposed: bool, across: bool, down: bool) -> Demo:
+    """Return an episode of contact as a mirror shows it; the table, the T and friction are symmetric."""
+    images = demo.observations["image"]
+
+    def places(values: Any) -> Any:
+        values = values[:, ::-1] if transposed else values
+        ends = np.array([SIDE if across else 0, SIDE if down else 0], values.dtype)
+        return np.abs(ends - values)
+
+    images = images.swapaxes(1, 2) if transposed else images
+    images = images[:, :: -1 if down else 1, :: -1 if across else 1]
+    observations = {
+        "image": np.ascontiguousarray(images),
+        "agent_pos": places(demo.observations["agent_pos"]),
+    }
+    return replace(demo, actions=places(demo.actions), observations=observations)
+
+
+def record_contact(part: Path, episodes: Iterable[int], seed: int, ways: Sequence[Any] = MIRRORS[:1]) -> None:
+    """Record `contact_demo` in each of the mirrors."""
+    demos = (contact_demo(seed, episode) for episode in episodes)
+    pusht.write_fast(part, (mirrored(demo, *way) for demo in demos for way in ways))
 
 
 def main() -> None:
@@ -125,14 +149,16 @@ def main() -> None:
     parser.add_argument(
         "--contact", type=int, default=0, help="episodes that push towards one goal after another"
     )
+    parser.add_argument("--mirrored", action="store_true", help="these in all eight mirrors of the table")
     parser.add_argument("--seed", type=int, default=7)
     given = parser.parse_args()
     planned = partial(pusht.record, robot="pusht_fast")
+    contact = partial(record_contact, ways=MIRRORS if given.mirrored else MIRRORS[:1])
     for name, record, count, seed in (
         ("planned", planned, given.planned, given.seed),
         ("noisy", record_noisy, given.noisy, given.seed + 4),
         ("play", record_play, given.play, given.seed + 8),
-        ("contact", record_contact, given.contact, given.seed + 12),
+        ("contact", contact, given.contact, given.seed + 12),
     ):
         file = given.out / name / "pusht_fast.hdf5"
         if count and not file.exists():

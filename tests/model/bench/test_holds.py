@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from hma_data.errors import UsageError
+from hma_data.lab import pusht
 from hma_model.evaluation.wholeness import Left, left_at, left_words
 from recipes.bench import holds
 from recipes.lab import pushes
@@ -95,6 +96,21 @@ def test_what_melted_or_what_nobody_touched_is_told() -> None:
 def test_a_robot_without_a_simulator_is_named() -> None:
     with pytest.raises(UsageError, match="bridge: has no simulator in the toolkit"):
         holds.run({**holds.BENCH.defaults, "robots": "bridge"})
+
+
+@pytest.mark.parametrize("way", pushes.MIRRORS)
+def test_a_mirrored_episode_shows_the_disc_where_it_is(way: tuple[bool, bool, bool]) -> None:
+    demo = pushes.contact_demo(912, 0)
+    seen = pushes.mirrored(demo, *way)
+    for one in (demo, seen):
+        images, places = one.observations["image"], (one.observations["agent_pos"] * pusht.PX).astype(int)
+        shown = {tuple(image[y, x]) for image, (x, y) in zip(images, places, strict=True)}
+        assert shown == {(78, 126, 255)}
+    assert np.ptp(seen.actions, axis=0) == pytest.approx(np.ptp(demo.actions, axis=0)[:: -1 if way[0] else 1])
+    if not way[0] or way[1] == way[2]:  # these are their own inverses
+        again = pushes.mirrored(seen, *way)
+        assert np.array_equal(again.observations["image"], demo.observations["image"])
+        np.testing.assert_allclose(again.actions, demo.actions, atol=1e-3)
 
 
 def test_contact_episodes_are_those_of_the_recording_with_the_places_of_the_parts(tmp_path) -> None:

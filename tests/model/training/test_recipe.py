@@ -240,7 +240,16 @@ SHIPPED = sorted(path.stem for path in (shipped("recipes") / "train").glob("*.ya
 
 def test_every_kind_of_recipe_is_shipped():
     sizes = {f"{kind}_{size}" for kind in ("discrete", "continuous") for size in ("tiny", "base", "xl")}
-    others = {"pretrain40", "finetune", "finetune_tiny", "unet_colors", "unet_tiny", "world", "world_unet"}
+    others = {
+        "pretrain40",
+        "finetune",
+        "finetune_tiny",
+        "unet_colors",
+        "unet_tiny",
+        "world",
+        "world_pusht",
+        "world_unet",
+    }
     assert set(SHIPPED) == sizes | others
 
 
@@ -248,6 +257,7 @@ TOKENIZERS = {
     "world": "fsq-lab",
     "unet_tiny": "raw-128",
     "unet_colors": "palette-64",
+    "world_pusht": "palette-64",
     "world_unet": "palette-64",
 }
 
