@@ -22,10 +22,10 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/lab": (3_327, 30_594, 16),
     "hma_data/loading": (1_274, 10_943, 6),
     "hma_data/registry": (1_287, 8_311, 6),
-    "hma_data/shards": (2_553, 19_549, 11),
+    "hma_data/shards": (2_555, 19_554, 11),
     "hma_data/sources": (12_552, 104_849, 50),
     "hma_data/storage": (1_664, 10_939, 11),
-    "hma_data/tokenizers": (3_442, 25_316, 18),
+    "hma_data/tokenizers": (3_475, 25_529, 18),
     "hma_model": (518, 3_161, 4),
     "hma_model/benchmark": (845, 7_250, 5),
     "hma_model/checkpoint": (885, 6_600, 5),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_621, 30_120, 19),
     "hma_model/worlds": (1_520, 11_387, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_449, 518_563
-TEST_LINES = 48_587
+PRODUCT_LINES, PRODUCT_NODES = 65_484, 518_781
+TEST_LINES = 48_624
 DOC_WORDS = 40_640
 
 

@@ -35,7 +35,7 @@ from hma_data.shards.windows import WINDOW, WindowIndex
 from hma_data.sources.common.choice import chosen_ids
 from hma_data.sources.common.survey import sampled
 from hma_data.storage.paths import StrPath, as_path
-from hma_data.tokenizers.base import Tokenizer, full_name, get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, full_name, get_tokenizer, reopened
 
 THUMB_SIDE, FILM_SIDE = 144, 256  # pixels of an image in the sheet and in the video
 FRAMES_DECODED = 16  # frames decoded at a time
@@ -137,11 +137,13 @@ def tokenizer_of(shards: ShardSet, weights: StrPath | None = None, device: str =
     Raises:
         TokenizerError: the tokenizer on this machine would give other tokens.
     """
-    tokenizer = get_tokenizer(
-        full_name(shards.spec.to_json()), weights=weights or shards.spec.colors or None, device=device
-    )
+    stated = shards.spec.to_json()
+    if weights is None:
+        tokenizer = reopened(stated, device)
+    else:
+        tokenizer = get_tokenizer(full_name(stated), weights=weights, device=device)
     if tokenizer.spec != shards.spec:
-        made, here = shards.spec.weights_sha256[:12], tokenizer.spec.weights_sha256[:12]
+        made, here = shards.spec.weights_digest, tokenizer.spec.weights_digest
         fault = f"was made by {shards.spec.name} with weights {made}, and the weights here are {here}"
         raise TokenizerError(shards.folder, fault, "give the weights it was made with, or convert again")
     return tokenizer

@@ -95,6 +95,12 @@ class TokenizerSpec:
         return self.grid if self.kind == "discrete" else (self.channels or 0, *self.grid)
 
     @property
+    def weights_digest(self) -> str:
+        """Return twelve hex digits of the SHA-256 of the weights, or of the colours; empty for neither."""
+        colors = hashlib.sha256(self.colors.encode()).hexdigest() if self.colors else ""
+        return (self.weights_sha256 or colors)[:12]
+
+    @property
     def digest(self) -> str:
         """Return sixteen hex digits of the SHA-256 over all attributes."""
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
@@ -132,9 +138,22 @@ def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, devi
         MissingDependencyError: a package that it needs is not installed.
         PluginError: the package that adds it is broken.
     """
-    name, given = as_text(name_or_path), None if weights is None else as_text(weights)
+    return _opened(as_text(name_or_path), None if weights is None else as_text(weights), device)
+
+
+def reopened(spec: Mapping[str, Any], device: str = "cpu") -> Tokenizer:
+    """Return the tokenizer of a spec's values, as in a checkpoint; raise as `get_tokenizer`.
+
+    A palette is made of the colours in the spec. No file is opened that a spec names.
+    """
+    return _opened(full_name(spec), None, device, spec.get("colors"))
+
+
+def _opened(name: str, weights: str | None, device: str, colors: Any = None) -> Tokenizer:
     entry = usable_entry(name)
-    keywords = {"weights": given, "device": device, **entry.arguments}
+    keywords = {"weights": weights, "device": device, **entry.arguments}
+    if "colors" in keywords:
+        keywords["colors"] = colors
     if entry.name in CATALOG:
         tokenizer: Tokenizer = import_module(entry.module).load(entry.name, **keywords)
     else:
@@ -144,11 +163,6 @@ def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, devi
         tokenizer = copy(tokenizer)
         tokenizer.spec = spec
     return tokenizer
-
-
-def reopened(spec: Mapping[str, Any], device: str = "cpu") -> Tokenizer:
-    """Return the tokenizer of a spec's values, as in a checkpoint; raise as `get_tokenizer`."""
-    return get_tokenizer(full_name(spec), weights=spec.get("colors") or None, device=device)
 
 
 def filtered(spec: TokenizerSpec, name: str) -> TokenizerSpec:

@@ -130,7 +130,8 @@ _ROWS = (
     Entry(
         "palette-64", "discrete", 64, (32, 32),
         "a colour per pixel of a short list, 2×2 pixels a token: sharp edges for a convolutional world model",
-        "embedded", "hma_data.tokenizers.palette", {"image_size": 64}, file="palette.safetensors",
+        "embedded", "hma_data.tokenizers.palette", {"image_size": 64, "colors": None},
+        file="palette.safetensors",
     ),
     Entry(
         "vae-8", "continuous", 256, (32, 32),

@@ -7,9 +7,9 @@ photographs; `fit` makes one of other images. The embedded list is that of the l
 B images, S pixels a side, h·w grid, K colours. Pixels inside the network are in [-1, 1].
 """
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from hma_data.storage.files import write_atomic
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 from hma_data.tokenizers.checkpoints import find_weights
 from hma_data.tokenizers.network import NetworkTokenizer, open_device
-from hma_data.tokenizers.shapes import CELL, MOST_COLORS, palette_spec, read_colors
+from hma_data.tokenizers.shapes import CELL, MOST_COLORS, palette_spec, parse_colors, read_colors
 
 BITS = 5  # of a channel in the table of nearest colours
 ROUNDS = 40  # of k-means
@@ -64,18 +64,19 @@ class Shown(nn.Module):
         return self.colors[squares.flatten(3, 4).flatten(1, 2)].permute(0, 3, 1, 2)
 
 
-def load(name: str, *, weights: str | None, device: str, image_size: int) -> NetworkTokenizer:
+def load(name: str, *, weights: str | None, device: str, image_size: int, colors: Any) -> NetworkTokenizer:
     """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors.
 
     Args:
-        weights: a file of `write`, or the colours themselves as `TokenizerSpec.colors` has them.
+        weights: a file that `read_colors` reads.
+        colors: those of a spec, as `TokenizerSpec.colors`, instead of a file.
     """
     place = open_device(name, device)
-    if weights and re.fullmatch("([0-9a-f]{6})+", weights):
-        colors: NDArray[np.uint8] = np.frombuffer(bytes.fromhex(weights), np.uint8).reshape(-1, 3)
+    if colors:
+        chosen = parse_colors(colors, name)
     else:
-        colors = read_colors(find_weights(name, weights) if weights else EMBEDDED / CATALOG[name].file)
-    spec, values = palette_spec(name, image_size, colors), torch.from_numpy(colors.copy())
+        chosen = read_colors(find_weights(name, weights) if weights else EMBEDDED / CATALOG[name].file)
+    spec, values = palette_spec(name, image_size, chosen), torch.from_numpy(chosen.copy())
     network = nn.Module()
     network.encoder, network.decoder = Nearest(values), Shown(values)
     return NetworkTokenizer(spec, network, place, network.encoder, network.decoder, light=True)

@@ -4,13 +4,14 @@ The command that plans a conversion needs what a tokenizer is, not its network: 
 """
 
 import math
+import re
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from safetensors import SafetensorError, safe_open
 
 from hma_data.errors import TokenizerError
-from hma_data.storage.files import file_sha256
+from hma_data.storage.files import file_sha256, read_json
 from hma_data.storage.kinds import unreadable
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.base import TokenizerSpec, filtered, get_tokenizer, usable_entry
@@ -28,6 +29,7 @@ VERSION = 1
 PATCH = 8
 CELL = 2  # pixels a side of the square that is a token of a palette
 MOST_COLORS = 255  # four of them fit 32 bits
+_COLORS = "name a file of `hma tokenizer fit`, or a config.json or manifest.json with colours"
 Width = Annotated[int, Field(ge=1, le=4096)]
 Blocks = Annotated[int, Field(ge=0, le=256)]
 
@@ -142,18 +144,33 @@ def read_shape[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[C,
 
 
 def read_colors(path: Path) -> NDArray[np.uint8]:
-    """Return the colours (K, 3) of a palette's file; raise TokenizerError if it holds something else."""
-    remedy = "name a file that `hma tokenizer fit` wrote"
+    """Return the colours (K, 3) in a file of `hma tokenizer fit`, a config.json, or a manifest.json.
+
+    Raises:
+        TokenizerError: the file holds something else.
+    """
+    if path.suffix == ".json":
+        spec = read_json(path, TokenizerError).get("tokenizer")
+        return parse_colors(spec.get("colors") if isinstance(spec, dict) else None, path)
     try:
         with safe_open(path, "np") as file:
             colors = file.get_tensor("colors")
     except (SafetensorError, OSError) as fault:
         text = f"holds no colours: {' '.join(str(fault).split())[:160]}"
-        raise TokenizerError(path, *unreadable(path, text, remedy)) from fault
+        raise TokenizerError(path, *unreadable(path, text, _COLORS)) from fault
     if colors.dtype != np.uint8 or colors.shape[1:] != (3,) or not 2 <= len(colors) <= MOST_COLORS:
         text = f"its colours are {colors.dtype} {colors.shape}, not uint8 (2 to {MOST_COLORS}, 3)"
-        raise TokenizerError(path, text, remedy)
+        raise TokenizerError(path, text, _COLORS)
     return colors
+
+
+def parse_colors(text: Any, where: object) -> NDArray[np.uint8]:
+    """Return the colours (K, 3) of a value of `TokenizerSpec.colors`; raise TokenizerError for another."""
+    if not isinstance(text, str) or not re.fullmatch("[0-9a-f]*", text) or len(text) % 6:
+        raise TokenizerError(where, "holds no colours in hex, six digits each", _COLORS)
+    if not 2 <= len(text) // 6 <= MOST_COLORS:
+        raise TokenizerError(where, f"has {len(text) // 6} colours, not 2 to {MOST_COLORS}", _COLORS)
+    return np.frombuffer(bytes.fromhex(text), np.uint8).reshape(-1, 3)
 
 
 def palette_spec(name: str, image_size: int, colors: NDArray[np.uint8]) -> TokenizerSpec:

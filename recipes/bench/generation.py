@@ -187,10 +187,10 @@ class Frames:
         return rollout
 
     def _tokenizer(self) -> Any:
-        from hma_data.tokenizers.base import get_tokenizer
+        from hma_data.tokenizers.base import reopened
 
         usual = "fsq-16" if self.model.config.kind == "discrete" else "vae-8"
-        return get_tokenizer(self.model.config.tokenizer.get("name", usual), device=str(self.model.device))
+        return reopened({"name": usual, **self.model.config.tokenizer}, str(self.model.device))
 
     def _show(self, frames: "torch.Tensor") -> Any:
         """Return the pictures of frames if they are to be decoded."""

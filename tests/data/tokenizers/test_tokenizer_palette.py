@@ -73,3 +73,40 @@ def test_a_file_of_other_values_is_refused(tmp_path: Path, colors: Colors) -> No
     path.write_bytes(b"no")
     with pytest.raises(TokenizerError, match=r"own.safetensors: "):
         get_spec("palette-64", weights=path)
+
+
+OWN = np.array([[0, 0, 0], [255, 255, 255], [200, 0, 0]], np.uint8)
+
+
+@pytest.mark.parametrize(
+    "colors", ["own.safetensors", "hf://team/own/own.safetensors", "0a0b0", "00" * 3, "000000" * 256, 7]
+)
+@pytest.mark.parametrize("name", ["palette-64", "fsq-16"])
+def test_colours_of_a_spec_open_no_file_and_are_never_too_many(
+    name: str, colors: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path / "own.safetensors", OWN)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("hma_data.tokenizers.palette.Nearest", None)  # a table for millions of colours
+    spec = {"name": name, "colors": colors}
+    if name == "palette-64":
+        with pytest.raises(TokenizerError, match="palette-64: (holds no|has 1|has 256) colours"):
+            reopened(spec)
+    else:
+        assert reopened(spec).spec == get_spec("fsq-16")
+
+
+def test_a_file_whose_name_could_be_colours_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "decade", OWN)
+    monkeypatch.chdir(tmp_path)
+    assert get_tokenizer("palette-64", weights="decade").spec.factored == (3,) * 4
+
+
+def test_colours_are_read_from_the_json_of_a_model_or_a_set(tmp_path: Path) -> None:
+    write(tmp_path / "own.safetensors", OWN)
+    own, path = get_spec("palette-64", weights=tmp_path / "own.safetensors"), tmp_path / "config.json"
+    path.write_text(json.dumps({"model": {}, "tokenizer": own.to_json()}))
+    assert get_tokenizer("palette-64", weights=path).spec == own
+    path.write_text(json.dumps({"tokenizer": get_spec("fsq-16").to_json()}))
+    with pytest.raises(TokenizerError, match=r"config.json: holds no colours"):
+        get_tokenizer("palette-64", weights=path)
