@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (684, 3_882, 7),
     "hma_data/cli": (1_553, 11_132, 8),
-    "hma_data/conversion": (4_258, 31_626, 15),
+    "hma_data/conversion": (4_260, 31_626, 15),
     "hma_data/episodes": (1_671, 14_652, 9),
     "hma_data/hub": (512, 3_787, 3),
     "hma_data/inspection": (2_151, 20_090, 8),
@@ -28,13 +28,13 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/tokenizers": (3_475, 25_529, 18),
     "hma_model": (518, 3_161, 4),
     "hma_model/benchmark": (845, 7_250, 5),
-    "hma_model/checkpoint": (885, 6_600, 5),
+    "hma_model/checkpoint": (889, 6_600, 5),
     "hma_model/cli": (1_725, 10_738, 12),
     "hma_model/demo": (485, 4_100, 4),
     "hma_model/evaluation": (4_601, 36_893, 24),
     "hma_model/export": (1_189, 9_410, 9),
     "hma_model/generation": (1_666, 13_448, 10),
-    "hma_model/hub": (1_060, 8_209, 6),
+    "hma_model/hub": (1_062, 8_209, 6),
     "hma_model/lerobot_env": (638, 4_776, 3),
     "hma_model/network": (3_273, 28_792, 16),
     "hma_model/play": (1_655, 11_950, 8),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_621, 30_120, 19),
     "hma_model/worlds": (1_520, 11_387, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_484, 518_781
-TEST_LINES = 48_624
+PRODUCT_LINES, PRODUCT_NODES = 65_492, 518_790
+TEST_LINES = 48_649
 DOC_WORDS = 40_640
 
 

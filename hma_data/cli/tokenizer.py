@@ -130,7 +130,7 @@ def tokenizer_eval(
     for note in notes:
         say(note, err=True)
     if out:
-        title = f"{tokenizer}, weights {opened.spec.weights_sha256[:12] or 'none'}"
+        title = f"{tokenizer}, weights {opened.spec.weights_digest or 'none'}"
         paths = write_report(out, title, found, notes)
         say(f"wrote {', '.join(map(str, paths))}", err=True)
 

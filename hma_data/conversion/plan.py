@@ -260,7 +260,9 @@ def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:
 
 def _short(value: Any) -> str:
     if isinstance(value, dict):
-        return f"{value['name']} {value.get('weights_sha256', '')[:8]}".strip() if "name" in value else ""
+        if "weights_sha256" not in value:  # not a tokenizer
+            return ""
+        return f"{value['name']} {TokenizerSpec.from_json(value).weights_digest}".strip()
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 

@@ -277,6 +277,10 @@ def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -
         fault = f"was trained on tokenizer {name!r}, this is {spec.name!r}"
         if "name" in differing:
             raise CheckpointError(where, fault, f"convert the recordings with --tokenizer {name}")
+        if key == "colors":
+            fault = f"was trained on other colours of {name!r}"
+            remedy = f"convert with --tokenizer {name} --weights PATH, the path of its {CONFIG}"
+            raise CheckpointError(where, fault, remedy)
         fault = f"{fault}: {key} is {ours.get(key)!r} there and {theirs.get(key)!r} here"
         if differing == ["resize_filter"]:
             remedy = f"convert the recordings with --tokenizer {name}:{ours.get(key)}"

@@ -139,10 +139,12 @@ def _refuse_others(store: Store, manifest: Manifest) -> dict[str, int]:
     if MANIFEST not in files:
         return files
     there = _published(store, f"delete {MANIFEST} there if the set is yours, and push again")[0]
-    ours = (manifest.embodiment.id, manifest.tokenizer.name, manifest.tokenizer.weights_sha256)
-    theirs = (there.embodiment.id, there.tokenizer.name, there.tokenizer.weights_sha256)
+    theirs, ours = (
+        f"{one.embodiment.id} under {one.tokenizer.name} {one.tokenizer.weights_digest}".strip()
+        for one in (there, manifest)
+    )
     if ours != theirs:
-        fault = f"holds the shard set of {theirs[0]} under {theirs[1]}, not of {ours[0]} under {ours[1]}"
+        fault = f"holds the shard set of {theirs}, not of {ours}"
         raise HubError(store.name, fault, "push to another address")
     return files
 

@@ -6,10 +6,12 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from hma_data.errors import CheckpointError
+from hma_data.tokenizers.shapes import palette_spec
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import Checkpoint, read_metadata, require_tokenizer
 from tests.model.robots import CONFIG, SPEC, edit_card, make_model, save, yaml
@@ -82,6 +84,13 @@ def test_a_tokenizer_other_than_the_models_is_refused_with_the_difference(folder
     other = {**SPEC.to_json(), "image_size": 32}
     with pytest.raises(CheckpointError, match="image_size is 16 there and 32 here"):
         require_tokenizer(Checkpoint.open(folder).config, type(SPEC).from_json(other), folder)
+
+
+def test_colours_other_than_the_models_are_refused_with_where_its_own_are():
+    spec, other = (palette_spec("palette-64", 64, np.eye(3, dtype=np.uint8) * n) for n in (1, 2))
+    config = CONFIG.replace(tokenizer=spec.to_json())
+    with pytest.raises(CheckpointError, match="other colours of 'palette-64' — .*--weights PATH"):
+        require_tokenizer(config, other, "runs/own")
 
 
 def test_the_links_of_a_hub_cache_are_followed(folder, tmp_path):

@@ -10,6 +10,7 @@ import torch
 from huggingface_hub import DatasetCard, ModelCard
 
 from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.shapes import get_spec, palette_spec
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.checkpoint.io import record_evaluation
 from hma_model.checkpoint.model_card import licence, render
@@ -126,8 +127,10 @@ def test_a_shard_sets_card_tells_the_viewer_its_tables(tmp_path: Path) -> None:
     assert data.license == "apache-2.0" and data.task_categories == ["robotics"]
 
 
-def test_a_shard_sets_code_runs_as_pasted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = get_tokenizer("fsq-lab").spec
+@pytest.mark.parametrize("name", ["fsq-lab", "palette-64"])
+def test_a_shard_sets_code_runs_as_pasted(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    colors = np.random.default_rng(0).integers(0, 256, (3, 3), np.uint8)
+    spec = palette_spec(name, 64, colors) if name == "palette-64" else get_spec(name)
     push_data(make_shards(tmp_path / "shards", "arm", spec=spec), tmp_path / "hub")
     found = re.search(r"```python\n(.*?)```", (tmp_path / "hub" / "README.md").read_text(), re.DOTALL)
     assert found
@@ -135,7 +138,10 @@ def test_a_shard_sets_code_runs_as_pasted(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path / "cache")
     made: dict[str, Any] = {}
     exec(found[1], made)
-    assert made["images"].shape == (8, 128, 128, 3) and made["images"].dtype == np.uint8
+    size = spec.image_size
+    assert made["images"].shape == (8, size, size, 3) and made["images"].dtype == np.uint8
+    if spec.colors:
+        assert {*map(tuple, made["images"].reshape(-1, 3))} <= {*map(tuple, colors)}
 
 
 @pytest.mark.parametrize(

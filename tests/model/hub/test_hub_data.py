@@ -9,6 +9,7 @@ import pytest
 from hma_data.conversion import publish
 from hma_data.errors import HubError, ShardError
 from hma_data.shards.reader import ShardSet
+from hma_data.tokenizers.shapes import palette_spec
 from hma_model.hub.datasets import pull_data, push_data
 from tests.conftest import contents
 from tests.hub_server import Hub
@@ -97,6 +98,15 @@ def test_an_unfinished_push_is_no_shard_set(server, shards, tmp_path, monkeypatc
     assert "train/shard-00000.parquet" in dataset(server).files
     with pytest.raises(HubError, match=r"has no manifest\.json.*has its push finished"):
         pull_data(REPO, tmp_path / "out")
+
+
+def test_a_set_of_other_colours_is_not_pushed_over_another(server, tmp_path):
+    for seed, name in enumerate(("own", "other")):
+        colors = np.random.default_rng(seed).integers(0, 256, (3, 3), np.uint8)
+        make_shards(tmp_path / name, "arm", spec=palette_spec("palette-64", 64, colors))
+    push_data(tmp_path / "own", REPO)
+    with pytest.raises(HubError, match="holds the shard set of arm under palette-64 .*, not of arm under"):
+        push_data(tmp_path / "other", REPO)
 
 
 def test_an_interrupted_pull_goes_on_file_by_file(server, shards, tmp_path):
