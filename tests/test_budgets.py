@@ -25,7 +25,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/shards": (2_555, 19_554, 11),
     "hma_data/sources": (12_552, 104_849, 50),
     "hma_data/storage": (1_664, 10_939, 11),
-    "hma_data/tokenizers": (3_475, 25_529, 18),
+    "hma_data/tokenizers": (3_489, 25_694, 18),
     "hma_model": (518, 3_161, 4),
     "hma_model/benchmark": (845, 7_250, 5),
     "hma_model/checkpoint": (889, 6_600, 5),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_621, 30_120, 19),
     "hma_model/worlds": (1_520, 11_387, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_492, 518_790
-TEST_LINES = 48_649
+PRODUCT_LINES, PRODUCT_NODES = 65_504, 518_937
+TEST_LINES = 48_683
 DOC_WORDS = 40_640
 
 

@@ -155,14 +155,12 @@ def tokenizer_fit(
     from hma_data.tokenizers.training.frames import films_of
 
     spec, skipped = get_spec("palette-64"), list[str]()
-    films: list[Any] = []
-    for place in data:
-        films += films_of(place, spec, embodiment=robot, frames=frames, on_skip=skipped.append)
-    chosen = fit(films, colors)
+    given: Any = {"embodiment": robot, "frames": frames, "on_skip": skipped.append}
+    chosen = fit((film for place in data for film in films_of(place, spec, **given)), colors)
     write(out, chosen)
     if skipped:
         say(f"{len(skipped)} files or episodes could not be read, the first: {skipped[0]}", err=True)
-    print(f"wrote {out}: {len(chosen)} colours, from {sum(map(len, films)):,} frames")
+    print(f"wrote {out}: {len(chosen)} colours")
 
 
 def _perceptual(wanted: bool | None, device: str) -> tuple[Any, str]:

@@ -7,7 +7,7 @@ photographs; `fit` makes one of other images. The embedded list is that of the l
 B images, S pixels a side, h·w grid, K colours. Pixels inside the network are in [-1, 1].
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 from torch import Tensor, nn
 
+from hma_data.errors import TokenizerError
 from hma_data.storage.files import write_atomic
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 from hma_data.tokenizers.checkpoints import find_weights
@@ -25,6 +26,7 @@ from hma_data.tokenizers.shapes import CELL, MOST_COLORS, palette_spec, parse_co
 
 BITS = 5  # of a channel in the table of nearest colours
 ROUNDS = 40  # of k-means
+AT_ONCE = 2**16  # colours whose distances to all centres are in memory
 
 
 class Nearest(nn.Module):
@@ -87,24 +89,31 @@ def write(path: Path, colors: NDArray[np.uint8]) -> None:
     write_atomic(path, save({"colors": colors}))
 
 
-def fit(films: Sequence[NDArray[np.uint8]], count: int = MOST_COLORS) -> NDArray[np.uint8]:
+def fit(films: Iterable[NDArray[np.uint8]], count: int = MOST_COLORS) -> NDArray[np.uint8]:
     """Return at most `count` colours (K, 3) for films (N, S, S, 3), by k-means.
 
     Each different colour counts by the fourth root of its pixels, so that small objects keep theirs. The
     search begins at the commonest colour, and at those that are far from the ones before.
+
+    Raises:
+        TokenizerError: the films have fewer than two colours.
     """
-    packed = np.concatenate(films).reshape(-1, 3).astype(np.uint32) @ np.array(
-        [1 << 16, 1 << 8, 1], np.uint32
-    )
-    values, counts = np.unique(packed, return_counts=True)
+    pixels = np.zeros(2**24, np.int64)  # of each colour there is
+    for film in films:
+        red, green, blue = film.reshape(-1, 3).T.astype(np.int64)
+        np.add.at(pixels, red << 16 | green << 8 | blue, 1)
+    values = np.flatnonzero(pixels)
+    if len(values) < 2:
+        raise TokenizerError("images", "show fewer than two colours", "name images of the robot's scene")
     colors = np.stack([values >> 16, values >> 8 & 255, values & 255], axis=1).astype(np.float32)
-    weights, centres = counts**0.25, colors[counts.argmax()][None]
+    weights, centres = pixels[values] ** 0.25, colors[pixels[values].argmax()][None]
     nearest = ((colors - centres) ** 2).sum(1)
     while len(centres) < min(count, len(colors)):
         centres = np.concatenate([centres, colors[[(nearest * weights).argmax()]]])
         nearest = np.minimum(nearest, ((colors - centres[-1]) ** 2).sum(1))
     for _ in range(ROUNDS):
-        own = torch.cdist(torch.from_numpy(colors), torch.from_numpy(centres)).argmin(1).numpy()
+        parts = torch.from_numpy(colors).split(AT_ONCE)
+        own = torch.cat([torch.cdist(part, torch.from_numpy(centres)).argmin(1) for part in parts]).numpy()
         total = np.bincount(own, weights, len(centres))[:, None]
         sums = np.stack([np.bincount(own, weights * colors[:, axis], len(centres)) for axis in range(3)], 1)
         centres = np.where(total > 0, sums / np.maximum(total, 1e-9), centres).astype(np.float32)

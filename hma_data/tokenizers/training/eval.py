@@ -120,30 +120,35 @@ def open_lpips(*, download: bool, device: str = "cpu") -> Perceptual:
 
 
 class CodebookUse:
-    """Counts of the ids that occur."""
+    """Counts of the ids that occur; a vocabulary may have billions that do not."""
 
     def __init__(self, spec: TokenizerSpec) -> None:
         self.sizes = spec.factored or (spec.vocab_size or 1,)
-        self.joint = np.zeros(spec.vocab_size or 1, np.int64)
+        self.ids, self.counts = np.zeros((2, 0), np.int64)  # the ids in rising order
 
     def add(self, ids: NDArray[Any]) -> None:
         """Count (N, h, w) ids."""
-        self.joint += np.bincount(ids.ravel().astype(np.int64), minlength=len(self.joint))
+        found, counts = np.unique(ids.astype(np.int64), return_counts=True)
+        self.ids, place = np.unique(np.concatenate([self.ids, found]), return_inverse=True)
+        total = np.zeros(len(self.ids), np.int64)
+        np.add.at(total, place, np.concatenate([self.counts, counts]))
+        self.counts = total
 
     def result(self) -> dict[str, Any]:
         """Return the share used and the perplexity of each digit, and figures of the whole id.
 
         For the whole id: the number of ids used, the perplexity, and the entropy in bits a token.
         """
-        # Low digit first: in C order of the reversed sizes it is the last axis.
-        table = self.joint.reshape(self.sizes[::-1])
-        axes = range(table.ndim)
-        digits = [table.sum(axis=tuple(other for other in axes if other != axis)) for axis in reversed(axes)]
-        entropy = _entropy_bits(self.joint)
+        digits, rest = list[NDArray[np.int64]](), self.ids
+        for size in self.sizes:  # low digit first
+            digits.append(np.zeros(size, np.int64))
+            np.add.at(digits[-1], rest % size, self.counts)
+            rest = rest // size
+        entropy = _entropy_bits(self.counts)
         return {
             "digit_use": [round(float((counts > 0).mean()), 4) for counts in digits],
             "digit_perplexity": [round(2 ** _entropy_bits(counts), 1) for counts in digits],
-            "joint_used_ids": int((self.joint > 0).sum()),
+            "joint_used_ids": len(self.ids),
             "joint_perplexity": round(2**entropy, 1),
             "entropy_bits_per_token": round(entropy, 3),
         }

@@ -11,12 +11,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
+from hma_data.episodes.sheets import write_png
 from hma_data.errors import TokenizerError
+from hma_data.tokenizers import palette
 from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer, reopened
 from hma_data.tokenizers.palette import Nearest, Shown, fit, write
 from hma_data.tokenizers.shapes import get_spec
+from tests.command import hma
 
 Colors = NDArray[np.uint8]
+OWN = np.array([[0, 0, 0], [255, 255, 255], [200, 0, 0]], np.uint8)
 
 
 @given(seed=st.integers(0, 10**6), count=st.integers(2, 255))
@@ -47,9 +51,31 @@ def test_fitted_colours_keep_a_small_object_apart() -> None:
     assert sorted(map(tuple, colors.tolist())) == [(90, 90, 90), (200, 30, 40), (250, 250, 250)]
 
 
+def test_fitted_colours_of_noise_are_found_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (1, 64, 64, 3)).astype(np.uint8)
+    whole = fit(iter([noise]), 8)
+    monkeypatch.setattr(palette, "AT_ONCE", 500)
+    assert np.abs(fit([noise], 8).astype(int) - whole).max() <= 1
+
+
+def test_the_command_writes_the_colours_of_images(tmp_path: Path) -> None:
+    write_png(tmp_path / "some.png", np.repeat(OWN[[0, 1, 2, 1]], 16, axis=0)[:, None].repeat(64, axis=1))
+    (tmp_path / "none.png").write_bytes(b"no")
+    done = hma("tokenizer", "fit", tmp_path, "--out", tmp_path / "own.safetensors")
+    assert done.returncode == 0 and done.stdout == f"wrote {tmp_path}/own.safetensors: 3 colours\n"
+    assert "1 files or episodes could not be read" in done.stderr
+    spec = get_spec("palette-64", weights=tmp_path / "own.safetensors")
+    assert {spec.colors[at : at + 6] for at in (0, 6, 12)} == {"000000", "ffffff", "c80000"}
+
+
+def test_images_of_one_colour_are_refused() -> None:
+    with pytest.raises(TokenizerError, match="images: show fewer than two colours — name images of"):
+        fit([np.zeros((1, 64, 64, 3), np.uint8)])
+
+
 def test_colours_of_ones_own(tmp_path: Path) -> None:
     path = tmp_path / "own.safetensors"
-    write(path, np.array([[0, 0, 0], [255, 255, 255], [200, 0, 0]], np.uint8))
+    write(path, OWN)
     tokenizer = get_tokenizer("palette-64", weights=path)
     assert tokenizer.spec.factored == (3,) * 4
     assert tokenizer.spec == get_spec("palette-64", weights=path)
@@ -73,9 +99,6 @@ def test_a_file_of_other_values_is_refused(tmp_path: Path, colors: Colors) -> No
     path.write_bytes(b"no")
     with pytest.raises(TokenizerError, match=r"own.safetensors: "):
         get_spec("palette-64", weights=path)
-
-
-OWN = np.array([[0, 0, 0], [255, 255, 255], [200, 0, 0]], np.uint8)
 
 
 @pytest.mark.parametrize(

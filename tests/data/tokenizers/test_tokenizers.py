@@ -392,6 +392,17 @@ def test_codebook_use_of_known_ids(fsq8):
     assert result["joint_perplexity"] == 4 and result["entropy_bits_per_token"] == 2
 
 
+def test_codebook_use_of_a_vocabulary_of_billions():
+    spec = get_spec("palette-64")
+    use = CodebookUse(spec)
+    for last in (0, spec.vocab_size - 1):
+        use.add(np.array([[[0, 1], [254, last]]], np.uint32))
+    result = use.result()
+    assert (
+        result["joint_used_ids"] == 4 and result["digit_use"] == [round(3 / 255, 4)] + [round(2 / 255, 4)] * 3
+    )
+
+
 def test_evaluation_does_not_depend_on_how_frames_are_batched(fsq8):
     frames = scenes(5, 128)
     single, whole = evaluate(fsq8, iter(frames), worst=2), evaluate(fsq8, [frames], worst=2)
