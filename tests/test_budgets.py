@@ -32,7 +32,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/cli": (1_725, 10_738, 12),
     "hma_model/demo": (485, 4_100, 4),
     "hma_model/evaluation": (4_601, 36_893, 24),
-    "hma_model/export": (1_189, 9_410, 9),
+    "hma_model/export": (1_193, 9_456, 9),
     "hma_model/generation": (1_666, 13_448, 10),
     "hma_model/hub": (1_062, 8_209, 6),
     "hma_model/lerobot_env": (638, 4_776, 3),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_621, 30_120, 19),
     "hma_model/worlds": (1_520, 11_387, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_504, 518_937
-TEST_LINES = 48_683
+PRODUCT_LINES, PRODUCT_NODES = 65_509, 518_985
+TEST_LINES = 48_689
 DOC_WORDS = 40_640
 
 

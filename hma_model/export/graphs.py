@@ -228,7 +228,7 @@ class StepGraph(nn.Module):
         self, frame: Tensor, conditioning: Conditioning, times: TimePositions, past: Carried, draws: Any
     ) -> tuple[Tensor, Tensor]:
         """Return the next frame's tokens (h, w) int32, and their mean entropy (1,) as of `Rollout`."""
-        before = self._digits(frame.long())
+        before = self._digits(self._ids(frame))
         digits, nats = torch.zeros_like(before), torch.zeros(1)
         shown = torch.zeros(before.shape[:2], dtype=torch.bool)
         uniform = draws["noise"].clamp(1e-20, 1 - 2**-24)
@@ -257,6 +257,11 @@ class StepGraph(nn.Module):
             likely = torch.cat([_widened(scores, values) for scores in unsure], dim=1).softmax(-1)
             nats = nats - (likely * likely.clamp_min(1e-30).log()).sum((1, 2, 3))
         return self._stored(digits), nats / digits.shape[1]
+
+    def _ids(self, stored: Tensor) -> Tensor:
+        """Return tokens int32 as int64 ids; those from 2³¹ on have become negative."""
+        ids = stored.long()
+        return ids % 2**32 if self.config.vocab_size > 2**31 else ids
 
     def _digits(self, frame: Tensor) -> Tensor:
         """Return the digits (1, S, F) of tokens (h, w), those of a square of tokens side by side."""
@@ -305,7 +310,7 @@ class StepGraph(nn.Module):
         else:
             assert isinstance(self.tokenizer, NetworkTokenizer)
             # Latents are decoded as shards store them.
-            kept = [view.long() if self.discrete else view.half().float() for view in views]
+            kept = [self._ids(view) if self.discrete else view.half().float() for view in views]
             images = [self.tokenizer.pixels(view).add(1).mul(127.5).round().clamp(0, 255) for view in kept]
         return torch.cat(images, dim=-1)[0].permute(1, 2, 0).to(torch.uint8)
 

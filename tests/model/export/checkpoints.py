@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from hma_data.lab import family
-from hma_data.tokenizers.shapes import get_spec, palette_spec
+from hma_data.tokenizers.shapes import get_spec
 from hma_model.checkpoint import io as checkpoint
 from hma_model.config import HMAConfig
 from hma_model.generation.unmask import masked_after
@@ -35,8 +35,8 @@ def save_pixels(folder: Path) -> Path:
 
 
 def save_colors(folder: Path) -> Path:
-    """Save a U-Net of colours whose frames move."""
-    spec = palette_spec("palette-64", 64, np.eye(3, dtype=np.uint8) * 255)
+    """Save a U-Net of colours whose frames move; most of their ids need 32 bits."""
+    spec = get_spec("palette-64")
     values = {**COLORS, "grid": spec.grid, "factored": spec.factored, "tokenizer": spec.to_json()}
     return _save_unet(folder, values)
 
