@@ -131,7 +131,9 @@ def test_the_estimate_of_a_pass_is_near_what_it_keeps_for_its_backward_pass(spec
     ],
 )
 def test_recipes_for_laptops_run_on_laptops(name, spec, objective):
-    recipe = load_recipe(name, [f"objectives={{{objective}: 1}}", "model.crop=0"])
+    reads = name == "unet_colors" and OBJECTIVES[objective].readout  # no squares: fewer windows
+    whole = ["model.crop=0", "batch_size=8"] if reads else []
+    recipe = load_recipe(name, [f"objectives={{{objective}: 1}}", *whole])
     assert needed_bytes(network(recipe, spec), recipe, CPU) < 2 * memory.GIB
 
 
