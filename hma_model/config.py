@@ -24,6 +24,7 @@ from hma_data.errors import RecipeError
 if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
 
+CROP_EDGE = 2  # tokens from the cut edge of a square that have no loss, as they lack what lies beyond it
 MOST_IDS = 2**62  # of the trunk's tokens: ids are int64
 
 
@@ -375,8 +376,8 @@ def _unet_rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
     fits = not any(size % side for size in (config.token_grid[0] // config.views, config.token_grid[1]))
     yield "levels", fits, f"fewer: tokens lie on {config.token_grid}, not multiples of {side}"
     most = min(config.token_grid[0] // config.views, config.token_grid[1])
-    fits = 0 <= config.crop <= most and not config.crop % side
-    yield "crop", fits, f"0, or a multiple of {side} of at most {most}"
+    fits = config.crop == 0 or (2 * CROP_EDGE < config.crop <= most and not config.crop % side)
+    yield "crop", fits, f"0, or a multiple of {side} from {2 * CROP_EDGE + 1} to {most}"
     whole = config.whole_frames and not config.trained_readouts
     needs = "0: parts of frames need training_pass pairs, whole_share 1 and no objective that reads actions"
     yield "crop", not config.crop or whole, needs

@@ -26,7 +26,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/sources": (12_552, 104_849, 50),
     "hma_data/storage": (1_664, 10_939, 11),
     "hma_data/tokenizers": (3_489, 25_694, 18),
-    "hma_model": (518, 3_161, 4),
+    "hma_model": (519, 3_188, 4),
     "hma_model/benchmark": (845, 7_250, 5),
     "hma_model/checkpoint": (889, 6_600, 5),
     "hma_model/cli": (1_725, 10_738, 12),
@@ -36,16 +36,16 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/generation": (1_666, 13_448, 10),
     "hma_model/hub": (1_062, 8_209, 6),
     "hma_model/lerobot_env": (638, 4_776, 3),
-    "hma_model/network": (3_273, 28_792, 16),
+    "hma_model/network": (3_277, 28_811, 16),
     "hma_model/play": (1_655, 11_950, 8),
     "hma_model/policies": (2_825, 20_100, 14),
     "hma_model/released": (825, 7_100, 4),
     "hma_model/synthetic": (1_205, 9_100, 5),
-    "hma_model/training": (3_621, 30_120, 19),
+    "hma_model/training": (3_622, 30_137, 19),
     "hma_model/worlds": (1_520, 11_387, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_509, 518_985
-TEST_LINES = 48_689
+PRODUCT_LINES, PRODUCT_NODES = 65_515, 519_048
+TEST_LINES = 48_741
 DOC_WORDS = 40_640
 
 

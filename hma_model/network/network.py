@@ -179,18 +179,20 @@ class Network(nn.Module):
             raise HMAError("window", fault, "give a shorter window")
         return window_times(self.config, frames, self.device)
 
-    def frame_values(self, frames: Tensor) -> Tensor:
+    def frame_values(self, frames: Tensor, places: Tensor | None = None) -> Tensor:
         """Return the trunk's token ids (B, T, S), or the scaled patches (B, T, S, c*p*p), of stored frames.
 
         Args:
             frames: tokens (B, T, h, w) int64, or latents (B, T, c, H, W).
+            places: those of squares of frames, as `Batch.places`; None for whole frames.
 
         Raises:
             HMAError: the frames have another shape.
         """
         config, shape = self.config, tuple(frames.shape[2:])
-        if shape not in (config.frame_shape, config.crop_shape):
-            fault = f"a frame has the shape {shape}, but the model takes {config.frame_shape}"
+        wanted = config.frame_shape if places is None else config.crop_shape
+        if shape != wanted:
+            fault = f"a frame has the shape {shape}, but the model takes {wanted}"
             raise HMAError("frames", fault, "use the model's tokenizer")
         if config.kind == "discrete":
             return merge_tokens(frames.long(), config.merge, config.vocab_size)

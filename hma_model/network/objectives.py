@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from hma_data.errors import HMAError
-from hma_model.config import OBJECTIVES, HMAConfig, Objective, Readout
+from hma_model.config import CROP_EDGE, OBJECTIVES, HMAConfig, Objective, Readout
 from hma_model.network.conditioning import Groups, align
 from hma_model.network.copying import frames_before
 from hma_model.network.head import randn, uniform
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from hma_data.loading.rows import Batch
 
 ACTION_LOSS_WEIGHT = 0.5  # relative to the video loss
-EDGE = 2  # places from a cut edge that have no loss, as they lack what lies beyond it
 
 
 @dataclass
@@ -119,9 +118,9 @@ def compute(
     stored = batch.tokens if config.kind == "discrete" else batch.latents
     if stored is None:
         raise HMAError("batch", f"has no frames for a {config.kind} model", "use the model's tokenizer")
-    frames, groups = model.frame_values(stored), Groups.of(batch.embodiment, len(batch.actions))
+    places, groups = _optional(batch, "places"), Groups.of(batch.embodiment, len(batch.actions))
+    frames = model.frame_values(stored, places)
     layout = Layout.of(model, batch.actions.shape[1], chosen)
-    places = _optional(batch, "places")
     layout.times.places = None if places is None else groups.sort(places)
 
     video = _hide_tokens(config, batch, chosen, layout, generator)
@@ -240,13 +239,16 @@ def _hide_tokens(
 
 
 def surrounded(config: HMAConfig, places: Tensor) -> Tensor:
-    """Return the places (B, S) of squares that lie EDGE or more from a cut edge; a frame's own is none."""
+    """Return which tokens (B, V·S) of squares at `places` (B, S) have a loss: those far from a cut edge.
+
+    An edge of the frame itself is not cut.
+    """
     side, (rows, across) = config.crop, config.token_grid
     inside = torch.arange(side, device=places.device)
     first = places[:, :1]
     kept = []
     for begin, size in ((first // across, rows // config.views), (first % across, across)):
-        near, far = (inside >= EDGE) | (begin == 0), (inside < side - EDGE) | (begin == size - side)
+        near, far = (inside >= CROP_EDGE) | (begin == 0), (inside < side - CROP_EDGE) | (begin == size - side)
         kept.append(near & far)
     square = (kept[0].unsqueeze(2) & kept[1].unsqueeze(1)).flatten(1)
     return square.repeat(1, config.views)
@@ -267,7 +269,7 @@ def _embed(
     instead, if there are any.
     """
     context = _optional(batch, "context")
-    frames = true if context is None else model.frame_values(context)
+    frames = true if context is None else model.frame_values(context, _optional(batch, "places"))
     if layout.paired:
         frames = torch.cat([frames[:, : layout.past], true[:, 1:]], dim=1)
     if model.config.kind == "discrete":

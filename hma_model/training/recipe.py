@@ -275,7 +275,7 @@ def make_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
     if recipe is not None and not faults:
         # any grid that the patches divide, and digits so few that they may be merged, will do for this check
         side = recipe.model.get("patch", 1) * recipe.model.get("merge", 1)
-        side *= max(2 ** len(recipe.model.get("levels", HMAConfig.levels)), recipe.model.get("crop", 0))
+        side *= 2 ** len(recipe.model.get("levels", HMAConfig.levels)) * max(recipe.model.get("crop", 0), 1)
         continuous = recipe.model.get("video_loss") == "regression"
         try:
             given = {"patch": 1, **recipe.model, "objectives": recipe.objectives}

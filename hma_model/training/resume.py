@@ -36,7 +36,7 @@ VERSION = 1  # of `training/`; any change in the meaning of its files raises it
 # fields that may differ from the checkpoint's network, because no weight's meaning depends on them
 TRAINED_BY = {
     *("label_smoothing", "corrupt_max", "history_probability", "diffusion_sample_steps"),
-    *("training_pass", "whole_share", "position_init", "latent_noise"),
+    *("training_pass", "whole_share", "position_init", "latent_noise", "crop"),
 }
 
 

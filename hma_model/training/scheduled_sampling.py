@@ -89,6 +89,7 @@ def _all_predicted(
     config, (actions, known, names) = model.config, given
     groups = Groups.of(names, len(context))
     layout = Layout.of(model, context.shape[1], OBJECTIVES["forward" if config.sees_actions else "passive"])
+    layout.times.wanted = layout.past
     grid = config.token_grid
     if places is not None:
         layout.times.places = groups.sort(places)
@@ -96,7 +97,7 @@ def _all_predicted(
     chunks = None
     if actions is not None:
         chunks = align(config, actions, known, context.shape[1]).frames(layout.frames)
-    frames = model.frame_values(context)
+    frames = model.frame_values(context, places)
     shown = groups.sort(torch.cat([frames[:, : layout.past], frames[:, 1:]], dim=1))
     masked = torch.zeros(shown.shape[:3], dtype=torch.bool, device=shown.device)
     masked[:, layout.past :] = True

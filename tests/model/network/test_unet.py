@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hma_data.errors import RecipeError
+from hma_data.errors import HMAError, RecipeError
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model import HMA
 from hma_model.config import HMAConfig
@@ -154,7 +154,7 @@ def test_each_pass_makes_one_more_frame_of_tokens_that_of_a_rollout() -> None:
     assert torch.equal(seen[:, first : first + 3], rolled[:, : 6 - first])
 
 
-CROP: dict[str, Any] = {"levels": (8,), "crop": 4}
+CROP: dict[str, Any] = {"levels": (8,), "crop": 5}
 
 
 @pytest.mark.parametrize("base", [{**PIXELS, "grid": (32, 32)}, {**COLORS, "grid": (8, 8)}])
@@ -167,12 +167,12 @@ def test_a_square_shows_what_the_frame_shows_there(base: dict[str, Any], views: 
     batch.tokens, batch.latents = None, None
     setattr(batch, name, true)
     cut = cropped(model.config, batch, torch.Generator().manual_seed(0))
-    assert cut.places is not None and cut.places.shape == (2, 16)
-    whole, part = model.frame_values(true), model.frame_values(getattr(cut, name))
+    assert cut.places is not None and cut.places.shape == (2, 25)
+    whole, part = model.frame_values(true), model.frame_values(getattr(cut, name), cut.places)
     for sample in range(2):
         for view in range(views):
             expected = whole[sample, :, cut.places[sample] + 64 * view]
-            assert torch.equal(part[sample, :, 16 * view : 16 * (view + 1)], expected)
+            assert torch.equal(part[sample, :, 25 * view : 25 * (view + 1)], expected)
 
 
 def test_inside_a_square_the_network_computes_what_it_would_of_the_frame() -> None:
@@ -186,7 +186,8 @@ def test_inside_a_square_the_network_computes_what_it_would_of_the_frame() -> No
     for tokens, places in ((batch.tokens, None), (cut.tokens, cut.places)):
         times = model.time_positions(4)
         times.places = places
-        features.append(model.trunk(model.embed(model.frame_values(tokens), None, order), under, times))
+        values = model.frame_values(tokens, places)
+        features.append(model.trunk(model.embed(values, None, order), under, times))
     inner = torch.arange(100).view(10, 10)[3:-3, 3:-3].flatten()
     torch.testing.assert_close(features[1][:, :, inner], features[0][:, :, cut.places[0, inner]])
 
@@ -208,7 +209,7 @@ def test_squares_lie_where_something_moves_and_have_no_loss_at_their_cut_edges()
 
 
 def test_a_model_is_trained_on_squares() -> None:
-    model = unet(**{**COLORS, "crop": 4}).train()
+    model = unet(**{**COLORS, "crop": 6}).train()
     batch = small_batch(model.config, ["arm", "hand.v1"])
     batch.tokens = stored(model, 2, model.config.frames)
     cut = cropped(model.config, batch, torch.Generator().manual_seed(0))
@@ -216,17 +217,25 @@ def test_a_model_is_trained_on_squares() -> None:
     assert seen.context is not None and seen.context.shape == cut.tokens.shape  # type: ignore[union-attr]
     output = model(seen, generator=torch.Generator().manual_seed(0))
     output.loss.backward()
-    assert torch.isfinite(output.loss) and output.masked.shape == (2, model.config.frames, 4, 4)
+    assert torch.isfinite(output.loss) and output.masked.shape == (2, model.config.frames, 6, 6)
+
+
+def test_a_square_is_no_frame_for_a_rollout() -> None:
+    model = unet(**{**COLORS, "crop": 6})
+    with pytest.raises(HMAError, match=r"frame has the shape \(6, 6\), but the model takes \(8, 8\)"):
+        model.generate(stored(model, 1, 2)[..., :6, :6], torch.zeros(1, 4, 6), "arm", 3)
 
 
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"crop": 3}, "crop"),
-        ({"crop": 8}, "crop"),
-        ({"crop": 2, "whole_share": 0.5}, "crop"),
-        ({"crop": 2, "objectives": {"full": 1.0}}, "crop"),
-        ({"crop": 2, "trunk": "transformer"}, "crop"),
+        ({"grid": (32, 32), "crop": 7}, "crop"),
+        ({"grid": (32, 32), "crop": 4}, "crop"),  # no token of such a square would have a loss
+        ({"grid": (32, 32), "crop": 10}, "crop"),
+        ({"grid": (32, 32), "crop": -6}, "crop"),
+        ({"grid": (32, 32), "crop": 6, "whole_share": 0.5}, "crop"),
+        ({"grid": (32, 32), "crop": 6, "objectives": {"full": 1.0}}, "crop"),
+        ({"grid": (32, 32), "crop": 6, "trunk": "transformer"}, "crop"),
         ({"levels": (8, 16, 32, 64)}, "levels"),
         ({"shared_modulation": False}, "shared_modulation"),
         ({"conditioning": ("concat",)}, "conditioning"),

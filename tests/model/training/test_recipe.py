@@ -233,6 +233,11 @@ def test_a_unet_needs_no_further_key_and_takes_either_loss(changes):
     assert make_recipe({"data": ["x"], "model": model}).model["trunk"] == "unet"
 
 
+def test_a_square_that_does_not_fit_the_levels_is_named():
+    with pytest.raises(RecipeError, match=r"model\.crop: 10 is not allowed: give 0, or a multiple of 4"):
+        load_recipe("unet_colors", ["model.crop=10", "model.patch=1"])
+
+
 # -- what is shipped
 
 SHIPPED = sorted(path.stem for path in (shipped("recipes") / "train").glob("*.yaml"))

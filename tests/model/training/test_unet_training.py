@@ -131,3 +131,39 @@ def test_the_loss_of_each_objective_falls(shards, tmp_path, objective):
     assert sum(losses[-8:]) < sum(losses[:8])
     model = HMA.from_pretrained(done.checkpoint).eval()
     assert "arm" in model.embodiments and weights(done.checkpoint)
+
+
+# -- squares
+
+TOKENS = TokenizerSpec("raw", 1, "discrete", 16, (8, 8), vocab_size=64, factored=(8, 8))
+CUT = {**UNET, "video_loss": "diffusion", "told_noise": False, "latent_noise": 0.0, "crop": 6}
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory) -> list[str]:
+    folder, made = tmp_path_factory.mktemp("moving"), []
+    for name, dims, length in (("arm", 2, 24), ("leg", 4, 3)):  # the second is padded
+        made.append(str(make_shards(folder / name, name, dims, length=length, spec=TOKENS)))
+    return made
+
+
+def of_squares(data: list[str], **changes: object) -> Recipe:
+    given = {"objectives": {"forward": 1}, "model": CUT, "short": "pad", "self_forward": 0.5, "batch_size": 2}
+    return recipe(data, **given, accumulate=2, **changes)
+
+
+def test_a_run_on_squares_goes_on_with_the_same_bits_and_is_tuned_on_whole_frames(moving, tmp_path):
+    whole = train(of_squares(moving), out=tmp_path / "whole", show=False)
+    train_until(of_squares(moving), tmp_path / "cut", 3)
+    assert same(train(of_squares(moving), out=tmp_path / "cut", show=False).checkpoint, whole.checkpoint)
+    more = [*TUNE, "objectives={policy: 1}", "model.crop=0"]
+    tuned = finetune(whole.out, moving[:1], out=tmp_path / "tuned", overrides=more, show=False)
+    assert Checkpoint.open(tuned.checkpoint).config.crop == 0
+
+
+@pytest.mark.slow
+def test_two_ranks_on_squares_give_the_curve_and_the_weights_of_one(moving, tmp_path):
+    alone = train(of_squares(moving), out=tmp_path / "alone", show=False)
+    told = spread(of_squares(moving), tmp_path / "run")
+    assert curve(tmp_path / "run") == pytest.approx([loss for _, loss in alone.losses], rel=1e-4), told
+    close(alone.checkpoint, resolve(tmp_path / "run"))
