@@ -381,6 +381,8 @@ def _unet_rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
     whole = config.whole_frames and not config.trained_readouts
     needs = "0: parts of frames need training_pass pairs, whole_share 1 and no objective that reads actions"
     yield "crop", not config.crop or whole, needs
+    local = config.kind == "discrete" or config.video_loss == "regression"
+    yield "crop", not config.crop or local, "0: the diffusion head knows the place of each token of a frame"
 
 
 @dataclass(frozen=True)

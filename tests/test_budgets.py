@@ -26,7 +26,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/sources": (12_552, 104_849, 50),
     "hma_data/storage": (1_664, 10_939, 11),
     "hma_data/tokenizers": (3_489, 25_694, 18),
-    "hma_model": (519, 3_188, 4),
+    "hma_model": (521, 3_223, 4),
     "hma_model/benchmark": (845, 7_250, 5),
     "hma_model/checkpoint": (889, 6_600, 5),
     "hma_model/cli": (1_725, 10_738, 12),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_622, 30_137, 19),
     "hma_model/worlds": (1_520, 11_387, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_515, 519_048
-TEST_LINES = 48_741
+PRODUCT_LINES, PRODUCT_NODES = 65_517, 519_083
+TEST_LINES = 48_742
 DOC_WORDS = 40_640
 
 

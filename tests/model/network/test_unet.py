@@ -236,6 +236,7 @@ def test_a_square_is_no_frame_for_a_rollout() -> None:
         ({"grid": (32, 32), "crop": 6, "whole_share": 0.5}, "crop"),
         ({"grid": (32, 32), "crop": 6, "objectives": {"full": 1.0}}, "crop"),
         ({"grid": (32, 32), "crop": 6, "trunk": "transformer"}, "crop"),
+        ({"grid": (32, 32), "crop": 6, "video_loss": "diffusion"}, "crop"),
         ({"levels": (8, 16, 32, 64)}, "levels"),
         ({"shared_modulation": False}, "shared_modulation"),
         ({"conditioning": ("concat",)}, "conditioning"),
