@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_517, 519_083
 TEST_LINES = 48_742
-DOC_WORDS = 40_640
+DOC_WORDS = 40_673
 
 
 @cache
