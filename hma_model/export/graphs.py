@@ -249,7 +249,8 @@ class StepGraph(nn.Module):
                 scores: Tensor, first: int, noise: Tensor = noise, unsure: list[Tensor] = unsure
             ) -> Tensor:
                 unsure.append(scores)
-                return (scores + noise[:, first : first + scores.shape[1], :, : scores.shape[3]]).argmax(-1)
+                drawn = scores + noise[:, first : first + scores.shape[1], :, : scores.shape[3]]
+                return self._readout.taken(drawn)
 
             copied = _at(before, places) if self.config.copy_previous else None
             made = self._readout.decide(_at(features, places), choose, copied)

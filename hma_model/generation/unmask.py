@@ -139,7 +139,7 @@ class TokenFrame:
             if noise is not None:
                 n, digits, _, values = scores.shape
                 drawn = scores + noise[:n, first : first + digits, :, :values]
-            taken = drawn.argmax(-1)
+            taken = readout.taken(drawn)
             if way.measure:
                 unsure.append(torch.special.entr(scores.softmax(-1)).sum((1, -1)))
             if way.order == "confidence":

@@ -12,10 +12,13 @@ from functools import cache, partial
 from itertools import accumulate
 from operator import mul
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from hma_data.errors import TokenizerError
+from hma_data.tokenizers.shapes import parse_colors
 from hma_model.config import ActionSpace, HMAConfig, Readout
 from hma_model.network.copying import CopyGain, Copying, PatchCopy
 from hma_model.network.linear import Linear
@@ -119,6 +122,17 @@ class DigitChain(nn.Module):
         return hidden * self.multiplier if self.multiplier != 1 else hidden
 
 
+def color_distances(config: HMAConfig) -> Tensor | None:
+    """Return the distances (V, V) in RGB between the colours of a palette; None for other tokens."""
+    if not config.tokenizer.get("colors"):
+        return None
+    values = torch.from_numpy(parse_colors(config.tokenizer["colors"], "tokenizer").astype(np.float32))
+    if {*config.digits} != {len(values)}:
+        fault = f"has {len(values)} colours, but digits of {max(config.digits)} values"
+        raise TokenizerError("tokenizer", fault, "take the whole config.json of one checkpoint")
+    return (values.unsqueeze(1) - values).norm(dim=-1)
+
+
 class TokenReadout(nn.Module):
     """The readout of the discrete model: scores of every digit's values, and their cross-entropy.
 
@@ -127,6 +141,7 @@ class TokenReadout(nn.Module):
     """
 
     worth: Tensor
+    distances: Tensor | None  # (V, V) between the colours of a palette
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
@@ -135,6 +150,7 @@ class TokenReadout(nn.Module):
         self.linear = Linear(config.width, sum(config.digits))
         worth = torch.tensor([1, *accumulate(config.digits[:-1], mul)])
         self.register_buffer("worth", worth, persistent=False)  # on the device, where code is compiled
+        self.register_buffer("distances", color_distances(config), persistent=False)
         nn.init.normal_(self.linear.weight, std=0.02)
         nn.init.zeros_(self.linear.bias)
         self.chain = DigitChain(config) if config.digit_order == "chain" else None
@@ -158,7 +174,7 @@ class TokenReadout(nn.Module):
 
         def likeliest(scores: Tensor, first: int) -> Tensor:
             made.append(scores)
-            return scores.argmax(-1)
+            return self.taken(scores)
 
         before = None if before is None else before.flatten(0, -2).unsqueeze(0)
         self.decide(features.flatten(0, -2).unsqueeze(0), likeliest, before)
@@ -178,6 +194,16 @@ class TokenReadout(nn.Module):
 
     def _alone(self, features: Tensor) -> Tensor:
         return self.linear(features * self.multiplier if self.multiplier != 1 else features).float()
+
+    def taken(self, scores: Tensor) -> Tensor:
+        """Return the values (...) chosen by scores (..., V): the likeliest, or the median of colours.
+
+        Where an object's edge may lie here or there, its probability is spread over its shades, and the
+        ground is likelier than each: an object of the likeliest colours shrinks frame by frame.
+        """
+        if self.distances is None:
+            return scores.argmax(-1)
+        return (scores.softmax(-1) @ self.distances).argmin(-1)
 
     def ids(self, digits: Tensor) -> Tensor:
         """Return the ids (...) of digits (..., F)."""

@@ -109,7 +109,7 @@ def _all_predicted(
     own, before = readout_inputs(model, features, shown, video, layout, groups)
     if config.kind == "discrete":
         scores = model.token_readout.split(model.token_readout(own, None, before))
-        tokens = groups.unsort(from_digits(scores.argmax(-1), config.digits))
+        tokens = groups.unsort(from_digits(model.token_readout.taken(scores), config.digits))
         made = split_tokens(tokens, config.merge, config.vocab_size, grid)
     else:
         patches = model.latent_readout.sample(own.flatten(0, 2), SAMPLE_STEPS, generator=generator)
@@ -132,7 +132,7 @@ def _predicted(
         hidden = context.clone()
         hidden[rows, at] = config.vocab_size
         scores = model.video_logits(hidden, actions, names, known, frame=at)
-        tokens = from_digits(scores[:, 0].argmax(-1), config.digits).flatten(1)
+        tokens = from_digits(model.token_readout.taken(scores[:, 0]), config.digits).flatten(1)
         return split_tokens(tokens, config.merge, config.vocab_size, config.token_grid)
     scaled = context.float() * config.latent_scale
     mask = torch.zeros(context.shape[:2] + context.shape[3:], dtype=torch.bool, device=context.device)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hma_data.errors import HMAError, RecipeError
+from hma_data.errors import HMAError, RecipeError, TokenizerError
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model import HMA
 from hma_model.config import HMAConfig
@@ -152,6 +152,23 @@ def test_each_pass_makes_one_more_frame_of_tokens_that_of_a_rollout() -> None:
     known = batch.tokens[:, :first]
     rolled = model.generate(known, batch.actions, "arm", 3, unmask_steps=1, temperature=0.0)
     assert torch.equal(seen[:, first : first + 3], rolled[:, : 6 - first])
+
+
+SHADES = "ffffff8090a08494a47c8c9cff0000"  # a ground, three shades of an object, another one
+
+
+def test_a_shade_of_an_object_is_taken_though_the_ground_is_likelier_than_each_shade() -> None:
+    readout = unet(**{**COLORS, "tokenizer": {"colors": SHADES}}).token_readout
+    shares = torch.tensor(
+        [[0.40, 0.20, 0.18, 0.20, 0.02], [0.6, 0.2, 0.1, 0.1, 0.0], [0.1, 0.0, 0.0, 0.0, 0.9]]
+    )
+    assert readout.taken(shares.log().clamp(min=-1e9)).tolist() == [2, 0, 4]
+    assert unet(**COLORS).token_readout.taken(shares).tolist() == [0, 0, 4]
+
+
+def test_colours_that_are_not_those_of_the_tokens_are_refused() -> None:
+    with pytest.raises(TokenizerError, match="has 2 colours, but digits of 5 values"):
+        unet(**{**COLORS, "tokenizer": {"colors": "ffffff000000"}})
 
 
 CROP: dict[str, Any] = {"levels": (8,), "crop": 5}
