@@ -36,7 +36,9 @@ pytestmark = pytest.mark.slow  # exporting a graph takes a quarter of a minute
 FRAMES, EXACT = 100, 40
 
 
-def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[Any, Any, float]]:
+def closed_loop(
+    page: Path, checkpoint: Checkpoint, robot: str, count: int = FRAMES
+) -> list[tuple[Any, Any, float]]:
     """Return the frames that onnxruntime and torch make of the same actions, and the images' PSNR."""
     model = rounded(load(checkpoint, [robot], "cpu").eval())
     tokenizer = reopened(model.config.tokenizer)
@@ -48,7 +50,7 @@ def closed_loop(page: Path, checkpoint: Checkpoint, robot: str) -> list[tuple[An
     draws = drawn_as_torch(driver, model.config, 7)
     low, high = np.transpose([(dim["low"], dim["high"]) for dim in driver.robot["dimensions"]])
     actions, found = np.random.default_rng(3), []
-    for number in range(FRAMES):
+    for number in range(count):
         chunk = actions.uniform(low, high, (driver.robot["stride"], len(low))).astype(np.float32).reshape(-1)
         image = driver.advance(chunk, next(draws))
         frame = rollout.step(torch.from_numpy(chunk)[None])
@@ -72,10 +74,10 @@ def test_a_u_net_makes_the_pixels_of_torch(pixels: Path) -> None:
 
 
 def test_a_u_net_makes_the_colours_of_torch(colors: Path) -> None:
-    made = closed_loop(colors, Checkpoint.open(colors.with_name("model")), ROBOT)
+    made = closed_loop(colors, Checkpoint.open(colors.with_name("model")), ROBOT, count=10)
     equal = [float((own == expected).mean()) for own, expected, _ in made]
     assert equal[0] > 0.99, equal  # of an untrained model many scores are nearly equal, and may swap
-    assert len({own.tobytes() for own, *_ in made}) > FRAMES / 2
+    assert len({own.tobytes() for own, *_ in made}) > 5
 
 
 @pytest.mark.timeout(3000)
