@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_544, 519_279
 TEST_LINES = 48_763
-DOC_WORDS = 40_762
+DOC_WORDS = 40_820
 
 
 @cache
