@@ -32,6 +32,10 @@ async function main() {
   document.title = $("model").textContent = manifest.model;
   $("robot").replaceChildren(...manifest.robots.map((one) => new Option(one.id + (one.about && " — " + one.about) + (one.holds && " · " + one.holds), one.id)));
   $("temperature-row").hidden = manifest.temperature === null;
+  if (manifest.temperature !== null) {
+    $("temperature").value = manifest.temperature;
+    $("temperature").oninput();
+  }
   const asks = asked.get("backend"), gpu = asks !== "wasm" && await hasGpu(asks === "webgpu");
   const named = manifest.robots.find((one) => one.id === asked.get("robot"));
   robot = named || manifest.robots[0];

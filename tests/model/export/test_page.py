@@ -162,6 +162,14 @@ def test_200_frames_driven_by_keys_are_those_of_onnxruntime_and_it_works_offline
     page.wait_for_function("Number(document.body.dataset.frame) >= 1")
 
 
+def test_the_temperature_begins_as_the_manifest_says(page: "Page", server: Any, site: Path) -> None:
+    about = site / "sub" / "page" / "manifest.json"
+    about.write_text(json.dumps(json.loads(about.read_text()) | {"temperature": 0.2}))
+    page.goto(address(server))
+    page.wait_for_selector("#veil", state="hidden")
+    assert page.input_value("#temperature") == "0.2" and page.text_content("#temperature-out") == "0.2"
+
+
 def test_a_replay_shows_the_true_images_until_a_person_drives(page: "Page", server: Any, site: Path) -> None:
     chunks = without_simulator(site / "sub" / "page")[0]
     page.goto(address(server))
