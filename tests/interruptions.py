@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from dataclasses import replace as changed
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from fsspec.implementations.memory import MemoryFileSystem
 
 from hma_data.episodes.sheets import write_mp4
@@ -73,8 +74,14 @@ class Command:
     trusted: str = "nothing"
 
     def run(self, data: Path, folder: Path) -> CompletedProcess[str]:
-        """Run it to its end in a folder, in this process."""
-        with pytest.MonkeyPatch.context() as patch:
+        """Run it to its end in a folder, in this process, on one thread.
+
+        The bytes of a training depend on the number of threads, and other tests leave other numbers.
+        """
+        before = torch.get_num_threads()
+        with pytest.MonkeyPatch.context() as patch, ExitStack() as after:
+            after.callback(torch.set_num_threads, before)
+            torch.set_num_threads(1)
             if "{store}" in self.words:
                 patch.setenv("HMA_CACHE", str(folder / "cache"))
             self.patch(patch)

@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_520, 11_387, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_544, 519_279
-TEST_LINES = 48_771
+TEST_LINES = 48_778
 DOC_WORDS = 40_820
 
 
