@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from hma_data.errors import RecipeError
+from hma_data.errors import RecipeError, TokenizerError
 
 if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
@@ -198,6 +198,8 @@ class HMAConfig:
             if not kept:
                 fault = f"{getattr(self, name)!r} is not allowed"
                 raise RecipeError(f"model.{name}", fault, f"give {allowed}")
+        if colors := self.tokenizer.get("colors"):
+            _require_colors(colors, self.digits)
 
     @property
     def released(self) -> bool:
@@ -383,6 +385,15 @@ def _unet_rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
     yield "crop", not config.crop or whole, needs
     local = config.kind == "discrete" or config.video_loss == "regression"
     yield "crop", not config.crop or local, "0: the diffusion head knows the place of each token of a frame"
+
+
+def _require_colors(colors: Any, digits: tuple[int, ...]) -> None:
+    """Raise TokenizerError unless each digit's values are these colours."""
+    from hma_data.tokenizers.shapes import parse_colors
+
+    if {*digits} != {count := len(parse_colors(colors, "tokenizer"))}:
+        fault = f"has {count} colours, but digits of {max(digits)} values"
+        raise TokenizerError("tokenizer", fault, "take the whole config.json of one checkpoint")
 
 
 @dataclass(frozen=True)

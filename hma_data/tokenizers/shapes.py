@@ -152,6 +152,8 @@ def read_colors(path: Path) -> NDArray[np.uint8]:
     if path.suffix == ".json":
         spec = read_json(path, TokenizerError).get("tokenizer")
         return parse_colors(spec.get("colors") if isinstance(spec, dict) else None, path)
+    if path.is_dir():
+        raise TokenizerError(path, "is a folder, not a file of colours", _COLORS)
     try:
         with safe_open(path, "np") as file:
             colors = file.get_tensor("colors")

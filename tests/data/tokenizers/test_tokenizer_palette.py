@@ -96,6 +96,8 @@ def test_a_file_of_other_values_is_refused(tmp_path: Path, colors: Colors) -> No
     save_file({"colors": colors}, path)
     with pytest.raises(TokenizerError, match=r"own.safetensors: its colours are .* — name a file"):
         get_tokenizer("palette-64", weights=path)
+    with pytest.raises(TokenizerError, match="is a folder, not a file of colours"):
+        get_tokenizer("palette-64", weights=tmp_path)
     path.write_bytes(b"no")
     with pytest.raises(TokenizerError, match=r"own.safetensors: "):
         get_spec("palette-64", weights=path)

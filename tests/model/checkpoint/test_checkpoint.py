@@ -88,9 +88,19 @@ def test_a_tokenizer_other_than_the_models_is_refused_with_the_difference(folder
 
 def test_colours_other_than_the_models_are_refused_with_where_its_own_are():
     spec, other = (palette_spec("palette-64", 64, np.eye(3, dtype=np.uint8) * n) for n in (1, 2))
-    config = CONFIG.replace(tokenizer=spec.to_json())
+    config = CONFIG.replace(tokenizer=spec.to_json(), factored=spec.factored)
     with pytest.raises(CheckpointError, match="other colours of 'palette-64' — .*--weights PATH"):
         require_tokenizer(config, other, "runs/own")
+
+
+@pytest.mark.parametrize("colors", ["zz0000", "../../x", 7, "ffffff" * 300, "ffffff000000"])
+def test_a_configuration_of_colours_that_are_none_names_its_file(folder, colors):
+    path = folder / "config.json"
+    values = json.loads(path.read_text())
+    values["tokenizer"]["colors"] = colors
+    path.write_text(json.dumps(values))
+    with pytest.raises(CheckpointError, match=r"config\.json: does not describe a model: tokenizer: ha?"):
+        Checkpoint.open(folder)
 
 
 def test_the_links_of_a_hub_cache_are_followed(folder, tmp_path):
