@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_553, 519_335
 TEST_LINES = 48_792
-DOC_WORDS = 40_820
+DOC_WORDS = 40_920
 
 
 @cache
