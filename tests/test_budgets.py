@@ -25,7 +25,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/shards": (2_555, 19_554, 11),
     "hma_data/sources": (12_552, 104_849, 50),
     "hma_data/storage": (1_664, 10_939, 11),
-    "hma_data/tokenizers": (3_491, 25_709, 18),
+    "hma_data/tokenizers": (3_522, 26_155, 18),
     "hma_model": (532, 3_311, 4),
     "hma_model/benchmark": (845, 7_250, 5),
     "hma_model/checkpoint": (889, 6_600, 5),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_622, 30_139, 19),
     "hma_model/worlds": (1_520, 11_387, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_553, 519_335
-TEST_LINES = 48_792
+PRODUCT_LINES, PRODUCT_NODES = 65_584, 519_781
+TEST_LINES = 48_808
 DOC_WORDS = 40_920
 
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from hma_data.errors import TokenizerError
 from hma_data.storage.files import write_atomic
+from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 from hma_data.tokenizers.checkpoints import find_weights
 from hma_data.tokenizers.network import NetworkTokenizer, open_device
@@ -66,6 +67,39 @@ class Shown(nn.Module):
         return self.colors[squares.flatten(3, 4).flatten(1, 2)].permute(0, 3, 1, 2)
 
 
+class Palette(NetworkTokenizer):
+    """The tokenizer. On a CPU it looks colours up itself: the same bytes in a fraction of the time."""
+
+    def __init__(self, spec: TokenizerSpec, colors: NDArray[np.uint8], device: torch.device) -> None:
+        network, values = nn.Module(), torch.from_numpy(colors.copy())
+        network.encoder, network.decoder = nearest, shown = Nearest(values), Shown(values)
+        self._colors, self._table = colors, nearest.table.numpy().astype(np.uint8)
+        self._worth = [len(colors) ** place for place in range(CELL**2)]
+        super().__init__(spec, network, device, nearest, shown, light=True)
+        self.batch = 16 if device.type == "cpu" else self.batch
+
+    def _encode_batch(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
+        if self.device.type != "cpu":
+            return super()._encode_batch(frames)
+        red, green, blue = np.moveaxis(frames >> (8 - BITS), -1, 0).astype(np.uint16)
+        digits = self._table[red << 2 * BITS | green << BITS | blue].astype(self.spec.dtype)
+        tokens = np.zeros((len(frames), *self.spec.cells), self.spec.dtype)
+        for place, worth in enumerate(self._worth):
+            row, column = divmod(place, CELL)
+            tokens += digits[:, row::CELL, column::CELL] * worth
+        return tokens
+
+    def _decode_batch(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
+        if self.device.type != "cpu":
+            return super()._decode_batch(tokens)
+        size = self.spec.image_size
+        frames = np.empty((len(tokens), size, size, 3), np.uint8)
+        for place, worth in enumerate(self._worth):
+            row, column = divmod(place, CELL)
+            frames[:, row::CELL, column::CELL] = self._colors[tokens // worth % len(self._colors)]
+        return frames
+
+
 def load(name: str, *, weights: str | None, device: str, image_size: int, colors: Any) -> NetworkTokenizer:
     """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors.
 
@@ -78,10 +112,7 @@ def load(name: str, *, weights: str | None, device: str, image_size: int, colors
         chosen = parse_colors(colors, name)
     else:
         chosen = read_colors(find_weights(name, weights) if weights else EMBEDDED / CATALOG[name].file)
-    spec, values = palette_spec(name, image_size, chosen), torch.from_numpy(chosen.copy())
-    network = nn.Module()
-    network.encoder, network.decoder = Nearest(values), Shown(values)
-    return NetworkTokenizer(spec, network, place, network.encoder, network.decoder, light=True)
+    return Palette(palette_spec(name, image_size, chosen), chosen, place)
 
 
 def write(path: Path, colors: NDArray[np.uint8]) -> None:

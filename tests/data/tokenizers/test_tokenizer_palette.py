@@ -16,10 +16,11 @@ from hma_data.errors import TokenizerError
 from hma_data.tokenizers import palette
 from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer, reopened
 from hma_data.tokenizers.palette import Nearest, Shown, fit, write
-from hma_data.tokenizers.shapes import get_spec
+from hma_data.tokenizers.shapes import get_spec, palette_spec
 from tests.command import hma
 
 Colors = NDArray[np.uint8]
+CPU = torch.device("cpu")
 OWN = np.array([[0, 0, 0], [255, 255, 255], [200, 0, 0]], np.uint8)
 
 
@@ -32,6 +33,23 @@ def test_an_image_in_colours_of_the_list_comes_back_exactly(seed: int, count: in
     ids = Nearest(colors)(frames)
     assert ids.shape == (2, 4, 6) and int(ids.min()) >= 0 and int(ids.max()) < count**4
     assert torch.equal(Shown(colors)(ids), frames)
+
+
+@given(seed=st.integers(0, 10**6), count=st.integers(2, 255))
+def test_the_tables_of_a_cpu_give_what_the_network_gives(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    tokenizer = palette.Palette(palette_spec("palette-64", 64, colors := drawn(rng, count)), colors, CPU)
+    frames = rng.integers(0, 256, (3, 64, 64, 3)).astype(np.uint8)
+    pixels = torch.from_numpy(frames).permute(0, 3, 1, 2).float().mul(2 / 255).sub(1)
+    ids = tokenizer.encode(frames)
+    assert np.array_equal(ids, Nearest(torch.from_numpy(colors))(pixels).numpy())
+    assert np.array_equal(tokenizer.decode(ids), tokenizer.pictures(torch.from_numpy(ids.astype(np.int64))))
+
+
+def drawn(rng: np.random.Generator, count: int) -> Colors:
+    """Return different colours (K, 3)."""
+    numbers = rng.choice(2**24, count, replace=False)
+    return np.stack([numbers >> 16, numbers >> 8 & 255, numbers & 255], axis=1).astype(np.uint8)
 
 
 def test_other_colours_become_the_nearest_of_the_list() -> None:
