@@ -39,8 +39,8 @@ def table(heads: list[str], rows: list[list[str]]) -> str:
 def cli_page() -> str:
     """Return the page of all commands, from the application itself."""
     parts = [
-        f"{MADE}# Command line\n\nThe `--help` of every command. Each also takes `--help` and, "
-        "before or after it, `--debug`, which shows tracebacks."
+        f"{MADE}# Command line\n\nThe `--help` of every command. Each also takes `--help`, and "
+        "`--debug` (also before the command), which shows tracebacks."
     ]
     root = typer.main.get_command(app)
     for name, command in _commands(root, "hma"):

@@ -22,7 +22,7 @@ _share = partial(Option, rich_help_panel="Weights, groups and caps")
 def mixture(
     folders: Annotated[list[str], Argument(help="Shard sets.")],
     temperature: Annotated[
-        float | None, Option(help="Temperature τ: 1 is proportional, large is uniform; default 3, for val 4.")
+        float | None, Option(help="Temperature τ: 1 follows set sizes, large is uniform; default 3 (val: 4).")
     ] = None,
     frames: Annotated[int, Option(min=1, help="Frames T per window.")] = 12,
     split: Annotated[Literal["train", "val"], Option(help="Split to draw from.")] = "train",
@@ -42,7 +42,7 @@ def mixture(
     cap: Annotated[Pairs, _share(metavar="ID=SHARE", help="Maximum probability of an embodiment.")] = None,
     max_epochs: Annotated[float | None, _share(help="Maximum number of passes over one set.")] = None,
     samples: Annotated[
-        int | None, Option(min=1, help="Planned draws; default: the number of windows.")
+        int | None, Option(min=1, help="Windows to draw in total; default: as many as there are.")
     ] = None,
     plot: Annotated[Path | None, Option(help="Plot file: PNG, SVG or PDF.")] = None,
     json: Json = False,

@@ -269,7 +269,7 @@ def shards_export(
     folder: Folder,
     out: Annotated[Path, Option(help="New folder, with a subfolder per split.")],
     to: Annotated[Literal["memmap"], Option(help="memmap: the layout of the paper's code.")] = "memmap",
-    split: Annotated[str | None, Option(help="Only this split, directly into --out.")] = None,
+    split: Annotated[str | None, Option(help="Only this split, into --out itself.")] = None,
     camera: Annotated[str | None, Option(help="Camera to export; default: the first.")] = None,
 ) -> None:
     """Export flat files for the paper's code: video.bin, actions, segment_ids.bin, metadata.json.

@@ -41,7 +41,7 @@ def play(
     host: Annotated[
         str, Option(help="Address to listen on; all but loopback require a token.")
     ] = "127.0.0.1",
-    token: Annotated[str | None, Option(help="Access token; by default generated with --host.")] = None,
+    token: Annotated[str | None, Option(help="Access token; default: generated if required.")] = None,
     device: Device = "auto",
     precision: Precision = "float32",
     compile: Compile = False,

@@ -26,8 +26,8 @@ MaxError = Annotated[
     float | None,
     Option(
         min=0,
-        help="Maximum expected state error (px of 128): augment keeps only episodes up to it; policy-eval "
-        "reports the judge also for these alone.",
+        help="Maximum expected state error at the end, in px of 128: augment drops episodes above it; "
+        "policy-eval also reports the judge without them.",
     ),
 ]
 
@@ -141,7 +141,7 @@ def augment(
     keep: Annotated[float, Option(help="Share of episodes to keep, lowest uncertainty first.")] = 0.5,
     max_error: MaxError = None,
     judge: Annotated[
-        str, Option(help="Keep only successes of a judge: moved, moved=PX, reached, placed, a reward model.")
+        str, Option(help="Keep only successes. The judge: moved, moved=PX, reached, placed, a reward model.")
     ] = "",
     lerobot: Annotated[Path | None, Option(help="Also write a LeRobotDataset v3.0 to this folder.")] = None,
     unmask_steps: UnmaskSteps = 2,

@@ -30,8 +30,8 @@ def view(
 ) -> None:
     """Show an episode in Rerun: cameras, decoded tokens, actions, states and skew on one clock.
 
-    For a run, it shows losses, rates, and a held-out window next to its prediction. Without a display, it
-    writes the file to the current folder.
+    For a run, it shows losses, learning rate, gradient norm, step times, and a held-out window next to its
+    prediction. Without a display, it writes the file to the current folder.
 
     Example: hma view shards/my_arm --out my_arm.rrd
     """
