@@ -183,8 +183,8 @@ def test_not_a_shard_set(tmp_path: Path) -> None:
 def test_a_target_above_the_recorded_rate_is_noted(tmp_path: Path) -> None:
     path = tmp_path / "arm.yaml"
     text = hma("registry", "show", "pusht_fast").stdout.split("# derived")[0]
-    assert "target_hz: 2.5" in text
-    path.write_text(text.replace("target_hz: 2.5", "target_hz: 40"))
+    assert "target_hz: 5" in text
+    path.write_text(text.replace("target_hz: 5", "target_hz: 40"))
     done = hma("registry", "validate", str(path))
     assert done.returncode == 0 and "note: target_hz 40 is above the recorded rate" in done.stdout
     path.write_text(path.read_text().replace("target_hz: 40", "target_hz: 40\nstride: 4"))

@@ -38,7 +38,9 @@ STEM, HEAD, YAML, STATS, CARD = (
 PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card is last: its presence means that the others are there
 SAMPLE, FILM = "sample.png", "sample.gif"
 PICTURES = (SAMPLE, FILM)  # optional, shown in the model card
-EMBEDDED, EMBEDDED_NAME = Path(__file__).parents[1] / "embedded", "embedded"  # bundled with the package
+EMBEDDED_NAME = "embedded"
+BUNDLED = {name: Path(__file__).parents[1] / name for name in (EMBEDDED_NAME, "embedded-pusht")}
+EMBEDDED = BUNDLED[EMBEDDED_NAME]
 _OTHER_TRUNK = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was interrupted: run it again"
 _OTHER_YAML = "restore the one that it was trained with; change descriptions in the card instead"
@@ -78,15 +80,18 @@ class Checkpoint:
     _hashes: dict[Path, str] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
-    def open(cls, checkpoint: "StrPath | Checkpoint") -> "Checkpoint":
+    def open(
+        cls, checkpoint: "StrPath | Checkpoint", embodiments: Iterable[str] | None = None
+    ) -> "Checkpoint":
         """Open the checkpoint in a folder, or the newest one in the folder of a training run.
 
         Args:
             checkpoint: str or path of it; an open one is returned as it is.
+            embodiments: as of `resolve`.
         """
         if isinstance(checkpoint, Checkpoint):
             return checkpoint
-        folder = resolve(checkpoint)
+        folder = resolve(checkpoint, embodiments)
         values = read_json(inside(folder, CONFIG))
         config = parse_config(values, folder / CONFIG)
         homes = folder / "embodiments"
@@ -96,8 +101,13 @@ class Checkpoint:
 
     @property
     def name(self) -> str:
-        """Return its folder, or `embedded`, as an error names it."""
-        return EMBEDDED_NAME if self.folder == EMBEDDED else str(self.folder)
+        """Return its folder, or the name of a bundled one, as an error names it."""
+        return self.folder.name if self.bundled else str(self.folder)
+
+    @property
+    def bundled(self) -> bool:
+        """Return whether it is part of the installed package."""
+        return self.folder in BUNDLED.values()
 
     def _sha256(self, path: Path) -> str:
         if path not in self._hashes:
@@ -207,17 +217,19 @@ def _require_version(values: Mapping[str, Any], where: object) -> None:
         raise CheckpointError(where, fault, "update hma-toolkit, or save the checkpoint again")
 
 
-def resolve(folder: StrPath) -> Path:
+def resolve(folder: StrPath, embodiments: Iterable[str] | None = None) -> Path:
     """Return the folder of a checkpoint: the path itself, or the newest of a run's `checkpoints/`.
 
     Args:
-        folder: str or path of it; `embedded` is the checkpoint bundled with the package.
+        folder: str or path of it, or the name of a checkpoint bundled with the package. Robots that have a
+            bundled checkpoint to themselves (`pusht_fast`: `embedded-pusht`) are part of `embedded` too.
+        embodiments: ids of the robots that are wanted.
     """
     folder = as_path(folder)
     if (folder / CONFIG).is_file():
         return folder
-    if str(folder) == EMBEDDED_NAME and not folder.exists():
-        return EMBEDDED
+    if str(folder) in BUNDLED and not folder.exists():
+        return _bundled(str(folder), list(embodiments or ()))
     steps = training_checkpoints(folder)
     if steps:
         return steps[-1]
@@ -225,6 +237,21 @@ def resolve(folder: StrPath) -> Path:
         raise CheckpointError(folder, *found)
     fault = f"has no {CONFIG} and no checkpoints/" if folder.is_dir() else "no such folder"
     raise CheckpointError(folder, fault, "give a checkpoint, or the folder of a training run")
+
+
+def _bundled(name: str, embodiments: list[str]) -> Path:
+    """Return the bundled checkpoint of a name; of `embedded`, the part that has the embodiments."""
+    parts = list(BUNDLED) if name == EMBEDDED_NAME else []
+    having = {part: [one for one in embodiments if _has(BUNDLED[part], one)] for part in parts}
+    found = [part for part, ones in having.items() if ones]
+    if len(found) > 1:
+        fault = f"{having[found[0]][0]} and {having[found[1]][0]} are robots of different networks"
+        raise CheckpointError(name, fault, "name robots of one network: " + " or ".join(found))
+    return BUNDLED[found[0] if found else name]
+
+
+def _has(folder: Path, embodiment: str) -> bool:
+    return ID_PATTERN.fullmatch(embodiment) is not None and (folder / "embodiments" / embodiment).is_dir()
 
 
 def training_checkpoints(run: StrPath) -> list[Path]:

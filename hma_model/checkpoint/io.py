@@ -17,7 +17,6 @@ from hma_model.checkpoint import weights
 from hma_model.checkpoint.folder import (
     CARD,
     CONFIG,
-    EMBEDDED,
     FORMAT_VERSION,
     HEAD,
     LIBRARY,
@@ -204,7 +203,7 @@ def record_locally(
     part: str = "evaluation",
 ) -> None:
     """Do as `record_evaluation` if a command's checkpoint, `label`, is the user's own on this machine."""
-    if source is None or source.folder == EMBEDDED or is_repository(label) or "://" in str(label):
+    if source is None or source.bundled or is_repository(label) or "://" in str(label):
         return
     with suppress(OutputError):  # a folder that may only be read
         record_evaluation(source, embodiment, facts, part)

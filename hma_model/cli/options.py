@@ -1,5 +1,6 @@
 """Define the arguments and options that several model verbs share."""
 
+import glob
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,8 +12,8 @@ from hma_data.errors import HMAError, UsageError
 
 def embedded_robots(incomplete: str) -> list[str]:
     """Return the robots of the embedded checkpoint whose ids begin so, for the Tab key."""
-    folders = (Path(__file__).parents[1] / "embedded" / "embodiments").iterdir()
-    return sorted(folder.name for folder in folders if folder.name.startswith(incomplete))
+    folders = Path(__file__).parents[1].glob(f"embedded*/embodiments/{glob.escape(incomplete)}*")
+    return sorted(folder.name for folder in folders)
 
 
 Checkpoint = Annotated[

@@ -5,9 +5,9 @@ import secrets
 import socket
 import sys
 import webbrowser
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import quote
 
 from typer import Argument, Option
@@ -15,6 +15,11 @@ from typer import Argument, Option
 from hma_data.console import say
 from hma_data.errors import UsageError
 from hma_model.cli.options import Compile, Device, Precision, device_name, embedded_robots, require_checkpoint
+
+if TYPE_CHECKING:
+    from hma_data.shards.reader import ShardSet
+    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.checkpoint.folder import Checkpoint
 
 
 def play(
@@ -54,7 +59,7 @@ def play(
     import asyncio
 
     from hma_data.shards.reader import ShardSet
-    from hma_model.checkpoint.folder import EMBEDDED
+    from hma_model.checkpoint.folder import BUNDLED, EMBEDDED_NAME, Checkpoint
     from hma_model.hub.publish import located
     from hma_model.worlds.images import read_image
     from hma_model.worlds.scenes import drivable, opening, trained_on
@@ -63,22 +68,19 @@ def play(
     sets, images = list(map(ShardSet, data or ())), list(map(read_image, prompt or ()))
     require_checkpoint(checkpoint)
     opened, device = located(checkpoint)[0], device_name(device)
-
-    @cache
-    def tokenizer() -> Any:
-        from hma_data.tokenizers.base import reopened
-
-        return reopened(opened.config.tokenizer, device)
-
     sets = sets or trained_on(opened)
-    robots = drivable(opened, sets, tokenizer, images)
+    every = [Checkpoint.open(part) for part in BUNDLED.values()] if opened.name == EMBEDDED_NAME else [opened]
+    tokenizers = [cache(partial(_tokenizer, part, device)) for part in every]
+    parted = _by_checkpoint(sets, every)
+    driven = [drivable(*part, images) for part in zip(every, parted, tokenizers, strict=True)]
+    robots = {key: robot for part in driven for key, robot in part.items()}
     first = opening(robots, embodiment, "images" if images else "recordings" if sets else None)
     if len(opened.embodiments) > 1 and images and embodiment is None:
         say("every robot can start from the image; -e ROBOT selects yours", err=True)
-    from hma_model.play.server import LOOPBACK, serve
+    from hma_model.play.server import LOOPBACK, Part, serve
 
     listener = _listen(host, port)
-    name = "the bundled model" if opened.folder == EMBEDDED else checkpoint
+    name = "the bundled model" if opened.bundled else checkpoint
     if token is None and host not in LOOPBACK:
         token = secrets.token_urlsafe(18)
     shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
@@ -92,9 +94,25 @@ def play(
 
     settings: dict[str, Any] = {"device": device, "precision": precision, "compile": compile, "first": first}
     try:
-        asyncio.run(serve(opened, name, robots, tokenizer(), listener, host, token, ready, **settings))
+        parts = [Part(one, made(), own) for one, made, own in zip(every, tokenizers, driven, strict=True)]
+        asyncio.run(serve(parts, name, listener, host, token, ready, **settings))
     except KeyboardInterrupt:
         print("stopped; unsaved sessions are lost")
+
+
+def _tokenizer(checkpoint: "Checkpoint", device: str) -> "Tokenizer":
+    from hma_data.tokenizers.base import reopened
+
+    return reopened(checkpoint.config.tokenizer, device)
+
+
+def _by_checkpoint(sets: "list[ShardSet]", every: "list[Checkpoint]") -> "list[list[ShardSet]]":
+    """Return for each checkpoint the shard sets of its robots; the first has those of unknown robots too."""
+    parts: list[list[ShardSet]] = [[] for _ in every]
+    for shards in sets:
+        known = [number for number, one in enumerate(every) if shards.embodiment.id in one.embodiments]
+        parts[known[0] if known else 0].append(shards)
+    return parts
 
 
 def _listen(host: str, port: int) -> socket.socket:

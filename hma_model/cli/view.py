@@ -55,10 +55,10 @@ def _made(
     """Return the view of what lies at a place."""
     from hma_data.inspection.view import view_recording, view_shards
     from hma_data.storage.kinds import kind_of
-    from hma_model.checkpoint.folder import EMBEDDED_NAME
+    from hma_model.checkpoint.folder import BUNDLED
 
     kind = kind_of(Path(place).expanduser())
-    if place == EMBEDDED_NAME and not Path(place).exists():
+    if place in BUNDLED and not Path(place).exists():
         kind = "a checkpoint"
     if not kind and not Path(place).expanduser().exists() and "://" not in place:
         raise UsageError(place, "does not exist", "name a recording (with -e), a shard set or a run")

@@ -85,7 +85,7 @@ def push(
             embodiment; nothing is made or sent then.
         HubError: the target has another trunk or holds something else, or cannot be reached or written.
     """
-    source = Checkpoint.open(checkpoint)
+    source = Checkpoint.open(checkpoint, embodiments)
     ids = sorted(source.chosen(embodiments))
     _require_publishable(source, ids)
     store = open_store(target, write=True, private=private)
@@ -251,12 +251,12 @@ def located(
     address, revision = addressed(as_address(source), revision)
     if is_repository(address) or "://" in str(address):
         return _pull(address, embodiments, None, revision)
-    checkpoint = Checkpoint.open(Path(address).expanduser())
+    checkpoint = Checkpoint.open(Path(address).expanduser(), embodiments)
     checkpoint.trunk()
     try:
         return checkpoint, checkpoint.chosen(embodiments)
     except CheckpointError as fault:
-        if checkpoint.name != EMBEDDED_NAME:
+        if not checkpoint.bundled:
             raise
         remedy = f"{fault.remedy}. {_ADD_ONE.format(**checkpoint.config.tokenizer)}"
         raise CheckpointError(fault.where, fault.fault, remedy) from fault

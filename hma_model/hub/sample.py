@@ -11,7 +11,7 @@ from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RemotePath
 from hma_model.checkpoint import io as checkpoints
-from hma_model.checkpoint.folder import EMBEDDED, FILM, SAMPLE, Checkpoint, require_tokenizer
+from hma_model.checkpoint.folder import FILM, SAMPLE, Checkpoint, require_tokenizer
 
 if TYPE_CHECKING:
     from hma_data.shards.reader import ShardSet
@@ -32,7 +32,7 @@ def add_samples(checkpoint: StrPath | Checkpoint, data: Iterable[StrPath]) -> li
     from hma_data.shards.reader import ShardSet
 
     source, made = Checkpoint.open(checkpoint), []
-    if source.folder == EMBEDDED:
+    if source.bundled:
         remedy = "copy the folder and name the copy, or finetune it"
         raise CheckpointError(source.folder, "is part of the installed package, which is not changed", remedy)
     for folder in data:

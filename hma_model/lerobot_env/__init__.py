@@ -87,7 +87,7 @@ class HMAEnvConfig(EnvConfig):
             if self.judge is None:
                 log.warning("no judge is given, so pc_success will be 0; name one by --env.judge")
             world = load_world(
-                self.checkpoint, device=self.device, unmask_steps=self.unmask_steps,
+                self.checkpoint, [self.embodiment], device=self.device, unmask_steps=self.unmask_steps,
                 temperature=self.temperature,
             )  # fmt: skip
             read_prompt(world.model, self.embodiment, self.prompt)  # or a refusal before what takes minutes
@@ -161,7 +161,7 @@ def published_envs(file: str, repo: str | None, n_envs: int, cfg: Any = None) ->
     given = {} if cfg is None else dict(vars(cfg))
     names = [given["embodiment"]] if given.get("embodiment") else None
     checkpoint, chosen = located(source, names)
-    world = load_world(source, device=given.get("device", "cpu"))
+    world = load_world(source, names, device=given.get("device", "cpu"))
     return {name: {0: made(checkpoint, name, n_envs, world, given)} for name in chosen}
 
 

@@ -77,6 +77,7 @@ class WorldModelPolicy(PreTrainedPolicy):
             self._cameras = camera_names(checkpoint, self._embodiment)
             self._world = load_world(
                 config.checkpoint,
+                [self._embodiment],
                 device=config.device or "cpu",
                 unmask_steps=config.unmask_steps,
                 temperature=config.temperature,

@@ -1,7 +1,7 @@
 """Say how long each robot of a checkpoint stays with the truth, so that people choose one that does.
 
-The bundled model's robots were measured by `recipes/bench/holding.py`. Of other checkpoints the verdict of
-`hma evaluate` is known, if its card has one.
+The robots of bundled checkpoints were measured by `recipes/bench/holding.py`. Of others the verdict of
+`hma evaluate` is known, if the card has one.
 """
 
 import json
@@ -10,7 +10,7 @@ from importlib.resources import files
 
 from hma_model.checkpoint.folder import Checkpoint
 
-MEASURED = "holding.json"
+MEASURED = "holding.json"  # by the trunk's SHA-256
 FOLLOWS_S = 2.0  # a robot that is lost within so many seconds does not follow its actions
 
 
@@ -49,7 +49,7 @@ UNKNOWN = Holding(None, False, None)
 def holdings(checkpoint: Checkpoint) -> dict[str, Holding]:
     """Return what is known of each robot of a checkpoint."""
     measured = json.loads(files("hma_model.play").joinpath(MEASURED).read_text("utf-8"))
-    known = measured["robots"] if measured["trunk_sha256"] == checkpoint.trunk_sha256 else {}
+    known = measured.get(checkpoint.trunk_sha256, {})
     found = {}
     for name in checkpoint.embodiments:
         if name in known:

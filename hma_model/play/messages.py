@@ -78,7 +78,7 @@ class SampleMessage(_Message):
     """Change how frames are decoded."""
 
     do: Literal["sample"]
-    passes: int = Field(ge=1, le=16)
+    passes: int | None = Field(ge=1, le=16)  # None where the page shows none
     temperature: float = Field(ge=0, le=2)
     order: Literal["random", "confidence"]
 

@@ -12,11 +12,11 @@ import secrets
 import socket
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.resources import files
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from urllib.parse import parse_qs, quote, urlsplit
 
 import anyio
@@ -42,7 +42,7 @@ from hma_model.worlds.scenes import Drivable
 
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-FIRST_ROBOT = "rails_03"  # the robot that a page opens with: it follows, and is easy to drive
+FIRST_ROBOT = "pusht_fast"  # that a page opens with: its T stays whole, and it is easy to drive
 PARTS = {"page.css": "text/css", "controls.js": "text/javascript"}  # that the page shares with exported pages
 MAX_VIEWERS = 32
 MESSAGES_PER_S, MESSAGE_BURST = 200.0, 400.0  # messages of a viewer a second, and at once
@@ -391,8 +391,9 @@ class Connection:
                     session.ended = False
                 case messages.SampleMessage():
                     warmth = round(message.temperature, 1)
+                    steps = message.passes or session.sampling.unmask_steps
                     way = replace(
-                        session.sampling, unmask_steps=message.passes, temperature=warmth, order=message.order
+                        session.sampling, unmask_steps=steps, temperature=warmth, order=message.order
                     )
                     self.stepper.change(session, way)
             self.tell(session.status())
@@ -423,11 +424,17 @@ class Connection:
             self.tell({"kind": "error", "text": f"action: {known}. Shown only once"})
 
 
+class Part(NamedTuple):
+    """A checkpoint, its tokenizer, and those of its robots that can be driven, by key."""
+
+    checkpoint: Checkpoint
+    tokenizer: "Tokenizer"
+    robots: Mapping[str, Drivable]
+
+
 async def serve(
-    checkpoint: Checkpoint,
+    parts: Sequence[Part],
     name: str,
-    robots: Mapping[str, Drivable],
-    tokenizer: "Tokenizer",
     listener: socket.socket,
     host: str,
     token: str | None,
@@ -436,12 +443,11 @@ async def serve(
     first: str | None = None,
     **settings: Any,
 ) -> None:
-    """Serve a checkpoint until the process is interrupted.
+    """Serve checkpoints until the process is interrupted.
 
     Args:
+        parts: one a checkpoint; no robot is in two.
         name: for the model, shown on the page.
-        robots: those that can be driven.
-        tokenizer: the checkpoint's.
         listener: a socket that listens.
         ready: called when the page can be opened.
         device: of the network.
@@ -449,18 +455,25 @@ async def serve(
         settings: of `World`.
 
     Raises:
-        CheckpointError: the checkpoint is damaged.
+        CheckpointError: a checkpoint is damaged.
     """
     from hma_model.checkpoint.io import load
     from hma_model.worlds.world import World
 
-    names = sorted({robot.embodiment.id for robot in robots.values()})
-    model = load(checkpoint, names, device)
-    confidence = ("confidence",) if checkpoint.config.kind == "discrete" else ()
-    stepper = Stepper(World(model, tokenizer, **settings), robots, orders=("random", *confidence))
+    worlds: dict[str, World] = {}
+    robots: dict[str, Drivable] = {}
+    held: dict[str, Holding] = {}
+    for part in parts:
+        names = sorted({robot.embodiment.id for robot in part.robots.values()})
+        world = World(load(part.checkpoint, names, device), part.tokenizer, **settings)
+        worlds |= dict.fromkeys(part.robots, world)
+        robots |= part.robots
+        held |= holdings(part.checkpoint)
+    confidence = ("confidence",) if all(part.checkpoint.config.kind == "discrete" for part in parts) else ()
+    stepper = Stepper(worlds, robots, orders=("random", *confidence))
     stepper.start()
     try:
-        server = Server(stepper, name, host, token, first, holdings(checkpoint))
+        server = Server(stepper, name, host, token, first, held)
         await run(server.app, listener, lambda server: ready())
     finally:
         stepper.stop()

@@ -69,6 +69,7 @@ class Session:
     """A robot, its scene, its place in a world, and the frames so far.
 
     Attributes:
+        world: of the model.
         row: the world's number for it.
         meter: calibrated uncertainty; None where `unmetered` says why.
         viewer: who watches; without one the session stands still.
@@ -81,7 +82,7 @@ class Session:
     ) -> None:
         self.name = name
         self.robot = robot
-        self._world = world
+        self.world = world
         self.viewer: Viewer | None = None
         self.due = self.touched = now
         self.paused = True
@@ -103,7 +104,7 @@ class Session:
     def sample(self, sampling: Decoding) -> None:
         """Go on with another sampling; the meter of uncertainty is that of such frames."""
         self.sampling = sampling
-        meter, self.unmetered = self._world.meter(self.robot.embodiment.id, **vars(sampling))
+        meter, self.unmetered = self.world.meter(self.robot.embodiment.id, **vars(sampling))
         if meter is not None and not meter.better:
             self.unmetered = meter.verdict
         self.meter = None if self.unmetered else meter
@@ -113,7 +114,7 @@ class Session:
     def begin(self, number: int) -> None:
         """Begin another scene, or the same anew."""
         self._begin(number)
-        self._world.reset(self.row, *self._history())
+        self.world.reset(self.row, *self._history())
         self._set_start()
 
     def _begin(self, number: int) -> None:
@@ -136,7 +137,7 @@ class Session:
 
     def _restarted(self, frame: Frame) -> Frame:
         """Return a frame with the images from which the model goes on; divergence is looked for anew."""
-        shown = self._world.image(self.row)
+        shown = self.world.image(self.row)
         true = self._true[-1]
         rate = self.robot.embodiment.rate_hz / self.robot.embodiment.stride
         self._divergence = DivergenceDetector(true, shown, round(rate))
@@ -157,7 +158,7 @@ class Session:
         """
         if not self._true:
             raise UsageError("sync", "the true frames are unknown here", "reset first, or drive a simulator")
-        self._world.reset(self.row, *self._history())
+        self.world.reset(self.row, *self._history())
         self._last = self._restarted(self._last)
 
     def _history(self) -> tuple[Images, Float32s]:
@@ -187,7 +188,7 @@ class Session:
 
     def end(self) -> None:
         """Give the place in the world back."""
-        self._world.close(self.row)
+        self.world.close(self.row)
 
     def take(self, image: Images, now: float, took: float) -> None:
         """Take the model's image (H, W, 3) of the step, which took so many seconds, and show it."""
@@ -200,7 +201,7 @@ class Session:
             self._true.clear()
         else:
             self._true.append(self._truth)
-        unsure = self._world.uncertainty.get(self.row, math.nan) if self.meter else math.nan
+        unsure = self.world.uncertainty.get(self.row, math.nan) if self.meter else math.nan
         self._stated = (self._stated**POWER + unsure**POWER) ** (1 / POWER)
         score = still = None
         if self._truth is not None:
@@ -248,7 +249,8 @@ class Session:
     def status(self) -> dict[str, Any]:
         """Return the settings that the page shows, as plain values."""
         way = self.sampling
-        sampling = {"passes": way.unmask_steps, "temperature": way.temperature, "order": way.order}
+        passes = None if self.world.one_pass else way.unmask_steps
+        sampling = {"passes": passes, "temperature": way.temperature, "order": way.order}
         return {
             "kind": "status", "paused": self.paused, "replays": self.replays, "fast": self.fast,
             "sampling": sampling, "scene": self.number, "frame": self.count, "ended": self.ended,

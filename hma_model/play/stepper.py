@@ -1,12 +1,12 @@
 """Step all sessions that are due together, in one thread that alone touches the model and the simulators.
 
-    stepper = Stepper(world, robots)
+    stepper = Stepper(dict.fromkeys(robots, world), robots)
     stepper.start()
     session = stepper.call(lambda: stepper.open("mover_04", 0)).result()
     stepper.call(lambda: stepper.attach(session.name, viewer))
 
-Every session has its own clock. Sessions that are due at the same time, with the same sampling, share one
-pass of the model.
+Every session has its own clock. Sessions of one model that are due at the same time, with the same sampling,
+share one pass.
 """
 
 import logging
@@ -36,7 +36,7 @@ class Stepper:
     """The thread and its sessions.
 
     Args:
-        world: of the model; nobody else may use it.
+        worlds: of the models, by the keys of robots; nobody else may use them.
         robots: those that can be driven, by key.
         orders: those in which the model can decode a frame.
         most: sessions at a time.
@@ -46,7 +46,7 @@ class Stepper:
 
     def __init__(
         self,
-        world: World,
+        worlds: Mapping[str, World],
         robots: Mapping[str, Drivable],
         *,
         orders: Sequence[str] = ("random", "confidence"),
@@ -57,8 +57,7 @@ class Stepper:
         self.orders = orders
         self.most = most
         self.idle_s = idle_s
-        self._world = world
-        self._sampling = world.decoding
+        self._worlds = {key: (world, world.decoding) for key, world in worlds.items()}
         self.sessions: dict[str, Session] = {}
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="stepper", daemon=True)
@@ -110,9 +109,7 @@ class Stepper:
                 raise UsageError("sessions", fault, "close another page, or try again in a few minutes")
             said = "Closed after a while without input: another page needed the session."
             self.close(min(left, key=lambda one: (one.viewer is not None, one.touched)).name, said)
-        session = Session(
-            secrets.token_urlsafe(18), robot, number, self._world, self._sampling, time.monotonic()
-        )
+        session = Session(secrets.token_urlsafe(18), robot, number, *self._worlds[key], time.monotonic())
         self.sessions[session.name] = session
         return session
 
@@ -185,18 +182,19 @@ class Stepper:
                 text = f"Paused after {self.idle_s / 60:.0f} minutes without input."
                 session.viewer.tell({"kind": "error", "text": text})
         due = [session for session in self.sessions.values() if session.ready(now)]
-        together: dict[Decoding, list[Session]] = {}
+        together: dict[tuple[int, Decoding], list[Session]] = {}
         for session in due:
-            together.setdefault(session.sampling, []).append(session)
-        for sampling, group in together.items():
-            self._step_together(sampling, group)
+            together.setdefault((id(session.world), session.sampling), []).append(session)
+        for group in together.values():
+            self._step_together(group)
         if due:
             return 0.0  # look at what came in meanwhile
         waiting = [s.due - now for s in self.sessions.values() if s.viewer and (s.steps or not s.paused)]
         return min([SLEEP_S, *(wait for wait in waiting if wait > 0)])
 
-    def _step_together(self, sampling: Decoding, sessions: list[Session]) -> None:
-        world = self._world
+    def _step_together(self, sessions: list[Session]) -> None:
+        """Step sessions of one world with the same sampling."""
+        world, sampling = sessions[0].world, sessions[0].sampling
         world.decoding = replace(sampling, measure=any(session.meter is not None for session in sessions))
         begun = time.monotonic()
         chunks: dict[int, Float32s] = {}

@@ -162,5 +162,5 @@ def read_acting(words: str, scenes: Scenes, device: str = "cpu") -> Acting:
     checkpoint, options = split_options("hma", words, OPTIONS)
     horizon = options.pop("horizon", 1)
     memory = options.pop("memory", None)
-    world = load_world(checkpoint, device=device, **options)
+    world = load_world(checkpoint, [scenes.name], device=device, **options)
     return Acting(world, scenes, horizon, f"policy hma:{checkpoint}", memory)

@@ -35,7 +35,7 @@ def policy_facts(words: str, embodiment: str) -> dict[str, str]:
     kind, _, rest = words.partition(":")
     if kind == "hma" and rest:
         with suppress(HMAError):
-            kept = Checkpoint.open(split_options(kind, rest, OPTIONS)[0])
+            kept = Checkpoint.open(split_options(kind, rest, OPTIONS)[0], [embodiment])
             parts = {part: file_sha256(kept.path(embodiment, part)) for part in (STEM, HEAD, YAML, STATS)}
             return {"trunk": kept.trunk_sha256} | parts
         return {}  # of the hub or a store

@@ -162,7 +162,7 @@ def evaluate_recorded(
             raise UsageError(f"policy {name}", "reads the state of a simulator", "give another policy")
     folder = None if out is None else as_path(out)
     with locked(folder) if folder else nullcontext():
-        world = world or load_world(checkpoint, **settings)
+        world = world or load_world(checkpoint, [embodiment], **settings)
         scenes = Scenes.of(world, embodiment, episodes, seed, simulator=False)
         made = [read_policy(one, scenes, world) if isinstance(one, str) else one[1] for one in policies]
         if planner := next((name for name, one in zip(names, made) if isinstance(one, Judged)), None):

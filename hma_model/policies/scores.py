@@ -270,7 +270,7 @@ def evaluate_policies(
     names = names_of(policies)
     folder = None if out is None else as_path(out)
     with locked(folder) if folder else nullcontext():
-        world = world or load_world(checkpoint, **settings)
+        world = world or load_world(checkpoint, [embodiment], **settings)
         sampling = sampling_of(world)
         scenes = Scenes.of(world, embodiment, episodes, seed)
         meter = None if max_error is None else choosing_meter(world, embodiment)

@@ -192,8 +192,8 @@ def augment(
     if lerobot is not None:
         require_dataset(as_path(lerobot))
     world = world or load_world(
-        checkpoint, unmask_steps=settings.unmask_steps, temperature=settings.temperature,
-        precision=settings.precision, **given,
+        checkpoint, [settings.embodiment], unmask_steps=settings.unmask_steps,
+        temperature=settings.temperature, precision=settings.precision, **given,
     )  # fmt: skip
     meter = None if settings.max_error is None else choosing_meter(world, settings.embodiment)
     if settings.keep < 1 and meter is None:

@@ -114,7 +114,7 @@ def label_actions(
     find_film(film)
     if folder.exists() and not folder.is_dir():
         raise OutputError(folder, "is a file", "name a folder")
-    world = world or load_world(checkpoint, device=device)
+    world = world or load_world(checkpoint, [embodiment], device=device)
     model = world.model
     model.require_readout(INVERSE, checkpoint)
     spec = world.action_spec(embodiment)

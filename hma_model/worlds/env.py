@@ -112,7 +112,8 @@ class WorldModelEnv(gymnasium.Env[Images, Float32s]):
         **settings: Any,
     ) -> None:
         if world is None:
-            world = load_world(checkpoint, device=device, **settings)
+            wanted = None if embodiment is None else [embodiment]
+            world = load_world(checkpoint, wanted, device=device, **settings)
         elif settings:
             raise UsageError("world", f"is given with {', '.join(settings)}", "set them in the world")
         if embodiment is None:

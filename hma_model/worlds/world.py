@@ -104,6 +104,11 @@ class World:
         return meter_of(self.model.config, card, way.unmask_steps, way.temperature, way.order)
 
     @property
+    def one_pass(self) -> bool:
+        """Return whether the model predicts a whole frame in one pass, whatever `decoding` says."""
+        return self.model.config.whole_frames
+
+    @property
     def sessions(self) -> dict[int, str]:
         """Return the open sessions and their embodiments."""
         return {number: one.embodiment for number, one in self._sessions.items()}
@@ -326,15 +331,22 @@ class World:
         return np.concatenate(views, axis=-2).astype(np.int64 if config.kind == "discrete" else np.float32)
 
 
-def load_world(checkpoint: StrPath = "embedded", *, device: str = "cpu", **settings: Any) -> World:
-    """Return a world of a checkpoint with all its embodiments, and of its tokenizer.
+def load_world(
+    checkpoint: StrPath = "embedded",
+    embodiments: Sequence[str] | None = None,
+    *,
+    device: str = "cpu",
+    **settings: Any,
+) -> World:
+    """Return a world of a checkpoint and of its tokenizer.
 
     Args:
         checkpoint: str or path of a checkpoint or training run, a URI, a hub repository, or `embedded`.
+        embodiments: ids of those to load; None for all.
         device: of the network and of the tokenizer.
         settings: of `World`.
     """
     from hma_model.network.model import HMA
 
-    model = HMA.from_pretrained(checkpoint, device=device)
+    model = HMA.from_pretrained(checkpoint, embodiments, device=device)
     return World(model, reopened(model.config.tokenizer, device), **settings)

@@ -101,10 +101,10 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
             raise UsageError("bench drift", f"{key}={settings[key]} is not allowed", f"give at least {least}")
     from hma_data.tokenizers.network import single_threads
 
-    model, tokenizer = opened(settings["checkpoint"], robots, settings["device"])
-    work = partial(measure, model, tokenizer, samplings=samplings, settings=settings)
+    models = [opened(settings["checkpoint"], [robot], settings["device"]) for robot in robots]
+    work = partial(measure, samplings=samplings, settings=settings)
     with single_threads(len(robots)) as pool:
-        found = list(pool.map(work, robots))
+        found = list(pool.map(work, *zip(*models), robots))
     if settings["sheet"]:
         draw(found, Path(settings["sheet"]))
     return [row for one in found for row in rows(one, settings["seed"])]

@@ -1,6 +1,6 @@
 """Measure how long the robots of a checkpoint stay with the truth, as `hma play` sees it.
 
-    python recipes/bench/holding.py            # writes hma_model/play/holding.json for the bundled model
+    python recipes/bench/holding.py embedded          # into hma_model/play/holding.json
 
 Each robot with a simulator replays the recorder's actions in the model until model and truth have parted
 (`hma_model.play.session`), in several scenes. The lower median over scenes is the time that it holds.
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import hma_model.play
 from hma_data.storage.files import write_atomic
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.play.holding import MEASURED
 from hma_model.play.session import Session
 from hma_model.worlds.scenes import drivable
@@ -22,7 +22,7 @@ from hma_model.worlds.world import load_world
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--checkpoint", default=str(EMBEDDED))
+    parser.add_argument("checkpoint")
     parser.add_argument("--out", type=Path, default=Path(hma_model.play.__file__).parent / MEASURED)
     parser.add_argument("--scenes", type=int, default=4)
     parser.add_argument("--frames", type=int, default=300)
@@ -53,9 +53,10 @@ def main() -> None:
         frames = statistics.median_low(session.parted or given.frames for session in some)
         at_least = frames >= given.frames
         found[name] = {"seconds": round(frames / hz, 1), "at_least": at_least}
-    settings = {"scenes": given.scenes, "frames": given.frames}
-    content = {"trunk_sha256": checkpoint.trunk_sha256, **settings, "robots": found}
-    write_atomic(given.out, json.dumps(content, indent=1) + "\n")
+    bundled = {Checkpoint.open(part).trunk_sha256 for part in BUNDLED.values()}
+    before = json.loads(given.out.read_text()) if given.out.exists() else {}
+    kept = {trunk: robots for trunk, robots in before.items() if trunk in bundled}
+    write_atomic(given.out, json.dumps(kept | {checkpoint.trunk_sha256: found}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

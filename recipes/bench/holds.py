@@ -60,8 +60,8 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
         if settings["driver"] == "contact" and robot != "pusht_fast":
             fault = f"driver=contact is of pusht_fast, not of {robot}"
             raise UsageError("bench holds", fault, "give robots=pusht_fast, or another driver")
-    model, tokenizer = opened(settings["checkpoint"], robots, settings["device"])
-    found = [measure(model, tokenizer, robot, settings) for robot in robots]
+    models = [opened(settings["checkpoint"], [robot], settings["device"]) for robot in robots]
+    found = [measure(*model, robot, settings) for model, robot in zip(models, robots, strict=True)]
     if settings["sheet"]:
         draw(found, Path(settings["sheet"]))
     marks = sorted({mark for mark in (*MARKS, settings["frames"]) if mark <= settings["frames"]})
@@ -90,7 +90,6 @@ def record(checkpoint: str, rows: list[dict[str, Any]], rollouts: int) -> None:
     from hma_model.checkpoint.folder import Checkpoint
     from hma_model.checkpoint.io import record_evaluation
 
-    folder = Checkpoint.open(checkpoint)
     for robot in dict.fromkeys(row["robot"] for row in rows):
         marks = {
             str(row["frame"]): {key: value for key, value in row.items() if key not in ("robot", "frame")}
@@ -99,7 +98,7 @@ def record(checkpoint: str, rows: list[dict[str, Any]], rollouts: int) -> None:
         }
         if marks:
             facts = {"verdict": sentence(marks), "rollouts": rollouts, "frames": marks}
-            record_evaluation(folder, robot, facts, "holds")
+            record_evaluation(Checkpoint.open(checkpoint, [robot]), robot, facts, "holds")
 
 
 def sentence(marks: dict[str, dict[str, Any]]) -> str:

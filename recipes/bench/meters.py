@@ -1,6 +1,6 @@
-"""Calibrate the uncertainty of the bundled model's robots, and record the meters in its cards.
+"""Calibrate the uncertainty of a bundled model's robots, and record the meters in its cards.
 
-    python recipes/bench/meters.py                 # all robots; or name some
+    python recipes/bench/meters.py embedded        # all its robots; or name some; then embedded-pusht
 
 The measurement is that of `hma benchmark`, which records the meters of other checkpoints itself.
 """
@@ -10,7 +10,7 @@ import argparse
 from hma_data.console import run_script
 from hma_model.benchmark.measures import choose, frame_errors
 from hma_model.benchmark.run import NOISE
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.checkpoint.io import record_evaluation
 from hma_model.evaluation.calibration import calibration
 from hma_model.evaluation.probe import train_probe
@@ -23,15 +23,15 @@ FRAMES = 20
 
 def main() -> None:
     """Calibrate robots one by one; each is recorded as it is finished."""
-    bundled = Checkpoint.open(EMBEDDED)
-    parser = argparse.ArgumentParser(description="Calibrate the bundled model's uncertainty")
-    parser.add_argument("robots", nargs="*", default=bundled.embodiments)
+    parser = argparse.ArgumentParser(description="Calibrate a bundled model's uncertainty")
+    parser.add_argument("checkpoint", choices=BUNDLED)
+    parser.add_argument("robots", nargs="*")
     parser.add_argument("--scenes", type=int, default=32)
     parser.add_argument("--sequences", type=int, default=2, help="of actions in each scene")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    world = load_world(EMBEDDED)
-    for robot in given.robots:
+    bundled, world = Checkpoint.open(given.checkpoint), load_world(given.checkpoint)
+    for robot in given.robots or bundled.embodiments:
         scenes = Scenes.of(world, robot, given.scenes, given.seed)
         probe = train_probe(robot, world.tokenizer, scenes.stride, given.seed)
         arrays = frame_errors(choose(world, scenes, probe, Scripted(NOISE), FRAMES, given.sequences))

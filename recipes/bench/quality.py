@@ -208,20 +208,20 @@ def measure(name: str, data: Path, budget: dict[str, Any], seed: int) -> dict[st
 
 
 def bundled_digest() -> str:
-    """Return sixteen hex digits that stand for the bundled trunk."""
-    from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+    """Return sixteen hex digits that stand for the trunk that the bundled robot has."""
+    from hma_model.checkpoint.folder import Checkpoint
 
-    return Checkpoint.open(EMBEDDED).trunk_sha256[:16]
+    return Checkpoint.open("embedded", [HOLDS_ROBOT]).trunk_sha256[:16]
 
 
 def measure_holds(seed: int) -> dict[str, float]:
-    """Return what the bundled model keeps of a pushed T and of its pusher."""
+    """Return what the bundled model keeps of a pushed T, and of its pusher if that is large enough."""
     from recipes.bench import holds
 
     _tell(f"{HOLDS}, seed {seed}: {HOLDS_ROBOT}, {HOLDS_FRAMES} frames")
     own = {"robots": HOLDS_ROBOT, "frames": HOLDS_FRAMES, "rollouts": HOLDS_ROLLOUTS, "seed": seed}
     last = holds.run(holds.BENCH.defaults | own)[-1]
-    return {key: last[key] for key in ("limbs", "left", "shape", "off")}
+    return {key: last[key] for key in ("limbs", "left", "shape", "off") if last[key] is not None}
 
 
 def recipe_of(case: Case, data: Path, steps: int, seed: int) -> Any:

@@ -1,6 +1,6 @@
-"""Judge each robot of the bundled model on new recordings, and write the verdicts into its cards.
+"""Judge each robot of a bundled model on new recordings, and write the verdicts into its cards.
 
-    python recipes/bench/verdicts.py          # six minutes of one core; what is finished in --work is kept
+    python recipes/bench/verdicts.py embedded # six minutes of one core; what is finished in --work is kept
 
 The laboratory records 40 episodes of each robot with another seed than those of the training. Those that the
 recording holds out, at most eight, are judged as `hma evaluate --windows 8` does.
@@ -15,8 +15,8 @@ from hma_data.conversion.plan import Settings
 from hma_data.lab import record
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
-from hma_data.tokenizers.base import get_tokenizer
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_data.tokenizers.base import reopened
+from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.checkpoint.io import record_evaluation
 from hma_model.evaluation.suite import EvaluationSettings, evaluate_all
 
@@ -25,11 +25,13 @@ EPISODES, SEED, JUDGED, WINDOWS = 40, 20261126, 8, 8
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("checkpoint", choices=BUNDLED)
     parser.add_argument("--work", type=Path, default=Path("verdicts"))
-    work = parser.parse_args().work
-    copy, tokenizer, bundled = work / "model", get_tokenizer("fsq-lab"), Checkpoint.open(EMBEDDED)
+    given = parser.parse_args()
+    work, bundled = given.work / given.checkpoint, Checkpoint.open(given.checkpoint)
+    copy, tokenizer = work / "model", reopened(bundled.config.tokenizer)
     if not copy.is_dir():
-        shutil.copytree(EMBEDDED, copy)
+        shutil.copytree(bundled.folder, copy)
     for name in bundled.embodiments:
         card = Checkpoint.open(copy).card(name)
         if "evaluation" not in card or not (work / name).is_dir():

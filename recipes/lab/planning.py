@@ -100,7 +100,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=3)
     parser.add_argument("--seed", type=int, default=7, help="of the episodes")
     given = parser.parse_args()
-    world = load_world(given.checkpoint, unmask_steps=1, temperature=0.0)
+    world = load_world(given.checkpoint, [given.robot], unmask_steps=1, temperature=0.0)
     cost = HistoryCost(world, given.robot)
     scenes = Scenes.of(world, given.robot, given.episodes, given.seed)
     own = {"cost": cost, "scenes": scenes, "ahead": given.ahead, "near": given.near}

@@ -12,7 +12,7 @@ import numpy as np
 
 from hma_data.episodes.sheets import webp_bytes
 from hma_data.storage.files import write_atomic
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
 from hma_model.play.save import panels
 from hma_model.play.session import Session
 from hma_model.worlds.scenes import drivable
@@ -24,13 +24,14 @@ SIDE = 256  # pixels of a panel
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("robot")
-    parser.add_argument("--checkpoint", default=str(EMBEDDED))
+    parser.add_argument("--checkpoint", default=EMBEDDED_NAME)
     parser.add_argument("--scene", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=6.0)
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
-    world = load_world(given.checkpoint)
-    robot = drivable(Checkpoint.open(given.checkpoint), (), lambda: world.tokenizer)[given.robot]
+    world = load_world(given.checkpoint, [given.robot])
+    checkpoint = Checkpoint.open(given.checkpoint, [given.robot])
+    robot = drivable(checkpoint, (), lambda: world.tokenizer)[given.robot]
     session = Session(given.robot, robot, given.scene, world, world.decoding, 0.0)
     session.replays = True
     hz = robot.embodiment.effective_hz

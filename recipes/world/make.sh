@@ -14,8 +14,6 @@ episodes=${EPISODES:-400} contact=${CONTACT:-4000} workers=${WORKERS:-2}
 robots="arm1_02 arm1_03 arm2_02 arm2_07 arm3_04 arm4_01 crane_04 gantry_04 mover_04 mover_10 rails_03 rails_09
     pendulum planar_arm pusht_slow"
 mkdir -p "$out"
-# The rate at which the model shows the pusher is twice that of the registry's, whose bundled model is older.
-sed 's/target_hz: 2.5/target_hz: 5/' "$here/registry/lab/pusht_fast.yaml" > "$out/pusht_fast.yaml"
 
 # shellcheck disable=SC2086
 python "$here/recipes/world/record.py" "$out" --episodes "$episodes" --workers "$workers" --tokenizer palette-64 \
@@ -25,7 +23,7 @@ push() { # a thousand episodes; the recording goes when its shards are complete
     [ -e "$out/push/$1/manifest.json" ] && return
     python "$here/recipes/lab/pushes.py" "$out/record/$1" --planned 0 --noisy 0 \
         --contact $((contact / parts)) --seed $((200 + $1))
-    hma convert "$out/record/$1/contact/pusht_fast.hdf5" -e "$out/pusht_fast.yaml" --tokenizer palette-64 \
+    hma convert "$out/record/$1/contact/pusht_fast.hdf5" -e pusht_fast --tokenizer palette-64 \
         --frames strided --out "$out/push/$1"
     rm -r "$out/record/$1"
 }

@@ -16,7 +16,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer
 from hma_model.checkpoint import io as checkpoint
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint, action_stats
+from hma_model.checkpoint.folder import Checkpoint, action_stats
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.generation.unmask import Decoding
 from hma_model.network.model import HMA
@@ -36,6 +36,8 @@ class TrueWorld:
         begun: (frames, chunks) of each open and reset.
         blind: rows that show black.
     """
+
+    one_pass = False
 
     def __init__(self) -> None:
         self.rows: dict[int, LabSimulator] = {}
@@ -163,9 +165,9 @@ def _of_robot(made: HMA, own: Embodiment, stirred: bool) -> HMA:
 
 def lab_robots(*names: str) -> dict[str, Drivable]:
     """Return robots of the laboratory, with the embedded checkpoint's statistics or their ranges."""
-    checkpoint = Checkpoint.open(EMBEDDED)
     robots: dict[str, Drivable] = {}
     for name in names:
+        checkpoint = Checkpoint.open("embedded", [name])
         if name in checkpoint.embodiments:
             robots[name] = LabRobot(checkpoint.embodiment(name), checkpoint.stats(name))
         else:

@@ -270,5 +270,5 @@ def test_a_checkpoint_that_may_only_be_read_gets_no_meter_and_no_error(
         raise OutputError(tmp_path, "cannot be written: Permission denied")
 
     monkeypatch.setattr(checkpoints, "record_evaluation", refused)
-    source: Any = SimpleNamespace(folder=tmp_path)
+    source: Any = SimpleNamespace(folder=tmp_path, bundled=False)
     checkpoints.record_locally(tmp_path, source, "mover_04", {}, "meter")

@@ -25,7 +25,7 @@ def test_for_a_robot_that_it_lacks_the_command_that_adds_one_is_named(tmp_path, 
 
 ROBOTS = {
     *("arm1_02", "arm1_03", "arm2_02", "arm2_07", "arm3_04", "arm4_01", "crane_04", "gantry_04", "mover_04"),
-    *("mover_10", "rails_03", "rails_09", "pendulum", "planar_arm", "pusht_fast", "pusht_slow"),
+    *("mover_10", "rails_03", "rails_09", "pendulum", "planar_arm", "pusht_slow"),
 }
 
 

@@ -32,7 +32,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def stepper() -> Iterator[Stepper]:
-    made = Stepper(TrueWorld(), lab_robots("mover_04", "mover_02", "arm4_04", "rails_03"))
+    robots = lab_robots("mover_04", "mover_02", "arm4_04", "rails_03")
+    made = Stepper(dict.fromkeys(robots, TrueWorld()), robots)
     made.start()
     yield made
     made.stop()
@@ -77,7 +78,7 @@ def recorded(
     convert(own, toy_recording, block_tokenizer, tmp_path / "shards")
     shards = ShardSet(tmp_path / "shards")
     robot = RecordedRobot(shards, lambda: block_tokenizer, shards.manifest.stats, "first")
-    made = Stepper(StillWorld(), {robot.key: robot})
+    made = Stepper({robot.key: StillWorld()}, {robot.key: robot})
     made.start()
     yield made
     made.stop()

@@ -5,19 +5,20 @@ from importlib.resources import files
 
 import pytest
 
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.checkpoint.io import record_evaluation
 from hma_model.play.holding import MEASURED, Holding, holdings
 from tests.model.robots import save
 
 
 def test_the_bundled_models_robots_were_measured() -> None:
-    """A new bundled model needs a new measurement: python recipes/bench/holding.py."""
+    """A new bundled model needs a new measurement: python recipes/bench/holding.py CHECKPOINT."""
     measured = json.loads(files("hma_model.play").joinpath(MEASURED).read_text("utf-8"))
-    checkpoint = Checkpoint.open(EMBEDDED)
-    assert measured["trunk_sha256"] == checkpoint.trunk_sha256
-    assert measured["robots"].keys() == set(checkpoint.embodiments)
-    found = holdings(checkpoint)
+    found = dict[str, Holding]()
+    for part in map(Checkpoint.open, BUNDLED.values()):
+        assert measured[part.trunk_sha256].keys() == set(part.embodiments)
+        found |= holdings(part)
+    assert len(measured) == len(BUNDLED)
     assert found["mover_10"].follows is False and found["mover_10"].words == "does not follow its actions"
     assert all(one.follows is not None for one in found.values())
 

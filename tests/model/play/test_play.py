@@ -41,9 +41,20 @@ def image(tmp_path: Path) -> str:
 @pytest.mark.parametrize("address", [REPO, f"{REPO}@main", f"hf://{REPO}"])
 def test_a_published_checkpoint_is_fetched(published, served, image, address) -> None:
     assert main(["play", address, "--prompt", image, "--no-browser"]) == 0
-    ((checkpoint, name, robots, *_),) = served
-    assert name == address and set(robots) == {f"{robot}:images" for robot in ROBOTS}
-    assert set(Checkpoint.open(checkpoint.folder).embodiments) == set(ROBOTS)
+    (([part], name, *_),) = served
+    assert name == address and set(part.robots) == {f"{robot}:images" for robot in ROBOTS}
+    assert set(Checkpoint.open(part.checkpoint.folder).embodiments) == set(ROBOTS)
+
+
+def test_the_bundled_model_is_played_with_all_its_checkpoints(served) -> None:
+    assert main(["play", "-e", "pusht_fast", "--no-browser"]) == 0
+    ((parts, name, *_, settings),) = served
+    assert [part.checkpoint.name for part in parts] == ["embedded", "embedded-pusht"]
+    assert name == "the bundled model" and settings["first"] == "pusht_fast"
+    assert [("pusht_fast" in part.robots, "arm2_02" in part.robots) for part in parts] == [
+        (False, True),
+        (True, False),
+    ]
 
 
 def test_a_damaged_trunk_is_refused(tmp_path, served, image, capsys) -> None:
@@ -66,7 +77,7 @@ def test_a_run_brings_the_shards_of_its_training(tmp_path: Path, request: pytest
     assert json.loads((tmp_path / "run/recipe.json").read_text())["data"] == [data]
     served = request.getfixturevalue("served")  # from here on no tokenizer is real
     assert main(["play", out, "--no-browser"]) == 0
-    assert list(served[0][2]) == ["rover:recordings"]
+    assert list(served[0][0][0].robots) == ["rover:recordings"]
 
 
 def test_the_page_opens_with_the_robot_that_was_named_or_the_image_that_was_given(

@@ -24,7 +24,8 @@ HOST, DRIVE = "http://127.0.0.1:8000", "ws://127.0.0.1:8000/drive"
 
 @pytest.fixture
 def stepper() -> Iterator[Stepper]:
-    made = Stepper(TrueWorld(), lab_robots("mover_04", "arm2_12"), most=3)
+    robots = lab_robots("mover_04", "arm2_12")
+    made = Stepper(dict.fromkeys(robots, TrueWorld()), robots, most=3)
     made.start()
     yield made
     made.stop()
@@ -210,7 +211,7 @@ def test_a_flood_and_bytes_close_their_connections_alone(client, monkeypatch) ->
 def test_a_page_cannot_begin_scenes_so_often_that_the_others_wait(client, stepper, monkeypatch, do) -> None:
     monkeypatch.setattr(server, "MESSAGES_PER_S", 0.0)  # time restores no credit
     values = {"open": {"robot": "mover_04"}, "scene": {"number": 1}, "sync": {}}[do]
-    world = stepper._world
+    world, _ = stepper._worlds["mover_04"]
     assert isinstance(world, TrueWorld)
     with client.websocket_connect(DRIVE) as bad:
         PageViewer(bad).open()

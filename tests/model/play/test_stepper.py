@@ -23,7 +23,8 @@ class Bench:
 
     def __init__(self, **settings: Any) -> None:
         self.world = TrueWorld()
-        self.stepper = Stepper(self.world, lab_robots(*ROBOTS), **settings)
+        robots = lab_robots(*ROBOTS)
+        self.stepper = Stepper(dict.fromkeys(robots, self.world), robots, **settings)
 
     def open(self, robot: str = "mover_04", scene: int = 0) -> tuple[Session, Watcher]:
         session, viewer = self.stepper.open(robot, scene), Watcher()
@@ -48,6 +49,21 @@ def test_sessions_that_are_due_share_a_pass_and_hold_their_own_actions() -> None
     for number, session in enumerate(sessions):
         expected = np.full(session.robot.embodiment.chunk_dim, 0.25 * (number + 1), np.float32)
         np.testing.assert_array_equal(chunks[session.row], expected)
+
+
+def test_sessions_of_two_models_are_stepped_by_their_own() -> None:
+    worlds = {"mover_04": TrueWorld(), "pendulum": TrueWorld()}
+    worlds["pendulum"].one_pass = True
+    worlds["pendulum"].decoding = Decoding(1, 0.0)
+    stepper = Stepper(worlds, lab_robots(*worlds))
+    for robot, passes in (("mover_04", 2), ("pendulum", None)):
+        session = stepper.open(robot, 0)
+        stepper.attach(session.name, Watcher())
+        session.paused, session.due = False, 0.0
+        assert session.status()["sampling"]["passes"] == passes
+    stepper.step()
+    assert [len(world.steps) for world in worlds.values()] == [1, 1]
+    assert [world.sampling[0][0] for world in worlds.values()] == [2, 1]
 
 
 def test_a_session_steps_at_the_rate_of_its_robot_or_as_fast_as_it_can() -> None:

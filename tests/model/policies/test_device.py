@@ -26,7 +26,7 @@ class Asked(Exception):
     ],
 )
 def test_device_and_precision_reach_the_world(module, words, options, monkeypatch, tmp_path) -> None:
-    def load(checkpoint: str, **given: Any) -> World:
+    def load(checkpoint: str, robots: list[str], **given: Any) -> World:
         raise Asked(given["device"], given.get("precision"), given.get("compile"))
 
     monkeypatch.chdir(tmp_path)
@@ -47,7 +47,7 @@ def test_a_device_that_is_not_here_is_refused(capsys: pytest.CaptureFixture[str]
 def test_a_model_that_acts_is_on_the_device_of_its_world(world, monkeypatch) -> None:
     asked: list[str] = []
 
-    def load(checkpoint: str, **given: Any) -> World:
+    def load(checkpoint: str, robots: list[str], **given: Any) -> World:
         asked.append(given["device"])
         return world
 

@@ -39,7 +39,7 @@ from hma_model.policies.scores import (
     score_policy,
 )
 from hma_model.policies.scripted import Called, Still
-from hma_model.simulate import World
+from hma_model.simulate import World, load_world
 from tests.model.true_world import TrueWorld, tiny_model
 
 ROBOT = "rails_03"
@@ -120,8 +120,8 @@ def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJu
 
 
 def test_policies_of_gym_pusht_are_told_where_the_disc_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = HMA.from_pretrained("embedded", ["pusht_fast"])
-    world = FlawlessWorld(World(model, get_tokenizer(model.config.tokenizer["name"])))
+    world = FlawlessWorld(load_world("embedded", ["pusht_fast"]))
+    world.image_shape = 128, 128, 3  # as the simulator draws
     probe: Any = KnownPlaces(monkeypatch)
     true = TrueArena(Scenes.of(world, "pusht_fast", 2, 0), 128)  # type: ignore[arg-type]
     arena = ModelArena(world, true, probe)  # type: ignore[arg-type]

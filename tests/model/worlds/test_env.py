@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import RecordVideo
 
 from hma_data.errors import HMAError
-from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.base import reopened
 from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.network.model import HMA
 from hma_model.simulate import World, WorldModelEnv, WorldModelVectorEnv, starting_window
@@ -36,7 +36,7 @@ def window(model: HMA) -> tuple[Any, Any]:
 
 @pytest.fixture
 def world(model: HMA) -> World:
-    return World(model, get_tokenizer(model.config.tokenizer["name"]))
+    return World(model, reopened(model.config.tokenizer))
 
 
 def prompt(window: tuple[Any, Any]) -> dict[str, Any]:
@@ -55,10 +55,10 @@ def test_gymnasium_finds_nothing_wrong(control: str, window: tuple[Any, Any]) ->
         horizon=5, render_mode="rgb_array",
     )  # fmt: skip
     check_env(env.unwrapped, skip_close_check=True)
-    assert env.metadata["render_fps"] == (10 if control == "frame" else 2.5)
+    assert env.metadata["render_fps"] == (10 if control == "frame" else 5)
     assert env.unwrapped.action_names == ("x", "y")  # type: ignore[attr-defined]
     low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
-    assert low.shape == ((2,) if control == "frame" else (4, 2)) and (low == 0).all() and (high == 512).all()
+    assert low.shape == ((2,) if control == "frame" else (2, 2)) and (low == 0).all() and (high == 512).all()
     env.close()
 
 
@@ -69,21 +69,21 @@ def test_steps_show_what_the_world_shows(world: World, window: tuple[Any, Any], 
         world=world,
         prompt=prompt(window),
         control=control,
-        horizon=8,
+        horizon=4,
         render_mode="rgb_array",
     )
     first, _ = env.reset(seed=3)
-    chunks = actions(2, 4)
+    chunks = actions(2, 2)
     session = world.open(PUSH, *window, seed=world._sessions[env.session].seed)  # type: ignore[index]
     assert np.array_equal(first, world.image(session))
     made = [world.step({session: chunk})[session] for chunk in chunks]
     seen = [env.step(action) for action in (chunks if control == "chunk" else chunks.reshape(-1, 2))]
     images = [image for image, *_ in seen]
-    if control == "frame":  # an image comes with every fourth action; the last one is shown between
-        assert all(np.array_equal(image, first) for image in images[:3])
-        assert all(np.array_equal(image, made[0]) for image in images[3:7])
-        images = [images[3], images[7]]
-        assert [truncated for *_, truncated, _ in seen] == [False] * 7 + [True]
+    if control == "frame":  # an image comes with every second action; the last one is shown between
+        assert all(np.array_equal(image, first) for image in images[:1])
+        assert all(np.array_equal(image, made[0]) for image in images[1:3])
+        images = [images[1], images[3]]
+        assert [truncated for *_, truncated, _ in seen] == [False] * 3 + [True]
     assert all(np.array_equal(a, b) for a, b in zip(images, made, strict=True))
     assert np.array_equal(env.render(), made[-1])  # type: ignore[arg-type]
 
@@ -96,12 +96,12 @@ def test_a_judge_sees_the_episode_and_ends_it(world: World, window: tuple[Any, A
         return float(actions[-1, 0, 0]), len(actions) == 2
 
     env = WorldModelEnv(embodiment=PUSH, world=world, prompt=prompt(window), control="chunk", judge=judge)
-    chunks = actions(2, 4)
+    chunks = actions(2, 2)
     for _ in range(2):
         env.reset(seed=0)
         assert env.step(chunks[0])[1:4] == (chunks[0, 0, 0], False, False)
         assert env.step(chunks[1])[1:4] == (chunks[1, 0, 0], True, False)
-    assert shapes == [((2, 128, 128, 3), (1, 4, 2)), ((3, 128, 128, 3), (2, 4, 2))] * 2
+    assert shapes == [((2, 64, 64, 3), (1, 2, 2)), ((3, 64, 64, 3), (2, 2, 2))] * 2
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_vector_steps_as_gymnasium_steps_environments_one_by_one(model, window
     def judge(images: np.ndarray, actions: np.ndarray) -> tuple[float, bool]:
         return float(images[-1].mean()), bool(actions[-1, 0, 0] > 300)  # episodes end at different steps
 
-    tokenizer = get_tokenizer(model.config.tokenizer["name"])
+    tokenizer = reopened(model.config.tokenizer)
     how: dict[str, Any] = {
         "embodiment": PUSH, "prompt": prompt(window), "control": "chunk", "horizon": 4, "judge": judge,
         "world": World(model, tokenizer, temperature=0.5),
@@ -122,7 +122,7 @@ def test_a_vector_steps_as_gymnasium_steps_environments_one_by_one(model, window
     found = [env.reset(seed=5) for env in (ours, theirs)]
     assert np.array_equal(found[0][0], found[1][0])
     ends = 0
-    for action in actions(8, 3, 4):
+    for action in actions(8, 3, 2):
         mine, other = (env.step(action) for env in (ours, theirs))
         assert all(np.array_equal(a, b) for a, b in zip(mine[:4], other[:4]))
         assert mine[4].keys() == other[4].keys()
@@ -138,7 +138,7 @@ def test_a_vector_without_autoreset_starts_those_that_are_asked_for(world, windo
         autoreset_mode="Disabled",
     )  # fmt: skip
     first, _ = env.reset(seed=0)
-    chunks = actions(3, 2, 4)
+    chunks = actions(3, 2, 2)
     env.step(chunks[0])
     mask = np.array([True, False])
     again, _ = env.reset(seed=0, options={"reset_mask": mask})
@@ -149,7 +149,7 @@ def test_a_vector_without_autoreset_starts_those_that_are_asked_for(world, windo
     made = gymnasium.make_vec(
         "hma/WorldModel-v0", 2, "vector_entry_point", embodiment=PUSH, world=world, prompt=prompt(window)
     )
-    assert isinstance(made, WorldModelVectorEnv) and made.reset()[0].shape == (2, 128, 128, 3)
+    assert isinstance(made, WorldModelVectorEnv) and made.reset()[0].shape == (2, 64, 64, 3)
 
 
 def test_a_policy_of_gym_pusht_runs_unchanged(world: World) -> None:
@@ -188,17 +188,17 @@ def test_gymnasium_records_a_film_of_the_images(world, window, tmp_path) -> None
     )
     env = RecordVideo(env, str(tmp_path), episode_trigger=lambda number: True)
     env.reset(seed=0)
-    images = [env.step(chunk)[0] for chunk in actions(2, 4)]
+    images = [env.step(chunk)[0] for chunk in actions(2, 2)]
     env.close()
     with av.open(tmp_path / "rl-video-episode-0.mp4") as film:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
-        assert film.streams.video[0].average_rate == 2.5 and len(frames) == 3
+        assert film.streams.video[0].average_rate == 5 and len(frames) == 3
     assert np.abs(np.stack(frames[1:]) - np.stack(images).astype(float)).mean() < 6
 
 
 def test_actions_outside_the_training_range_warn_once_and_are_clipped_only_if_asked(world, window) -> None:
     how: dict[str, Any] = {"embodiment": PUSH, "world": world, "prompt": prompt(window), "control": "chunk"}
-    wild, edge = np.full((4, 2), 700.0), np.tile(world.action_spec(PUSH).seen[1], (4, 1))  # type: ignore[index]
+    wild, edge = np.full((2, 2), 700.0), np.tile(world.action_spec(PUSH).seen[1], (2, 1))  # type: ignore[index]
     free, clipped, at_edge = (WorldModelEnv(**how, clip=clip) for clip in (False, True, False))
     for env in (free, clipped, at_edge):
         env.reset(seed=0)
@@ -216,9 +216,9 @@ def test_an_unknown_action_is_nan(world: World, window: tuple[Any, Any]) -> None
     env.reset(seed=0)
     session = world.open(PUSH, *window, seed=world._sessions[env.session].seed)  # type: ignore[index]
     one = np.array([300.0, 200.0])
-    for action in (one, one, np.full(2, np.nan), one):
+    for action in (one, np.full(2, np.nan)):
         image, *_ = env.step(action)
-    assert np.array_equal(image, world.step({session: np.full(8, np.nan)})[session])
+    assert np.array_equal(image, world.step({session: np.full(4, np.nan)})[session])
 
 
 @pytest.mark.parametrize(
@@ -249,7 +249,7 @@ def test_an_action_that_is_refused_leaves_no_environment_of_a_vector_ahead(world
     with pytest.raises(HMAError, match="not finite"):
         envs.step(bad)
     frames = [envs.step(action)[4]["frames"].tolist() for action in given[1:]]
-    assert frames == [[0, 0], [0, 0], [1, 1]]  # both get their image after four actions
+    assert frames == [[1, 1], [1, 1], [2, 2]]  # both get their image after two actions
 
 
 @pytest.mark.parametrize(

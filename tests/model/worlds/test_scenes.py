@@ -21,7 +21,7 @@ from hma_data.lab import family
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.checkpoint.folder import BUNDLED, EMBEDDED, Checkpoint
 from hma_model.generation.unmask import Decoding
 from hma_model.play.pads import Pad, describe, hint, labels, pads
 from hma_model.play.save import film, lerobot_episode
@@ -114,7 +114,8 @@ def test_values_without_names_are_labelled_by_the_end_of_their_key() -> None:
 
 
 def test_all_robots_of_the_embedded_model_can_be_driven() -> None:
-    robots = drivable(Checkpoint.open(EMBEDDED), (), pytest.fail)
+    parts = [drivable(Checkpoint.open(part), (), pytest.fail) for part in BUNDLED.values()]
+    robots = {name: robot for part in parts for name, robot in part.items()}
     assert len(robots) == 16 and all(isinstance(robot, LabRobot) for robot in robots.values())
 
 

@@ -14,18 +14,18 @@ from hma_model.generation.decode import decode
 from hma_model.network.model import HMA
 from hma_model.simulate import World, load_world, starting_window
 
-ARM, PUSH = "arm2_07", "pusht_fast"
+ARM, OTHER = "arm2_07", "arm2_02"
 SURE: dict[str, Any] = {"unmask_steps": 1, "temperature": 0.0}  # draws nothing
 
 
 @pytest.fixture(scope="module")
 def model() -> HMA:
-    return HMA.from_pretrained("embedded", [ARM, PUSH])
+    return HMA.from_pretrained("embedded", [ARM, OTHER])
 
 
 @pytest.fixture(scope="module")
 def windows(model: HMA) -> dict[str, Any]:
-    return {name: starting_window(model, name) for name in (ARM, PUSH)}
+    return {name: starting_window(model, name) for name in (ARM, OTHER)}
 
 
 def make(model: HMA, **settings: Any) -> World:
@@ -41,7 +41,7 @@ def drawn(model: HMA, name: str, count: int, seed: int = 0) -> np.ndarray:
 
 def test_sessions_get_the_images_that_they_get_alone(model: HMA, windows: dict[str, Any]) -> None:
     world, made = make(model, temperature=0.5), {}
-    names = [PUSH, ARM, ARM, PUSH]
+    names = [OTHER, ARM, ARM, OTHER]
     chunks = {seed: drawn(model, name, 5, seed) for seed, name in enumerate(names)}
     sessions: dict[int, int] = {}
     for seed, name in enumerate(names):  # one more in each step, beyond the rows that there are
@@ -64,23 +64,23 @@ def test_sessions_get_the_images_that_they_get_alone(model: HMA, windows: dict[s
 
 def test_a_session_of_stored_tokens_goes_on_as_generation_does(model: HMA, windows: dict[str, Any]) -> None:
     world = make(model, **SURE)
-    images, before = windows[PUSH]
-    tokens, chunks = world.tokenizer.encode(images), drawn(model, PUSH, 3)
-    session = world.open(PUSH, tokens, before)
+    images, before = windows[OTHER]
+    tokens, chunks = world.tokenizer.encode(images), drawn(model, OTHER, 3)
+    session = world.open(OTHER, tokens, before)
     assert np.array_equal(world.image(session), world.tokenizer.decode(tokens[-1:])[0])
     made = [world.step({session: chunk.reshape(4, 2)})[session] for chunk in chunks]
     actions = torch.from_numpy(np.concatenate([before, chunks]))[None]
     stored = torch.from_numpy(tokens.astype(np.int64))[None]
-    expected = decode(world.tokenizer, model.generate(stored, actions, PUSH, 3, **SURE))[0]
+    expected = decode(world.tokenizer, model.generate(stored, actions, OTHER, 3, **SURE))[0]
     assert np.array_equal(np.stack(made), expected)
     assert np.array_equal(world.image(session), made[-1])
 
 
 def test_a_snapshot_brings_a_session_back(model: HMA, windows: dict[str, Any]) -> None:
     world = make(model, temperature=0.5)
-    first, second = (world.open(name, *windows[name], seed=3) for name in (PUSH, ARM))
+    first, second = (world.open(name, *windows[name], seed=3) for name in (OTHER, ARM))
     chunks = drawn(model, ARM, 3)
-    world.step({second: chunks[0], first: drawn(model, PUSH, 1)[0]})
+    world.step({second: chunks[0], first: drawn(model, OTHER, 1)[0]})
     kept = world.snapshot(second)
     made = [world.step({second: chunk})[second] for chunk in chunks]
     world.restore(first, kept)
@@ -109,19 +109,19 @@ def test_a_reset_gives_the_same_images_again_and_settings_count_at_once(model, w
 
 def test_a_action_of_nan_is_unknown_and_not_zero(model: HMA, windows: dict[str, Any]) -> None:
     world = make(model, **SURE)
-    images, before = windows[PUSH]
-    (chunk,) = drawn(model, PUSH, 1)
+    images, before = windows[OTHER]
+    (chunk,) = drawn(model, OTHER, 1)
     hidden = np.where(np.arange(4)[:, None] == 2, np.nan, chunk.reshape(4, 2))
     cases = {"unknown": (hidden, before), "zero": (np.zeros(8), before), "no chunks": (hidden, None)}
     made = {}
     for name, (actions, chunks) in cases.items():
-        session = world.open(PUSH, images, chunks)
+        session = world.open(OTHER, images, chunks)
         made[name] = world.step({session: actions})[session]
     stored = torch.from_numpy(world.tokenizer.encode(images).astype(np.int64))[None]
     actions = torch.from_numpy(np.concatenate([before, chunk[None]]))[None]
     for name, known in (("unknown", [True] * len(before) + [False]), ("no chunks", [False] * 4)):
         masks = torch.tensor([known])
-        expected = model.generate(stored, actions, PUSH, 1, known=masks, **SURE)
+        expected = model.generate(stored, actions, OTHER, 1, known=masks, **SURE)
         assert np.array_equal(decode(world.tokenizer, expected)[0, 0], made[name])
     assert not np.array_equal(made["unknown"], made["zero"])
 
@@ -130,21 +130,21 @@ def test_images_of_another_size_are_resized_as_in_a_conversion(model: HMA, windo
     world = make(model)
     wide = np.zeros((2, 160, 200, 3), np.uint8)
     wide[:, ::7, ::5] = 200
-    one, other = (world.open(PUSH, frames) for frames in (wide, resize(wide, 128)))
+    one, other = (world.open(OTHER, frames) for frames in (wide, resize(wide, 128)))
     assert np.array_equal(world.image(one), world.image(other))
 
 
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        (np.zeros(7), r"of pusht_fast have the shape \(7,\) — give \(8,\) or \(4, 2\)"),
+        (np.zeros(7), r"of arm2_02 have the shape \(7,\) — give \(8,\) or \(4, 2\)"),
         (np.full(8, np.inf), "not finite"),
         (np.array([[0, np.nan]] * 4), "not finite"),
     ],
 )
 def test_actions_that_do_not_fit_are_refused(model, windows, actions, message) -> None:
     world = make(model)
-    session, other = (world.open(PUSH, *windows[PUSH]) for _ in range(2))
+    session, other = (world.open(OTHER, *windows[OTHER]) for _ in range(2))
     with pytest.raises(HMAError, match=message):
         world.step({session: actions, other: np.zeros(8)})
 
@@ -160,14 +160,14 @@ def test_actions_that_do_not_fit_are_refused(model, windows, actions, message) -
 )
 def test_prompts_that_do_not_fit_are_refused(model: HMA, frames: Any, chunks: Any, message: str) -> None:
     with pytest.raises(HMAError, match=message):
-        make(model).open(PUSH, frames, chunks)
+        make(model).open(OTHER, frames, chunks)
 
 
 def test_what_is_not_there_is_said(model: HMA, windows: dict[str, Any]) -> None:
     world = make(model)
-    with pytest.raises(HMAError, match="ur5: is not in the model, which has: arm2_07, pusht_fast"):
-        world.open("ur5", windows[PUSH][0])
-    session = world.open(PUSH, *windows[PUSH])
+    with pytest.raises(HMAError, match="ur5: is not in the model, which has: arm2_07, arm2_02"):
+        world.open("ur5", windows[OTHER][0])
+    session = world.open(OTHER, *windows[OTHER])
     world.close(session)
     with pytest.raises(HMAError, match=f"session {session}: is not open; open are: none"):
         world.step({session: np.zeros(8)})
@@ -175,8 +175,17 @@ def test_what_is_not_there_is_said(model: HMA, windows: dict[str, Any]) -> None:
 
 def test_the_embedded_world_opens_without_arguments() -> None:
     world = load_world(unmask_steps=3)
-    actions = world.action_spec(PUSH)
-    assert actions.names == ("x", "y") and actions.stride == 4 and actions.rate_hz == 10
+    assert world.decoding.unmask_steps == 3 and len(world.model.embodiments) > 10
+
+
+def test_a_robot_with_a_bundled_checkpoint_to_itself_is_found_by_the_name_embedded() -> None:
+    world = load_world("embedded", ["pusht_fast"])
+    actions = world.action_spec("pusht_fast")
+    assert actions.names == ("x", "y") and actions.stride == 2 and actions.rate_hz == 10
     assert actions.low.tolist() == [0, 0] and actions.high.tolist() == [512, 512]
     assert actions.seen is not None and (actions.seen[0] >= 15).all() and (actions.seen[1] <= 497).all()
-    assert world.decoding.unmask_steps == 3 and len(world.model.embodiments) > 10
+    assert world.one_pass and world.decoding.temperature == 0
+    with pytest.raises(HMAError, match="embedded: arm2_07 and pusht_fast are robots of different networks"):
+        load_world("embedded", ["pusht_fast", ARM])
+    with pytest.raises(HMAError, match=r"embedded: '\.\.' is not an embodiment's id"):
+        load_world("embedded", [".."])
