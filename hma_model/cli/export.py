@@ -91,7 +91,7 @@ def export_checkpoint(
     from hma_model.export.folder import export_folder
 
     model = load(opened, list(chosen), "cpu").eval()
-    shown = name or ("the bundled model" if opened.name == "embedded" else Path(checkpoint).name)
+    shown = name or ("the bundled model" if opened.bundled else Path(checkpoint).name)
     robots = list(chosen.values())
 
     def report(said: str) -> None:
