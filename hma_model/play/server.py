@@ -42,7 +42,7 @@ from hma_model.worlds.scenes import Drivable
 
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-FIRST_ROBOT = "pusht_fast"  # that a page opens with: its T stays whole, and it is easy to drive
+FIRST_ROBOT = "pusht_fast"  # the robot that a page opens with: its T stays whole, and it is easy to drive
 PARTS = {"page.css": "text/css", "controls.js": "text/javascript"}  # that the page shares with exported pages
 MAX_VIEWERS = 32
 MESSAGES_PER_S, MESSAGE_BURST = 200.0, 400.0  # messages of a viewer a second, and at once
@@ -446,7 +446,7 @@ async def serve(
     """Serve checkpoints until the process is interrupted.
 
     Args:
-        parts: one a checkpoint; no robot is in two.
+        parts: one per checkpoint; no robot is in two.
         name: for the model, shown on the page.
         listener: a socket that listens.
         ready: called when the page can be opened.

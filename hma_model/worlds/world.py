@@ -1,7 +1,7 @@
 """Keep sessions of a world model side by side, in images and actions.
 
     world = load_world("embedded")
-    session = world.open("pusht_fast", *starting_window(world.model, "pusht_fast"))
+    session = world.open("rails_03", *starting_window(world.model, "rails_03"))
     images = world.step({session: actions})   # the image that the actions lead to
     actions = world.act([session])              # those of the model itself, if it was trained to act
 
@@ -342,7 +342,7 @@ def load_world(
 
     Args:
         checkpoint: str or path of a checkpoint or training run, a URI, a hub repository, or `embedded`.
-        embodiments: ids of those to load; None for all.
+        embodiments: ids of those to load; None for all of one network, `embedded` then lacks `pusht_fast`.
         device: of the network and of the tokenizer.
         settings: of `World`.
     """

@@ -7,7 +7,7 @@
     hma finetune build/pushes/shards/all --from embedded --out runs/pushes \\
         batch_size=4 cpu_seconds=3250 steps=100000 ema=0.995 self_forward=0.15 self_forward_from=0
     hma policy-eval pusht_fast scripted scripted:noise=0.1 scripted:noise=0.25 scripted:noise=0.5 random \\
-        still --checkpoint runs/pushes --judge placed --frames 20 --out policies
+        still --checkpoint runs/pushes --judge placed --frames 40 --out policies
 
 The noisy part has episodes in which 10 to 100 % of the commands are random: a model that has seen good
 pushes alone is kind to bad policies. `--play N` records a third part, in pictures of 96 px, in which most
