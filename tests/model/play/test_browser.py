@@ -410,13 +410,13 @@ def test_two_fingers_drive_two_sliders(browser: "Browser", address: str, stepper
 
 def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", stepper: Stepper) -> None:
     session = session_of(stepper, page)
-    stepper.call(lambda: stepper._world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
+    stepper.call(lambda: session.world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
     page.locator("input[value=fast]").check(force=True)
     page.click("#run")
     page.wait_for_selector("#parted:has-text('diverged at 0.1 s')")
     assert "Sync restarts the model" in (page.text_content("#note") or "")
     assert page.get_attribute("#sync", "class") == "call"
-    stepper.call(lambda: stepper._world.blind.clear()).result(10)  # type: ignore[attr-defined]
+    stepper.call(lambda: session.world.blind.clear()).result(10)  # type: ignore[attr-defined]
     page.keyboard.press("y")
     page.wait_for_selector("#parted:has-text('parted')", state="hidden")
     page.wait_for_selector("#sync:not(.call)")
@@ -427,7 +427,7 @@ def test_the_border_warns_when_the_calibrated_uncertainty_does(
 ) -> None:
     assert page.text_content("#meter") == "no error meter"
     assert page.get_attribute("#meter", "title") == "it is never unsure"
-    session, world = session_of(stepper, page), stepper._world
+    session, world = session_of(stepper, page), stepper._worlds["mover_04"][0]
     monkeypatch.setattr(world, "meter", lambda robot, **way: (METER, ""))
 
     def begin() -> None:
@@ -452,7 +452,7 @@ def test_the_border_warns_when_the_calibrated_uncertainty_does(
 
 def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(page, stepper) -> None:
     session = session_of(stepper, page)
-    stepper.call(lambda: stepper._world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
+    stepper.call(lambda: session.world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
     page.locator("input[value=fast]").check(force=True)
     page.click("#run")
     page.wait_for_selector("#parted:has-text('diverged at 0.1 s')")
