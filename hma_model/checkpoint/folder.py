@@ -246,7 +246,7 @@ def _bundled(name: str, embodiments: list[str]) -> Path:
     found = [part for part, ones in having.items() if ones]
     if len(found) > 1:
         fault = f"{having[found[0]][0]} and {having[found[1]][0]} are robots of different networks"
-        raise CheckpointError(name, fault, "name robots of one network: " + " or ".join(found))
+        raise CheckpointError(name, fault, "name robots of one network")
     return BUNDLED[found[0] if found else name]
 
 
@@ -302,17 +302,24 @@ def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -
     if differing:
         key, name = differing[0], ours.get("name")
         fault = f"was trained on tokenizer {name!r}, this is {spec.name!r}"
-        if "name" in differing:
-            raise CheckpointError(where, fault, f"convert the recordings with --tokenizer {name}")
-        if key == "colors":
+        if key == "colors" and "name" not in differing:
             fault = f"was trained on other colours of {name!r}"
-            remedy = f"convert with --tokenizer {name} --weights PATH, the path of its {CONFIG}"
-            raise CheckpointError(where, fault, remedy)
+        if key == "colors" or "name" in differing:
+            remedy = f"convert the recordings with --tokenizer {name}"
+            raise CheckpointError(where, fault, remedy + (_own_colors(config) if ours.get("colors") else ""))
         fault = f"{fault}: {key} is {ours.get(key)!r} there and {theirs.get(key)!r} here"
         if differing == ["resize_filter"]:
             remedy = f"convert the recordings with --tokenizer {name}:{ours.get(key)}"
             raise CheckpointError(where, fault, remedy)
         raise CheckpointError(where, fault, f"use the tokenizer described in its {CONFIG}")
+
+
+def _own_colors(config: HMAConfig) -> str:
+    """Return the option of `hma convert` that takes the colours of a model."""
+    for folder in BUNDLED.values():
+        if parse_config(read_json(folder / CONFIG), folder / CONFIG).tokenizer == config.tokenizer:
+            return f" --weights {folder / CONFIG}"
+    return f" --weights PATH, the path of the model's {CONFIG}"
 
 
 def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:

@@ -56,7 +56,7 @@ def push(
 
     if space and not page:
         raise UsageError("--space", "needs the page that it shows", "add --page")
-    opened = Checkpoint.open(checkpoint)
+    opened = Checkpoint.open(checkpoint, embodiment)
     static = Space(space, private) if space else None
     if film or sample:
         _add_films(opened, sample, embodiment)

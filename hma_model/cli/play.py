@@ -59,7 +59,7 @@ def play(
     import asyncio
 
     from hma_data.shards.reader import ShardSet
-    from hma_model.checkpoint.folder import BUNDLED, EMBEDDED_NAME, Checkpoint
+    from hma_model.checkpoint.folder import BUNDLED, EMBEDDED, Checkpoint
     from hma_model.hub.publish import located
     from hma_model.worlds.images import read_image
     from hma_model.worlds.scenes import drivable, opening, trained_on
@@ -69,7 +69,7 @@ def play(
     require_checkpoint(checkpoint)
     opened, device = located(checkpoint)[0], device_name(device)
     sets = sets or trained_on(opened)
-    every = [Checkpoint.open(part) for part in BUNDLED.values()] if opened.name == EMBEDDED_NAME else [opened]
+    every = [Checkpoint.open(part) for part in BUNDLED.values()] if opened.folder == EMBEDDED else [opened]
     tokenizers = [cache(partial(_tokenizer, part, device)) for part in every]
     parted = _by_checkpoint(sets, every)
     driven = [drivable(*part, images) for part in zip(every, parted, tokenizers, strict=True)]

@@ -22,6 +22,7 @@ from hma_model.checkpoint import weights
 from hma_model.checkpoint.folder import (
     CARD,
     CONFIG,
+    EMBEDDED,
     EMBEDDED_NAME,
     PARTS,
     PICTURES,
@@ -258,7 +259,7 @@ def located(
     except CheckpointError as fault:
         if not checkpoint.bundled:
             raise
-        remedy = f"{fault.remedy}. {_ADD_ONE.format(**checkpoint.config.tokenizer)}"
+        remedy = f"{fault.remedy}. {_ADD_ONE.format(**Checkpoint.open(EMBEDDED).config.tokenizer)}"
         raise CheckpointError(fault.where, fault.fault, remedy) from fault
 
 

@@ -32,8 +32,9 @@ def view_run(out: StrPath, window: int = 0, data: Sequence[StrPath] = ()) -> Vie
         CheckpointError: there is no checkpoint.
         UsageError: neither figures nor shards are there, the data is of other robots, or no such window.
     """
-    out, checkpoint = as_path(out), Checkpoint.open(out)
-    sets = [ShardSet(folder) for folder in data] if data else checkpoint.shards()
+    out, sets = as_path(out), list(map(ShardSet, data))
+    checkpoint = Checkpoint.open(out, [one.embodiment.id for one in sets])
+    sets = sets or checkpoint.shards()
     shards = next((one for one in sets if one.embodiment.id in checkpoint.embodiments), None)
     if not checkpoint.config.predicts_video:
         sets, shards = [], None

@@ -1,6 +1,12 @@
 """The checkpoint that comes along with the package, by its name."""
 
+import re
+
+import pytest
+
+from hma_data.errors import CheckpointError
 from hma_data.lab.family import HELD_OUT
+from hma_data.shards.reader import ShardSet
 from hma_model.checkpoint import folder
 from hma_model.cli import main
 from hma_model.network.model import HMA
@@ -21,6 +27,22 @@ def test_for_a_robot_that_it_lacks_the_command_that_adds_one_is_named(tmp_path, 
     assert "embedded: has no embodiment 'my_arm'" in said and "it has: " in said and "arm2_02" in said
     assert "hma finetune SHARDS --from embedded --out RUN" in said
     assert f"hma convert --tokenizer {HMA.from_pretrained('embedded', []).config.tokenizer['name']}" in said
+
+    assert main(["evaluate", "embedded-pusht", str(shards)]) == 1
+    assert "with shards of hma convert --tokenizer fsq-lab" in capsys.readouterr().err
+
+
+def test_a_robot_with_a_checkpoint_to_itself_is_published_by_the_name_embedded(tmp_path) -> None:
+    assert main(["hub", "push", "embedded", str(tmp_path / "hub"), "-e", "pusht_fast"]) == 0
+    assert folder.Checkpoint.open(tmp_path / "hub").embodiments == ("pusht_fast",)
+
+
+def test_of_a_bundled_checkpoint_with_its_own_colours_the_option_that_takes_them_is_named(tmp_path) -> None:
+    shards = ShardSet(make_shards(tmp_path / "shards", "pusht_fast"))
+    own = folder.Checkpoint.open("embedded", ["pusht_fast"])
+    option = f"--tokenizer palette-64 --weights {own.folder / folder.CONFIG}"
+    with pytest.raises(CheckpointError, match=re.escape(option)):
+        folder.require_tokenizer(own.config, shards.spec, "shards")
 
 
 ROBOTS = {

@@ -1,6 +1,7 @@
 """`hma play` on the command line: what it opens, without serving it."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 
 from hma_data.episodes.sheets import write_png
 from hma_data.lab import record
-from hma_model.checkpoint.folder import Checkpoint
+from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.cli import main
 from tests.hostile import flip
 from tests.hub_server import Hub
@@ -55,6 +56,14 @@ def test_the_bundled_model_is_played_with_all_its_checkpoints(served) -> None:
         (False, True),
         (True, False),
     ]
+
+
+def test_a_folder_of_the_bundled_models_name_is_played_alone(tmp_path, served, monkeypatch) -> None:
+    shutil.copytree(EMBEDDED, tmp_path / "embedded")
+    monkeypatch.chdir(tmp_path)
+    assert main(["play", "--no-browser"]) == 0
+    (([part], name, *_),) = served
+    assert name == "embedded" and "pusht_fast" not in part.robots
 
 
 def test_a_damaged_trunk_is_refused(tmp_path, served, image, capsys) -> None:

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from hma_data.errors import UsageError
+from hma_data.inspection.view import View
 from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.reader import ShardSet
+from hma_model.checkpoint.folder import Checkpoint
 from hma_model.cli import main
 from hma_model.training import view as module
 from tests.data.inspection.test_view import pictures, read, seconds
@@ -77,3 +79,15 @@ def test_the_command_refuses_what_does_not_belong_to_the_place(run, tmp_path, ca
         assert main(["view", *words, *out]) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "x.rrd").exists()
+
+
+def test_a_robot_with_a_bundled_checkpoint_to_itself_is_found_by_its_shards(tmp_path, monkeypatch) -> None:
+    seen: list[str] = []
+
+    def rolled(out: Path, checkpoint: Checkpoint, *_: object) -> View:
+        seen.append(checkpoint.name)
+        return View("a window", np.zeros(0))
+
+    monkeypatch.setattr(module, "_rolled", rolled)
+    module.view_run("embedded", data=[make_shards(tmp_path / "shards", "pusht_fast")])
+    assert seen == ["embedded-pusht"]
