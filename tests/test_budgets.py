@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_533, 11_429, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_665, 520_626
-TEST_LINES = 48_896
+TEST_LINES = 48_897
 DOC_WORDS = 41_066
 
 

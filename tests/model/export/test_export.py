@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import CheckpointError, OutputError, UsageError
 from hma_data.tokenizers.base import reopened
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.checkpoint.io import load
 from hma_model.cli.export import export_checkpoint
 from hma_model.export.files import rounded
@@ -81,9 +81,10 @@ def test_a_u_net_makes_the_colours_of_torch(colors: Path) -> None:
 
 
 @pytest.mark.timeout(3000)
-def test_every_bundled_robot_makes_the_tokens_of_torch(tmp_path: Path) -> None:
-    manifest = export_checkpoint("embedded", [], tmp_path / "page", None)
-    checkpoint = Checkpoint.open(EMBEDDED)
+@pytest.mark.parametrize("name", BUNDLED)
+def test_every_bundled_robot_makes_the_tokens_of_torch(name: str, tmp_path: Path) -> None:
+    manifest = export_checkpoint(name, [], tmp_path / "page", None)
+    checkpoint = Checkpoint.open(name)
     assert {robot["id"] for robot in manifest["robots"]} == set(checkpoint.embodiments)
     assert manifest["weights"] == "float16" and manifest["step"]["bytes"] < 15e6
     for robot in checkpoint.embodiments:
