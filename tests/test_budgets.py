@@ -31,7 +31,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/checkpoint": (922, 6_917, 5),
     "hma_model/cli": (1_744, 10_957, 12),
     "hma_model/demo": (485, 4_100, 4),
-    "hma_model/evaluation": (4_601, 36_893, 24),
+    "hma_model/evaluation": (4_602, 36_910, 24),
     "hma_model/export": (1_194, 9_462, 9),
     "hma_model/generation": (1_666, 13_448, 10),
     "hma_model/hub": (1_063, 8_209, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_623, 30_154, 19),
     "hma_model/worlds": (1_533, 11_429, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_665, 520_626
-TEST_LINES = 48_897
+PRODUCT_LINES, PRODUCT_NODES = 65_666, 520_643
+TEST_LINES = 48_899
 DOC_WORDS = 41_066
 
 

@@ -113,7 +113,8 @@ def meter_of(
         meter = Meter.of(card["meter"])
     except (KeyError, TypeError, ValueError):
         return None, "the card's calibration of uncertainty is damaged: hma benchmark rebuilds it"
-    if (meter.unmask_steps, meter.temperature, "random") != (unmask_steps, temperature, order):
+    drawn = (meter.unmask_steps, "random") == (unmask_steps, order) or config.whole_frames  # of one pass
+    if meter.temperature != temperature or not drawn:
         way = f"{meter.unmask_steps} passes at temperature {meter.temperature:g} in random order"
         return None, f"uncertainty is calibrated only for {way}"
     return meter, ""

@@ -165,6 +165,8 @@ def test_a_card_gives_a_meter_for_the_frames_that_it_was_measured_on_or_says_why
         ((2, 0.5, "confidence"), "in random order"),
     ):
         assert said in meter_of(tokens, card, *way)[1]
+    whole = HMAConfig(layers=1, width=32, heads=2, training_pass="pairs", whole_share=1.0)
+    assert whole.whole_frames and meter_of(whole, card, 5, 0.5, "confidence")[1] == ""  # one pass in any case
     assert "hma benchmark calibrates it" in meter_of(tokens, {}, *way)[1]
     broken: tuple[dict[str, Any], ...] = (
         {"limit": "x"},
