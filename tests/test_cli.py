@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from hma_data.errors import UsageError
+from hma_model.cli import main
 from tests.command import ROOT, fails, hma, hma_process
 from tests.conftest import ARM_YAML
 
@@ -89,6 +90,16 @@ def test_tab_completes_verbs_robots_tokenizers_and_recipes(monkeypatch: pytest.M
 
 
 @pytest.mark.slow
+def test_only_a_training_command_with_a_process_of_its_own_keeps_freed_memory(monkeypatch) -> None:
+    asked: list[str] = []
+    for verb in ("train", "convert", "finetune"):
+        monkeypatch.setattr("hma_model.cli.keep_freed_memory", lambda verb=verb: asked.append(verb))
+        monkeypatch.setattr(sys, "argv", ["hma", "--debug", verb, "--help"])
+        assert main() == 0
+        assert main([verb, "--help"]) == 0
+    assert asked == ["train", "finetune"]
+
+
 def test_the_whole_data_road_on_a_toy_recording(toy_yaml: Path, tmp_path: Path) -> None:
     out = tmp_path / "shards"
     source = str(tmp_path / "toy.hdf5")

@@ -19,7 +19,7 @@ from typer.core import TyperGroup
 from hma_data import __version__
 from hma_data.cli import mount
 from hma_data.console import fail, interruptible, say
-from hma_data.cpu import bound_spinning, take_ordinary_priority
+from hma_data.cpu import bound_spinning, keep_freed_memory, take_ordinary_priority
 from hma_data.errors import HMAError, UsageError, escaped
 from hma_model.cli import train as cli_train
 from hma_model.cli.benchmark import benchmark
@@ -66,6 +66,7 @@ app = typer.Typer(
     help="Convert robot recordings to shards, train a world model, publish it. Add --debug for tracebacks.",
 )
 _Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[2]  # ClickException of typer's click
+TRAINING = ("train", "finetune", "demo")
 _TAG = re.compile(r"\[(?=[a-z#/@][^\[]*\])")  # the beginning of what rich takes for markup
 
 
@@ -125,6 +126,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.formatwarning = _one_line
     try:
         plain = [word for word in words if word != "--debug"]
+        if argv is None and plain and plain[0] in TRAINING:  # a program that calls this keeps its allocator
+            keep_freed_memory()
         code = _command().main(plain, prog_name="hma", standalone_mode=False)
     except SystemExit as ended:  # a rank whose error another rank has reported
         return ended.code if isinstance(ended.code, int) else 1

@@ -1,6 +1,8 @@
-"""Real-time priority that a parent had is not kept; how threads wait is left to the environment."""
+"""Real-time priority of a parent is not kept, freed memory is; the environment may decide otherwise."""
 
 import os
+import platform
+import resource
 import subprocess
 import sys
 
@@ -33,3 +35,28 @@ def test_how_threads_wait_is_left_to_the_environment(name, value, monkeypatch) -
     before = dict(os.environ)
     bound_spinning()
     assert dict(os.environ) == before
+
+
+TUNED = {"GLIBC_TUNABLES": "glibc.malloc.trim_threshold=1:glibc.malloc.mmap_threshold=65536"}
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+@pytest.mark.parametrize("environment", [{}, {"MALLOC_ARENA_MAX": "4"}, TUNED])
+def test_freed_memory_is_kept_unless_the_environment_says_how_it_is_allocated(environment) -> None:
+    script = (
+        "import resource\n"
+        "from hma_data.cpu import keep_freed_memory\n"
+        "keep_freed_memory()\n"
+        "for turn in range(4):\n"
+        "    b'x' * 2**26\n"
+        "    if turn == 0:\n"
+        "        first = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - first)\n"
+    )
+    own = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, env=own | environment
+    )
+    assert done.returncode == 0, done.stderr
+    pages = 3 * 2**26 // resource.getpagesize()
+    assert (int(done.stdout) < pages // 100) == (not environment)
