@@ -199,7 +199,13 @@ class TokenReadout(nn.Module):
         """
         if self.distances is None:
             return scores.argmax(-1)
-        return (scores.softmax(-1) @ self.distances).argmin(-1)
+        shares = scores.softmax(-1)
+        if shares.device.type != "cpu" or torch.compiler.is_compiling():
+            return (shares @ self.distances).argmin(-1)  # compiled graphs need sizes that no score decides
+        most, values = shares.max(-1)
+        unsure = most < 0.5  # a colour with half of the probability is the median
+        values[unsure] = (shares[unsure] @ self.distances).argmin(-1)
+        return values
 
     def ids(self, digits: Tensor) -> Tensor:
         """Return the ids (...) of digits (..., F)."""

@@ -5,6 +5,8 @@ from typing import Any
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from hma_data.errors import HMAError, RecipeError, TokenizerError
@@ -164,6 +166,15 @@ def test_a_shade_of_an_object_is_taken_though_the_ground_is_likelier_than_each_s
     )
     assert readout.taken(shares.log().clamp(min=-1e9)).tolist() == [2, 0, 4]
     assert unet(**COLORS).token_readout.taken(shares).tolist() == [0, 0, 4]
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 20.0))
+def test_the_colour_taken_has_the_least_expected_distance_also_where_one_is_likely(seed, spread) -> None:
+    readout = unet(**{**COLORS, "tokenizer": {"colors": SHADES}}).token_readout
+    scores = spread * torch.randn(2, 30, 5, generator=torch.Generator().manual_seed(seed))
+    expected = scores.double().softmax(-1) @ readout.distances.double()
+    taken = expected.gather(-1, readout.taken(scores).unsqueeze(-1)).squeeze(-1)
+    assert torch.allclose(taken, expected.min(-1).values, atol=1e-3)
 
 
 def test_colours_that_are_not_those_of_the_tokens_are_refused() -> None:
