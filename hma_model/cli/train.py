@@ -108,7 +108,7 @@ def finetune(
     ] = False,
     recipe: Annotated[
         str | None,
-        Option(help="Recipe name or YAML file; default: finetune_tiny for embedded, else finetune."),
+        Option(help="Recipe name or YAML file; default: finetune, or that of a bundled model."),
     ] = None,
     out: Out = None,
     force: Force = False,

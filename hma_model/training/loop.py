@@ -120,12 +120,13 @@ def finetune(
     Args:
         source: str or path of a checkpoint or a run's folder, a URI, or a hub repository, also
             `org/name@revision`.
-        data: str or path of folders of shards, made with the checkpoint's tokenizer.
+        data: str or path of folders of shards, made with the checkpoint's tokenizer; for a tuned trunk of
+            colours also with other colours.
         out: str or path of the run's folder; by default the one that the overrides name.
         freeze_trunk: train only the stems and heads.
         overrides: `key=value` strings that override the recipe.
-        recipe: name, or str or path of a YAML; by default `finetune_tiny` for the embedded model, else
-            `finetune`.
+        recipe: name, or str or path of a YAML; by default `finetune_tiny` for `embedded`,
+            `finetune_colors` for the other bundled models, else `finetune`.
         options: `show`, `force`, `on_progress` of `train`.
 
     Raises:

@@ -31,7 +31,7 @@ from hma_data.loading.views import view_count
 from hma_data.storage.paths import StrPath, as_text, shipped
 from hma_data.storage.yaml_io import parse_yaml, plain_fault, read_yaml
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model.checkpoint.folder import BUNDLED
+from hma_model.checkpoint.folder import BUNDLED, EMBEDDED_NAME
 from hma_model.config import MOST_IDS, HMAConfig
 
 # keys that may change when a run is resumed: places and intervals, but nothing that changes the weights
@@ -312,7 +312,10 @@ def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
 
 def recipe_for(source: StrPath) -> str:
     """Return the name of the recipe by which a model is finetuned where none is given."""
-    return "finetune_tiny" if as_text(source) in BUNDLED else "finetune"
+    name = as_text(source)
+    if name == EMBEDDED_NAME:
+        return "finetune_tiny"
+    return "finetune_colors" if name in BUNDLED else "finetune"
 
 
 def parse_overrides(overrides: Sequence[str], base: Mapping[str, Any] | None = None) -> dict[str, Any]:

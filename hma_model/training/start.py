@@ -29,6 +29,7 @@ from hma_model.checkpoint.folder import README, Checkpoint, require_tokenizer, r
 from hma_model.config import HMAConfig
 from hma_model.network.model import HMA
 from hma_model.network.stem import waves_of_stem
+from hma_model.training.colors import carried, recolored
 from hma_model.training.new_stem import FETCHED, candidates
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import TRAINED_BY
@@ -47,6 +48,7 @@ class Start:
     """A checkpoint from which a run starts."""
 
     checkpoint: Checkpoint  # the run's own copy
+    config: HMAConfig  # the checkpoint's, for the colours of the data
     frozen: bool  # the trunk is not trained
     source: str  # where the checkpoint is from, for notes
 
@@ -69,7 +71,7 @@ class Start:
         local = not is_repository(source) and "://" not in source
         if local:
             found = Checkpoint.open(resolve(Path(source).expanduser()))
-            require_tokenizer(found.config, _spec(sets), found.folder)
+            _config_for(found, recipe, sets, found.folder)
             found.trunk()
             source = str(found.folder)
         wanted, likes = _robots(recipe, sets, source, revision, local)
@@ -88,9 +90,9 @@ class Start:
         Raises:
             CheckpointError: the copy is damaged, or the data is of another tokenizer.
         """
-        start = cls(Checkpoint.open(out / START), recipe.freeze == "trunk", str(recipe.start))
-        require_tokenizer(start.checkpoint.config, _spec(sets), start.source)
-        return start
+        checkpoint = Checkpoint.open(out / START)
+        config = _config_for(checkpoint, recipe, sets, recipe.start)
+        return cls(checkpoint, config, recipe.freeze == "trunk", str(recipe.start))
 
     def network(self, recipe: Recipe) -> HMAConfig:
         """Return the configuration of the checkpoint's network, with the recipe's training options.
@@ -98,7 +100,7 @@ class Start:
         Raises:
             RecipeError: the recipe asks for another network.
         """
-        config = self.checkpoint.config
+        config = self.config
         changes: dict[str, Any] = {"objectives": recipe.objectives}
         for key, value in recipe.model.items():
             if key in OF_THE_TRUNK and self.frozen:
@@ -159,7 +161,7 @@ class Start:
 
     def fill(self, model: HMA) -> None:
         """Load the checkpoint's weights for the model's embodiments; freeze trunk and readout if required."""
-        kept = stored.trunk(self.checkpoint)
+        kept = carried(stored.trunk(self.checkpoint), self.checkpoint.config, self.config)
         added = tuple(self._off().values())
         model.load_trunk({n: t for n, t in model.trunk_state().items() if n.startswith(added)} | kept)
         for name in model.embodiments:
@@ -179,6 +181,8 @@ class Start:
         known = [name for name in names if name in self.checkpoint.embodiments]
         fresh = [name for name in names if name not in known]
         notes = [f"from {self.source}: trunk {'frozen' if self.frozen else 'tuned'}"]
+        if self.config.tokenizer != self.checkpoint.config.tokenizer:
+            notes.append("other colours than the checkpoint's: each begins as the nearest one")
         if fresh:
             notes.append(f"new stem and head: {', '.join(fresh)}")
         if known:
@@ -223,5 +227,20 @@ def _require_source(source: str, out: Path) -> None:
         raise RecipeError(out, fault, "train into another folder, or name the first")
 
 
-def _spec(sets: Mapping[str, ShardSet]) -> Any:
-    return next(iter(sets.values())).spec
+def _config_for(
+    checkpoint: Checkpoint, recipe: Recipe, sets: Mapping[str, ShardSet], where: object
+) -> HMAConfig:
+    """Return the checkpoint's configuration; that of a tuned trunk has the data's colours.
+
+    Raises:
+        CheckpointError: the data is of another tokenizer.
+    """
+    spec = next(iter(sets.values())).spec
+    config = recolored(checkpoint.config, spec)
+    try:
+        require_tokenizer(checkpoint.config if recipe.freeze == "trunk" else config, spec, where)
+    except CheckpointError as fault:
+        if config is checkpoint.config:
+            raise
+        raise CheckpointError(where, fault.fault, f"{fault.remedy}, or tune the trunk too") from fault
+    return config

@@ -10,7 +10,7 @@ from hma_data.errors import RecipeError, UsageError
 from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.shapes import get_spec
-from hma_model.training.recipe import differences, load_recipe, make_recipe, parse_overrides
+from hma_model.training.recipe import differences, load_recipe, make_recipe, parse_overrides, recipe_for
 from tests.model.robots import SPEC
 
 
@@ -248,6 +248,7 @@ def test_every_kind_of_recipe_is_shipped():
     others = {
         "pretrain40",
         "finetune",
+        "finetune_colors",
         "finetune_tiny",
         "unet_colors",
         "unet_tiny",
@@ -258,9 +259,18 @@ def test_every_kind_of_recipe_is_shipped():
     assert set(SHIPPED) == sizes | others
 
 
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [("embedded", "finetune_tiny"), ("embedded-lab", "finetune_colors"), ("org/name", "finetune")],
+)
+def test_bundled_models_are_finetuned_by_recipes_of_their_own(source, name):
+    assert recipe_for(source) == name and name in SHIPPED
+
+
 TOKENIZERS = {
     "world": "fsq-lab",
     "unet_tiny": "raw-128",
+    "finetune_colors": "palette-64",
     "unet_colors": "palette-64",
     "world_pusht": "palette-64",
     "world_unet": "palette-64",
