@@ -15,7 +15,7 @@ from mkdocs.structure.nav import Link, Navigation, Section
 
 PAGES = {  # few robots, so that the pages stay small
     "try": ("Push a T", ["pusht_fast"]),
-    "try/arms": ("Arms", ["rails_03", "planar_arm"]),
+    "try/arms": ("Arms", ["planar_arm", "arm2_02"]),
 }
 
 

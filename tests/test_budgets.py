@@ -13,9 +13,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (684, 3_882, 7),
-    "hma_data/cli": (1_553, 11_132, 8),
-    "hma_data/conversion": (4_260, 31_626, 15),
+    "hma_data": (702, 4_001, 7),
+    "hma_data/cli": (1_551, 11_112, 8),
+    "hma_data/conversion": (4_260, 31_625, 15),
     "hma_data/episodes": (1_671, 14_652, 9),
     "hma_data/hub": (512, 3_787, 3),
     "hma_data/inspection": (2_151, 20_090, 8),
@@ -27,26 +27,26 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/storage": (1_664, 10_939, 11),
     "hma_data/tokenizers": (3_522, 26_155, 18),
     "hma_model": (532, 3_311, 4),
-    "hma_model/benchmark": (845, 7_250, 5),
-    "hma_model/checkpoint": (922, 6_917, 5),
-    "hma_model/cli": (1_744, 10_957, 12),
-    "hma_model/demo": (485, 4_100, 4),
+    "hma_model/benchmark": (841, 7_246, 5),
+    "hma_model/checkpoint": (937, 7_033, 5),
+    "hma_model/cli": (1_753, 11_059, 12),
+    "hma_model/demo": (485, 4_069, 4),
     "hma_model/evaluation": (4_602, 36_910, 24),
     "hma_model/export": (1_194, 9_462, 9),
-    "hma_model/generation": (1_666, 13_448, 10),
-    "hma_model/hub": (1_063, 8_209, 6),
+    "hma_model/generation": (1_666, 13_447, 10),
+    "hma_model/hub": (1_063, 8_190, 6),
     "hma_model/lerobot_env": (639, 4_790, 3),
-    "hma_model/network": (3_303, 29_000, 16),
+    "hma_model/network": (3_305, 29_028, 16),
     "hma_model/play": (1_665, 12_122, 8),
-    "hma_model/policies": (2_825, 20_100, 14),
-    "hma_model/released": (825, 7_100, 4),
-    "hma_model/synthetic": (1_205, 9_100, 5),
-    "hma_model/training": (3_623, 30_154, 19),
+    "hma_model/policies": (2_821, 20_024, 14),
+    "hma_model/released": (822, 7_096, 4),
+    "hma_model/synthetic": (1_205, 9_074, 5),
+    "hma_model/training": (3_695, 30_650, 20),
     "hma_model/worlds": (1_533, 11_429, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_666, 520_643
-TEST_LINES = 48_899
-DOC_WORDS = 41_066
+PRODUCT_LINES, PRODUCT_NODES = 65_786, 521_552
+TEST_LINES = 49_078
+DOC_WORDS = 41_500
 
 
 @cache

@@ -48,7 +48,7 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_
     assert "def generate" not in (tmp_path / "reference/python.html").read_text()  # signatures, not source
     assert 'id="hma_model.network.model.HMA.generate"' in (tmp_path / "reference/python.html").read_text()
     require_search_from_a_folder(tmp_path)
-    for page, robots in (("try", {"pusht_fast"}), ("try/arms", {"rails_03", "planar_arm"})):
+    for page, robots in (("try", {"pusht_fast"}), ("try/arms", {"planar_arm", "arm2_02"})):
         manifest = json.loads((tmp_path / page / "manifest.json").read_text())
         assert {robot["id"] for robot in manifest["robots"]} == robots
     beside_runtime = [path for path in (tmp_path / "try").rglob("*.*") if path.parent.name != "ort"]

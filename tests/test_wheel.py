@@ -62,7 +62,9 @@ def test_it_holds_registry_recipes_and_weights(installed: Path) -> None:
         "hma_data/py.typed",
         "hma_model/py.typed",
     } <= files
-    assert {f"hma_model/{name}/trunk.safetensors" for name in ("embedded", "embedded-pusht")} <= files
+    assert {
+        f"hma_model/{name}/trunk.safetensors" for name in ("embedded", "embedded-lab", "embedded-pusht")
+    } <= files
     assert not any(name.startswith(("tests/", "docs/")) for name in files)
 
 

@@ -39,7 +39,9 @@ PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card is last: its presence means 
 SAMPLE, FILM = "sample.png", "sample.gif"
 PICTURES = (SAMPLE, FILM)  # optional, shown in the model card
 EMBEDDED_NAME = "embedded"
-BUNDLED = {name: Path(__file__).parents[1] / name for name in (EMBEDDED_NAME, "embedded-pusht")}
+BUNDLED = {
+    name: Path(__file__).parents[1] / name for name in (EMBEDDED_NAME, "embedded-lab", "embedded-pusht")
+}
 EMBEDDED = BUNDLED[EMBEDDED_NAME]
 _OTHER_TRUNK = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was interrupted: run it again"
@@ -94,10 +96,8 @@ class Checkpoint:
         folder = resolve(checkpoint, embodiments)
         values = read_json(inside(folder, CONFIG))
         config = parse_config(values, folder / CONFIG)
-        homes = folder / "embodiments"
-        present = sorted(path.parent.name for path in homes.glob(f"*/{CARD}") if path.is_file())
         tokenizer = digest(values["tokenizer"])
-        return cls(folder, config, tuple(present), str(values.get("trunk_sha256")), tokenizer)
+        return cls(folder, config, embodiments_in(folder), str(values.get("trunk_sha256")), tokenizer)
 
     @property
     def name(self) -> str:
@@ -128,7 +128,9 @@ class Checkpoint:
         for name in wanted:
             check_id(name, self.name)
             if name not in self.embodiments:
-                known = f"it has: {', '.join(self.embodiments) or 'none'}"
+                parts = BUNDLED.values() if self.folder == EMBEDDED else ()
+                there = sorted({*self.embodiments}.union(*map(embodiments_in, parts)) - {name})
+                known = f"it has: {', '.join(there) or 'none'}"
                 raise CheckpointError(self.name, f"has no embodiment {name!r}", known)
         return wanted
 
@@ -221,8 +223,8 @@ def resolve(folder: StrPath, embodiments: Iterable[str] | None = None) -> Path:
     """Return the folder of a checkpoint: the path itself, or the newest of a run's `checkpoints/`.
 
     Args:
-        folder: str or path of it, or the name of a checkpoint bundled with the package. Robots that have a
-            bundled checkpoint to themselves (`pusht_fast`: `embedded-pusht`) are part of `embedded` too.
+        folder: str or path of it, or the name of a checkpoint bundled with the package. With robots of
+            `embedded-lab` or `embedded-pusht`, the name `embedded` stands for these networks.
         embodiments: ids of the robots that are wanted.
     """
     folder = as_path(folder)
@@ -240,14 +242,22 @@ def resolve(folder: StrPath, embodiments: Iterable[str] | None = None) -> Path:
 
 
 def _bundled(name: str, embodiments: list[str]) -> Path:
-    """Return the bundled checkpoint of a name; of `embedded`, the part that has the embodiments."""
-    parts = list(BUNDLED) if name == EMBEDDED_NAME else []
-    having = {part: [one for one in embodiments if _has(BUNDLED[part], one)] for part in parts}
-    found = [part for part, ones in having.items() if ones]
-    if len(found) > 1:
-        fault = f"{having[found[0]][0]} and {having[found[1]][0]} are robots of different networks"
-        raise CheckpointError(name, fault, "name robots of one network")
-    return BUNDLED[found[0] if found else name]
+    """Return the bundled checkpoint of a name; for `embedded`, the best one that has the embodiments."""
+    if name != EMBEDDED_NAME or not embodiments:
+        return BUNDLED[name]
+    homes = {one: [part for part in BUNDLED if _has(BUNDLED[part], one)] for one in embodiments}
+    shared = [part for part in BUNDLED if all(part in parts for parts in homes.values())]
+    if shared:
+        return BUNDLED[shared[-1]]
+    if all(homes.values()):
+        where = " and ".join(f"{one} is in {parts[-1]}" for one, parts in homes.items())
+        raise CheckpointError(name, f"{where}: no network has all of them", "name robots of one network")
+    return BUNDLED[name]
+
+
+def embodiments_in(folder: Path) -> tuple[str, ...]:
+    """Return the ids of a checkpoint's embodiments."""
+    return tuple(sorted(path.parent.name for path in folder.glob(f"embodiments/*/{CARD}") if path.is_file()))
 
 
 def _has(folder: Path, embodiment: str) -> bool:
@@ -315,7 +325,12 @@ def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -
 
 
 def _own_colors(config: HMAConfig) -> str:
-    """Return the option of `hma convert` that takes the colours of a model."""
+    """Return the option of `hma convert` that takes the colours of a model; none for the default ones."""
+    from hma_data.tokenizers.shapes import get_spec
+
+    with suppress(HMAError):  # an installed package may lack this tokenizer
+        if config.tokenizer["colors"] == get_spec(str(config.tokenizer["name"])).colors:
+            return ""
     for folder in BUNDLED.values():
         if parse_config(read_json(folder / CONFIG), folder / CONFIG).tokenizer == config.tokenizer:
             return f" --weights {folder / CONFIG}"

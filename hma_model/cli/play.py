@@ -74,6 +74,8 @@ def play(
     parted = _by_checkpoint(sets, every)
     driven = [drivable(*part, images) for part in zip(every, parted, tokenizers, strict=True)]
     robots = {key: robot for part in driven for key, robot in part.items()}
+    # of networks with the same robot the last one drives it
+    driven = [{key: one for key, one in part.items() if robots[key] is one} for part in driven]
     first = opening(robots, embodiment, "images" if images else "recordings" if sets else None)
     if len(opened.embodiments) > 1 and images and embodiment is None:
         say("every robot can start from the image; -e ROBOT selects yours", err=True)
@@ -107,11 +109,15 @@ def _tokenizer(checkpoint: "Checkpoint", device: str) -> "Tokenizer":
 
 
 def _by_checkpoint(sets: "list[ShardSet]", every: "list[Checkpoint]") -> "list[list[ShardSet]]":
-    """Return for each checkpoint the shard sets of its robots; the first has those of unknown robots too."""
+    """Return for each checkpoint the shard sets of its robots; the first has those of unknown robots too.
+
+    Of several with a robot, the one of the shards' tokenizer has them.
+    """
     parts: list[list[ShardSet]] = [[] for _ in every]
     for shards in sets:
         known = [number for number, one in enumerate(every) if shards.embodiment.id in one.embodiments]
-        parts[known[0] if known else 0].append(shards)
+        fit = [number for number in known if every[number].config.tokenizer == shards.spec.to_json()]
+        parts[(fit or known or [0])[-1]].append(shards)
     return parts
 
 

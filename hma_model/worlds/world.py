@@ -342,7 +342,7 @@ def load_world(
 
     Args:
         checkpoint: str or path of a checkpoint or training run, a URI, a hub repository, or `embedded`.
-        embodiments: ids of those to load; None for all of one network, `embedded` then lacks `pusht_fast`.
+        embodiments: ids of those to load; None for all of one network; of `embedded`, its transformer.
         device: of the network and of the tokenizer.
         settings: of `World`.
     """

@@ -15,6 +15,7 @@ recording=$out/contact/pusht_fast.hdf5
     hma tokenizer fit "$recording" -e pusht_fast --colors 16 --out "$out/colors.safetensors"
 hma convert "$recording" -e pusht_fast --tokenizer palette-64 --weights "$out/colors.safetensors" \
     --frames strided --val-fraction 0.02 --out "$out/shards"
-OMP_NUM_THREADS=1 torchrun --nproc-per-node 2 --no-python hma train world_pusht "data=$out/shards" "$@" --out "$out/run"
+OMP_NUM_THREADS=1 torchrun --nproc-per-node "${PROCESSES:-2}" --no-python \
+    hma train world_pusht "data=$out/shards" "$@" --out "$out/run"
 hma bench holds checkpoint="$out/run" robots=pusht_fast driver=contact frames=45 prompt=5 seed=5012 rollouts=48 \
     sheet="$out/holds.png" | tee "$out/holds.txt"

@@ -24,7 +24,7 @@ def test_for_a_robot_that_it_lacks_the_command_that_adds_one_is_named(tmp_path, 
     shards = make_shards(tmp_path / "shards", "my_arm")
     assert main(["evaluate", "embedded", str(shards)]) == 1
     said = capsys.readouterr().err
-    assert "embedded: has no embodiment 'my_arm'" in said and "it has: " in said and "arm2_02" in said
+    assert "embedded: has no embodiment 'my_arm' — it has: arm1_02, " in said and "pusht_fast" in said
     assert "hma finetune SHARDS --from embedded --out RUN" in said
     assert f"hma convert --tokenizer {HMA.from_pretrained('embedded', []).config.tokenizer['name']}" in said
 
@@ -43,12 +43,40 @@ def test_of_a_bundled_checkpoint_with_its_own_colours_the_option_that_takes_them
     option = f"--tokenizer palette-64 --weights {own.folder / folder.CONFIG}"
     with pytest.raises(CheckpointError, match=re.escape(option)):
         folder.require_tokenizer(own.config, shards.spec, "shards")
+    own = folder.Checkpoint.open("embedded-lab")  # of the default colours
+    with pytest.raises(CheckpointError, match="--tokenizer palette-64$"):
+        folder.require_tokenizer(own.config, shards.spec, "shards")
 
 
 ROBOTS = {
     *("arm1_02", "arm1_03", "arm2_02", "arm2_07", "arm3_04", "arm4_01", "crane_04", "gantry_04", "mover_04"),
     *("mover_10", "rails_03", "rails_09", "pendulum", "planar_arm", "pusht_slow"),
 }
+LAB = {"arm2_02", "arm2_07", "arm3_04", "arm4_01", "crane_04", "mover_10", "planar_arm", "pusht_slow"}
+
+
+@pytest.mark.parametrize("name", folder.BUNDLED)
+def test_every_bundled_checkpoint_is_whole_and_small(name) -> None:
+    own = folder.Checkpoint.open(name)
+    assert own.trunk().stat().st_size < 8e6
+    for robot in own.embodiments:
+        own.check(robot)
+
+
+@pytest.mark.parametrize(
+    ("robots", "part"),
+    [
+        ([], "embedded"),
+        (["arm2_02"], "embedded-lab"),
+        (["arm2_02", "planar_arm"], "embedded-lab"),
+        (["arm2_02", "rails_03"], "embedded"),
+        (["pusht_fast"], "embedded-pusht"),
+        (["nobody"], "embedded"),
+    ],
+)
+def test_the_best_network_that_has_all_robots_is_found_by_the_name_embedded(robots, part) -> None:
+    assert folder.resolve("embedded", robots) == folder.BUNDLED[part]
+    assert set(folder.embodiments_in(folder.BUNDLED["embedded-lab"])) == LAB < ROBOTS
 
 
 def test_the_embedded_trunk_is_the_one_of_the_recipe() -> None:

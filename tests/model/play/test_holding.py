@@ -19,8 +19,9 @@ def test_the_bundled_models_robots_were_measured() -> None:
         assert measured[part.trunk_sha256].keys() == set(part.embodiments)
         found |= holdings(part)
     assert len(measured) == len(BUNDLED)
-    assert found["mover_10"].follows is False and found["mover_10"].words == "does not follow its actions"
-    assert all(one.follows is not None for one in found.values())
+    assert all(one.follows for one in found.values())
+    lost = Holding(1.6, False, False)
+    assert lost.words == "does not follow its actions"
 
 
 @pytest.mark.parametrize(

@@ -21,27 +21,32 @@ from tests.model.network_parts import small_model
 from tests.model.shards import make_shards, state_pauses
 from tests.model.true_world import trained_on
 
-MOVER, ARM, RECORDED = "mover_10", "planar_arm", "arm"
+RAILS, MOVER, ARM, RECORDED = "rails_03", "mover_04", "planar_arm", "arm"
 
 
 @pytest.fixture(scope="module")
 def model() -> HMA:
-    return HMA.from_pretrained("embedded", [MOVER, ARM])
+    return HMA.from_pretrained("embedded", [RAILS, MOVER])
+
+
+@pytest.fixture(scope="module")
+def arm() -> HMA:
+    return HMA.from_pretrained("embedded", [ARM])
 
 
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Episode 0 and 1 of the mover, recorded and converted."""
-    folder = tmp_path_factory.mktemp("mover")
-    yaml = folder / f"{MOVER}.yaml"
-    yaml.write_text(Checkpoint.open("embedded").embodiment(MOVER).to_yaml())
-    source = str(record(MOVER, folder, 2))
+    """Episode 0 and 1 of the robot on rails, recorded and converted."""
+    folder = tmp_path_factory.mktemp("rails")
+    yaml = folder / f"{RAILS}.yaml"
+    yaml.write_text(Checkpoint.open("embedded").embodiment(RAILS).to_yaml())
+    source = str(record(RAILS, folder, 2))
     words = ["convert", "-e", str(yaml), "--source", source, "--tokenizer", "fsq-lab", "--out"]
     assert main([*words, str(folder / "shards"), "--workers", "1"]) == 0
     return folder / "shards"
 
 
-@pytest.mark.parametrize("name", [MOVER, ARM])
+@pytest.mark.parametrize("name", [RAILS, MOVER])
 def test_a_laboratory_robot_comes_with_a_prompt(model: HMA, name: str) -> None:
     frames, chunks = starting_window(model, name, seed=4)
     assert frames.shape == (4, 128, 128, 3) and frames.dtype == np.uint8 and frames.std() > 10
@@ -52,17 +57,17 @@ def test_a_laboratory_robot_comes_with_a_prompt(model: HMA, name: str) -> None:
 
 @pytest.mark.slow
 def test_shards_give_the_tokens_and_chunks_of_the_recording(model: HMA, shards: Path) -> None:
-    images, chunks = starting_window(model, MOVER)
+    images, chunks = starting_window(model, RAILS)
     tokens = get_tokenizer("fsq-lab").encode(images)
-    whole = read_prompt(model, MOVER, shards)
-    later = read_prompt(model, MOVER, {"shards": str(shards), "episode": 0, "start": 2, "frames": 3})
+    whole = read_prompt(model, RAILS, shards)
+    later = read_prompt(model, RAILS, {"shards": str(shards), "episode": 0, "start": 5, "frames": 3})
     assert np.array_equal(whole[0], tokens) and np.array_equal(whole[1], chunks)
     assert np.array_equal(later[0], tokens[1:]) and np.array_equal(later[1], chunks[1:])
-    assert not np.array_equal(read_prompt(model, MOVER, {"shards": shards, "episode": 1})[0], tokens)
+    assert not np.array_equal(read_prompt(model, RAILS, {"shards": shards, "episode": 1})[0], tokens)
 
 
 def test_images_come_as_arrays_files_and_from_environments(model: HMA, tmp_path: Path) -> None:
-    images, _ = starting_window(model, MOVER)
+    images, _ = starting_window(model, RAILS)
     for i in range(2):
         write_png(tmp_path / f"{i}.png", images[i])
 
@@ -74,7 +79,7 @@ def test_images_come_as_arrays_files_and_from_environments(model: HMA, tmp_path:
     several = [images[:2], [tmp_path / "0.png", tmp_path / "1.png"], {"frames": images[:2]}]
     for prompts, count in ((one, 1), (several, 2)):
         for prompt in prompts:
-            frames, chunks = read_prompt(model, MOVER, prompt)
+            frames, chunks = read_prompt(model, RAILS, prompt)
             assert np.array_equal(frames, images[:count])
             assert len(chunks) == count - 1 and np.isnan(chunks).all()
 
@@ -82,18 +87,18 @@ def test_images_come_as_arrays_files_and_from_environments(model: HMA, tmp_path:
 def test_frames_at_the_control_rate_become_chunks_that_end_at_the_last_frame(model: HMA) -> None:
     frames = np.arange(12, dtype=np.uint8)[:, None, None, None].repeat(3, axis=3)
     actions = np.arange(22, dtype=np.float32).reshape(11, 2)
-    kept, chunks = read_prompt(model, MOVER, {"frames": frames, "actions": actions})  # its stride is 5
+    kept, chunks = read_prompt(model, RAILS, {"frames": frames, "actions": actions})  # its stride is 5
     assert kept[:, 0, 0, 0].tolist() == [1, 6, 11]
     assert chunks is not None and chunks.tolist() == [list(range(2, 12)), list(range(12, 22))]
 
 
 @pytest.mark.slow
-def test_a_lerobot_episode_is_a_prompt_of_the_same_robot_recorded_elsewhere(model, tmp_path) -> None:
+def test_a_lerobot_episode_is_a_prompt_of_the_same_robot_recorded_elsewhere(arm, tmp_path) -> None:
     dataset = record("planar_arm_lerobot", tmp_path, 2)
-    images, chunks = starting_window(model, ARM)
-    frames, found = read_prompt(model, ARM, dataset)
+    images, chunks = starting_window(arm, ARM)
+    frames, found = read_prompt(arm, ARM, dataset)
     assert np.array_equal(found, chunks) and np.abs(frames.astype(int) - images).mean() < 8  # lossy video
-    other, _ = read_prompt(model, ARM, {"lerobot": dataset, "episode": 1, "start": 3})
+    other, _ = read_prompt(arm, ARM, {"lerobot": dataset, "episode": 1, "start": 3})
     assert other.shape == frames.shape and np.abs(other.astype(int) - images).mean() > 8
 
 
@@ -111,32 +116,32 @@ def test_a_lerobot_episode_is_a_prompt_of_the_same_robot_recorded_elsewhere(mode
 )
 def test_prompts_that_cannot_be_read_are_refused(model: HMA, prompt: Any, message: str) -> None:
     with pytest.raises(HMAError, match=message):
-        read_prompt(model, MOVER, prompt)
+        read_prompt(model, RAILS, prompt)
 
 
 @pytest.mark.slow
 def test_windows_that_are_not_there_are_refused(model: HMA, shards: Path) -> None:
     with pytest.raises(HMAError, match="has no episode 7 — give 0 to 1, or an id"):
-        read_prompt(model, MOVER, {"shards": shards, "episode": 7})
+        read_prompt(model, RAILS, {"shards": shards, "episode": 7})
     with pytest.raises(HMAError, match="has no episode -1 — give 0 to 1, or an id"):
-        read_prompt(model, MOVER, {"shards": shards, "episode": -1})
+        read_prompt(model, RAILS, {"shards": shards, "episode": -1})
     with pytest.raises(HMAError, match="4 frames, 5 rows apart, from row 900 on do not fit an episode of"):
-        read_prompt(model, MOVER, {"shards": shards, "start": 900})
-    with pytest.raises(HMAError, match="5 actions of 2 values in a chunk — planar_arm takes 3 of 2"):
-        read_prompt(model, ARM, shards)
+        read_prompt(model, RAILS, {"shards": shards, "start": 900})
+    with pytest.raises(HMAError, match="5 actions of 2 values in a chunk — mover_04 takes 1 of 2"):
+        read_prompt(model, MOVER, shards)
 
 
 @pytest.mark.slow
 def test_a_prompt_crosses_no_pause(model: HMA, shards: Path, tmp_path: Path) -> None:
     paused = shutil.copytree(shards, tmp_path / "paused")
     state_pauses(paused, {7: 90, 40: 4})  # the second is shorter than a step of the model, 5
-    first, _ = read_prompt(model, MOVER, paused)
-    assert np.array_equal(first, read_prompt(model, MOVER, {"shards": shards, "start": 8})[0])
+    first, _ = read_prompt(model, RAILS, paused)
+    assert np.array_equal(first, read_prompt(model, RAILS, {"shards": shards, "start": 8})[0])
     with pytest.raises(HMAError, match="from row 3 on do not fit an episode .* pauses after row 7"):
-        read_prompt(model, MOVER, {"shards": paused, "start": 3})
+        read_prompt(model, RAILS, {"shards": paused, "start": 3})
     for start, frames in ((0, 2), (8, 4), (30, 4)):
         given = {"start": start, "frames": frames}
-        whole, pausing = (read_prompt(model, MOVER, {"shards": s} | given) for s in (shards, paused))
+        whole, pausing = (read_prompt(model, RAILS, {"shards": s} | given) for s in (shards, paused))
         assert np.array_equal(whole[0], pausing[0]) and np.array_equal(whole[1], pausing[1])
 
 

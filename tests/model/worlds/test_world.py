@@ -14,7 +14,7 @@ from hma_model.generation.decode import decode
 from hma_model.network.model import HMA
 from hma_model.simulate import World, load_world, starting_window
 
-ARM, OTHER = "arm2_07", "arm2_02"
+ARM, OTHER = "gantry_04", "rails_03"
 SURE: dict[str, Any] = {"unmask_steps": 1, "temperature": 0.0}  # draws nothing
 
 
@@ -68,7 +68,7 @@ def test_a_session_of_stored_tokens_goes_on_as_generation_does(model: HMA, windo
     tokens, chunks = world.tokenizer.encode(images), drawn(model, OTHER, 3)
     session = world.open(OTHER, tokens, before)
     assert np.array_equal(world.image(session), world.tokenizer.decode(tokens[-1:])[0])
-    made = [world.step({session: chunk.reshape(4, 2)})[session] for chunk in chunks]
+    made = [world.step({session: chunk.reshape(5, 2)})[session] for chunk in chunks]
     actions = torch.from_numpy(np.concatenate([before, chunks]))[None]
     stored = torch.from_numpy(tokens.astype(np.int64))[None]
     expected = decode(world.tokenizer, model.generate(stored, actions, OTHER, 3, **SURE))[0]
@@ -111,8 +111,8 @@ def test_a_action_of_nan_is_unknown_and_not_zero(model: HMA, windows: dict[str, 
     world = make(model, **SURE)
     images, before = windows[OTHER]
     (chunk,) = drawn(model, OTHER, 1)
-    hidden = np.where(np.arange(4)[:, None] == 2, np.nan, chunk.reshape(4, 2))
-    cases = {"unknown": (hidden, before), "zero": (np.zeros(8), before), "no chunks": (hidden, None)}
+    hidden = np.where(np.arange(5)[:, None] == 2, np.nan, chunk.reshape(5, 2))
+    cases = {"unknown": (hidden, before), "zero": (np.zeros(10), before), "no chunks": (hidden, None)}
     made = {}
     for name, (actions, chunks) in cases.items():
         session = world.open(OTHER, images, chunks)
@@ -137,16 +137,16 @@ def test_images_of_another_size_are_resized_as_in_a_conversion(model: HMA, windo
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        (np.zeros(7), r"of arm2_02 have the shape \(7,\) — give \(8,\) or \(4, 2\)"),
-        (np.full(8, np.inf), "not finite"),
-        (np.array([[0, np.nan]] * 4), "not finite"),
+        (np.zeros(7), r"of rails_03 have the shape \(7,\) — give \(10,\) or \(5, 2\)"),
+        (np.full(10, np.inf), "not finite"),
+        (np.array([[0, np.nan]] * 5), "not finite"),
     ],
 )
 def test_actions_that_do_not_fit_are_refused(model, windows, actions, message) -> None:
     world = make(model)
     session, other = (world.open(OTHER, *windows[OTHER]) for _ in range(2))
     with pytest.raises(HMAError, match=message):
-        world.step({session: actions, other: np.zeros(8)})
+        world.step({session: actions, other: np.zeros(10)})
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_actions_that_do_not_fit_are_refused(model, windows, actions, message) -
     [
         (np.zeros((2, 8, 8, 3), np.float32), None, r"frames are float32 of the shape \(2, 8, 8, 3\)"),
         (np.zeros((0, 8, 8, 3), np.uint8), None, "frames are uint8"),
-        (np.zeros((3, 8, 8, 3), np.uint8), np.zeros((1, 8)), "has 1 chunks for 3 frames — give 2"),
+        (np.zeros((3, 8, 8, 3), np.uint8), np.zeros((1, 10)), "has 1 chunks for 3 frames — give 2"),
         (np.zeros((2, 8, 8, 3), np.uint8), np.zeros((1, 6)), r"have the shape \(6,\)"),
     ],
 )
@@ -165,12 +165,12 @@ def test_prompts_that_do_not_fit_are_refused(model: HMA, frames: Any, chunks: An
 
 def test_what_is_not_there_is_said(model: HMA, windows: dict[str, Any]) -> None:
     world = make(model)
-    with pytest.raises(HMAError, match="ur5: is not in the model, which has: arm2_07, arm2_02"):
+    with pytest.raises(HMAError, match="ur5: is not in the model, which has: gantry_04, rails_03"):
         world.open("ur5", windows[OTHER][0])
     session = world.open(OTHER, *windows[OTHER])
     world.close(session)
     with pytest.raises(HMAError, match=f"session {session}: is not open; open are: none"):
-        world.step({session: np.zeros(8)})
+        world.step({session: np.zeros(10)})
 
 
 def test_the_embedded_world_opens_without_arguments() -> None:
@@ -185,7 +185,9 @@ def test_a_robot_with_a_bundled_checkpoint_to_itself_is_found_by_the_name_embedd
     assert actions.low.tolist() == [0, 0] and actions.high.tolist() == [512, 512]
     assert actions.seen is not None and (actions.seen[0] >= 15).all() and (actions.seen[1] <= 497).all()
     assert world.one_pass and world.decoding.temperature == 0
-    with pytest.raises(HMAError, match="embedded: arm2_07 and pusht_fast are robots of different networks"):
+    with pytest.raises(
+        HMAError, match="embedded: pusht_fast is in embedded-pusht and gantry_04 is in embedded: no"
+    ):
         load_world("embedded", ["pusht_fast", ARM])
     with pytest.raises(HMAError, match=r"embedded: '\.\.' is not an embodiment's id"):
         load_world("embedded", [".."])
