@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_533, 11_429, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_786, 521_552
-TEST_LINES = 49_078
+TEST_LINES = 49_079
 DOC_WORDS = 41_500
 
 

@@ -475,7 +475,7 @@ def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(pa
     page.wait_for_selector("#sync:not(.call)")
     pixel = "document.getElementById('model-view').getContext('2d').getImageData(5, 5, 1, 1).data"
     bright = f"Math.max(...{pixel}.slice(0, 3)) > 50"
-    for _ in range(100):  # until the true image is there, where the model of before was black
+    for _ in range(300):  # until the true image is there, where the model of before was black
         if page.evaluate(bright):
             break
         page.wait_for_timeout(100)
