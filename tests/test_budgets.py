@@ -28,7 +28,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/tokenizers": (3_522, 26_155, 18),
     "hma_model": (532, 3_311, 4),
     "hma_model/benchmark": (841, 7_246, 5),
-    "hma_model/checkpoint": (937, 7_033, 5),
+    "hma_model/checkpoint": (934, 7_020, 5),
     "hma_model/cli": (1_753, 11_059, 12),
     "hma_model/demo": (485, 4_069, 4),
     "hma_model/evaluation": (4_602, 36_910, 24),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_695, 30_650, 20),
     "hma_model/worlds": (1_533, 11_429, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_786, 521_552
-TEST_LINES = 49_079
+PRODUCT_LINES, PRODUCT_NODES = 65_783, 521_539
+TEST_LINES = 49_077
 DOC_WORDS = 41_500
 
 

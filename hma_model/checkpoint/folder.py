@@ -245,7 +245,8 @@ def _bundled(name: str, embodiments: list[str]) -> Path:
     """Return the bundled checkpoint of a name; for `embedded`, the best one that has the embodiments."""
     if name != EMBEDDED_NAME or not embodiments:
         return BUNDLED[name]
-    homes = {one: [part for part in BUNDLED if _has(BUNDLED[part], one)] for one in embodiments}
+    there = {part: embodiments_in(path) for part, path in BUNDLED.items()}
+    homes = {one: [part for part in there if one in there[part]] for one in embodiments}
     shared = [part for part in BUNDLED if all(part in parts for parts in homes.values())]
     if shared:
         return BUNDLED[shared[-1]]
@@ -258,10 +259,6 @@ def _bundled(name: str, embodiments: list[str]) -> Path:
 def embodiments_in(folder: Path) -> tuple[str, ...]:
     """Return the ids of a checkpoint's embodiments."""
     return tuple(sorted(path.parent.name for path in folder.glob(f"embodiments/*/{CARD}") if path.is_file()))
-
-
-def _has(folder: Path, embodiment: str) -> bool:
-    return ID_PATTERN.fullmatch(embodiment) is not None and (folder / "embodiments" / embodiment).is_dir()
 
 
 def training_checkpoints(run: StrPath) -> list[Path]:

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Everything that wants a GPU, within half an hour, the most valuable first; each part writes its figures at once.
+# Everything that wants a GPU, the most valuable first, in 37 minutes at most; each part writes its figures at once.
 #
 #     recipes/gpu/all.sh OUT        # OUT: what is to be kept, figures and the trained models
 #

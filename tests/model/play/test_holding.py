@@ -20,8 +20,6 @@ def test_the_bundled_models_robots_were_measured() -> None:
         found |= holdings(part)
     assert len(measured) == len(BUNDLED)
     assert all(one.follows for one in found.values())
-    lost = Holding(1.6, False, False)
-    assert lost.words == "does not follow its actions"
 
 
 @pytest.mark.parametrize(
