@@ -108,7 +108,7 @@ def _overfit(objective: str, steps: int, **changes: Any) -> list[float]:
 OVERFITS = [  # objective, changes, steps, share of the first losses that the last ones stay below
     ("forward", {}, 120, 0.06),
     *(
-        (name, {}, {"passive": 400, "full": 400}.get(name, 200), 0.06)
+        (name, {}, {"passive": 600, "full": 400}.get(name, 200), 0.06)
         for name in OBJECTIVES
         if name != "forward"
     ),
