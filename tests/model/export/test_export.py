@@ -89,7 +89,7 @@ def test_every_bundled_robot_makes_the_tokens_of_torch(name: str, tmp_path: Path
     assert {robot["id"] for robot in manifest["robots"]} == set(checkpoint.embodiments)
     assert manifest["weights"] == "float16" and manifest["step"]["bytes"] < 15e6
     for robot in checkpoint.embodiments:
-        made = closed_loop(tmp_path / "page", checkpoint, robot)
+        made = closed_loop(tmp_path / "page", checkpoint, robot, count=60)
         assert all(np.array_equal(own, theirs) for own, theirs, _ in made[:EXACT]), robot
         # Later two scores may be alike up to rounding: those of `arm1_03` were 1e-6 apart in frame 42.
         assert np.mean([own != theirs for own, theirs, _ in made]) < 1e-3, robot
