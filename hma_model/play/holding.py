@@ -1,7 +1,7 @@
 """Say how long each robot of a checkpoint stays with the truth, so that people choose one that does.
 
-The robots of bundled checkpoints were measured by `recipes/bench/holding.py`. Of others the verdict of
-`hma evaluate` is known, if the card has one.
+The robots of bundled checkpoints were measured by `recipes/bench/holding.py`. Whether a robot follows its
+actions, the verdict of `hma evaluate` in its card says.
 """
 
 import json
@@ -11,7 +11,6 @@ from importlib.resources import files
 from hma_model.checkpoint.folder import Checkpoint
 
 MEASURED = "holding.json"  # by the trunk's SHA-256
-FOLLOWS_S = 2.0  # a robot that is lost within so many seconds does not follow its actions
 
 
 @dataclass(frozen=True)
@@ -52,13 +51,9 @@ def holdings(checkpoint: Checkpoint) -> dict[str, Holding]:
     known = measured.get(checkpoint.trunk_sha256, {})
     found = {}
     for name in checkpoint.embodiments:
-        if name in known:
-            seconds = known[name]["seconds"]
-            at_least = known[name]["at_least"]
-            found[name] = Holding(seconds, at_least, at_least or seconds > FOLLOWS_S)
-        else:
-            verdict = (checkpoint.card(name).get("evaluation") or {}).get("verdict", "")
-            says = {"follows": True, "does not follow": False}
-            follows = [value for words, value in says.items() if str(verdict).startswith(words)]
-            found[name] = Holding(None, False, follows[0] if follows else None)
+        verdict = str((checkpoint.card(name).get("evaluation") or {}).get("verdict", ""))
+        says = {"follows": True, "does not follow": False}
+        follows = next((value for words, value in says.items() if verdict.startswith(words)), None)
+        own = known.get(name, {})
+        found[name] = Holding(own.get("seconds"), own.get("at_least", False), follows)
     return found
