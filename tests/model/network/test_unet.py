@@ -13,6 +13,7 @@ from hma_data.errors import HMAError, RecipeError, TokenizerError
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model import HMA
 from hma_model.config import HMAConfig
+from hma_model.network.head import SURE, balanced
 from hma_model.network.objectives import surrounded
 from hma_model.network.trunks.contract import Conditioning, TimePositions, paired_times
 from hma_model.training.crops import cropped
@@ -164,17 +165,43 @@ def test_a_shade_of_an_object_is_taken_though_the_ground_is_likelier_than_each_s
     shares = torch.tensor(
         [[0.40, 0.20, 0.18, 0.20, 0.02], [0.6, 0.2, 0.1, 0.1, 0.0], [0.1, 0.0, 0.0, 0.0, 0.9]]
     )
-    assert readout.taken(shares.log().clamp(min=-1e9)).tolist() == [2, 0, 4]
-    assert unet(**COLORS).token_readout.taken(shares).tolist() == [0, 0, 4]
+    scores = shares.log().clamp(min=-1e9).view(3, 1, 1, 5)  # frames of one pixel
+    assert readout.taken(scores).flatten().tolist() == [2, 0, 4]
+    assert unet(**COLORS).token_readout.taken(scores).flatten().tolist() == [0, 0, 4]
+
+
+def test_a_small_object_that_may_lie_here_or_there_keeps_its_pixels_where_they_are_likeliest() -> None:
+    readout = unet(**{**COLORS, "tokenizer": {"colors": SHADES}}).token_readout
+    shares = torch.full((64, 5), 1e-6)
+    shares[:, 0] = 1.0
+    shares[20:30, 4] = torch.linspace(0.3, 0.48, 10)  # 3.9 pixels, nowhere likelier than the ground
+    shares[20:30, 0] -= shares[20:30, 4]
+    taken = readout.taken(shares.log().view(1, 16, 4, 5)).flatten()
+    assert taken.unique().tolist() == [0, 4]
+    assert (taken == 4).nonzero().flatten().tolist() == [27, 28, 29]
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 20.0))
-def test_the_colour_taken_has_the_least_expected_distance_also_where_one_is_likely(seed, spread) -> None:
+def test_a_colour_has_the_least_expected_distance_or_restores_one_that_would_be_lost(seed, spread) -> None:
     readout = unet(**{**COLORS, "tokenizer": {"colors": SHADES}}).token_readout
-    scores = spread * torch.randn(2, 30, 5, generator=torch.Generator().manual_seed(seed))
-    expected = scores.double().softmax(-1) @ readout.distances.double()
-    taken = expected.gather(-1, readout.taken(scores).unsqueeze(-1)).squeeze(-1)
-    assert torch.allclose(taken, expected.min(-1).values, atol=1e-3)
+    scores = spread * torch.randn(2, 10, 3, 5, generator=torch.Generator().manual_seed(seed))
+    given = scores.softmax(-1).flatten(1, 2)
+    for shares, taken in zip(given, readout.taken(scores).flatten(1), strict=True):
+        unsure = shares.amax(-1) < SURE
+        even = balanced(shares[unsure])
+        assert torch.allclose(even.sum(-1), torch.ones(int(unsure.sum())), atol=1e-5)
+        assert torch.allclose(even.sum(0), shares[unsure].sum(0), atol=1.5)
+        medians = (shares @ readout.distances).argmin(-1) == taken
+        medians[unsure] |= (even @ readout.distances).argmin(-1) == taken[unsure]
+        assert medians.all()
+
+
+def test_a_graph_of_fixed_sizes_takes_the_same_colours(monkeypatch) -> None:
+    readout = unet(**{**COLORS, "tokenizer": {"colors": SHADES}}).token_readout
+    scores = 4 * torch.randn(2, 3, 10, 3, 5, generator=torch.Generator().manual_seed(0))
+    taken = readout.taken(scores)
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    assert torch.equal(readout.taken(scores), taken)
 
 
 def test_colours_that_are_not_those_of_the_tokens_are_refused() -> None:
