@@ -12,13 +12,12 @@ from functools import cache, partial
 from itertools import accumulate
 from operator import mul
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from hma_data.tokenizers.shapes import parse_colors
 from hma_model.config import ActionSpace, HMAConfig, Readout
+from hma_model.network.colors import chosen, color_distances
 from hma_model.network.copying import CopyGain, Copying, PatchCopy
 from hma_model.network.linear import Linear
 from hma_model.network.trunks.contract import rows_at
@@ -27,10 +26,6 @@ ABSOLUTE_SHARE = 0.2  # of the absolute error beside the squared one: edges stay
 MOTION_SLOPE = 3.0  # a change of a third of a unit has most of the weight of motion
 _LEVEL_VALUES = 256  # sinusoids that describe a noise level
 TRAINING_LEVELS = 1000  # of noise
-SHARPNESS, ROUNDS, SMALLEST = 3, 8, 1e-30  # of balanced shares
-NEAR = 60.0  # distance of RGB up to which colours are shades of one
-KEPT = 0.9  # of the pixels expected of a colour; with fewer it is lost
-SURE = 0.98  # probability of a colour from which a pixel takes no part in balancing
 CLIP = 10.0  # a step's estimate of the clean sample is clipped to ± this
 
 
@@ -125,35 +120,6 @@ class DigitChain(nn.Module):
         return hidden * self.multiplier if self.multiplier != 1 else hidden
 
 
-def color_distances(config: HMAConfig) -> Tensor | None:
-    """Return the distances (V, V) in RGB between the colours of a palette; None for other tokens."""
-    if not config.tokenizer.get("colors"):
-        return None
-    values = torch.from_numpy(parse_colors(config.tokenizer["colors"], "tokenizer").astype(np.float32))
-    return (values.unsqueeze(1) - values).norm(dim=-1)
-
-
-def balanced(shares: Tensor) -> Tensor:
-    """Return a frame's probabilities (..., N, V) sharpened, with as much of each value as before.
-
-    A small object that may lie here or there is nowhere likelier than the ground. Here it keeps its expected
-    number of places, the likeliest: Sinkhorn's iteration (Cuturi, 2013, arXiv:1306.0895) between the places,
-    each with one value, and those numbers. A place of zeros stays one.
-    """
-    wanted, sharp = shares.sum(-2, keepdim=True), shares**SHARPNESS
-    weight = torch.ones_like(wanted)
-    for _ in range(ROUNDS):  # products of rows, (1, V) by (V, N): of columns they take four times as long
-        place = (weight @ sharp.mT).clamp(min=SMALLEST).reciprocal()
-        weight = wanted / (place @ sharp).clamp(min=SMALLEST)
-    shares = sharp * weight
-    return shares / shares.sum(-1, keepdim=True).clamp(min=SMALLEST)
-
-
-def _fixed(values: Tensor) -> bool:
-    """Return whether code is compiled for a device, or into a graph: no size may depend on values."""
-    return values.device.type != "cpu" or torch.compiler.is_compiling()
-
-
 class TokenReadout(nn.Module):
     """The readout of the discrete model: scores of every digit's values, and their cross-entropy.
 
@@ -217,44 +183,10 @@ class TokenReadout(nn.Module):
         return self.linear(features * self.multiplier if self.multiplier != 1 else features).float()
 
     def taken(self, scores: Tensor) -> Tensor:
-        """Return the values (..., k, F) chosen by a frame's scores (..., k, F, V).
-
-        They are the likeliest, or of colours the medians: where an object's edge may lie here or there, its
-        probability is spread over its shades, and the ground is likelier than each. An object that may as a
-        whole lie here or there would still vanish: colours that lose many of the pixels that are expected of
-        them and of those near them take the pixels that they have in `balanced` shares.
-        """
+        """Return the values (..., k, F) of a frame's scores (..., k, F, V): the likeliest, or its colours."""
         if self.distances is None:
             return scores.argmax(-1)
-        shares = scores.softmax(-1).flatten(-3, -2)
-        values = self._medians(shares)
-        expected, near = shares.sum(-2), (self.distances < NEAR).to(shares.dtype)
-        counted = torch.zeros_like(expected).scatter_add(-1, values, torch.ones_like(shares[..., 0]))
-        lost = counted @ near < KEPT * (expected @ near) - 0.5
-        restored = self._restored(shares, values)
-        return torch.where(lost.gather(-1, restored), restored, values).view(scores.shape[:-1])
-
-    def _restored(self, shares: Tensor, values: Tensor) -> Tensor:
-        """Return the values (..., N) of a frame with those of unsure places from their balanced shares."""
-        unsure = shares.amax(-1) < SURE
-        if _fixed(shares):
-            medians = self._medians(balanced(shares * unsure.unsqueeze(-1)))
-            return torch.where(unsure, medians, values)
-        restored = values.clone()
-        frames = zip(restored.flatten(0, -2), shares.flatten(0, -3), unsure.flatten(0, -2), strict=True)
-        for frame, share, places in frames:
-            frame[places] = self._medians(balanced(share[places]))
-        return restored
-
-    def _medians(self, shares: Tensor) -> Tensor:
-        """Return the colours (..., N) of shares (..., N, V) with the least expected distances."""
-        assert self.distances is not None
-        if _fixed(shares):
-            return (shares @ self.distances).argmin(-1)
-        most, values = shares.max(-1)
-        unsure = most < 0.5  # a colour with half of the probability is the median
-        values[unsure] = (shares[unsure] @ self.distances).argmin(-1)
-        return values
+        return chosen(scores.softmax(-1).flatten(-3, -2), self.distances).view(scores.shape[:-1])
 
     def ids(self, digits: Tensor) -> Tensor:
         """Return the ids (...) of digits (..., F)."""

@@ -13,7 +13,7 @@ from hma_data.errors import HMAError, RecipeError, TokenizerError
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model import HMA
 from hma_model.config import HMAConfig
-from hma_model.network.head import SURE, balanced
+from hma_model.network.colors import SURE, balanced
 from hma_model.network.objectives import surrounded
 from hma_model.network.trunks.contract import Conditioning, TimePositions, paired_times
 from hma_model.training.crops import cropped
