@@ -158,6 +158,7 @@ class Session:
         """
         if not self._true:
             raise UsageError("sync", "the true frames are unknown here", "reset first, or drive a simulator")
+        self.steps = 0  # a step asked for before is not one from the true frames
         self.world.reset(self.row, *self._history())
         self._last = self._restarted(self._last)
 

@@ -450,7 +450,7 @@ def test_the_border_warns_when_the_calibrated_uncertainty_does(
     page.wait_for_selector("#stage:not(.warns)")
 
 
-def test_a_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(page, stepper) -> None:
+def test_an_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(page, stepper) -> None:
     session = session_of(stepper, page)
     stepper.call(lambda: session.world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
     page.locator("input[value=fast]").check(force=True)

@@ -184,6 +184,17 @@ def test_sync_restarts_the_model_from_the_true_frames_and_their_actions() -> Non
     assert len(frames) == len(chunks) + 1 and frames.max() > 0
 
 
+def test_a_step_that_still_waits_at_a_sync_is_not_made_from_the_true_frames() -> None:
+    bench = Bench()
+    session, viewer = bench.open()
+    bench.step(2)
+    bench.world.blind.add(session.row)
+    session.paused, session.steps = True, 1
+    session.sync()
+    bench.stepper.step()
+    assert session.count == len(viewer.frames) == 2 and not session.ready(session.due)
+
+
 def test_sessions_of_another_sampling_have_a_pass_of_their_own() -> None:
     bench = Bench(orders=("random",))
     one, other, third = (bench.open()[0] for _ in range(3))
