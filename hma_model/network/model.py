@@ -82,7 +82,6 @@ class HMA(Network):
         embodiment: str | Sequence[str],
         action_mask: Tensor | None = None,
         true: Tensor | None = None,
-        frame: Tensor | None = None,
     ) -> Tensor:
         """Compute the scores of every token of a window.
 
@@ -93,7 +92,6 @@ class HMA(Network):
             action_mask: (B, T) bool, True where a chunk is known; by default all are.
             true: (B, T, h, w) int64 tokens whose digits a chain's later digits are given; by default those
                 are the likeliest.
-            frame: (B,) int64, the only frame of each window to score; T of the result is then 1.
 
         Returns:
             (B, T, h, w, F, V) float32, low digit first; with `merge`, of the trunk's tokens and their digits.
@@ -108,11 +106,6 @@ class HMA(Network):
         if self.config.copy_previous:
             before = frames_before(values, list(range(-1, values.shape[1] - 1)), self.config)
         features = self.video_features(self.trunk(x, conditioning, times))
-        if frame is not None:
-            at = torch.arange(len(frame), device=frame.device).unsqueeze(1), groups.sort(frame).unsqueeze(1)
-            features = features[at]
-            given = None if given is None else given[at]
-            before = None if before is None else before[at]
         scores = self.token_readout(features, given, before)
         return groups.unsort(self.token_readout.split(scores)).unflatten(2, self.config.token_grid)
 

@@ -169,21 +169,6 @@ def test_action_loss_is_the_mean_over_present_chunks(layout: str) -> None:
         assert torch.allclose(out.per_sample[[0, 2]], expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{}, {"digit_order": "chain"}, {"copy_previous": True}, {"merge": 2, "factored": (6, 4)}],
-    ids=str,
-)
-def test_the_scores_of_one_frame_of_each_window_are_those_of_all_at_these_frames(changes) -> None:
-    model = small_model(**changes)
-    batch = small_batch(model.config, ["arm", "hand.v1", "arm"])
-    frame = torch.tensor([4, 1, 0])
-    for true in (None, batch.tokens):
-        given = batch.tokens, batch.actions, batch.embodiment, None, true
-        whole, one = model.video_logits(*given), model.video_logits(*given, frame=frame)
-        assert torch.allclose(one[:, 0], whole[torch.arange(3), frame], atol=1e-5)
-
-
 def test_predicted_actions_are_raw_and_padded() -> None:
     model = small_model(objectives={"forward": 1, "policy": 1, "inverse": 1})
     batch = small_batch(model.config, ["arm", "hand.v1"])

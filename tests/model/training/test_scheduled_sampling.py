@@ -8,12 +8,13 @@ import torch
 from hma_data.errors import RecipeError
 from hma_data.loading.dataset import Batch
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model.network.stem import to_digits
+from hma_model.network.stem import from_digits, split_tokens
 from hma_model.training.loop import train
 from hma_model.training.parallel import Ranks
 from hma_model.training.recipe import make_recipe
 from hma_model.training.run import Run
-from hma_model.training.scheduled_sampling import SAMPLE_STEPS, forwarded
+from hma_model.training.scheduled_sampling import SAMPLE_STEPS, _predicted, forwarded
+from tests.model.network_parts import small_batch, small_model
 from tests.model.robots import CONFIG, make_model
 from tests.model.runs import TINY
 from tests.model.shards import make_shards
@@ -190,15 +191,30 @@ def test_targets_of_a_continuous_model_are_the_true_latents_whatever_it_sees(tar
     assert torch.equal(targets[0], targets[1])
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"digit_order": "chain"}, {"copy_previous": True}, {"merge": 2, "factored": (6, 4)}],
+    ids=str,
+)
+def test_a_predicted_frame_has_the_likeliest_digits_of_that_frame_masked(changes):
+    model = small_model(**changes)
+    given, rows = small_batch(model.config, ["arm", "hand.v1", "arm"]), torch.tensor([2, 1])
+    made = _predicted(model, given, given.tokens[:, :4], rows, None)
+    hidden = given.tokens[rows, :4]
+    hidden[:, 3] = model.config.vocab_size
+    scores = model.video_logits(hidden, given.actions[rows], ["arm", "hand.v1"], given.action_mask[rows])
+    likeliest = from_digits(scores.argmax(-1), model.config.digits)[:, 3:].flatten(2)
+    expected = split_tokens(likeliest, model.config.merge, model.config.vocab_size, model.config.token_grid)
+    assert torch.equal(made, expected[:, 0])
+
+
 def test_one_that_knows_the_frames_already_gives_the_very_batch(model, monkeypatch):
     true = batch()
-    exact = to_digits(true.tokens, model.config.factored)
-    scores = torch.nn.functional.one_hot(exact, 8).float()
 
-    def known(*given, frame, **more):
-        return scores[torch.arange(len(frame)), frame].unsqueeze(1)
+    def known(of, batch, context, rows, generator):
+        return true.tokens[rows, context.shape[1] - 1]
 
-    monkeypatch.setattr(model, "video_logits", known)
+    monkeypatch.setattr("hma_model.training.scheduled_sampling._predicted", known)
     given = forwarded(model, true, 1.0, 3, torch.Generator().manual_seed(3))
     assert torch.equal(given.context, true.tokens)
 
