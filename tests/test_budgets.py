@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_790, 521_378
 TEST_LINES = 49_117
-DOC_WORDS = 41_650
+DOC_WORDS = 41_750
 
 
 @cache
