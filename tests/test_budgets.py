@@ -41,10 +41,10 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_821, 20_024, 14),
     "hma_model/released": (822, 7_096, 4),
     "hma_model/synthetic": (1_205, 9_074, 5),
-    "hma_model/training": (3_651, 30_148, 20),
+    "hma_model/training": (3_649, 30_138, 20),
     "hma_model/worlds": (1_533, 11_429, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_790, 521_378
+PRODUCT_LINES, PRODUCT_NODES = 65_788, 521_368
 TEST_LINES = 49_117
 DOC_WORDS = 41_750
 

@@ -79,13 +79,11 @@ def _predicted(
     if config.sees_actions:
         given = align(config, batch.actions[rows], batch.action_mask[rows], past + 1)
     shown = groups.sort(model.frame_values(context[rows], places))
+    hidden = torch.zeros(*shown.shape[:3], 1, dtype=torch.bool, device=shown.device)
+    hidden[:, past] = True
     if config.kind == "discrete":
         shown[:, past] = config.mask_id
-        masked = None
-    else:
-        masked = torch.zeros(*shown.shape[:3], config.patch**2, dtype=torch.bool, device=shown.device)
-        masked[:, past] = True
-    x = model.embed(shown, masked)
+    x = model.embed(shown, hidden)
     features = model.trunk(x, model.condition(given, groups, times.positions), times)
     own = model.video_features(features)[:, past:]
     if config.kind == "discrete":
@@ -93,7 +91,7 @@ def _predicted(
         scores = model.token_readout.split(model.token_readout(own, None, before))
         tokens = groups.unsort(from_digits(model.token_readout.taken(scores), config.digits))
         return split_tokens(tokens, config.merge, config.vocab_size, grid)[:, 0].to(context.dtype)
-    kept = patches_before(shown, masked, [past - 1], config.patch) if config.copy_previous else None
+    kept = patches_before(shown, hidden, [past - 1], config.patch) if config.copy_previous else None
     conditions = model.latent_readout(own, times.positions[past:], kept)
     patches = model.latent_readout.sample(conditions.flatten(0, 2), SAMPLE_STEPS, generator=generator)
     whole = groups.unsort(patches.view(*own.shape[:3], config.patch_dim))
