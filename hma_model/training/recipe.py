@@ -156,7 +156,7 @@ class Recipe(_Settings):
     nonfinite: Literal["stop", "skip"] = Field("stop", description="what a non-finite loss does")
     ema: Beta = Field(0.0, description="decay of averaged weights, which are evaluated and saved; 0: off")
     self_forward: Share = Field(0.0, description="share of windows with a self-predicted past")
-    self_forward_frames: Count = Field(2, ge=1, description="consecutive self-predicted frames")
+    self_forward_frames: Count = Field(2, ge=1, description="self-predicted frames in a row; U-Net: at least")
     self_forward_from: Steps = Field(0, description="first step with such windows, counted from 0")
 
     seed: Count = Field(42, ge=0, lt=2**63)
