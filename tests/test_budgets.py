@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_274, 10_943, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_555, 19_554, 11),
-    "hma_data/sources": (12_552, 104_849, 50),
+    "hma_data/sources": (12_565, 105_015, 50),
     "hma_data/storage": (1_664, 10_939, 11),
     "hma_data/tokenizers": (3_522, 26_155, 18),
     "hma_model": (532, 3_311, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_649, 30_138, 20),
     "hma_model/worlds": (1_533, 11_429, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_788, 521_368
-TEST_LINES = 49_117
+PRODUCT_LINES, PRODUCT_NODES = 65_801, 521_534
+TEST_LINES = 49_138
 DOC_WORDS = 41_750
 
 

@@ -5,7 +5,7 @@ import re
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from itertools import groupby
 from operator import itemgetter
@@ -46,22 +46,22 @@ class Bag:
     Args:
         path: a bag file, or a folder with rosbag2's metadata.yaml.
         root: a link that leads out of this folder is refused; default the bag itself.
+        parts: the files that continue it, as `find_bags` finds them.
 
     Raises:
         EpisodeError: it cannot be a bag, by its first bytes or its metadata.
     """
 
-    def __init__(self, path: Path, root: Path | None = None) -> None:
+    def __init__(self, path: Path, root: Path | None = None, parts: Sequence[Path] = ()) -> None:
         self.path = path
         self._metadata = _metadata(path) if path.is_dir() else {}
         self.remarks: tuple[str, ...] = ()  # what its folder has beside what is read, one sentence each
-        self._paths = [path]
+        self._paths = [path, *parts]
         self._stated = False  # whether the metadata describes all of its files
         if path.is_dir():
             self._paths, self.remarks = _listed(path, self._metadata)
             self._stated = not self.remarks
-        elif root is not None and root != path and (parts := following_parts(path)):
-            self._paths = [path, *parts]
+        elif parts:
             said = f"{path.name} to {parts[-1].name} follow each other without a pause"
             self.remarks = (f"{said}: the {len(self._paths)} files are read as one recording",)
         self._message_packed = str(self._metadata.get("compression_mode", "")).lower() == "message"
@@ -208,35 +208,27 @@ def _require_space(path: Path, folder: Path) -> None:
         raise OutputError(path, fault, "set TMPDIR to a larger disk, or write it as MCAP (ros2 bag convert)")
 
 
-def find_bags(root: Path) -> dict[str, Path]:
-    """Return episode id -> bag at or under a path, in order of the ids.
+def find_bags(root: Path) -> dict[str, list[Path]]:
+    """Return episode id -> bag at or under a path and the files that continue it, in order of the ids.
 
     An id is the path relative to `root` without suffix; the suffix stays where two ids would be equal. A
     folder with rosbag2's metadata.yaml is one bag. Elsewhere every bag file is one, but files that a recorder
-    split (run_0.mcap, run_1.mcap) are one bag together, with the path of the first and the id `run`.
+    split (run_0.mcap, run_1.mcap) are one bag together, and its id is `run`.
     """
     if root.is_file() or is_bag_folder(root):
-        return {root.stem if root.is_file() else root.name: root}
-    found: dict[Path, str] = {}  # bag -> its id
+        return {root.stem if root.is_file() else root.name: [root]}
     files = [path for path in root.rglob("*") if _is_bag_name(path.name) or path.name == "metadata.yaml"]
     folders = {path.parent for path in files if path.name == "metadata.yaml" and is_bag_folder(path.parent)}
-    for path in folders:
-        found[path] = path.relative_to(root).as_posix()
-    for path in files:
-        is_file = (
-            is_remote(path) or not path.is_dir()
-        )  # also a link to nothing, which is told when it is read
-        if is_file and _is_bag_name(path.name) and folders.isdisjoint(path.parents):
-            found[path] = path.relative_to(root).with_suffix("").as_posix()
-    for path in sorted(path for path in found if _part_number(path) is not None):
-        parts = following_parts(path) if path in found else []
-        if parts and (match := SPLIT_PART.fullmatch(path.name)):
-            found[path] = (path.relative_to(root).parent / match["stem"]).as_posix()
-        for part in parts:
-            del found[part]
-    counts = Counter(found.values())
+    found = [(path.relative_to(root).as_posix(), [path]) for path in folders]  # ids and files
+    loose = [path for path in files if _is_bag_name(path.name) and folders.isdisjoint(path.parents)]
+    # a link to nothing is told when it is read
+    for paths in _recordings(path for path in loose if is_remote(path) or not path.is_dir()):
+        place = paths[0].relative_to(root)
+        match = SPLIT_PART.fullmatch(place.name) if len(paths) > 1 else None
+        found.append(((place.with_name(match["stem"]) if match else place.with_suffix("")).as_posix(), paths))
+    counts = Counter(name for name, _ in found)
     named = {
-        name if counts[name] == 1 else path.relative_to(root).as_posix(): path for path, name in found.items()
+        name if counts[name] == 1 else paths[0].relative_to(root).as_posix(): paths for name, paths in found
     }
     return dict(sorted(named.items()))
 
@@ -334,22 +326,32 @@ def _is_bag_name(name: str) -> bool:
     return name.removesuffix(".zstd").removesuffix(".active").endswith(SUFFIXES)
 
 
-def following_parts(path: Path) -> list[Path]:
-    """Return the files that continue a recording after its first part; empty where there are none.
+def _recordings(files: Iterable[Path]) -> Iterator[list[Path]]:
+    """Yield the files of each recording, in order.
 
-    They are numbered on, and each begins when the one before ends. Names alone do not tell: episodes recorded
-    one after the other are often numbered too.
+    Files that continue one another are numbered on, and each begins when the one before ends. Names alone do
+    not tell: episodes recorded one after the other are often numbered too.
     """
-    stem, number = _split_stem(path), _part_number(path)
-    if stem is None or number is None:
-        return []
-    siblings = {_part_number(item): item for item in path.parent.iterdir() if _split_stem(item) == stem}
-    if (before := siblings.get(number - 1)) and _continues(before, path):
-        return []  # it is no first part
-    parts = [path]
-    while (following := siblings.get(number + len(parts))) and _continues(parts[-1], following):
-        parts.append(following)
-    return parts[1:]
+    numbered: dict[object, list[tuple[int, Path]]] = {}
+    for path in files:
+        match = SPLIT_PART.fullmatch(path.name)
+        if match is None:
+            yield [path]
+        else:
+            numbered.setdefault((path.parent, _split_stem(path)), []).append((int(match["number"]), path))
+    for group in numbered.values():
+        parts: list[Path] = []
+        last = -1
+        for number, path in sorted(group):
+            if number == last:  # a part that is there packed too
+                yield [path]
+                continue
+            if parts and not (number == last + 1 and _continues(parts[-1], path)):
+                yield parts
+                parts = []
+            parts.append(path)
+            last = number
+        yield parts
 
 
 def _continues(path: Path, following: Path) -> bool:

@@ -139,20 +139,20 @@ class _Budget:
         return self.bytes < 0 or self.messages < 0
 
 
-def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspection:
+def report(uri: str, root: Path, bags: dict[str, list[Path]], episodes: int) -> Inspection:
     """Return the inspection of bags.
 
     Raises:
         SourceError: none of them can be read.
     """
     survey, budget = Survey(len(bags), alone=len(bags) == 1, by_field=True), _Budget()
-    for link in unfollowed(root, set(bags.values())):
+    for link in unfollowed(root, {paths[0] for paths in bags.values()}):
         survey.note(link)
     opened: dict[str, Bag] = {}
     lengths: list[Counter[str]] = []  # of each bag: messages by topic
-    for name, path in bags.items():
+    for name, (path, *parts) in bags.items():
         try:
-            bag = Bag(path, root)
+            bag = Bag(path, root, parts)
             for remark in bag.remarks:
                 survey.note(Finding("files", "info" if path.is_file() else "warn", remark))
             counts = bag.topics()

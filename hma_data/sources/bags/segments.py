@@ -92,14 +92,13 @@ _bags: dict[int, dict[Any, Bag]] = {}
 _tables: dict[Any, SegmentTable] = {}
 
 
-def parted(path: Path, root: Path, embodiment: Embodiment, segments: Segments) -> tuple[Bag, SegmentTable]:
+def parted(opened: Bag, root: Path, embodiment: Embodiment, segments: Segments) -> tuple[Bag, SegmentTable]:
     """Return the bag and its episodes, from the cache where no file changed.
 
     Raises:
         EpisodeError: the bag cannot be read, or holds no episode.
     """
-    opened = Bag(path, root)
-    state = opened.state()
+    path, state = opened.path, opened.state()
     bag = _cached(_bags.setdefault(os.getpid(), {}), (path, root, state), lambda: opened, KEPT_BAGS)
     cameras = tuple((camera.key, camera.stamp) for camera in embodiment.cameras)
     key = (path, state, segments, cameras, embodiment.primary_camera.name, embodiment.sync.stamp)

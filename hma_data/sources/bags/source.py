@@ -43,10 +43,13 @@ def open() -> "RosbagSource":
 class RosbagSource:
     """The source of bags; see sources.base.Source."""
 
+    def __init__(self) -> None:
+        self._found: dict[str, dict[str, list[Path]]] = {}  # bags by URI, as they were last listed
+
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""
         uri = as_text(uri)
-        return report(uri, existing_path(uri), _bags(uri), episodes)
+        return report(uri, existing_path(uri), self._list(uri), episodes)
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """See Source. A bag that cannot be read has no frames here; `read` raises its error.
@@ -55,11 +58,13 @@ class RosbagSource:
         """
         uri = as_text(uri)
         root = existing_path(uri)
-        return [ref for name, path in _bags(uri).items() for ref in _refs(name, path, root, embodiment)]
+        return [
+            ref for name, paths in self._list(uri).items() for ref in _refs(name, paths, root, embodiment)
+        ]
 
     def episode_ids(self, uri: StrPath) -> list[str]:
         """See Source: return the ids of whole bags, even where an embodiment divides them."""
-        return list(_bags(as_text(uri)))
+        return list(self._list(as_text(uri)))
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
         """See Source. A bag's own id reads the whole bag, even where the embodiment divides bags.
@@ -69,31 +74,38 @@ class RosbagSource:
             EpisodeError: the bag is damaged, holds no episode, or lacks what the embodiment names.
         """
         uri = as_text(uri)
-        bags, root, segments = _bags(uri), existing_path(uri), embodiment.source.segments
-        if episode_id in bags:
-            path = bags[episode_id]
-            bag = parted(path, root, embodiment, segments)[0] if segments else Bag(path, root)
-            return _EpisodeReading(bag, episode_id, embodiment).episode()
+        root, segments = existing_path(uri), embodiment.source.segments
         match = PART.fullmatch(episode_id)
+        bags = self._found.get(uri, {})  # listed once: thousands of bags, each read on its own
+        if episode_id not in bags and (match is None or match["bag"] not in bags):
+            bags = self._list(uri)
+        if episode_id in bags:
+            path, *parts = bags[episode_id]
+            bag = Bag(path, root, parts)
+            if segments:
+                bag = parted(bag, root, embodiment, segments)[0]
+            return _EpisodeReading(bag, episode_id, embodiment).episode()
         if not segments or not match or match["bag"] not in bags:
             raise SourceError(uri, f"has no bag {episode_id!r}", f"it has {', '.join(list(bags)[:10])}")
         name, number = match["bag"], int(match["number"])
-        bag, table = parted(bags[name], root, embodiment, segments)
+        path, *parts = bags[name]
+        bag, table = parted(Bag(path, root, parts), root, embodiment, segments)
         if number >= len(table.segments):
             held = f"{name} holds {_part_id(name, 0)} to {_part_id(name, len(table.segments) - 1)}"
             raise SourceError(uri, f"has no episode {episode_id!r}", held)
         return _EpisodeReading(bag, episode_id, embodiment, table, number).episode()
 
-
-def _bags(uri: str) -> dict[str, Path]:
-    path = existing_path(uri)
-    if path.is_file() and path.name == "metadata.yaml":
-        raise SourceError(uri, "only describes a bag", f"give the bag's folder, {path.parent}")
-    bags = find_bags(path)
-    if not bags:
-        remedy = "expected .bag, .mcap, .db3, or folders with a metadata.yaml"
-        raise nothing_there(uri, path, "holds no bags", remedy)
-    return bags
+    def _list(self, uri: str) -> dict[str, list[Path]]:
+        """Find the bags, and remember them for `read`."""
+        path = existing_path(uri)
+        if path.is_file() and path.name == "metadata.yaml":
+            raise SourceError(uri, "only describes a bag", f"give the bag's folder, {path.parent}")
+        bags = find_bags(path)
+        if not bags:
+            remedy = "expected .bag, .mcap, .db3, or folders with a metadata.yaml"
+            raise nothing_there(uri, path, "holds no bags", remedy)
+        self._found[uri] = bags
+        return bags
 
 
 @cache
@@ -105,18 +117,18 @@ def _part_id(name: str, number: int) -> str:
     return f"{name}/{number:04d}"
 
 
-def _refs(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> list[EpisodeRef]:
+def _refs(name: str, paths: list[Path], root: Path, embodiment: Embodiment | None) -> list[EpisodeRef]:
     """List the episodes of one bag; one without frames where it cannot be read, and `read` raises why."""
     fingerprint = ""
     try:
-        bag = Bag(path, root)
+        bag = Bag(paths[0], root, paths[1:])
         for remark in bag.remarks:
             _say_once(remark)
         fingerprint = bag.fingerprint()
         segments = embodiment.source.segments if embodiment else None
         if not embodiment or not segments:
             return [EpisodeRef(name, _frames(bag, embodiment), fingerprint=fingerprint)]
-        table = parted(path, root, embodiment, segments)[1]
+        table = parted(bag, root, embodiment, segments)[1]
     except (EpisodeError, OSError):
         return [EpisodeRef(name, 0, fingerprint=fingerprint)]
     return [

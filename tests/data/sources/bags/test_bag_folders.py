@@ -7,6 +7,7 @@ import zstandard
 
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
+from hma_data.sources.bags import source as bags_source
 from hma_data.sources.bags.clocks import SECOND_NS
 from tests.data import ros2
 from tests.data.bag_files import SOURCE
@@ -72,6 +73,26 @@ def test_a_missing_part_divides_the_recording(tmp_path: Path) -> None:
     assert len(ids) == 2
     found = [pairs(folder, robot(), name) for name in ids]
     assert sorted(found) == [same(6), [(i, i) for i in range(9, 15)]]
+
+
+def test_a_part_that_is_there_packed_too_does_not_hide_the_others(tmp_path: Path) -> None:
+    folder = split(tmp_path / "run", "mcap", 3)
+    part(folder / "rec_1.mcap.zstd", range(3, 6), packed=True)
+    assert SOURCE.episode_ids(str(folder)) == ["rec", "rec_1.mcap"]
+    assert pairs(folder, robot(), "rec") == same(9)
+
+
+def test_a_folder_is_listed_once_for_all_its_bags(tmp_path: Path, monkeypatch) -> None:
+    folder = split(tmp_path / "run", "mcap", 6, pause_ns=2 * SECOND_NS)
+    listed = []
+    find = bags_source.find_bags
+    monkeypatch.setattr(bags_source, "find_bags", lambda path: listed.append(path) or find(path))
+    source = bags_source.open()
+    for number in range(6):
+        assert len(to_clip(source.read(str(folder), f"rec_{number}", robot()), robot())) == 3
+    assert listed == [folder]
+    part(folder / "rec_6.mcap", range(18, 21), 12 * SECOND_NS)  # a bag that is not known is looked for
+    assert len(to_clip(source.read(str(folder), "rec_6", robot()), robot())) == 3
 
 
 def test_one_part_given_alone_is_read_alone(tmp_path: Path) -> None:
