@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from hma_model.config import ActionSpace, HMAConfig, Readout
 from hma_model.network.colors import chosen, color_distances
 from hma_model.network.copying import CopyGain, Copying, PatchCopy
+from hma_model.network.cross_entropy import cross_entropy, has_kernel
 from hma_model.network.linear import Linear
 from hma_model.network.trunks.contract import rows_at
 
@@ -208,6 +209,8 @@ class TokenReadout(nn.Module):
         `before` (M, F) are the digits of the frame before, or -1.
         """
         if len(set(self.factored)) == 1:
+            if self.chain is None and not self.smoothing and has_kernel(self.linear, features):
+                return self._kernel_loss(features, digits, before)
             scores = self.split(self(features, digits, before)).flatten(0, 1)
             losses = F.cross_entropy(
                 scores, digits.flatten(), reduction="none", label_smoothing=self.smoothing
@@ -219,6 +222,13 @@ class TokenReadout(nn.Module):
             for i, part in enumerate(parts)
         ]
         return torch.stack(each).sum(0)
+
+    def _kernel_loss(self, features: Tensor, digits: Tensor, before: Tensor | None) -> Tensor:
+        gains = None
+        if self.copy is not None and before is not None:
+            gains, before = self.copy.gains(features, before)[..., 0], before.clamp(min=0)
+        features = features * self.multiplier if self.multiplier != 1 else features
+        return cross_entropy(features, self.linear, gains, digits if before is None else before, digits)
 
 
 class LatentReadout(nn.Module):

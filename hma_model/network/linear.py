@@ -76,15 +76,25 @@ def recomputed(linear: nn.Module | None, function: Callable[..., Tensor], x: Ten
     return out
 
 
+def is_whole(linear: nn.Module) -> bool:
+    """Check whether a map is one of float32 that is all here, and computes what `Linear` says."""
+    if not isinstance(linear, Linear) or linear.weight.dtype != torch.float32:
+        return False
+    return type(linear.weight) is nn.Parameter  # FSDP's shards are of another type
+
+
+def product(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Map (M, I) by a weight (O, I) and a bias (O,), float32 on a CPU, without autograd."""
+    return _product(x, weight, bias) if has_kernels() else F.linear(x, weight, bias)
+
+
 def _suits_onednn(linear: nn.Module, x: Tensor) -> bool:
     """Check whether oneDNN is to compute this product."""
     if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu"):
         return False
     if x.device.type != "cpu" or x.dtype != torch.float32 or x.numel() < ROWS * x.shape[-1]:
         return False
-    if not isinstance(linear, Linear) or linear.weight.dtype != torch.float32 or not has_kernels():
-        return False
-    return type(linear.weight) is nn.Parameter  # FSDP's shards are of another type
+    return is_whole(linear) and has_kernels()
 
 
 def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:

@@ -35,17 +35,18 @@ PASS_VALUES = 23.0  # of the embedding and of the backward pass through one bloc
 BF16_SHARE = 0.7  # of float32's bytes: norms and sums stay float32
 HIDDEN_SHARE = 0.8  # of the tokens are masked and predicted, at most, as a rule
 SCORE_COPIES = 3  # scores, their softmax, and their gradient
+KERNEL_VALUES = 6  # of a digit: numbers of 8 bytes of it and of the one before, its gain, its total
 DIFFUSION_VALUES = 13.0  # of a layer of the diffusion head, for each of its width
 UNET_VALUES = 9.0  # of a U-Net's block, for each value of its result
 UNET_BF16_SHARE = 0.54
 
 
-def activation_bytes(config: HMAConfig, recipe: Recipe, windows: int) -> float:
-    """Return the bytes that a pass over B windows keeps for its backward pass."""
+def activation_bytes(config: HMAConfig, recipe: Recipe, windows: int, device: torch.device) -> float:
+    """Return the bytes that a pass over B windows on a device keeps for its backward pass."""
     predicts_video = any(OBJECTIVES[name].predicts_video for name in recipe.objectives)
     predicted = config.frames - 1 if predicts_video else 0
     if config.trunk == "unet":
-        return windows * _unet_bytes(config, recipe, predicted)
+        return windows * _unet_bytes(config, recipe, predicted, _score_values(config, recipe, device))
     frames = config.frames
     if config.training_pass == "pairs" and predicts_video:
         frames += predicted  # a masked copy of each frame from the second on
@@ -56,16 +57,27 @@ def activation_bytes(config: HMAConfig, recipe: Recipe, windows: int) -> float:
     kept = CHECKPOINT_VALUES * config.layers + block if recipe.checkpointing else block * config.layers
     hidden = windows * predicted * config.tokens_per_frame * HIDDEN_SHARE
     if config.kind == "discrete":
-        read = SCORE_COPIES * sum(config.digits)
-        if config.digit_order == "chain":
-            read += SCORE_COPIES * len(config.digits) * config.width
+        read = _score_values(config, recipe, device)
     else:
         layers = config.diffusion_depth
         read = int(DIFFUSION_VALUES * layers * config.diffusion_width)
     return 4.0 * (values * (kept + PASS_VALUES) + hidden * read)
 
 
-def _unet_bytes(config: HMAConfig, recipe: Recipe, predicted: int) -> float:
+def _score_values(config: HMAConfig, recipe: Recipe, device: torch.device) -> int:
+    """Return how many values are kept for the scores of a token."""
+    if config.kind != "discrete":
+        return 0
+    digits = config.digits
+    if config.digit_order == "chain":
+        return SCORE_COPIES * (sum(digits) + len(digits) * config.width)
+    plain = len(set(digits)) == 1 and not config.label_smoothing
+    if plain and device.type == "cpu" and not recipe.compile:  # `network.cross_entropy` keeps no scores
+        return config.width + KERNEL_VALUES * len(digits)
+    return SCORE_COPIES * sum(digits)
+
+
+def _unet_bytes(config: HMAConfig, recipe: Recipe, predicted: int, scores: int) -> float:
     """Return the bytes that a U-Net's pass over one window keeps for its backward pass.
 
     A block keeps the same number of values for each of its result; most lie at the finest resolution.
@@ -82,8 +94,7 @@ def _unet_bytes(config: HMAConfig, recipe: Recipe, predicted: int) -> float:
     )  # frames before the predicted ones are not computed
     embedded = 2 * config.frames * places * config.views * config.width
     share = UNET_BF16_SHARE if recipe.precision == "bf16" else 1.0
-    scores = SCORE_COPIES * sum(config.digits) * places * config.views if config.kind == "discrete" else 0
-    return 4.0 * (share * computed * (blocks + embedded) + predicted * scores)
+    return 4.0 * (share * computed * (blocks + embedded) + predicted * scores * places * config.views)
 
 
 def needed_bytes(
@@ -103,7 +114,7 @@ def needed_bytes(
     of_weights = 4.0 * values / (ranks if recipe.parallel == "fsdp" else 1)
     if not (device.type != "cuda" if passes is None else passes):
         return of_weights
-    return PROCESS + of_weights + activation_bytes(model.config, recipe, share(recipe, ranks)[1])
+    return PROCESS + of_weights + activation_bytes(model.config, recipe, share(recipe, ranks)[1], device)
 
 
 def free_bytes(device: torch.device) -> float:

@@ -117,7 +117,7 @@ def test_the_estimate_of_a_pass_is_near_what_it_keeps_for_its_backward_pass(spec
 
     with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
         forward(model, recipe)
-    assert 0.5 < activation_bytes(model.config, recipe, 1) / sum(kept.values()) < 2
+    assert 0.5 < activation_bytes(model.config, recipe, 1, CPU) / sum(kept.values()) < 2
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
