@@ -35,7 +35,7 @@ def cross_entropy(
         before: (M, F) int64 those of the frame before, from 0.
         digits: (M, F) int64 the true ones.
     """
-    values = features, linear.weight, linear.bias
+    values: tuple[Tensor, ...] = features, linear.weight, linear.bias
     if torch.is_autocast_enabled("cpu"):
         values = tuple(each.to(torch.get_autocast_dtype("cpu")) for each in values)
     with torch.autocast("cpu", enabled=False):
