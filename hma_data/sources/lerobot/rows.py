@@ -22,6 +22,7 @@ from hma_data.sources.lerobot.metadata import Folder, Metadata, parquet_explaine
 
 MAX_BYTES = 1 << 30  # of one column of a row group, as stored
 MAX_VALUES = 1 << 26  # of such a column: a run of equal values may be stored as one value
+State = tuple[int, int]  # a file's size and time of change
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Rows:
         with parquet_explained(self.path, EpisodeError):
             parts, order = [], []
             for group in np.unique(self.places[:, 0]):
-                held = _column_of_group(self.path, _changed(self.path), int(group), key)
+                held = _column_of_group(self.path, _state(self.path), int(group), key)
                 mine = np.flatnonzero(self.places[:, 0] == group)
                 parts.append(held.take(self.places[mine, 1]))
                 order.append(mine)
@@ -98,20 +99,17 @@ def rows_of(meta: Metadata, index: int) -> Rows:
     """
     path = meta.folder.path(meta.data_path(index))
     with parquet_explained(path, EpisodeError):
-        with pq.ParquetFile(path) as file:
-            columns = tuple(file.schema_arrow.names)
-            metadata = file.metadata
+        state = _state(path)
+        footer = _footer(path, state)
         places = [np.zeros((0, 2), np.int64)]
-        for group in range(metadata.num_row_groups):
-            if not _may_hold(metadata.row_group(group), index):
-                continue
-            stored = _column_of_group(path, _changed(path), group, "episode_index")
+        for group in np.flatnonzero((footer.lows <= index) & (index <= footer.highs)).tolist():
+            stored = _column_of_group(path, state, group, "episode_index")
             within = np.flatnonzero(stored.to_numpy(zero_copy_only=False) == index)
             places.append(np.stack([np.full(len(within), group), within], axis=1))
         placed = np.concatenate(places)
         if not len(placed):
             raise EpisodeError(path, f"has no rows of episode {index}", "the dataset is not complete")
-        return _in_order(Rows(path, columns, placed), index)
+        return _in_order(Rows(path, footer.columns, placed), index)
 
 
 def _in_order(rows: Rows, index: int) -> Rows:
@@ -134,27 +132,47 @@ def _in_order(rows: Rows, index: int) -> Rows:
     return Rows(rows.path, rows.columns, rows.places[order])
 
 
-def _may_hold(held: Any, index: int) -> bool:
-    """Check by its statistics whether a row group can hold rows of the episode."""
-    for i in range(held.num_columns):
-        column = held.column(i)
-        if column.path_in_schema == "episode_index" and column.statistics and column.statistics.has_min_max:
-            return bool(column.statistics.min <= index <= column.statistics.max)
-    return True
+@dataclass(frozen=True)
+class _Footer:
+    """What a parquet file of G row groups says of them.
+
+    Attributes:
+        columns: names of all columns.
+        lows, highs: (G,) range of `episode_index` in each row group, unbounded where none is stated.
+    """
+
+    metadata: pq.FileMetaData
+    columns: tuple[str, ...]
+    lows: Floats
+    highs: Floats
+
+
+@lru_cache(maxsize=8)  # lerobot's merges write a row group an episode: it takes long to parse thousands
+def _footer(path: Path, state: State) -> _Footer:
+    with pq.ParquetFile(path) as file:
+        metadata, columns = file.metadata, tuple(file.schema_arrow.names)
+    ranges = np.tile([-np.inf, np.inf], (metadata.num_row_groups, 1))
+    paths = [metadata.schema.column(i).path for i in range(metadata.num_columns)]
+    for group in range(metadata.num_row_groups) if "episode_index" in paths else ():
+        stated = metadata.row_group(group).column(paths.index("episode_index")).statistics
+        if stated and stated.has_min_max:
+            ranges[group] = stated.min, stated.max
+    return _Footer(metadata, columns, ranges[:, 0], ranges[:, 1])
 
 
 @lru_cache(maxsize=8)  # version 3: the episodes of a file come one after the other
-def _column_of_group(path: Path, changed: int, group: int, key: str) -> pa.Array:
-    return _read(path, group, key)
+def _column_of_group(path: Path, state: State, group: int, key: str) -> pa.Array:
+    return _read(path, state, group, key)
 
 
-def _changed(path: Path) -> int:
-    return path.stat().st_mtime_ns
+def _state(path: Path) -> State:
+    found = path.stat()
+    return found.st_size, found.st_mtime_ns
 
 
-def _read(path: Path, group: int, key: str) -> pa.Array:
+def _read(path: Path, state: State, group: int, key: str) -> pa.Array:
     """Return a whole column of a row group, if its size is plausible for a recording."""
-    with pq.ParquetFile(path) as file:
+    with pq.ParquetFile(path, metadata=_footer(path, state).metadata) as file:
         held = file.metadata.row_group(group)
         columns = [held.column(i) for i in range(held.num_columns)]
         parts = [item for item in columns if item.path_in_schema.startswith(key)]
@@ -230,7 +248,7 @@ class StillImages:
         group, within = (int(place) for place in self._rows.places[index])
         with parquet_explained(self._rows.path, EpisodeError):
             if self._held is None or self._held[0] != group:
-                self._held = group, _read(self._rows.path, group, self._key)
+                self._held = group, _read(self._rows.path, _state(self._rows.path), group, self._key)
             value = self._held[1][within].as_py()
         if isinstance(value, dict):
             value = value.get("bytes") or value.get("path")

@@ -68,6 +68,28 @@ def test_the_episodes_of_one_file_are_read_from_one_open_file_in_order(tmp_path,
     assert len(opened) == len(set(opened)) == len(list(folder.rglob("*.mp4")))
 
 
+def test_the_footer_of_a_file_of_many_episodes_is_parsed_once_until_it_changes(tmp_path, monkeypatch) -> None:
+    parsed: list[str] = []
+    opened = pq.ParquetFile
+
+    def counted(path: Path, metadata: Any = None) -> pq.ParquetFile:
+        parsed.extend([] if metadata else [path.parts[-3]])
+        return opened(path, metadata=metadata)
+
+    folder, robot, source = make_v3(tmp_path / "v3", LENGTHS), embodiment(), open_source("lerobot")
+    monkeypatch.setattr(pq, "ParquetFile", counted)
+    path = folder / "data/chunk-000/file-000.parquet"
+    for reads, group_rows in ((1, None), (2, 5)):
+        if group_rows:  # the same rows elsewhere in the file
+            pq.write_table(pq.read_table(path)[::-1], path, row_group_size=group_rows)
+        for episode, length in enumerate(LENGTHS):
+            read = source.read(str(folder), f"episode_{episode:06d}", robot)
+            np.testing.assert_array_equal(read.actions[0].values, actions_of(episode, length))
+            shown = [number_of(frame) for frame in read.streams["still"].frames(range(length))]
+            assert shown == [10 * episode + i for i in range(length)]
+        assert parsed.count("data") == reads
+
+
 @pytest.fixture(scope="session", params=["v2.0", "v2.1", "v2.1 av1", "v3.0", "v3.0 av1"])
 def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of each version and codec, not to be changed."""
