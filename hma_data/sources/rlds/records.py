@@ -205,24 +205,29 @@ def scan_tfrecord(
     Raises:
         SourceError: the file cannot be read, or is compressed.
     """
-    offsets, lengths, checks = known.offsets.tolist(), known.lengths.tolist(), known.checks.tolist()
-    position, fault = offsets[-1] + lengths[-1] + FOOTER.size if offsets else 0, ""
+    rows: list[tuple[int, int, int]] = []  # of the records that are not known: offset, length and checksum
+    position, fault = int(known.offsets[-1] + known.lengths[-1]) + FOOTER.size if len(known) else 0, ""
     header = read(position, min(size, position + HEADER.size))
     if not position and header[:2] == b"\x1f\x8b":
         raise SourceError(path, "is gzip-compressed", "decompress it: gunzip")
     if not position and header == LFS[: HEADER.size]:
         raise SourceError(path, *unreadable(Path(path), "is a Git LFS pointer", "run git lfs pull"))
-    while position < size and len(offsets) != limit:
+    while position < size and len(known) + len(rows) != limit:
         end, fault = _data_end(header, position, size)
         if fault:
             break
         tail = read(end, min(size, end + FOOTER.size + HEADER.size))
-        offsets.append(position + HEADER.size)
-        lengths.append(end - position - HEADER.size)
-        checks.append(FOOTER.unpack_from(tail)[0])
+        start = position + HEADER.size
+        rows.append((start, end - start, FOOTER.unpack_from(tail)[0]))
         header, position = tail[FOOTER.size :], end + FOOTER.size
-    columns = np.array(offsets, np.int64), np.array(lengths, np.int64), np.array(checks, np.uint32)
-    return RecordFraming(*columns, fault, bool(fault) or position >= size)
+    offsets, lengths, checks = np.array(rows, np.int64).reshape(-1, 3).T
+    return RecordFraming(
+        np.append(known.offsets, offsets),
+        np.append(known.lengths, lengths),
+        np.append(known.checks, checks.astype(np.uint32)),
+        fault,
+        bool(fault) or position >= size,
+    )
 
 
 def _data_end(header: bytes, position: int, size: int) -> tuple[int, str]:

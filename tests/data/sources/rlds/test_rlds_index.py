@@ -2,6 +2,7 @@
 
 import json
 import threading
+import tracemalloc
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -14,6 +15,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from hma_data.errors import MissingDependencyError, SourceError
 from hma_data.sources.base import open_source
 from hma_data.sources.rlds.folder import open_folder
+from hma_data.sources.rlds.records import RecordFraming, masked_crc, scan_tfrecord
 from hma_data.storage import fetch as fetching
 from tests.data import rlds_files
 from tests.data.rlds_files import tensor
@@ -127,6 +129,25 @@ def test_a_remote_index_grows_no_further_than_asked(served):
     handler.asked.clear()
     assert number(uri, "train/000030") == 30
     assert len([name for name, _ in handler.asked if "tfrecord" in name]) == 1
+
+
+def test_one_record_more_costs_no_pass_over_those_that_are_known():
+    count, stored = 100_000, 2 * rlds_files.frame(b"abcd")
+    offsets = np.arange(count) * 20 + 12
+    known = RecordFraming(offsets, np.full(count, 4), np.zeros(count, np.uint32), whole=False)
+    tracemalloc.start()
+    found = scan_tfrecord(
+        lambda start, end: stored[start % 20 : start % 20 + end - start],
+        "x.tfrecord",
+        20 * (count + 5),
+        known,
+        count + 1,
+    )
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_array_equal(found.offsets, np.arange(count + 1) * 20 + 12)
+    assert (found.lengths[-1], found.checks[-1], found.whole) == (4, masked_crc(b"abcd"), False)
+    assert peak < 40 * count  # bytes: copies of the arrays, and no list of their numbers
 
 
 def test_what_passes_by_itself_is_tried_again_and_what_does_not_is_one_error(served):
