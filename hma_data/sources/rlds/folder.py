@@ -29,6 +29,7 @@ from hma_data.storage.blocks import Blocks
 from hma_data.storage.fetch import attempt, fetch_whole, file_system, is_listless, is_local
 
 LONGEST_JSON = 64 << 20  # most bytes of a description; more is an error
+_roots: dict[str, tuple[str, tuple[int, ...]]] = {}  # folder -> the version folder below it, and `_dates`
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 NUMBER = r"-(?P<shard>\d{5,})(?:-of-(?P<shards>\d{5,}))?"
 NAMED = (  # forms of file names: the suffix after the number, or before it as TFDS writes it
@@ -170,7 +171,7 @@ class RldsFolder:
         if not shards or not index.isdecimal():
             like = f"{next(iter(self.splits))}/000000"
             raise EpisodeError(episode_id, f"is not in {self.uri}; an id is like {like}")
-        shard = shards[max(0, bisect_right([item.first for item in shards], int(index)) - 1)]
+        shard = shards[max(0, bisect_right(shards, int(index), key=lambda item: item.first) - 1)]
         position = int(index) - shard.first
         if not 0 <= position < shard.count():
             raise EpisodeError(episode_id, f"is in no shard of {self.uri}")
@@ -195,7 +196,7 @@ def open_folder(uri: str) -> RldsFolder:
     if "://" in uri and not uri.startswith("file://"):
         return _open_remote(uri, os.getpid())
     files, path = fsspec.filesystem("file"), local_path(uri).absolute()
-    root = _version_folder(uri, files, str(path.parent if path.is_file() else path))
+    root = _local_root(uri, files, str(path.parent if path.is_file() else path))
     described = [Path(root, name) for name in ("", "features.json", "dataset_info.json")]
     changed = tuple(item.stat().st_mtime_ns if item.exists() else 0 for item in described)
     return _open(uri, files, root, str(path) if path.is_file() else "", changed)
@@ -212,6 +213,23 @@ def _open_remote(uri: str, pid: int) -> RldsFolder:
     above = files._parent(path) if is_file else path
     root = attempt(files, uri, lambda: _version_folder(uri, files, above))
     return _open(uri, files, root, path if is_file else "", ())
+
+
+def _local_root(uri: str, files: Any, path: str) -> str:
+    """Return `_version_folder`; the thousands of shards there are not listed again for each episode.
+
+    A second dataset or version changes the date of a folder above the first. What stays unnoticed in this
+    process is a features.json that comes later into a folder that lay beside the dataset all the time.
+    """
+    root, dates = _roots.get(path, (path, ()))
+    if not Path(root, "features.json").is_file() or dates != _dates(path, root):
+        root = _version_folder(uri, files, path)
+        _roots[path] = root, _dates(path, root)
+    return root
+
+
+def _dates(path: str, root: str) -> tuple[int, ...]:
+    return tuple(folder.stat().st_mtime_ns for folder in (Path(path), Path(root).parent))
 
 
 def _version_folder(uri: str, files: Any, path: str) -> str:

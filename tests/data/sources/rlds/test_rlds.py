@@ -19,6 +19,7 @@ from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.sources.detect import detect
 from hma_data.sources.rlds.example import Example
+from hma_data.sources.rlds.folder import Shard, open_folder
 from tests.data import rlds_files
 from tests.data.rlds_files import (
     PROTO,
@@ -272,6 +273,45 @@ def test_the_uri_may_name_the_dataset_the_version_or_one_shard(tmp_path):
     toy(tmp_path / "toy" / "2.0.0")
     with pytest.raises(SourceError, match=r"several datasets or versions: 1\.0\.0, 2\.0\.0"):
         RLDS.episode_ids(str(version.parent))
+
+
+def test_the_version_folder_is_looked_for_once_until_another_appears(tmp_path, monkeypatch):
+    looked: list[Path] = []
+    look = Path.glob
+
+    def counted(self: Path, *args, **options):
+        looked.append(self)
+        return look(self, *args, **options)
+
+    monkeypatch.setattr(Path, "glob", counted)
+    folder = toy(tmp_path / "data" / "toy" / "1.0.0")
+    for name in ("train/000000", "train/000002", "train/000001"):
+        assert read(tmp_path / "data", name).id == name
+    assert len(looked) == 2  # one and two levels below
+    for again in (folder.parent / "2.0.0", tmp_path / "data" / "other"):
+        shutil.copytree(folder, again)
+        with pytest.raises(SourceError, match=f"several datasets or versions: .*{again.name}"):
+            read(tmp_path / "data", "train/000000")
+        shutil.rmtree(again)
+        assert len(read(tmp_path / "data", "train/000000").actions[0].values) == 4
+    newer = toy(tmp_path / "made", (7,)).rename(folder.parent / "2.0.0")
+    shutil.rmtree(folder)
+    assert len(read(tmp_path / "data", "train/000000").actions[0].values) == 7
+    assert read(newer, "train/000000").source == read(tmp_path / "data", "train/000000").source
+
+
+def test_an_episodes_shard_is_found_without_a_look_at_each(tmp_path, monkeypatch):
+    names = [f"toy-train.tfrecord-{i:05d}-of-00064" for i in range(64)]
+    folder = open_folder(str(write(tmp_path / "d", {name: [record(i, 2)] for i, name in enumerate(names)})))
+    looked: list[int] = []
+
+    def first(self: Shard) -> int:
+        looked.append(self.number)
+        return self.__dict__["first"]
+
+    monkeypatch.setattr(Shard, "first", property(first))
+    assert folder.example("train/000037")[1].endswith(names[37])
+    assert len(looked) < 16
 
 
 def test_missing_shards_keep_the_ids_of_the_others(tmp_path, caplog):
