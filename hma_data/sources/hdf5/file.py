@@ -33,6 +33,7 @@ WHOLE_FILE = "/"
 OPEN_FILES = 8
 CHUNK_CACHE = 16 << 20  # bytes a dataset, where its chunks are not larger
 HELD_BYTES = 512 << 20  # of decompressed chunks in memory, over all datasets of images
+HELD_DATASETS = 64  # of images that stay open; without chunks they take no bytes of the above
 MAX_BYTES = 1 << 30  # of a chunk
 MAX_NUMBERS = 1 << 26  # values read whole; they become float64
 MAX_ROW = 1 << 28  # values of a row: more than any image has
@@ -59,6 +60,7 @@ class OpenFiles:
         self._process = os.getpid()
         self._files: OrderedDict[tuple[Path, int, int], h5py.File] = OrderedDict()
         self._held: OrderedDict[tuple[Path, str, str], tuple[int, h5py.Dataset]] = OrderedDict()
+        self._room = 0  # bytes of the caches in `_held`
 
     def get(self, path: Path) -> h5py.File:
         """Return the open file; open it again where it has changed.
@@ -67,7 +69,8 @@ class OpenFiles:
             OSError: it is not HDF5, or is cut off; `explained` raises that as our error.
         """
         if self._process != os.getpid():
-            self._files, self._held, self._process = OrderedDict(), OrderedDict(), os.getpid()
+            self._files, self._held, self._room = OrderedDict(), OrderedDict(), 0
+            self._process = os.getpid()
         status = path.stat()
         state = (path, status.st_size, status.st_mtime_ns)
         if state not in self._files:
@@ -88,11 +91,12 @@ class OpenFiles:
         name = (path, str(group.name), key)
         # A handle is false once its file is closed.
         if name not in self._held or not self._held[name][1]:
-            self._held.pop(name, None)
+            self._room -= self._held.pop(name, (0, None))[0]
             self._held[name] = _with_room(group, key, where)
+            self._room += self._held[name][0]
         self._held.move_to_end(name)
-        while len(self._held) > 1 and sum(room for room, _ in self._held.values()) > HELD_BYTES:
-            self._held.popitem(last=False)
+        while len(self._held) > 1 and (self._room > HELD_BYTES or len(self._held) > HELD_DATASETS):
+            self._room -= self._held.popitem(last=False)[1][0]
         return self._held[name][1]
 
 

@@ -237,6 +237,26 @@ def test_only_the_chunks_of_the_frames_asked_for_are_read(demos: Path) -> None:
         frames([13])
 
 
+@pytest.mark.parametrize(("chunks", "most"), [(None, 64), ((1, H, W, 3), 5)])
+def test_datasets_of_images_stay_open_up_to_a_number_and_a_size(tmp_path, monkeypatch, chunks, most) -> None:
+    monkeypatch.setattr(hdf5_file, "CHUNK_CACHE", 1 << 20)
+    monkeypatch.setattr(hdf5_file, "HELD_BYTES", 5 << 20)
+    count, path = 70, tmp_path / "demos.hdf5"
+    with h5py.File(path, "w") as file:
+        for i in range(count):
+            shown = np.full((2, H, W, 3), i, np.uint8)
+            file.create_dataset(f"demo_{i}/image", data=shown, chunks=chunks)
+    files = hdf5_file.OpenFiles()
+    handle = files.get(path)
+    for _ in range(2):
+        for i in range(count):
+            assert (files.cached(path, handle[f"demo_{i}"], "image", "x")[:] == i).all()
+        assert h5py.h5f.get_obj_count(handle.id, h5py.h5f.OBJ_DATASET) == most
+    handle.close()  # as a file is that is not read for long
+    with h5py.File(path) as handle:
+        assert (files.cached(path, handle["demo_69"], "image", "x")[:] == 69).all()
+
+
 FORKING = """
 import os, sys
 import numpy as np
