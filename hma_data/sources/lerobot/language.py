@@ -19,7 +19,7 @@ import numpy as np
 
 from hma_data.episodes.episode import Floats
 from hma_data.errors import SourceError
-from hma_data.sources.lerobot.metadata import Metadata, numbered_texts
+from hma_data.sources.lerobot.metadata import Metadata
 from hma_data.sources.lerobot.rows import Rows
 
 Items = Sequence[Mapping[str, Any]]
@@ -43,8 +43,7 @@ def language_of(meta: Metadata, rows: Rows, times: Floats) -> list[dict[str, Any
 
 
 def _subtasks(meta: Metadata, rows: Rows, times: Floats) -> list[dict[str, Any]]:
-    texts = dict(numbered_texts(meta.folder, "subtask"))
-    numbers = rows.numbers(SUBTASK).reshape(-1)
+    texts, numbers = meta.subtasks, rows.numbers(SUBTASK).reshape(-1)
     begins = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 1))
     return [
         {

@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -217,6 +218,11 @@ class Metadata:
         self.fits: dict[tuple[str, str], tuple[Any, Any]] = {}  # camera, video -> its table, and its Fit
         if not self.episodes:
             raise SourceError(folder.uri, "has no episodes", "record some, or check meta/")
+
+    @cached_property
+    def subtasks(self) -> dict[int, str]:
+        """Return the text of each subtask by its number, where older versions keep them."""
+        return dict(numbered_texts(self.folder, "subtask"))
 
     def data_path(self, index: int) -> str:
         """Return the path of the parquet file with an episode's rows, relative to the folder."""

@@ -14,6 +14,7 @@ from hma_data.conversion.plan import Settings
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
+from hma_data.sources.base import open_source
 from tests.data.cameras import LENGTHS, arm, write_dataset
 
 ALL = Settings(val_fraction=0.0)
@@ -101,7 +102,7 @@ def test_a_set_without_language_has_no_column_of_it(tmp_path: Path) -> None:
     assert "language" not in made.episodes.column_names
 
 
-def test_numbered_subtasks_of_older_datasets_are_read(tmp_path: Path) -> None:
+def test_numbered_subtasks_of_older_datasets_are_read(tmp_path: Path, monkeypatch) -> None:
     folder = write_dataset(tmp_path / "recorded")
     data = folder / "data/chunk-000/file-000.parquet"
     table = pq.read_table(data)
@@ -114,3 +115,16 @@ def test_numbered_subtasks_of_older_datasets_are_read(tmp_path: Path) -> None:
     for text in made.episodes["language"].to_pylist():
         told = [(one["content"], round(one["timestamp"], 3), one["style"]) for one in json.loads(text)]
         assert told == [("reach", 0.0, "subtask"), ("lift", 0.4, "subtask")]
+    opened: list[str] = []
+    plain = pq.ParquetFile
+
+    def counted(path: Path, **options: Any) -> pq.ParquetFile:
+        opened.append(path.name)
+        return plain(path, **options)
+
+    monkeypatch.setattr(pq, "ParquetFile", counted)
+    source = open_source("lerobot")
+    for name in source.episode_ids(str(folder)):
+        read = source.read(str(folder), name, robot).metadata["language"]
+        assert [one["content"] for one in read] == ["reach", "lift"]
+    assert opened.count("subtasks.parquet") == 1
