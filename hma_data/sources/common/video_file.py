@@ -48,6 +48,7 @@ class FrameTable:
         width, height: pixels of the decoded frames.
         codec: h264, av1, hevc, vp9, …
         hz: stated rate; None where the file states none.
+        state: size of the file in bytes, and its time of change in ns.
         counted: whether the container's times are those of packets, not of frames (B-frames in AVI);
             frames are then identified only by the order in which they are decoded.
     """
@@ -60,6 +61,7 @@ class FrameTable:
     height: int
     codec: str
     hz: float | None
+    state: tuple[int, int]
     counted: bool = False
 
     def __len__(self) -> int:
@@ -104,11 +106,12 @@ def _cached_table(path: str, size: int, changed: int) -> FrameTable:
                 shown.append(stamp)
         timeless = "avi" in container.format.name or delays <= {0, None}
         counted = bool(stream.codec_context.has_b_frames) and timeless and len(delays) == 1
-        return _table(path, stream, shown, keyframes, counted, size_px)
+        return _table(path, (size, changed), stream, shown, keyframes, counted, size_px)
 
 
 def _table(
     path: str,
+    state: tuple[int, int],
     stream: Any,
     shown: list[int],
     keyframes: list[tuple[int, int]],
@@ -132,6 +135,7 @@ def _table(
         height=size_px[1],
         codec=stream.codec.canonical_name,
         hz=float(rate) if rate else None,
+        state=state,
         counted=counted,
     )
 

@@ -145,9 +145,9 @@ def _misfit(clock: Floats, spans: Sequence[Span]) -> str:
 def fit_of(meta: Metadata, key: str, file: VideoFile, span: Span) -> Fit:
     """Return how the video of an episode's part fits all of its episodes; it is measured once."""
     known = meta.fits.get((key, span.path))
-    if known is None or known[0] is not file.table:
+    if known is None or known[0] != file.table.state:  # the table itself has 32 bytes a frame
         found = fit(file.timestamps, meta.spans(key, span.path), meta.fps)
-        known = meta.fits[key, span.path] = file.table, found
+        known = meta.fits[key, span.path] = file.table.state, found
     return known[1]
 
 

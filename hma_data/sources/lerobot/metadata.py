@@ -215,7 +215,7 @@ class Metadata:
         self.tasks = _by_number(numbered_texts(folder, "task") if is_v3 else _tasks_v2(folder))
         self.episodes = _by_index(_episodes_v3(folder) if is_v3 else _lines(folder, "episodes.jsonl"))
         self._spans: dict[str, dict[str, tuple[Span, ...]]] = {}  # camera -> video -> its episodes
-        self.fits: dict[tuple[str, str], tuple[Any, Any]] = {}  # camera, video -> its table, and its Fit
+        self.fits: dict[tuple[str, str], tuple[Any, Any]] = {}  # camera, video -> its state, and its Fit
         if not self.episodes:
             raise SourceError(folder.uri, "has no episodes", "record some, or check meta/")
 

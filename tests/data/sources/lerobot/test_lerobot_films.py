@@ -4,6 +4,8 @@ The datasets have episodes of 12, 9 and 15 rows; in version 3 all of them share 
 e shows 10 e + i, and so does its action.
 """
 
+import gc
+import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,8 @@ from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
+from hma_data.sources.common.video_file import _cached_table, frame_table
+from hma_data.sources.lerobot import films
 from tests.data.videos import CAMERA, TASKS, encode, make_v2, make_v3, number_of
 from tests.hostile import Edit, Row
 
@@ -96,6 +100,30 @@ def test_a_late_video_that_keeps_a_removed_episode_is_moved(shared: Path) -> Non
 
 def test_an_offset_that_was_never_reset_for_a_new_video_does_no_harm(tmp_path: Path) -> None:
     assert outcome(starts(make_v3(tmp_path / "v3", LENGTHS), 4.0, 5.2, 6.1)) == ["right"] * 3
+
+
+def test_how_a_film_fits_is_known_without_keeping_the_times_of_its_frames(tmp_path, monkeypatch) -> None:
+    measured: list[int] = []
+    measure = films.fit
+
+    def counted(clock: Any, *args: Any) -> Any:
+        measured.append(len(clock))
+        return measure(clock, *args)
+
+    monkeypatch.setattr(films, "fit", counted)
+    folder, source = make_v2(tmp_path / "v2", LENGTHS), open_source("lerobot")
+    paths = sorted(folder.rglob("*.mp4"))
+    tables = [weakref.ref(frame_table(path)) for path in paths]
+    for _ in range(2):
+        for name in EPISODES:
+            source.read(str(folder), name, robot())
+        _cached_table.cache_clear()  # as after many other films
+        gc.collect()
+        assert sum(table() is not None for table in tables) <= 1  # the film that is open
+        assert measured == list(LENGTHS)
+    encode(paths[0], range(11), stamps=1 + np.arange(11))
+    with pytest.raises(EpisodeError, match="11 frames for 12 rows"):
+        source.read(str(folder), EPISODES[0], robot())
 
 
 def shows(shown: Sequence[int], stamps: Sequence[float] | None = None) -> Edit:
