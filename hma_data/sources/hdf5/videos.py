@@ -8,9 +8,11 @@ without its ending: `{file}_front.mp4`. `*` stands for any characters; one file 
 T rows of an episode, N frames of a video.
 """
 
+import fnmatch
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ FILE = "{file}"  # in a key: the HDF5 file's name without its ending
 MAX_LISTED = 1_000  # files beside an HDF5 file among which videos are looked for
 MAX_VIDEOS = 8  # videos of one episode
 _NAME = re.compile(r"\{(\w+)\}")
+_WILD = re.compile(r"[*?\[]")
 
 
 def is_video(key: str) -> bool:
@@ -120,12 +123,12 @@ def _one(file: Path, folder: Path, pattern: str, what: str) -> Path:
         raise EpisodeError(file, f"{what}: {pattern} leads out of its folder", "give a path below it")
     path = folder / pattern
     if not path.is_file():
-        found = sorted(item for item in folder.glob(pattern) if item.is_file())
+        found = _matching(folder, pattern)
         if len(found) != 1:
             fault = f"{len(found)} files match" if found else "there is no"
             beside = sorted(
                 item.relative_to(folder).as_posix()
-                for item in folder.rglob("*")
+                for item in islice(folder.rglob("*"), MAX_LISTED)
                 if item.suffix.lower() in (*SUFFIXES, ".json")
             )
             remedy = f"next to it are {', '.join(beside[:MAX_NAMES]) or 'no videos'}"
@@ -134,3 +137,21 @@ def _one(file: Path, folder: Path, pattern: str, what: str) -> Path:
     if leaves(path, folder):
         raise EpisodeError(path, "is a link to a file outside its folder", "copy the file in")
     return path
+
+
+def _matching(folder: Path, pattern: str) -> list[Path]:
+    """Return the files below the folder that match; a folder of thousands is not listed for each episode."""
+    *above, name = Path(pattern).parts
+    place = folder.joinpath(*above)
+    if _WILD.search("/".join(above)):
+        found = list(folder.glob(pattern))
+    elif place.is_dir():
+        found = [place / one for one in fnmatch.filter(_names(place, place.stat().st_mtime_ns), name)]
+    else:
+        found = []
+    return sorted(item for item in found if item.is_file())
+
+
+@lru_cache(maxsize=8)
+def _names(folder: Path, changed: int) -> list[str]:
+    return [item.name for item in folder.iterdir()]

@@ -1,7 +1,9 @@
 """HDF5 whose images are in video files beside it, as in DROID's raw recordings."""
 
 import json
+import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +14,15 @@ import pytest
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.episodes.align import to_clip
+from hma_data.errors import EpisodeError
+from hma_data.registry.components import Camera, Hdf5Layout
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
 from hma_data.sources.detect import detect
+from hma_data.sources.hdf5.videos import video_path
 from tests.conftest import BlockTokenizer
+from tests.data.hdf5_files import embodiment
 from tests.data.inferring import answered, inferred
 from tests.data.videos import encode, number_of
 from tests.hostile import Edit, Row, check_refused, cut, linked_away, of, values, whole
@@ -115,6 +121,53 @@ def test_a_yaml_is_inferred_from_numbers_with_a_video_beside_them(tmp_path: Path
     for name in HDF5.episode_ids(str(tmp_path / "lab")):
         first = HDF5.read(str(tmp_path / "lab"), name, arm).streams["front"].frames([0])[0]
         assert number_of(first) == (10 if "10" in name else 1)
+
+
+def test_a_folder_of_many_episodes_is_listed_once_for_a_pattern(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "films").mkdir()
+    for take in range(3):
+        with h5py.File(tmp_path / f"run_{take}.h5", "w") as file:
+            file["actions"] = np.zeros((T, 3))
+        encode(tmp_path / f"films/run_{take}_{take}99_front.mp4", range(take, take + T), fps=60)
+    ids = HDF5.episode_ids(str(tmp_path))
+    listed: list[Path] = []
+
+    def counted(ask: Any) -> Any:
+        return lambda path: listed.append(Path(path)) or ask(path)
+
+    for name in ("listdir", "scandir"):
+        monkeypatch.setattr(os, name, counted(getattr(os, name)))
+    arm = embodiment(cameras=[{"name": "front", "key": "films/{file}_*_front.mp4"}])
+    for take, name in enumerate(ids):
+        first = HDF5.read(str(tmp_path), name, arm).streams["front"].frames([0])[0]
+        assert number_of(first) == take
+    assert listed.count(tmp_path / "films") == 1
+    shutil.copy(tmp_path / "films/run_0_099_front.mp4", tmp_path / "films/run_0_1_front.mp4")
+    with pytest.raises(EpisodeError, match=r"2 files match films/run_0_\*_front\.mp4"):
+        HDF5.read(str(tmp_path), "run_0", arm)
+
+
+@pytest.mark.parametrize("key", ["*/{file}_front.mp4", "gone/{file}_*.mp4", "f?lms/{file}.mp4"])
+def test_a_missing_video_is_told_without_listing_thousands_of_files(tmp_path, monkeypatch, key) -> None:
+    monkeypatch.setattr("hma_data.sources.hdf5.videos.MAX_LISTED", 20)
+    seen: list[Path] = []
+    walk = Path.rglob
+
+    def counted(folder: Path, pattern: str) -> Iterator[Path]:
+        for path in walk(folder, pattern):
+            seen.append(path)
+            yield path
+
+    monkeypatch.setattr(Path, "rglob", counted)
+    (tmp_path / "films").mkdir()
+    for i in range(50):
+        (tmp_path / f"films/other_{i}.mp4").touch()
+    with pytest.raises(EpisodeError, match=r"there is no .* — next to it are films/other_\d+\.mp4, "):
+        video_path(tmp_path / "run_0.h5", Camera(name="front", key=key), Hdf5Layout())
+    assert len(seen) == 20
+    (tmp_path / "films/run_0.mp4").touch()
+    found = video_path(tmp_path / "run_0.h5", Camera(name="front", key="f?lms/{file}*.mp4"), Hdf5Layout())
+    assert found == tmp_path / "films/run_0.mp4"
 
 
 MP4, FACTS = "**/MP4/22.mp4", "**/metadata_*.json"
