@@ -148,9 +148,10 @@ def report(uri: str, root: Path, bags: dict[str, list[Path]], episodes: int) -> 
     survey, budget = Survey(len(bags), alone=len(bags) == 1, by_field=True), _Budget()
     for link in unfollowed(root, {paths[0] for paths in bags.values()}):
         survey.note(link)
-    opened: dict[str, Bag] = {}
+    held: dict[str, list[Path]] = {}  # the bags with messages: an open one keeps its index and unpacked files
     lengths: list[Counter[str]] = []  # of each bag: messages by topic
-    for name, (path, *parts) in bags.items():
+    for name, paths in bags.items():
+        path, *parts = paths
         try:
             bag = Bag(path, root, parts)
             for remark in bag.remarks:
@@ -161,15 +162,17 @@ def report(uri: str, root: Path, bags: dict[str, list[Path]], episodes: int) -> 
             continue
         lengths.append(counts)
         if counts.total():
-            opened[name] = bag
+            held[name] = paths
         else:
             survey.note(Finding("readable", "info", f"{path}: holds no messages"))
     first: _BagInspection | None = None
     clocks: list[dict[str, _Clock]] = []
-    names = list(opened)
+    names = list(held)
     for name in [names[i] for i in sampled(len(names), episodes)] if names else []:
+        path, *parts = held[name]
         try:
-            looked = _BagInspection(name, opened[name], survey, budget)
+            bag = bag if len(bags) == 1 else Bag(path, root, parts)
+            looked = _BagInspection(name, bag, survey, budget)
         except EpisodeError as fault:
             survey.fault(name, fault)
             continue

@@ -1,12 +1,15 @@
 """The files of a recording that a recorder split: with metadata that names them, or only some, or without."""
 
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zstandard
 
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
+from hma_data.sources.bags import bag
 from hma_data.sources.bags import source as bags_source
 from hma_data.sources.bags.clocks import SECOND_NS
 from tests.data import ros2
@@ -93,6 +96,28 @@ def test_a_folder_is_listed_once_for_all_its_bags(tmp_path: Path, monkeypatch) -
     assert listed == [folder]
     part(folder / "rec_6.mcap", range(18, 21), 12 * SECOND_NS)  # a bag that is not known is looked for
     assert len(to_clip(source.read(str(folder), "rec_6", robot()), robot())) == 3
+
+
+def test_an_inspection_keeps_few_bags_unpacked_and_unpacks_the_only_one_once(tmp_path, monkeypatch) -> None:
+    kept: list[int] = []
+    unpack, temporary = bag._unpack_file, tmp_path / "temporary"
+
+    def counted(*args: Any) -> None:
+        unpack(*args)
+        kept.append(len(list(temporary.iterdir())))
+
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    monkeypatch.setattr(bag, "_unpack_file", counted)
+    folder = split(tmp_path / "run", "mcap.zstd", 8, pause_ns=2 * SECOND_NS, packed=True)
+    bags_source.find_bags(folder)  # to tell that no bag continues another, each is unpacked
+    kept.clear()
+    found = SOURCE.inspect(str(folder), 4)
+    assert (found.episodes, found.frames, found.lengths) == (8, 24, (3,) * 8)
+    assert len(kept) == 8 + 4 and max(kept) <= 3  # the first of the sample, the one before, and this one
+    kept.clear()
+    assert SOURCE.inspect(str(folder / "rec_5.mcap.zstd")).frames == 3
+    assert len(kept) == 1
 
 
 def test_one_part_given_alone_is_read_alone(tmp_path: Path) -> None:
