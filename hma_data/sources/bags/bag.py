@@ -6,6 +6,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from itertools import groupby
 from operator import itemgetter
@@ -255,6 +256,19 @@ def _container(path: Path, chunks: ChunkCache) -> Container:
 
 def _metadata(folder: Path) -> dict[str, Any]:
     where = folder / "metadata.yaml"
+    with suppress(OSError):  # reading it raises its error
+        if not is_remote(where):
+            stat = where.stat()
+            return _kept_information(where, stat.st_size, stat.st_mtime_ns)
+    return _information(where)
+
+
+@lru_cache(maxsize=16)  # each segment of a bag asks, and thousands of files or topics take half a second
+def _kept_information(where: Path, size: int, changed: int) -> dict[str, Any]:
+    return _information(where)
+
+
+def _information(where: Path) -> dict[str, Any]:
     values = read_yaml(where, EpisodeError)
     information = values.get("rosbag2_bagfile_information") if isinstance(values, dict) else None
     if not isinstance(information, dict):
@@ -271,10 +285,11 @@ def _listed(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], tuple[s
     if not isinstance(names, list) or not names:
         raise EpisodeError(where, "relative_file_paths names no files", "run ros2 bag reindex")
     paths = [_named_file(folder, PurePosixPath(str(name)).name, where) for name in names]
-    others = [path for path in folder.iterdir() if path not in paths and _is_bag_name(path.name)]
+    named = set(paths)
+    others = [path for path in folder.iterdir() if path not in named and _is_bag_name(path.name)]
     stems = {_split_stem(path) for path in paths} - {None}
     parts = [path for path in others if _split_stem(path) in stems]
-    left_out = sorted(path.name for path in others if path not in parts)
+    left_out = sorted(path.name for path in others if _split_stem(path) not in stems)
     remarks = []
     if parts:
         remarks.append(f"{where} names {len(paths)} of its {len(paths) + len(parts)} files: all are read")

@@ -1,7 +1,7 @@
 """The files of a recording that a recorder split: with metadata that names them, or only some, or without."""
 
 import tempfile
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import pytest
@@ -133,6 +133,40 @@ def test_stale_metadata_leaves_no_part_out(kind: str, tmp_path: Path, caplog) ->
     assert pairs(folder, robot(), "run") == same(36)
     assert any("names 1 of its 12 files: all are read" in record.message for record in caplog.records)
     assert any("names 1 of its 12" in problem for problem in SOURCE.inspect(str(folder)).problems)
+
+
+def test_metadata_are_parsed_once_until_they_change(tmp_path: Path, monkeypatch) -> None:
+    parsed: list[Path] = []
+    read = bag.read_yaml
+    monkeypatch.setattr(bag, "read_yaml", lambda path, error: parsed.append(path) or read(path, error))
+    folder = split(tmp_path / "run", "mcap", 2)
+    for names, frames in (("rec_0.mcap, rec_1.mcap", 6), ("rec_0.mcap", 6), ("gone.mcap", 0)):
+        (folder / "metadata.yaml").write_text(METADATA.format(names))
+        parsed.clear()
+        source = bags_source.open()
+        for _ in range(3):
+            assert source.index(str(folder), robot())[0].frames == frames
+        assert parsed == [folder / "metadata.yaml"]
+    (folder / "metadata.yaml").unlink()
+    with pytest.raises(EpisodeError, match="metadata.yaml"):
+        bag.Bag(folder)
+
+
+def test_a_folder_of_many_files_is_compared_with_its_metadata_once(tmp_path: Path, monkeypatch) -> None:
+    names = [f"rec_{i}.mcap" for i in range(300)]
+    for name in (*names, "backup.mcap"):
+        (tmp_path / name).touch()
+    (tmp_path / "metadata.yaml").write_text(METADATA.format(", ".join(names[:200])))
+    compared: list[int] = []
+    equal = PurePath.__eq__
+    monkeypatch.setattr(PurePath, "__eq__", lambda one, other: compared.append(1) or equal(one, other))
+    made = bag.Bag(tmp_path)
+    assert len(compared) < 10 * len(names)
+    assert [Path(path).name for path, _, _ in made.state()] == names
+    assert [remark.partition("metadata.yaml ")[2] for remark in made.remarks] == [
+        "names 200 of its 300 files: all are read",
+        "does not name backup.mcap: left out (1 in all)",
+    ]
 
 
 def test_a_file_of_another_name_is_left_out_and_named(tmp_path: Path) -> None:
