@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_274, 10_943, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_555, 19_554, 11),
-    "hma_data/sources": (12_565, 105_015, 50),
+    "hma_data/sources": (12_658, 105_821, 50),
     "hma_data/storage": (1_664, 10_939, 11),
     "hma_data/tokenizers": (3_522, 26_155, 18),
     "hma_model": (532, 3_311, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_660, 30_238, 20),
     "hma_model/worlds": (1_533, 11_429, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_932, 522_691
-TEST_LINES = 49_219
+PRODUCT_LINES, PRODUCT_NODES = 66_025, 523_497
+TEST_LINES = 49_476
 DOC_WORDS = 41_750
 
 
