@@ -54,6 +54,7 @@ def place(where: StrPath) -> Path:
         return Path("/" + found[2])
     path = RemotePath(text)
     _ = path.files  # raises where there is no driver
+    RemotePath._named += 1
     return path
 
 
@@ -72,8 +73,17 @@ def attempt[T](where: object, doing: str, action: Callable[[], T]) -> T:
         FileNotFoundError: there is no such file.
         StorageError: it fails for good; StorageAwayError: as `retried` does.
     """
+
+    def once() -> T:
+        try:
+            return action()
+        except Exception as fault:
+            if isinstance(where, RemotePath) and not isinstance(fault, ABSENT):
+                where.files.invalidate_cache()  # it may hold the part of a listing that had arrived
+            raise
+
     try:
-        return retried(action, where, doing, WAITS_S)
+        return retried(once, where, doing, WAITS_S)
     except HMAError:
         raise
     except ABSENT as fault:
@@ -89,6 +99,8 @@ def attempt[T](where: object, doing: str, action: Callable[[], T]) -> T:
 
 class RemotePath(PosixPath):
     """A file or folder of a store; operations that only a path of this machine supports raise an error."""
+
+    _named = 0  # how many places a user has named
 
     def with_segments(self, *segments: Any) -> Any:
         """Return a RemotePath, or a PurePosixPath where the result is relative to a remote path."""
@@ -114,12 +126,16 @@ class RemotePath(PosixPath):
 
     @property
     def files(self) -> Any:
-        """Return the store's file system; fsspec keeps one for each process."""
+        """Return the store's file system; fsspec keeps one a process, the hub's client one a thread."""
         try:
-            return file_system(str(self))[0]
+            files = file_system(str(self))[0]
         except ValueError as fault:
             text = f"is of no store that is known: {said(fault)}"
             raise StorageError(str(self), text, "use s3://, gs:// or hf://") from fault
+        if self.scheme == "hf" and getattr(files, "named", None) != self._named:
+            files.invalidate_cache()  # of this thread: no other thread is reading it
+            files.named = self._named
+        return files
 
     @property
     def key(self) -> str:
@@ -128,11 +144,21 @@ class RemotePath(PosixPath):
 
     # -- what is there
 
+    def _forget(self) -> None:
+        """Drop what the driver knows, because others write here too.
+
+        The hub's driver lists a whole folder to tell of one file. So what it has listed is kept until a user
+        names a place again (`place`): the toolkit writes there by commits only, not by paths, so that only
+        commits of others in the meantime go unseen.
+        """
+        if self.scheme != "hf":
+            self.files.invalidate_cache()
+
     def info(self) -> dict[str, Any]:
         """Return what the store says of a file or folder: type, size and more."""
 
         def ask() -> dict[str, Any]:
-            self.files.invalidate_cache()  # others write here too
+            self._forget()
             return dict(self.files.info(self.key))
 
         return attempt(self, "read", ask)
@@ -141,7 +167,7 @@ class RemotePath(PosixPath):
         """Return name below this folder -> bytes of every file, sorted by name; empty where there is none."""
 
         def ask() -> dict[str, Any]:
-            self.files.invalidate_cache()
+            self._forget()
             return dict(self.files.find(self.key, detail=True))
 
         try:
@@ -180,7 +206,7 @@ class RemotePath(PosixPath):
         """
 
         def ask() -> list[str]:
-            self.files.invalidate_cache()
+            self._forget()
             return [str(item["name"]) for item in self.files.ls(self.key, detail=True)]
 
         try:
@@ -315,9 +341,11 @@ def _put(to: RemotePath, upload: Callable[[str], Any]) -> None:
 
 def fetch_range(path: RemotePath, start: int, stop: int) -> bytes:
     """Return the bytes of a remote file from `start` up to `stop`, which lies inside it."""
+    # The hub's driver reads 5 MiB more than is wanted, where the file does not end before.
+    known = {"size": stop} if path.scheme == "hf" else {}
 
     def ask() -> bytes:
-        data = bytes(path.files.cat_file(path.key, start=start, end=stop))
+        data = bytes(path.files.cat_file(path.key, start=start, end=stop, **known))
         if len(data) != stop - start:
             raise ConnectionError(f"{len(data)} bytes arrived, {stop - start} were requested")
         return data

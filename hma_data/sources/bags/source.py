@@ -44,27 +44,24 @@ class RosbagSource:
     """The source of bags; see sources.base.Source."""
 
     def __init__(self) -> None:
-        self._found: dict[str, dict[str, list[Path]]] = {}  # bags by URI, as they were last listed
+        self._found: dict[str, tuple[Path, dict[str, list[Path]]]] = {}  # by URI, what `_list` returned last
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""
         uri = as_text(uri)
-        return report(uri, existing_path(uri), self._list(uri), episodes)
+        return report(uri, *self._list(uri), episodes)
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """See Source. A bag that cannot be read has no frames here; `read` raises its error.
 
         Where the embodiment divides bags, the episodes of the bag `run` are `run/0000`, `run/0001` …
         """
-        uri = as_text(uri)
-        root = existing_path(uri)
-        return [
-            ref for name, paths in self._list(uri).items() for ref in _refs(name, paths, root, embodiment)
-        ]
+        root, bags = self._list(as_text(uri))
+        return [ref for name, paths in bags.items() for ref in _refs(name, paths, root, embodiment)]
 
     def episode_ids(self, uri: StrPath) -> list[str]:
         """See Source: return the ids of whole bags, even where an embodiment divides them."""
-        return list(self._list(as_text(uri)))
+        return list(self._list(as_text(uri))[1])
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
         """See Source. A bag's own id reads the whole bag, even where the embodiment divides bags.
@@ -74,11 +71,11 @@ class RosbagSource:
             EpisodeError: the bag is damaged, holds no episode, or lacks what the embodiment names.
         """
         uri = as_text(uri)
-        root, segments = existing_path(uri), embodiment.source.segments
-        match = PART.fullmatch(episode_id)
-        bags = self._found.get(uri, {})  # listed once: thousands of bags, each read on its own
+        match, segments = PART.fullmatch(episode_id), embodiment.source.segments
+        # listed once: thousands of bags, each read on its own
+        root, bags = self._found.get(uri) or self._list(uri)
         if episode_id not in bags and (match is None or match["bag"] not in bags):
-            bags = self._list(uri)
+            root, bags = self._list(uri)
         if episode_id in bags:
             path, *parts = bags[episode_id]
             bag = Bag(path, root, parts)
@@ -95,8 +92,8 @@ class RosbagSource:
             raise SourceError(uri, f"has no episode {episode_id!r}", held)
         return _EpisodeReading(bag, episode_id, embodiment, table, number).episode()
 
-    def _list(self, uri: str) -> dict[str, list[Path]]:
-        """Find the bags, and remember them for `read`."""
+    def _list(self, uri: str) -> tuple[Path, dict[str, list[Path]]]:
+        """Return the place of the recordings and the bags in it, and remember both for `read`."""
         path = existing_path(uri)
         if path.is_file() and path.name == "metadata.yaml":
             raise SourceError(uri, "only describes a bag", f"give the bag's folder, {path.parent}")
@@ -104,8 +101,8 @@ class RosbagSource:
         if not bags:
             remedy = "expected .bag, .mcap, .db3, or folders with a metadata.yaml"
             raise nothing_there(uri, path, "holds no bags", remedy)
-        self._found[uri] = bags
-        return bags
+        self._found[uri] = path, bags
+        return path, bags
 
 
 @cache

@@ -1,5 +1,6 @@
 """Shard sets on the Hugging Face Hub, written and read by `hf://datasets/…`, against a hub on loopback."""
 
+import functools
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,10 +14,11 @@ from hma_data.conversion.job import Conversion, convert
 from hma_data.conversion.output import Share
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.publish import HubOutput
-from hma_data.errors import HubError, OutputError, ShardError
+from hma_data.errors import HubError, OutputError, ShardError, StorageAwayError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
+from hma_data.storage import blocks
 from hma_data.storage import remote as store
 from hma_data.storage.files import cache_folder
 from hma_data.storage.remote import place
@@ -83,6 +85,55 @@ def test_a_set_on_the_hub_is_read_and_verified_by_its_uri(toy_arm, toy_file, hub
     assert verify(Path(OUT)) == []
     with pytest.raises(ShardError, match="is not a folder"):
         ShardSet("hf://datasets/team/arm/none")
+
+
+def test_verifying_lists_folders_as_often_however_many_shards_they_have(
+    toy_arm, toy_file, hub, monkeypatch
+) -> None:
+    monkeypatch.setattr(blocks, "REQUESTS", 1)  # the client lists for each thread that reads
+    monkeypatch.setattr(blocks, "_cache", functools.cache(blocks._cache.__wrapped__))
+    found = []
+    for frames in (60, 10):
+        hub.repositories.clear()
+        shutil.rmtree(cache_folder(), ignore_errors=True)
+        run(toy_arm, toy_file, replace(SMALL, shard_frames=frames))
+        hub.log.clear()
+        assert verify(Path(OUT), workers=1) == []
+        found.append((sum("shard-" in name for name in published(hub)), hub.count("/tree/")))
+    (few, listings), (many, same) = found
+    assert many > 2 * few and listings == same
+
+
+def test_a_commit_of_others_is_seen_where_the_set_is_named_again(toy_arm, toy_file, hub) -> None:
+    run(toy_arm, toy_file)
+    assert verify(Path(OUT)) == []
+    name = next(name for name in dataset(hub).files if "shard-" in name)
+    whole = dataset(hub).files[name]
+    for content, said in ((None, "is missing"), (whole + b" ", "bytes, the manifest says"), (whole, "")):
+        dataset(hub).commit({name: content})
+        (problem,) = verify(Path(OUT)) or [""]
+        assert said in problem and bool(said) == bool(problem)
+
+
+def test_a_listing_that_was_cut_between_its_pages_is_made_anew(toy_arm, toy_file, hub) -> None:
+    run(toy_arm, toy_file)
+    there = place(OUT)
+    names = there.listing()
+    hub.habits.page = 2
+    for answered in range(1, 5):
+        there = place(OUT)
+        hub.gone_after = len(hub.log) + answered
+        with pytest.raises(StorageAwayError):
+            there.listing()
+        hub.gone_after = None
+        assert there.listing() == names
+
+
+def test_a_range_is_read_without_bytes_after_it(toy_arm, toy_file, hub) -> None:
+    run(toy_arm, toy_file)
+    dataset(hub).commit({"sets/one/large.bin": bytes(3_000_000)})
+    assert len(store.fetch_range(place(f"{OUT}/large.bin"), 10, 1_000_010)) == 1_000_000
+    assert hub.sent("large.bin") == {"sets/one/large.bin": 1_000_000}
 
 
 def test_lost_staging_makes_the_same_shards_and_uploads_none_again(toy_arm, toy_file, hub, whole) -> None:

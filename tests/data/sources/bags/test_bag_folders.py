@@ -87,13 +87,15 @@ def test_a_part_that_is_there_packed_too_does_not_hide_the_others(tmp_path: Path
 
 def test_a_folder_is_listed_once_for_all_its_bags(tmp_path: Path, monkeypatch) -> None:
     folder = split(tmp_path / "run", "mcap", 6, pause_ns=2 * SECOND_NS)
-    listed = []
-    find = bags_source.find_bags
+    listed: list[Path] = []
+    named: list[str] = []  # the hub's file system lists all folders again when a place is named
+    find, existing = bags_source.find_bags, bags_source.existing_path
     monkeypatch.setattr(bags_source, "find_bags", lambda path: listed.append(path) or find(path))
+    monkeypatch.setattr(bags_source, "existing_path", lambda uri: named.append(uri) or existing(uri))
     source = bags_source.open()
     for number in range(6):
         assert len(to_clip(source.read(str(folder), f"rec_{number}", robot()), robot())) == 3
-    assert listed == [folder]
+    assert listed == [folder] and named == [str(folder)]
     part(folder / "rec_6.mcap", range(18, 21), 12 * SECOND_NS)  # a bag that is not known is looked for
     assert len(to_clip(source.read(str(folder), "rec_6", robot()), robot())) == 3
 
