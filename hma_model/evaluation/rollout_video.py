@@ -3,7 +3,7 @@
 B windows, T frames, H×W pixels of a panel, A action dims.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
@@ -289,7 +289,6 @@ def write_sheets(
     return ""
 
 
-def newest_sheets(out: Path, names: Iterable[str]) -> dict[str, bytes]:
-    """Return the last sheet (PNG) of each robot that has one."""
-    found = {name: sorted((out / SHEETS).glob(f"step-????????-{name}.png")) for name in names}
-    return {name: paths[-1].read_bytes() for name, paths in found.items() if paths}
+def newest_sheets(out: Path) -> dict[str, Path]:
+    """Return the last sheet of each robot that has one."""
+    return {path.stem[14:]: path for path in sorted((out / SHEETS).glob("step-????????-*.png"))}

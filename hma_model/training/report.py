@@ -15,7 +15,7 @@ from hma_model.checkpoint.folder import Checkpoint, training_checkpoints
 from hma_model.config import OBJECTIVES, token_words
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import course, loss_curves
-from hma_model.evaluation.rollout_video import SHEETS
+from hma_model.evaluation.rollout_video import newest_sheets
 from hma_model.training.logging import read_metrics
 from hma_model.training.runtime import ENVIRONMENT, RECIPE
 
@@ -107,7 +107,7 @@ def _curves(page: Page, out: Path, recipe: dict[str, Any], steps: Lines, evaluat
 
 
 def _samples(page: Page, out: Path) -> None:
-    newest = {path.stem[14:]: path for path in sorted((out / SHEETS).glob("step-????????-*.png"))}
+    newest = newest_sheets(out)
     if newest:
         page.section("Predictions on held-out windows")
     for name, path in newest.items():

@@ -386,6 +386,7 @@ class Run:
 
         def write() -> Path:
             path = self.out / "checkpoints" / f"step-{self.step:08d}"
+            sheets = newest_sheets(self.out)
             checkpoints.save(
                 model,
                 path,
@@ -394,7 +395,7 @@ class Run:
                 cards={name: self._card(name, s) for name, s in self.sets.items()},
                 training=lambda folder: write_state(folder, state, moments, weights),
                 base=self.start.checkpoint if self.start and self.start.frozen else None,
-                samples=newest_sheets(self.out, self.sets),
+                samples={name: sheets[name].read_bytes() for name in self.sets if name in sheets},
             )
             for old in training_checkpoints(self.out)[: -self.recipe.keep_last]:
                 checkpoints.remove(old)
