@@ -34,6 +34,10 @@ class Place(Protocol):
         """Return the sizes of the place's files, by name."""
         ...
 
+    def holds(self, name: str) -> bool:
+        """Check whether there is such a file now; a place whose files are many need not list them for it."""
+        ...
+
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
         """Check whether what `files` saw has this content under this name."""
         ...
@@ -72,7 +76,7 @@ def publish(
     *batches, final = _batches([(path, shards[path].bytes) for path in missing])
 
     def part(batch: Sequence[str]) -> dict[str, Path | bytes | None]:
-        there = begin + MANIFEST in require()
+        there = place.holds(begin + MANIFEST) and begin + MANIFEST in require()
         stale = there and not place.has(begin + MANIFEST, folder / MANIFEST)  # it names other shards
         files: dict[str, Path | bytes | None] = {begin + path: folder / path for path in batch}
         return files | ({begin + MANIFEST: None} if stale else {})

@@ -1,7 +1,8 @@
 """List, pull and push a repository of the Hugging Face Hub at one commit.
 
 A push is one commit on top of the commit it was prepared for; if somebody else has committed in between, it
-is prepared again. The hub's client compares no digests of what it downloads, so this module does.
+is prepared again. What our own commits change is known, so that after them nothing is listed again. The hub's
+client compares no digests of what it downloads, so this module does.
 """
 
 import hashlib
@@ -39,7 +40,7 @@ class StoredFile:
 
     Attributes:
         size: bytes.
-        sha256: SHA-256 of a file that the hub keeps by LFS; None for any other file.
+        sha256: SHA-256 of a file that the hub keeps by LFS, or that was committed here; None for others.
         blob_id: git's name of its content, or of its LFS pointer; empty if the hub does not state it.
     """
 
@@ -117,23 +118,28 @@ class Repository:
 
         A repository that is to be written and does not exist yet has no files.
         """
-        self._commit, self._cached, self._absent = None, None, False
+        head, self._cached, self._absent = None, None, False
         try:
             asked: dict[str, Any] = {"revision": self._revision, "timeout": LISTING_S}
-            self._commit = self._ask(lambda: self._api.repo_info(**self._place, **asked).sha)
+            head = self._ask(lambda: self._api.repo_info(**self._place, **asked).sha)
         except HubError as fault:
             if self._write and is_missing(fault):
                 self._absent = True
             elif self._write or not is_away(fault):
                 raise
-        if self._commit is not None and not _COMMIT.fullmatch(self._commit):
-            named = f"names a commit {self._commit[:60]!r}"
+        if head is not None and not _COMMIT.fullmatch(head):
+            named = f"names a commit {head[:60]!r}"
             raise HubError(self.name, named, "check HF_ENDPOINT and your proxy")
-        if self._commit:
-            self._entries = self._ask(self._listing)
-        else:
+        if not head:
             self._entries = {} if self._write else self._of_cache()
+        elif head != self._commit:
+            self._entries = self._ask(lambda: self._listing(head))
+        self._commit = head
         return {name: entry.size for name, entry in self._entries.items()}
+
+    def holds(self, name: str) -> bool:
+        """Check whether there is such a file at the newest commit."""
+        return name in self.files()
 
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
         """Check whether the commit that `files` listed has this content (of this SHA-256) under this name."""
@@ -142,10 +148,10 @@ class Repository:
             return entry.sha256 == sha256
         return entry is not None and entry.states(content)
 
-    def _listing(self) -> dict[str, StoredFile]:
+    def _listing(self, commit: str) -> dict[str, StoredFile]:
         from huggingface_hub import RepoFile
 
-        entries = self._api.list_repo_tree(**self._place, revision=self._commit, recursive=True)
+        entries = self._api.list_repo_tree(**self._place, revision=commit, recursive=True)
         return {
             item.path: StoredFile(item.size or 0, item.lfs.sha256 if item.lfs else None, str(item.blob_id))
             for item in entries
@@ -291,16 +297,22 @@ class Repository:
                 # The client uploads open files by LFS over HTTP, also where it has Xet.
                 return str(content) if self._by_xet else opened.enter_context(content.open("rb"))
 
-            self._api.create_commit(
-                operations=[
-                    *(CommitOperationAdd(name, source(content)) for name, content in added.items()),
-                    *(CommitOperationDelete(name) for name in deleted),
-                ],
+            additions = [CommitOperationAdd(name, source(content)) for name, content in added.items()]
+            made = self._api.create_commit(
+                operations=[*additions, *(CommitOperationDelete(name) for name in deleted)],
                 **self._place,
                 revision=self._revision,
                 commit_message=message,
                 parent_commit=self._commit,
             )
+        # Where somebody else has just added all of it, the client makes no commit, but names theirs.
+        if self._commit and all(getattr(one, "_is_committed", False) for one in additions):
+            self._commit = made.oid
+            for name in deleted:
+                del self._entries[name]
+            for one in additions:
+                stored = StoredFile(one.upload_info.size, one.upload_info.sha256.hex(), "")
+                self._entries[one.path_in_repo] = stored
 
     def _make(self) -> None:
         asked: dict[str, Any] = {"private": self._private or None, "exist_ok": True}

@@ -46,6 +46,7 @@ class FolderStore:
 
     def __init__(self, address: StrPath, write: bool = False) -> None:
         text = as_text(address)
+        self._unfinished: set[str] | None = None  # what killed pushes have left, once it was listed
         self.name = text if "://" in text else str(Path(text).expanduser())
         with _explained(self.name, "used"):
             self._root = place(self.name)
@@ -74,6 +75,11 @@ class FolderStore:
                 fault = f"is larger than {MAX_JSON_BYTES:,} bytes"
                 raise HubError(f"{self.name}/{name}", fault, "the toolkit writes no such file")
             return (self._root / name).read_bytes()
+
+    def holds(self, name: str) -> bool:
+        """Check whether there is such a file."""
+        with _explained(f"{self.name}/{name}", "read"):
+            return (self._root / name).is_file()
 
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
         """Check whether a file has this content already; return False in a store, where reading is slow."""
@@ -113,6 +119,7 @@ class FolderStore:
         staged: dict[str, Path] = {}
         with _explained(self.name, "written"), _locked(self._root):
             files = dict(changes())
+            self._sweep({*files, README})
             page = files.pop(README, None)
             try:
                 for name, content in files.items():
@@ -129,7 +136,6 @@ class FolderStore:
             # The page lists all embodiments, also those that somebody pushed meanwhile.
             if page is not None and (now := changes().get(README)):
                 write_atomic(self._root / README, now if isinstance(now, bytes) else now.read_bytes())
-            self._sweep({*files, README})
         return self.name
 
     def _stage(self, name: str, content: Path | bytes) -> Path:
@@ -158,11 +164,14 @@ class FolderStore:
 
     def _sweep(self, files: set[str]) -> None:
         """Delete the temporary files of killed pushes; in a store only those of the files pushed now."""
-        for name in self._sizes():
+        if self._unfinished is None:
+            self._unfinished = {name for name in self._sizes() if name.endswith(PART)}
+        for name in sorted(self._unfinished):
             folder, _, last = name.rpartition("/")
             final = f"{folder}/{last[1:]}".lstrip("/").removesuffix(PART).rpartition(".")[0]
-            if last.endswith(PART) and (final in files or not isinstance(self._root, RemotePath)):
+            if final in files or not isinstance(self._root, RemotePath):
                 (self._root / name).unlink(missing_ok=True)
+                self._unfinished.discard(name)
 
     def _sizes(self) -> dict[str, int]:
         if isinstance(self._root, RemotePath):

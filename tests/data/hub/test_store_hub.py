@@ -15,6 +15,7 @@ from hma_data.conversion.output import Share
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.publish import HubOutput
 from hma_data.errors import HubError, OutputError, ShardError, StorageAwayError
+from hma_data.hub import repository as hub_repository
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
@@ -142,6 +143,44 @@ def test_lost_staging_makes_the_same_shards_and_uploads_none_again(toy_arm, toy_
     shutil.rmtree(cache_folder() / "staging")
     run(toy_arm, toy_file)
     assert published(hub) == whole and len(dataset(hub).commits) == before
+
+
+def test_an_upload_lists_the_repository_once_however_many_commits_it_makes(toy_arm, toy_file, hub) -> None:
+    run(toy_arm, toy_file, replace(SMALL, shard_frames=10))
+    output, there = HubOutput.of(place(OUT)), published(hub)
+    hub.repositories.clear()
+    output.prepare()
+    hub.log.clear()
+    output.upload()
+    assert published(hub) == there
+    assert len(dataset(hub).commits) == 1 + (sum("shard-" in name for name in there) + 1) // 2 == 7
+    assert hub.count("/tree/") == 0  # `prepare` did
+
+
+def test_a_listing_is_kept_after_own_commits_and_made_anew_after_those_of_others(hub) -> None:
+    hub.create("team/arm", "datasets")
+    ours = hub_repository.Repository("team/arm", write=True, kind="dataset")
+    assert set(ours.files()) == {".gitattributes"}
+    ours.publish(lambda: ours.files() and {"a.bin": b"a", "b.txt": b"b", "c.txt": b"c"}, "three")
+    ours.publish(lambda: ours.files() and {"a.bin": None, "b.txt": b"bb"}, "two")
+    assert ours.files().items() >= {"b.txt": 2, "c.txt": 1}.items() and not ours.holds("a.bin")
+    assert ours.has("b.txt", b"bb") and not ours.has("b.txt", b"b") and hub.count("/tree/") == 1
+    dataset(hub).commit({"b.txt": b"theirs"})
+    assert ours.holds("b.txt") and ours.has("b.txt", b"theirs") and hub.count("/tree/") == 2
+
+
+def test_a_commit_of_others_with_the_same_files_hides_none_of_their_others(hub) -> None:
+    hub.create("team/arm", "datasets")
+    ours = hub_repository.Repository("team/arm", write=True, kind="dataset")
+
+    def changes() -> dict[str, bytes]:
+        ours.files()
+        dataset(hub).commit({"a.bin": b"a", "theirs.txt": b"theirs"})
+        return {"a.bin": b"a"}
+
+    ours.publish(changes, "ours")
+    assert [commit.message for commit in dataset(hub).commits] == ["initial commit", "by hand"]
+    assert ours.holds("theirs.txt")
 
 
 def test_another_conversion_is_refused_before_anything_is_made_and_overwrite_replaces_it(

@@ -1,6 +1,8 @@
 """Shard sets on the hub: one commit, resumed, read back the same, and what the viewer is told."""
 
 import shutil
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,8 @@ from hma_data.errors import HubError, ShardError
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.shapes import palette_spec
 from hma_model.hub.datasets import pull_data, push_data
-from tests.conftest import contents
+from hma_model.hub.stores import FolderStore
+from tests.conftest import SMALL, contents, toy_shards
 from tests.hub_server import Hub
 from tests.model.shards import make_shards
 
@@ -75,6 +78,38 @@ def test_a_large_set_is_few_commits_with_the_manifest_in_the_last(server, shards
     commits = dataset(server).commits
     assert [commit.message for commit in commits[1:]] == ["Add shards of arm, 1 of 2", "Add arm"]
     assert ["manifest.json" in commit.files for commit in commits] == [False, False, True]
+
+
+@pytest.mark.parametrize("target", ["folder", "memory://data/many"])
+def test_a_folder_is_listed_as_often_however_many_batches_are_pushed(tmp_path, monkeypatch, target):
+    monkeypatch.setattr(publish, "FILES", 1)
+    sizes, counts = FolderStore._sizes, []
+    monkeypatch.setattr(FolderStore, "_sizes", lambda store: counts.append(store.name) or sizes(store))
+    for frames in (1000, 20):
+        folder = toy_shards(tmp_path / f"toy{frames}", [20] * 6, replace(SMALL, shard_frames=frames))
+        out = f"{target}{frames}" if "://" in target else str(tmp_path / f"{target}{frames}")
+        push_data(folder, out)
+    few, many = Counter(counts).values()
+    assert few == many
+
+
+def test_a_push_to_a_folder_finds_that_another_robots_set_came_meanwhile(tmp_path, monkeypatch):
+    monkeypatch.setattr(publish, "FILES", 1)
+    ours = toy_shards(tmp_path / "toy", [20] * 6, replace(SMALL, shard_frames=20))
+    theirs, out = make_shards(tmp_path / "theirs", "hand"), tmp_path / "out"
+    plain, pushed = FolderStore.publish, []
+
+    def between(store, changes, message):
+        if pushed == [1, 2]:
+            shutil.copytree(theirs, out, dirs_exist_ok=True)
+        pushed.append(len(pushed) + 1)
+        return plain(store, changes, message)
+
+    monkeypatch.setattr(FolderStore, "publish", between)
+    with pytest.raises(HubError, match="holds the shard set of hand"):
+        push_data(ours, str(out))
+    assert (out / "manifest.json").read_bytes() == (theirs / "manifest.json").read_bytes()
+    assert pushed == [1, 2, 3]
 
 
 def test_a_push_that_was_cut_goes_on_with_what_is_missing(server, shards, monkeypatch):
