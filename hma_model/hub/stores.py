@@ -98,10 +98,12 @@ class FolderStore:
 
     def download(self, names: list[str], out: Path) -> None:
         """Copy the files that `out` lacks or that differ there."""
+        for folder in {(out / name).parent for name in names}:
+            with _explained(folder, "pulled"):
+                remove_dead_parts(folder)  # of a killed pull
         for name in names:
             target, ours = out / name, self._root / name
             with _explained(target, "pulled"):
-                remove_dead_parts(target.parent)  # of a killed pull
                 if target.is_file():
                     sizes = {path.stat().st_size for path in (ours, target)}
                     if len(sizes) == 1 and file_sha256(ours) == file_sha256(target):

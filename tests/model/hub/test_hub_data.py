@@ -12,6 +12,7 @@ from hma_data.conversion import publish
 from hma_data.errors import HubError, ShardError
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.shapes import palette_spec
+from hma_model.hub import stores
 from hma_model.hub.datasets import pull_data, push_data
 from hma_model.hub.stores import FolderStore
 from tests.conftest import SMALL, contents, toy_shards
@@ -165,6 +166,18 @@ def test_a_set_made_anew_replaces_the_old_one_whole(server, shards, tmp_path):
     push_data(shards, REPO)
     assert "val/shard-00000.parquet" not in dataset(server).files
     assert contents(pull_data(REPO, tmp_path / "out")) == contents(shards)
+
+
+def test_a_pull_looks_for_parts_of_killed_ones_once_a_folder(tmp_path, monkeypatch):
+    there = toy_shards(tmp_path / "toy", [20] * 6, replace(SMALL, shard_frames=20))
+    remove, folders = stores.remove_dead_parts, []
+    monkeypatch.setattr(stores, "remove_dead_parts", lambda folder: folders.append(folder) or remove(folder))
+    left = tmp_path / "out/train/.shard-00000.parquet.999999999.part"
+    left.parent.mkdir(parents=True)
+    left.touch()
+    out = pull_data(str(there), tmp_path / "out")
+    assert contents(out) == contents(there)
+    assert sorted(one for one in folders if one.is_relative_to(out)) == [out, out / "train", out / "val"]
 
 
 def test_another_robots_set_is_not_overwritten(server, shards, tmp_path):
