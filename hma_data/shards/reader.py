@@ -171,8 +171,8 @@ class ShardSet:
         if not isinstance(path, RemotePath):
             return pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True)
         listed = self.listed[shard]
-        whole = sum(item.bytes for item in self.listed.values())
-        if self._cache and whole <= limit_bytes() and (kept := kept_shard(path, listed.sha256, listed.bytes)):
+        fits = self._cache and self._bytes <= limit_bytes()
+        if fits and (kept := kept_shard(path, listed.sha256, listed.bytes)):
             return pq.ParquetFile(kept, pre_buffer=False, page_checksum_verification=True)
         metadata = _footer(path, listed.bytes, listed.sha256)
         given = remote_file(path, listed.bytes)
@@ -182,6 +182,10 @@ class ShardSet:
     def listed(self) -> dict[str, ShardFile]:
         """Return name -> what the manifest says of that shard."""
         return {shard.path: shard for shard in self.manifest.shards}
+
+    @cached_property
+    def _bytes(self) -> int:
+        return sum(shard.bytes for shard in self.manifest.shards)
 
     def episode_rows(
         self, episode_index: int, columns: Sequence[str] | None = None

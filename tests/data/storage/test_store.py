@@ -7,6 +7,7 @@ import shutil
 import uuid
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -125,6 +126,25 @@ def test_reading_is_tried_again_and_ends_in_one_error(bucket, monkeypatch) -> No
 
 
 # -- shard sets
+
+
+@pytest.mark.parametrize("cache", [True, False])
+def test_a_read_of_one_shard_looks_at_no_other(both: tuple[Path, RemotePath], cache: bool) -> None:
+    looks = []
+
+    class Listed(dict):
+        def __iter__(self) -> Any:
+            looks.append("all")
+            return super().__iter__()
+
+        items = values = keys = __iter__
+
+    shards = ShardSet(both[1], cache=cache)
+    name = shards.manifest.shards[0].path
+    shards.read(name, [0], ["action"])
+    shards.listed = Listed(shards.listed)
+    shards.read(name, [0], ["action"])
+    assert looks == []
 
 
 @pytest.mark.parametrize("cache", [True, False])
