@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,13 +36,26 @@ def loss_curves(
         colour, style = COLOURS[i % len(COLOURS)], STYLES[i // len(COLOURS) % len(STYLES)]
         steps, losses = np.array(training[name], float).T
         width = max(1, len(losses) // 40)  # of the running mean
-        mean = np.convolve(losses, np.ones(width) / width, "valid")
+        mean = _running_mean(losses, width)
         axes.plot(steps[width - 1 :], mean, color=colour, ls=style, lw=1.6, label=name)
         if validation.get(name):
             steps, losses = np.array(validation[name], float).T
             axes.plot(steps, losses, MARKERS[i % len(MARKERS)], color=colour, ms=5)
     axes.legend(frameon=False, fontsize=9, ncols=1 + len(training) // 8)
     return svg_bytes(figure)
+
+
+def _running_mean(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
+    """Return the mean of every `width` values in a row, (N - width + 1,).
+
+    Each sums up the end of one block of `width` values and the beginning of the next. Differences of sums
+    over all values would be wrong after a huge one.
+    """
+    count = len(values) - width + 1
+    blocks = np.append(values, np.zeros(-len(values) % width)).reshape(-1, width)
+    ends = blocks[:, ::-1].cumsum(1)[:, ::-1].ravel()[:count]
+    beginnings = blocks.cumsum(1).ravel()[width - 1 : width - 1 + count]
+    return (ends + np.where(np.arange(count) % width, beginnings, 0)) / width
 
 
 def course(points: Sequence[tuple[int, float]], label: str, log: bool = False) -> bytes:

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from PIL import Image
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
@@ -17,6 +18,7 @@ from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import PyRecordReader_
 
 from hma_data.errors import MissingDependencyError, OutputError
 from hma_model.checkpoint.folder import resolve
+from hma_model.evaluation.plots import loss_curves
 from hma_model.training.logging import RunLog, read_metrics
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
@@ -194,6 +196,27 @@ def test_the_report_of_a_run_without_a_step_or_with_losses_that_are_no_numbers_c
     write_report(run)
     (run / "metrics.jsonl").write_text("")
     write_report(run)
+
+
+@pytest.mark.parametrize(("steps", "width"), [(1, 1), (39, 1), (100, 2), (121, 3), (1000, 25), (999, 24)])
+def test_a_curve_is_the_mean_of_its_last_steps_also_after_a_huge_loss(monkeypatch, steps, width):
+    losses, drawn = np.random.default_rng(steps).normal(size=steps), {}
+    losses[steps // 2] = 1e30
+
+    def plot(self, x, y, **look):
+        drawn[look["label"]] = x, y
+
+    monkeypatch.setattr("matplotlib.axes.Axes.plot", plot)
+    monkeypatch.setattr("matplotlib.axes.Axes.legend", lambda self, **look: None)
+    loss_curves({"arm": list(enumerate(losses))}, {}, "loss")
+    windows = np.lib.stride_tricks.sliding_window_view(losses, width)
+    np.testing.assert_array_equal(drawn["arm"][0], np.arange(width - 1, steps))
+    np.testing.assert_allclose(drawn["arm"][1], windows.mean(1), rtol=1e-12, atol=1e-14)
+
+
+def test_a_curve_takes_no_longer_for_its_width(monkeypatch):
+    monkeypatch.setattr(np, "convolve", lambda *_: pytest.fail("a product for each value and each of width"))
+    assert b"<svg" in loss_curves({"arm": [(step, 1.0) for step in range(100)]}, {}, "loss")
 
 
 def test_the_run_folder_has_its_recipe_and_ground(run):
