@@ -92,7 +92,7 @@ def loaded(made: Path, given: Given, out: Path) -> Any:
 def trained(made: Path, given: Given, out: Path) -> Any:
     recipe = make_recipe({**TINY, "data": [str(made / "tokens")], "steps": 1, "eval_every": 0})
     run = train(recipe, out=given(out / "run"), show=False)
-    return run.losses, len(read_metrics(given(out / "run"))), load_recipe(given(made / "recipe.yaml"))
+    return run.losses, len(list(read_metrics(given(out / "run")))), load_recipe(given(made / "recipe.yaml"))
 
 
 def published(made: Path, given: Given, out: Path) -> Any:

@@ -17,18 +17,15 @@ if TYPE_CHECKING:
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D")
+Points = Sequence[tuple[int, float]] | NDArray[np.float64]  # (N, 2): training steps, and a value at each
 SIX_COLOURS = (*COLOURS, "#56b4e9", "#555555")  # of plots with more curves
 
 
-def loss_curves(
-    training: Mapping[str, Sequence[tuple[int, float]]],
-    validation: Mapping[str, Sequence[tuple[int, float]]],
-    label: str,
-) -> bytes:
+def loss_curves(training: Mapping[str, Points], validation: Mapping[str, Points], label: str) -> bytes:
     """Plot losses over training, one curve a robot: training as a running mean, evaluations as markers.
 
     Args:
-        training, validation: robot -> (step, loss).
+        training, validation: robot -> its losses.
         label: the label of the losses' axis.
     """
     figure, axes = _axes("training step", label)
@@ -38,7 +35,7 @@ def loss_curves(
         width = max(1, len(losses) // 40)  # of the running mean
         mean = _running_mean(losses, width)
         axes.plot(steps[width - 1 :], mean, color=colour, ls=style, lw=1.6, label=name)
-        if validation.get(name):
+        if name in validation:
             steps, losses = np.array(validation[name], float).T
             axes.plot(steps, losses, MARKERS[i % len(MARKERS)], color=colour, ms=5)
     axes.legend(frameon=False, fontsize=9, ncols=1 + len(training) // 8)
@@ -58,10 +55,10 @@ def _running_mean(values: NDArray[np.float64], width: int) -> NDArray[np.float64
     return (ends + np.where(np.arange(count) % width, beginnings, 0)) / width
 
 
-def course(points: Sequence[tuple[int, float]], label: str, log: bool = False) -> bytes:
-    """Plot the values of (step, value) points, on a logarithmic axis if `log` is set."""
+def course(points: Points, label: str, log: bool = False) -> bytes:
+    """Plot values over training, on a logarithmic axis if `log` is set."""
     figure, axes = _axes("training step", label)
-    steps, values = np.array(points or [(0, np.nan)], float).T
+    steps, values = np.array(points if len(points) else [(0, np.nan)], float).T
     axes.plot(steps, values, color=COLOURS[0], lw=1.2)
     if log and (values > 0).any():
         axes.set_yscale("log")

@@ -14,14 +14,14 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TextIO
 
 from hma_data.console import Update, progress
 from hma_data.errors import MissingDependencyError, install_command
-from hma_data.storage.files import finite, write_atomic
+from hma_data.storage.files import atomic_path, finite
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.rollout_video import SHEETS
 from hma_model.training.recipe import Recipe
@@ -31,18 +31,23 @@ SMOOTHING = 20  # steps over which a shown loss is averaged
 LISTED = 6  # robots whose losses the progress names
 
 
-def read_metrics(out: StrPath) -> list[dict[str, Any]]:
-    """Read the complete lines of metrics.jsonl in a run's folder (str or path); none without the file."""
+def read_metrics(out: StrPath) -> Iterator[dict[str, Any]]:
+    """Yield the complete lines of metrics.jsonl in a run's folder (str or path); none without the file.
+
+    A line takes more than 2,000 bytes in memory, so those of a long run are not all kept.
+    """
     path = as_path(out) / METRICS
-    found: list[dict[str, Any]] = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
-        try:
-            values = json.loads(line)
-        except ValueError:  # a killed run's last line
-            continue
-        if isinstance(values, dict) and isinstance(values.get("step"), int) and values.get("kind") in KINDS:
-            found.append(values)
-    return found
+    if not path.is_file():
+        return
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for line in file:
+            try:
+                values = json.loads(line)
+            except ValueError:  # a killed run's last line
+                continue
+            whole = isinstance(values, dict) and isinstance(values.get("step"), int)
+            if whole and values.get("kind") in KINDS:
+                yield values
 
 
 def _package(tracker: str, module: str, install: str) -> Any:
@@ -156,16 +161,22 @@ class RunLog:
         self._steps, self._total, self._show, self._write_it = steps, steps, show, write
         self._trackers = trackers
         self._path = out / METRICS
-        kept = [line for line in read_metrics(out) if line["step"] <= begin]
-        if write:
-            write_atomic(self._path, "".join(_line(values) for values in kept))
         self._recent: dict[str, deque[float]] = {}
         self._last: dict[str, Any] = {}
-        evaluations = (line for line in reversed(kept) if line["kind"] == "eval")
-        self._evaluation: dict[str, Any] = next(evaluations, {})
+        self._evaluation: dict[str, Any] = {}
+        if write:
+            self._keep(read_metrics(out), begin)
         self._file: TextIO | None = None
         self._update: Update | None = None
         self._closing = ExitStack()
+
+    def _keep(self, lines: Iterator[dict[str, Any]], begin: int) -> None:
+        """Write the lines of finished steps anew, and note the last evaluation among them."""
+        with atomic_path(self._path) as part, part.open("w", encoding="utf-8") as file:
+            for line in lines:
+                if line["step"] <= begin:
+                    file.write(_line(line))
+                    self._evaluation = line if line["kind"] == "eval" else self._evaluation
 
     def __enter__(self) -> "RunLog":
         for tracker in self._trackers:

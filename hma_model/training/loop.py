@@ -188,13 +188,18 @@ def _due(step: int, every: int) -> bool:
 
 
 def _result(run: Run) -> TrainResult:
-    lines = read_metrics(run.out)
+    losses, evaluations = list[tuple[int, float]](), list[dict[str, Any]]()
+    for line in read_metrics(run.out):
+        if line["kind"] == "train":
+            losses.append((line["step"], line["loss"]))
+        else:
+            evaluations.append(line)
     return TrainResult(
         out=run.out,
         checkpoint=resolve(run.out),
         step=run.step,
-        losses=[(line["step"], line["loss"]) for line in lines if line["kind"] == "train"],
-        evaluations=[line for line in lines if line["kind"] == "eval"],
+        losses=losses,
+        evaluations=evaluations,
         masked_val_loss=run.evaluation.get("loss"),
         baseline=run.evaluation.get("baseline"),
         interrupted=run.done < 1,

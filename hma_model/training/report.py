@@ -5,8 +5,13 @@ made again at any time.
 """
 
 import json
+from array import array
+from collections import deque
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hma_data.console import human_seconds
 from hma_data.storage.files import read_json, write_atomic
@@ -21,8 +26,48 @@ from hma_model.training.runtime import ENVIRONMENT, RECIPE
 
 REPORT = "report.html"
 RECENT = 50  # number of last steps over which the closing figures are averaged
+RATES = {  # key of a line -> what it is, and whether its axis is logarithmic
+    "lr": ("learning rate", False),
+    "grad_norm": ("gradient's norm", True),
+    "step_seconds": ("seconds a step", False),
+}
 
-Lines = list[dict[str, Any]]
+Line = dict[str, Any]  # of metrics.jsonl
+
+
+class _Figures:
+    """Figures over training, of which a point takes 16 bytes: a run may have millions of steps."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, array[float]] = {}
+
+    def add(self, line: Line, values: dict[str, float | None]) -> None:
+        """Add the values of a line by name, without those that are None."""
+        for name, value in values.items():
+            if value is not None:
+                self._values.setdefault(name, array("d")).extend((line["step"], value))
+
+    def points(self) -> dict[str, NDArray[np.float64]]:
+        """Return the points (N, 2) of each figure: steps and values."""
+        return {name: np.array(values).reshape(-1, 2) for name, values in self._values.items()}
+
+
+class _Steps:
+    """What the report shows of the steps of a run, whose lines are added one by one."""
+
+    def __init__(self) -> None:
+        self.recent: deque[Line] = deque(maxlen=RECENT)
+        self.of_robots: dict[str, deque[float | None]] = {}  # the last losses of each
+        self.losses, self.rates = _Figures(), _Figures()
+        self.memory_mib = 0.0
+
+    def add(self, line: Line) -> None:
+        self.recent.append(line)
+        for name, loss in line["loss_by_embodiment"].items():
+            self.of_robots.setdefault(name, deque(maxlen=RECENT)).append(loss)
+        self.losses.add(line, line["loss_by_embodiment"])
+        self.rates.add(line, {key: line.get(key) for key in RATES})
+        self.memory_mib = max(self.memory_mib, line.get("memory_mib") or 0)
 
 
 def write_report(out: StrPath) -> None:
@@ -32,21 +77,21 @@ def write_report(out: StrPath) -> None:
         OSError: the file cannot be written.
     """
     out = as_path(out)
-    lines = read_metrics(out)
-    steps = [line for line in lines if line["kind"] == "train"]
-    evaluations = [line for line in lines if line["kind"] == "eval"]
+    steps, evaluations = _Steps(), list[Line]()
+    for line in read_metrics(out):
+        (steps.add if line["kind"] == "train" else evaluations.append)(line)
     recipe, ground = read_json(out / RECIPE), read_json(out / ENVIRONMENT)
     sets = f"{len(recipe['data'])} shard set{'s' * (len(recipe['data']) != 1)}"
     facts = [sets, ground["device"], f"torch {ground['torch']}"]
     if revision := ground["git_revision"]:
         facts.append(f"revision {revision[:10]}")
     page = Page(f"Training: {out.absolute().name}", ", ".join(facts))
-    if steps:
+    if steps.recent:
         _headline(page, recipe, steps, evaluations)
         _robots(page, steps, evaluations)
         _curves(page, out, recipe, steps, evaluations)
     _samples(page, out)
-    if steps:
+    if steps.recent:
         _course(page, steps)
     for title, columns, values in (
         ("Recipe", ["key", "value"], sorted(recipe.items())),
@@ -58,51 +103,46 @@ def write_report(out: StrPath) -> None:
     write_atomic(out / REPORT, page.html())
 
 
-def _headline(page: Page, recipe: dict[str, Any], steps: Lines, evaluations: Lines) -> None:
-    recent, main = steps[-RECENT:], max(recipe["objectives"], key=recipe["objectives"].get)
+def _headline(page: Page, recipe: dict[str, Any], steps: _Steps, evaluations: list[Line]) -> None:
+    recent, main = steps.recent, max(recipe["objectives"], key=recipe["objectives"].get)
     own = [s.get("loss_by_objective", {main: s["loss"]}).get(main) for s in recent]
     losses = [loss for loss in own if loss is not None]
     pace = sum(s["windows"] for s in recent) / max(sum(s["step_seconds"] for s in recent), 1e-9)
     last = evaluations[-1] if evaluations else {}
     tiles = [
-        (f"{steps[-1]['step']:,} of {recipe['steps']:,}", "steps"),
+        (f"{recent[-1]['step']:,} of {recipe['steps']:,}", "steps"),
         (_short(_mean(losses)) if losses else "", f"training loss, {main}, last {len(recent)} steps"),
         (_short(last.get("loss")), "held-out loss"),
         (_short(last.get("baseline")), "held-out loss of the token frequencies"),
         (f"{pace:.1f}", "windows a second"),
-        (human_seconds(sum(line["step_seconds"] for line in steps)), "spent in steps"),
-        (f"{max(s.get('memory_mib') or 0 for s in steps):,.0f} MiB", "of memory at most"),
-        (f"{steps[-1].get('skipped', 0)}", "steps skipped"),
+        (human_seconds(steps.rates.points()["step_seconds"][:, 1].sum()), "spent in steps"),
+        (f"{steps.memory_mib:,.0f} MiB", "of memory at most"),
+        (f"{recent[-1].get('skipped', 0)}", "steps skipped"),
     ]
     page.figures([tile for tile in tiles if tile[0]])
 
 
-def _robots(page: Page, steps: Lines, evaluations: Lines) -> None:
+def _robots(page: Page, steps: _Steps, evaluations: list[Line]) -> None:
     held = evaluations[-1] if evaluations else {}
     rows = []
-    for name in sorted({name for line in steps for name in line["loss_by_embodiment"]}):
-        own = [line["loss_by_embodiment"][name] for line in steps if name in line["loss_by_embodiment"]]
+    for name, losses in sorted(steps.of_robots.items()):
         figures = (held.get(f"{key}_by_embodiment", {}).get(name) for key in ("loss", "baseline", "accuracy"))
-        rows.append([name, _mean(own[-RECENT:]), *figures])
+        rows.append([name, _mean(list(losses)), *figures])
     page.section("Robots", "Losses of the last steps and the last evaluation.")
     page.table(["robot", "training loss", "held-out loss", "token frequencies", "accuracy"], rows)
 
 
-def _curves(page: Page, out: Path, recipe: dict[str, Any], steps: Lines, evaluations: Lines) -> None:
-    curves: list[dict[str, list[tuple[int, float]]]] = []
-    for lines in (steps, evaluations):
-        curves.append({})
-        for line in lines:
-            for name, loss in line["loss_by_embodiment"].items():
-                if loss is not None:
-                    curves[-1].setdefault(name, []).append((line["step"], loss))
+def _curves(page: Page, out: Path, recipe: dict[str, Any], steps: _Steps, evaluations: list[Line]) -> None:
+    held = _Figures()
+    for line in evaluations:
+        held.add(line, line["loss_by_embodiment"])
     video = any(OBJECTIVES[name].predicts_video for name in recipe["objectives"])
     discrete = any("perplexity" in line for line in evaluations)
     label, kept = "loss", training_checkpoints(out)
     if video and discrete:
         label = f"loss, nats a {token_words(Checkpoint.open(kept[-1]).config.merge) if kept else 'token'}"
     page.section("Losses")
-    plot = loss_curves(curves[0], curves[1], label)
+    plot = loss_curves(steps.losses.points(), held.points(), label)
     page.picture(plot, "svg+xml", "Training (lines) and held-out (markers) loss by robot")
 
 
@@ -114,15 +154,11 @@ def _samples(page: Page, out: Path) -> None:
         page.picture(path.read_bytes(), "png", f"{name}, after step {int(path.stem[5:13]):,}")
 
 
-def _course(page: Page, steps: Lines) -> None:
+def _course(page: Page, steps: _Steps) -> None:
     page.section("Course")
-    for key, label, log in (
-        ("lr", "learning rate", False),
-        ("grad_norm", "gradient's norm", True),
-        ("step_seconds", "seconds a step", False),
-    ):
-        points = [(line["step"], line[key]) for line in steps if line.get(key) is not None]
-        page.picture(course(points, label, log), "svg+xml", f"{label} over the run")
+    figures = steps.rates.points()
+    for key, (label, log) in RATES.items():
+        page.picture(course(figures.get(key, ()), label, log), "svg+xml", f"{label} over the run")
 
 
 def _mean(values: list[Any]) -> float:

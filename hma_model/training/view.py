@@ -1,7 +1,7 @@
 """Show a training run in Rerun: its losses and rates, and a held-out window beside its prediction."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ def view_run(out: StrPath, window: int = 0, data: Sequence[StrPath] = ()) -> Vie
     return view
 
 
-def _figures(lines: list[dict[str, Any]]) -> dict[str, list[tuple[int, float]]]:
+def _figures(lines: Iterable[dict[str, Any]]) -> dict[str, list[tuple[int, float]]]:
     """Return the points (step, value) of each figure by its entity."""
     found: dict[str, list[tuple[int, float]]] = defaultdict(list)
     for line in lines:

@@ -7,7 +7,7 @@ import re
 import shutil
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,8 +19,9 @@ from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import PyRecordReader_
 from hma_data.errors import MissingDependencyError, OutputError
 from hma_model.checkpoint.folder import resolve
 from hma_model.evaluation.plots import loss_curves
+from hma_model.training import logging
 from hma_model.training.logging import RunLog, read_metrics
-from hma_model.training.loop import train
+from hma_model.training.loop import _result, train
 from hma_model.training.recipe import make_recipe
 from hma_model.training.report import write_report
 from tests.model.robots import Blocks
@@ -183,19 +184,52 @@ def test_the_report_is_one_file_with_curves_samples_recipe_and_environment(run):
     page = (run / "report.html").read_text()
     assert not re.search(r"(src|href)=.?https?:", page)
     assert page.count("data:image/png") == 2 and page.count("data:image/svg+xml") == 4
-    last = read_metrics(run)[-1]
+    *_, last = read_metrics(run)
     for text in ("arm", "hand", "6 of 6", f"{last['loss']:.3f}", "temperature", "git_revision", "platform"):
         assert text in page, text
 
 
 def test_the_report_of_a_run_without_a_step_or_with_losses_that_are_no_numbers_can_be_made(run):
-    lines = read_metrics(run)
+    lines = list(read_metrics(run))
     lines[2]["loss"] = None
     lines[2]["loss_by_embodiment"] = {"arm": None}
     (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     write_report(run)
     (run / "metrics.jsonl").write_text("")
     write_report(run)
+
+
+class Line(dict):
+    """A line of metrics.jsonl in memory."""
+
+    alive = most = 0
+
+    def __init__(self, text: str) -> None:
+        super().__init__(json.loads(text))
+        Line.alive += 1
+        Line.most = max(Line.most, Line.alive)
+
+    def __del__(self) -> None:
+        Line.alive -= 1
+
+
+@pytest.mark.parametrize("use", ["resume", "result", "report"])
+def test_of_a_long_run_few_lines_are_in_memory_at_a_time(run, monkeypatch, use):
+    steps = [line for line in read_metrics(run) if line["kind"] == "train"]
+    lines = [{**steps[step % 6], "step": step + 1} for step in range(500)]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    monkeypatch.setattr(logging, "json", SimpleNamespace(loads=Line, dumps=json.dumps))
+    monkeypatch.setattr(Line, "most", 0)
+    if use == "resume":
+        RunLog(run, 500, 400, show=False)
+        assert len((run / "metrics.jsonl").read_text().splitlines()) == 400
+    elif use == "result":
+        ended = SimpleNamespace(out=run, step=500, done=1.0, evaluation={}, skipped=0, seconds=1.0)
+        assert _result(ended).losses == [(line["step"], line["loss"]) for line in lines]
+    else:
+        write_report(run)
+        assert "500 of" in (run / "report.html").read_text()
+    assert 1 <= Line.most <= 60
 
 
 @pytest.mark.parametrize(("steps", "width"), [(1, 1), (39, 1), (100, 2), (121, 3), (1000, 25), (999, 24)])

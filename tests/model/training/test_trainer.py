@@ -138,7 +138,7 @@ def test_the_evaluation_is_that_of_the_averaged_weights(recipe, tmp_path):
 
 def test_time_memory_and_waiting_are_in_the_log(recipe, tmp_path):
     train(recipe(steps=2), out=tmp_path / "run", show=False)
-    line = read_metrics(tmp_path / "run")[0]
+    line = next(read_metrics(tmp_path / "run"))
     assert 0 < line["data_seconds"] < line["step_seconds"] and line["memory_mib"] > 50
 
 
