@@ -110,6 +110,7 @@ class _NewSet:
     def run(self, out: StrPath, workers: int, on_progress: OnProgress) -> Manifest:
         """Write the set; keep shards that are already there."""
         plan, out, first = self.plan(), place(out), self.sets[0]
+        whole = replace(self, episodes=self.episodes.combine_chunks())  # else each `take` combines them
         with locked(out):
             done = finished_shards(out, plan, None, False)
             todo = [unit for unit in plan.units if unit.name not in done]
@@ -119,7 +120,7 @@ class _NewSet:
 
             def make(unit: ShardUnit) -> int:
                 refused = self.refused if unit is plan.units[0] else ()
-                _make_shard(self, plan, out, unit, refused)
+                _make_shard(whole, plan, out, unit, refused)
                 return unit.frames
 
             with ThreadPoolExecutor(workers) as pool:

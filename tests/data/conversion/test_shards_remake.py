@@ -11,6 +11,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
+from hma_data.conversion import rewrite
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import merge, split
@@ -132,6 +133,18 @@ def test_merged_statistics_are_those_of_all_train_rows(made: Path, tmp_path: Pat
     np.testing.assert_allclose(manifest.stats["action"]["mean"], values.mean(0), rtol=1e-12)
     np.testing.assert_allclose(manifest.stats["action"]["std"], values.std(0), rtol=1e-12)
     assert manifest.stats["action"]["count"] == len(values)
+
+
+def test_every_shard_takes_its_episodes_from_columns_of_one_chunk(made, tmp_path, monkeypatch) -> None:
+    plain, chunks = rewrite._make_shard, []
+
+    def make_shard(job, *given) -> None:
+        chunks.extend(column.num_chunks for column in job.episodes.columns)
+        plain(job, *given)
+
+    monkeypatch.setattr(rewrite, "_make_shard", make_shard)
+    merge([made, made], tmp_path / "all")
+    assert len(chunks) > 1 and set(chunks) == {1}
 
 
 def test_merge_gives_the_same_bytes_wherever_the_sets_lie(made: Path, tmp_path: Path) -> None:
