@@ -148,7 +148,7 @@ class UNet(nn.Module):
         if not index.shape[1]:
             return torch.zeros_like(x)
         b, t = index.shape[:2]
-        condition = self.condition(of_actions[index].flatten(2).flatten(0, 1))
+        condition = self.condition(self._seen_actions(of_actions, index).flatten(2).flatten(0, 1))
         if torch.is_autocast_enabled(x.device.type):  # else the products alone would be in less precision
             frames = frames.to(torch.get_autocast_dtype(x.device.type))
         unseen = (self.unseen * ~seen.unsqueeze(-1)).expand(b, -1, -1, -1).flatten(0, 1)
@@ -161,6 +161,17 @@ class UNet(nn.Module):
         if not times.wanted:
             return features
         return torch.cat([features.new_zeros(b, times.wanted, *features.shape[2:]), features], dim=1)
+
+    def _seen_actions(self, actions: Tensor, index: Tensor) -> Tensor:
+        """Return the actions (B, T, A, D) that led to the frames numbered `index` (B, T, A), from (N, D).
+
+        What led to the oldest frame is not seen: in training it is the window's first, and nothing leads there.
+        A rollout knows it, and would show the network what it was never trained on.
+        """
+        if self.config.action_alignment != "previous":
+            return actions[index]
+        recent = actions[index[..., :-1]]
+        return torch.cat([recent, self.absent.to(recent.dtype).expand_as(recent[:, :, :1])], dim=2)
 
     def _of_window(self, times: TimePositions, batch: int) -> tuple[Tensor, Tensor]:
         """Return for each frame of a window and age the index (B, T, A) of its frame, and whether it is seen.

@@ -68,7 +68,7 @@ def test_a_rollout_makes_the_frames_of_a_model_that_computes_everything_anew(
     frames, names = stored(model, 2, prompt), ["arm", "hand.v1"]
     actions = torch.randn(2, prompt + 7, 6, generator=torch.Generator().manual_seed(1))
     made, anew = (model.generate(frames, actions, names, 7, cache=cache) for cache in (True, False))
-    torch.testing.assert_close(made, anew, rtol=0, atol=1.0 if model.config.pixels else 1e-4)
+    torch.testing.assert_close(made, anew, rtol=0, atol=2.0 if model.config.pixels else 1e-4)
     assert (made[:, -1] - frames[:, -1]).abs().mean() > 0.05  # it moves
 
 
@@ -101,6 +101,16 @@ def test_a_frame_is_that_of_the_training_pass() -> None:
     expected = model.latent_readout.sample(conditions.flatten(0, 2)) / model.config.latent_scale
     got = model.frame_values(made) / model.config.latent_scale
     torch.testing.assert_close(got.flatten(0, 2), expected, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("changes", [LATENTS, COLORS])
+def test_a_late_frame_of_a_rollout_is_that_of_a_window_as_in_training(changes: dict[str, Any]) -> None:
+    model = unet(**changes)
+    past = model.config.frames - 1
+    frames, actions = stored(model, 2, 9), torch.randn(2, 9, 6, generator=torch.Generator().manual_seed(1))
+    late = model.generate(frames, actions, "arm", 1)
+    window = model.generate(frames[:, -past:], actions[:, -past:], "arm", 1)  # nothing leads to its first
+    torch.testing.assert_close(late.float(), window.float(), rtol=0, atol=1e-4)
 
 
 def test_what_is_not_wanted_is_not_computed_and_changes_nothing() -> None:
