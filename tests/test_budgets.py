@@ -36,7 +36,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/generation": (1_666, 13_447, 10),
     "hma_model/hub": (1_074, 8_300, 6),
     "hma_model/lerobot_env": (639, 4_790, 3),
-    "hma_model/network": (3_482, 30_488, 18),
+    "hma_model/network": (3_493, 30_575, 18),
     "hma_model/play": (1_661, 12_088, 8),
     "hma_model/policies": (2_821, 20_024, 14),
     "hma_model/released": (822, 7_096, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_713, 30_520, 20),
     "hma_model/worlds": (1_533, 11_429, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 66_145, 524_337
-TEST_LINES = 49_722
+PRODUCT_LINES, PRODUCT_NODES = 66_156, 524_424
+TEST_LINES = 49_732
 DOC_WORDS = 41_750
 
 

@@ -165,8 +165,8 @@ class UNet(nn.Module):
     def _seen_actions(self, actions: Tensor, index: Tensor) -> Tensor:
         """Return the actions (B, T, A, D) that led to the frames numbered `index` (B, T, A), from (N, D).
 
-        What led to the oldest frame is not seen: in training it is the window's first, and nothing leads there.
-        A rollout knows it, and would show the network what it was never trained on.
+        What led to the oldest frame is not seen: in training it is the window's first, and nothing leads
+        there. A rollout knows it, and would show the network what it was never trained on.
         """
         if self.config.action_alignment != "previous":
             return actions[index]
