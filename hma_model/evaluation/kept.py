@@ -1,24 +1,24 @@
 """Keep trained readers of images on disk, so that the next command does not train them again.
 
 A kept file has the digest of all that it was made of in its name: the simulator and the training as code, the
-tokenizer's weights, and what the caller names. It begins with the digest of its bytes: a damaged one is made
-again. It lies in `$HMA_CACHE/readers` and may be deleted.
+tokenizer's weights, and what the caller names. A damaged one is made again. It lies in `$HMA_CACHE/readers`
+and may be deleted.
 """
 
 import hashlib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.numpy import load, save
 from torch import nn
 
 from hma_data.errors import HMAError
-from hma_data.storage.files import atomic_path, cache_folder
+from hma_data.storage.files import cache_folder
+from hma_data.storage.kept import keep_arrays, kept_arrays
 from hma_data.tokenizers.base import Tokenizer
 
 Arrays = dict[str, NDArray[Any]]
@@ -48,19 +48,11 @@ def kept(kind: str, tokenizer: Tokenizer, facts: Mapping[str, Any], make: Callab
     told = f"{kind} {sorted(facts.items())} {tokenizer.spec.digest} {_code()} {torch.__version__}"
     digest = hashlib.sha256(f"{told} {weights_sha256(network)}".encode()).hexdigest()
     path = cache_folder() / "readers" / f"{kind}-{digest[:32]}"
-    try:
-        stated, data = path.read_bytes().split(b"\n", 1)
-        if stated == hashlib.sha256(data).hexdigest().encode():
-            return load(data)
-    except (OSError, ValueError):  # none yet, or an empty one
-        pass
+    if (found := kept_arrays(path)) is not None:
+        return found
     made = make()
-    data = save({name: np.ascontiguousarray(value) for name, value in made.items()})
-    try:
-        with atomic_path(path) as part:
-            part.write_bytes(hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
-    except HMAError:
-        pass  # a full disk or a folder that cannot be written costs the time alone
+    with suppress(HMAError):  # a full disk or a folder that cannot be written costs the time alone
+        keep_arrays(path, made)
     return made
 
 
