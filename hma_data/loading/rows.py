@@ -263,6 +263,13 @@ class Batch:
     def __len__(self) -> int:
         return len(self.embodiment)
 
+    @property
+    def stored(self) -> Tensor:
+        """Return the frames as shards store them: the tokens or the latents."""
+        stored = self.latents if self.tokens is None else self.tokens
+        assert stored is not None
+        return stored
+
     def to(self, device: torch.device | str) -> "Batch":
         """Return the same batch on another device."""
         return self._map(lambda value: value.to(device, non_blocking=True))

@@ -150,7 +150,7 @@ def measure_recorded_state(
         return nothing | {"missing": "the states of the training split are unknown in part"}, unknown
     errors: dict[str, list[Floats]] = {}
     for number, batch in enumerate(batches):
-        truth = decode(tokenizer, _stored(batch))
+        truth = decode(tokenizer, batch.stored)
         true = states.of(batch, truth.shape[1])[:, prompt:]
         films = {"copy": truth[:, prompt - 1 : prompt].repeat(true.shape[1], axis=1)}
         films["reconstruction"] = truth[:, prompt:]
@@ -209,7 +209,7 @@ def recorded_reader(
         return None
 
     def make() -> Reader:
-        return learn(decode(tokenizer, _stored(seen))[known, 0], wanted[known], seed, tell=tell)
+        return learn(decode(tokenizer, seen.stored)[known, 0], wanted[known], seed, tell=tell)
 
     told = hashlib.sha256((shards.folder / MANIFEST).read_bytes()).hexdigest()
     return _kept("recorded", tokenizer, {"manifest": told, "cameras": cameras, "seed": seed}, make)
@@ -259,12 +259,6 @@ def _values(shards: ShardSet, reader: Reader, own: Ints, errors: dict[str, Float
 
 def _digits(value: float) -> float | None:
     return float(f"{value:.4g}") if np.isfinite(value) else None
-
-
-def _stored(batch: Batch) -> Tensor:
-    stored = batch.latents if batch.tokens is None else batch.tokens
-    assert stored is not None
-    return stored
 
 
 class _States:

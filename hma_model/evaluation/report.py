@@ -264,8 +264,8 @@ def choose(parts: Sequence[Part]) -> Showcase:
     order = np.argsort(np.nan_to_num(parts[0].by_window["true.psnr_last"], nan=-1.0), kind="stable")[::-1]
     places = {int(order[at]): name for at, name in ((0, "best"), (len(order) // 2, "median"), (-1, "worst"))}
     numbers = list(places)
-    stored = batch.latents if batch.tokens is None else batch.tokens
-    assert stored is not None and batch.episode is not None and batch.frame is not None
+    assert batch.episode is not None and batch.frame is not None
+    stored = batch.stored
     truth = decode(tokenizer, stored[numbers])
     made: dict[tuple[str, str], Images] = {}
     for part in parts:

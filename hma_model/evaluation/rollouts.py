@@ -78,9 +78,7 @@ def rollout(
     count = length - first if frames is None else frames
     if first < 1 or count < 1 or first + count > length:
         raise UsageError("rollout", f"{first} + {count} frames do not fit windows of {length}")
-    stored = batch.tokens if model.config.kind == "discrete" else batch.latents
-    assert stored is not None
-    given, chunks = stored[:, :first].to(model.device), batch.actions
+    given, chunks = batch.stored[:, :first].to(model.device), batch.actions
     chunks = chunks[:, : first + count].to(model.device)
     generator = torch.Generator().manual_seed(seed)
     known = batch.action_mask[:, : first + count].to(model.device) & model.config.sees_actions
@@ -92,7 +90,7 @@ def rollout(
             known=None if passive else known, **sampling,
         ).cpu()  # fmt: skip
     if truth is None:
-        truth = decode(tokenizer, stored[:, : first + count])
+        truth = decode(tokenizer, batch.stored[:, : first + count])
     finite = np.ones(predicted.shape[:2], np.bool_)
     if predicted.is_floating_point():
         finite = predicted.isfinite().flatten(2).all(dim=2).cpu().numpy()

@@ -24,8 +24,7 @@ def cropped(config: HMAConfig, batch: Batch, generator: torch.Generator | None) 
     The square of a window has the same place in all its frames and views. It lies around a place that changes
     in the window, drawn evenly, or in some windows around any place.
     """
-    frames = batch.tokens if batch.tokens is not None else batch.latents
-    assert frames is not None
+    frames = batch.stored
     side, width = config.crop, config.token_grid[1]
     cell = config.merge if config.kind == "discrete" else config.patch
     corners = _corners(config, _moving(frames, cell, config.views).cpu(), generator).to(frames.device)

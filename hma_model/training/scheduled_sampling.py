@@ -39,9 +39,7 @@ def forwarded(
     Returns:
         The batch with `context`; the same batch if no window was drawn.
     """
-    true = batch.tokens if batch.tokens is not None else batch.latents
-    assert true is not None
-    size, frames = true.shape[:2]
+    size, frames = batch.stored.shape[:2]
     where = "cpu" if generator is None else generator.device
     draws = uniform((2, size), generator, where)
     if frames < 3 or not bool((draws[0] < share).any()):
@@ -49,7 +47,7 @@ def forwarded(
     depth = min(depth, frames - 2)
     first = 1 + (draws[1] * (frames - 1 - depth)).long()
     end = torch.full_like(first, frames - 1) if model.config.whole_frames else first + depth
-    context, training = true.clone(), model.training
+    context, training = batch.stored.clone(), model.training
     model.eval()
     for at in range(1, frames - 1):
         rows = ((draws[0] < share) & (first <= at) & (at < end)).nonzero().flatten()

@@ -212,9 +212,7 @@ class RecordedRobot:
 
         windows = self._windows
         batch = windows.batch([number * apart(len(windows)) % len(windows)])
-        stored = batch.latents if batch.tokens is None else batch.tokens
-        assert stored is not None
-        frames = decode(self._tokenizer(), stored)[0]
+        frames = decode(self._tokenizer(), batch.stored)[0]
         chunks = batch.actions[0].numpy().astype(np.float32)
         prompt = Prompt(frames[:PROMPT_FRAMES], chunks[: PROMPT_FRAMES - 1])
         held = prompt.chunks[-1, -len(self.dimensions) :]
