@@ -114,7 +114,7 @@ def policy_eval(
             compile=compile,
             on_progress=update,
         )
-        page = pages.write_report(found, out) if out else None
+        page = report.write_report(found.to_json(), pages.html(found), out) if out else None
     if json:
         print_json(found.to_json())
         return

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from hma_data import __version__
 from hma_data.episodes.images import opencv
+from hma_data.episodes.sheets import png_bytes
 from hma_data.errors import OutputError
 from hma_data.lab.family.bodies import Body
 from hma_data.storage.files import new_folder, read_json, to_json, write_atomic
@@ -190,7 +191,7 @@ def _write_robot(folder: Path, model: "HMA", robot: Drivable, starts: Sequence[S
     pictures = []
     for number, start in enumerate(starts):
         pictures.append(f"robots/{name}/start-{number}.png")
-        write_atomic(folder / pictures[-1], _png(start.image))
+        write_atomic(folder / pictures[-1], png_bytes(start.image))
     return {
         "stem": stem | {"file": f"robots/{name}/stem.onnx"},
         "frames": f"robots/{name}/frames.npy",
@@ -223,7 +224,7 @@ def _write_simulator(home: Path, starts: Sequence[Start]) -> dict[str, Any] | No
     if not tables:
         return None
     body = Body.of(home.name)
-    write_atomic(home / "table.png", _png(body.canvas))
+    write_atomic(home / "table.png", png_bytes(body.canvas))
     return {"body": body_values(body), "canvas": f"robots/{home.name}/table.png", "tables": tables}
 
 
@@ -241,9 +242,3 @@ def _webp(images: NDArray[np.uint8]) -> bytes:
 
 def _save(path: Path, values: NDArray[Any]) -> None:
     np.save(path, np.ascontiguousarray(values), allow_pickle=False)
-
-
-def _png(image: NDArray[np.uint8]) -> bytes:
-    cv2 = opencv()
-    data: bytes = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
-    return data

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,7 @@ from hma_model.policies.arenas import Beginning, ModelArena, Scenes
 from hma_model.policies.base import Judged, Policy, begin, checked
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import policy_facts
-from hma_model.policies.report import rate, write_files
+from hma_model.policies.report import rate
 from hma_model.policies.rewards import RewardJudge, labelled_shards, measured_judge
 from hma_model.policies.scores import (
     EPISODES,
@@ -240,11 +239,6 @@ def show(found: ModelEvaluation) -> None:
     print_table(list(COLUMNS), found.table())
     for sentence in found.sentences():
         print(sentence)
-
-
-def write_report(found: ModelEvaluation, folder: Path) -> Path:
-    """Write results.json and report.html; return the path of the page. Finished policies are then removed."""
-    return write_files(folder, found.to_json(), html(found))
 
 
 def html(found: ModelEvaluation) -> str:

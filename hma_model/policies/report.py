@@ -137,13 +137,8 @@ def show(found: PolicyEvaluation) -> None:
         print(sentence)
 
 
-def write_report(found: PolicyEvaluation, folder: Path) -> Path:
+def write_report(results: dict[str, Any], page: str, folder: Path) -> Path:
     """Write results.json and report.html; return the path of the page. Finished policies are then removed."""
-    return write_files(folder, found.to_json(), html(found))
-
-
-def write_files(folder: Path, results: dict[str, Any], page: str) -> Path:
-    """Write the results and the page of policies, and remove what was kept to continue; return the page."""
     folder.mkdir(parents=True, exist_ok=True)
     write_atomic(folder / "results.json", json.dumps(results, indent=1))
     write_atomic(folder / "report.html", page)

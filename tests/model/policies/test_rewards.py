@@ -24,7 +24,8 @@ from hma_model.checkpoint.folder import Checkpoint
 from hma_model.cli import app
 from hma_model.evaluation.agreement import accuracy
 from hma_model.lerobot_env.vector import LeRobotVectorEnv
-from hma_model.policies.recorded import UNKNOWN, evaluate_recorded, write_report
+from hma_model.policies.recorded import UNKNOWN, evaluate_recorded, html
+from hma_model.policies.report import write_report
 from hma_model.policies.rewards import NEEDED, RewardModel, measured_judge
 from hma_model.simulate import World, load_world
 from hma_model.synthetic.augment import Augmentation, augment
@@ -126,7 +127,7 @@ def test_policies_are_scored_in_the_model_alone_and_a_stop_continues(
         patch.setattr("hma_model.policies.recorded.run", None)
         again = evaluate_recorded(ROBOT, ["random", "still"], world=world, out=tmp_path / "out", **given)
     assert json.dumps(again.to_json()) == json.dumps(found.to_json())
-    page = write_report(found, tmp_path / "out").read_text()
+    page = write_report(found.to_json(), html(found), tmp_path / "out").read_text()
     assert page.count("<img") >= 2 and "true positives 7 of 8" in page
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["report.html", "results.json"]
 

@@ -143,8 +143,8 @@ def test_a_model_is_scored_and_the_report_written(world: World, judge: StateJudg
     )
     assert json.dumps(found.to_json()) == json.dumps(again.to_json())
     assert len(found.to_json()["outcomes"]["random"]["model"]["scores"]) == 4
-    page = write_report(found, tmp_path / "out").read_text()
-    assert page == html(found) and page.count("<img") >= 2
+    page = write_report(found.to_json(), html(found), tmp_path / "out").read_text()
+    assert page.count("<img") >= 2
     assert json.loads((tmp_path / "out" / "results.json").read_text())["policies"][0]["policy"] == "random"
 
 
