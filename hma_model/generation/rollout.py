@@ -360,29 +360,3 @@ class Rollout:
         latents = unpatchify(values.unsqueeze(1), config.patch, config.token_grid)
         shown = latents.squeeze(1) / config.latent_scale
         return shown.round() if config.pixels else shown  # the scale is not exact in float32
-
-
-def generate(
-    model: Network,
-    prompt: Tensor,
-    actions: Tensor | None,
-    embodiment: str | Sequence[str],
-    frames: int,
-    mask: Tensor | None = None,
-    **options: Any,
-) -> Tensor:
-    """Continue a prompt by `frames` frames; `HMA.generate` explains the arguments."""
-    known = prompt.shape[1]
-    rollout = Rollout(model, embodiment, prompt.shape[0], **options)
-    chunks: Sequence[Tensor | None] = [None] * (known + frames)
-    if actions is not None:
-        if actions.shape[1] < known + frames - 1:
-            fault = f"there are {actions.shape[1]} chunks for {known} + {frames} frames"
-            raise HMAError("actions", fault, f"give {known + frames}")
-        chunks = [*actions.unbind(1), None]
-    rollout.prompt(prompt, actions, mask)
-    made = [
-        rollout.step(chunks[i], chunks[i + 1], known=None if mask is None else mask[:, i : i + 2])
-        for i in range(known - 1, known - 1 + frames)
-    ]
-    return torch.stack(made, dim=1)

@@ -224,17 +224,29 @@ class HMA(Network):
             (B, frames, h, w) int64 tokens, or (B, frames, c, H, W) float32 latents as stored.
         """
         from hma_model.generation.commands import warn_outside
-        from hma_model.generation.rollout import generate
+        from hma_model.generation.rollout import Rollout
 
-        made = generate(
-            self, prompt, actions, embodiment, frames, mask=known, unmask_steps=unmask_steps,
-            temperature=temperature, generator=generator, order=order, cache=cache, sample_steps=sample_steps,
-            precision=precision, compile=compile,
+        first = prompt.shape[1]
+        used = first + frames - 1
+        rollout = Rollout(
+            self, embodiment, len(prompt), generator=generator, cache=cache, compile=compile,
+            precision=precision, unmask_steps=unmask_steps, temperature=temperature, order=order,
+            sample_steps=sample_steps,
         )  # fmt: skip
+        chunks: Sequence[Tensor | None] = [None] * (used + 1)
         if actions is not None:
-            used = prompt.shape[1] + frames - 1
+            if actions.shape[1] < used:
+                fault = f"there are {actions.shape[1]} chunks for {first} + {frames} frames"
+                raise HMAError("actions", fault, f"give {first + frames}")
+            chunks = [*actions.unbind(1), None]
+        rollout.prompt(prompt, actions, known)
+        made = [
+            rollout.step(chunks[i], chunks[i + 1], known=None if known is None else known[:, i : i + 2])
+            for i in range(first - 1, used)
+        ]
+        if actions is not None:
             warn_outside(self, actions[:, :used], embodiment, None if known is None else known[:, :used])
-        return made
+        return torch.stack(made, dim=1)
 
     def _condition_window(
         self, actions: Tensor | None, known: Tensor | None, groups: Groups, times: TimePositions
