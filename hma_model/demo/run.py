@@ -32,11 +32,16 @@ from hma_data.shards.verify import verify
 from hma_data.shards.windows import WindowIndex
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
+from hma_data.tokenizers.network import single_threads
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.demo.report import write_report
 from hma_model.demo.results import HELD, TIMINGS, DemoRun
-from hma_model.evaluation.rollout_video import RolloutVideo
-from hma_model.evaluation.wholeness import Left
+from hma_model.evaluation.evaluate import EvaluationSettings, measure
+from hma_model.evaluation.rollout_video import RolloutVideo, lively_windows, rollout_video
+from hma_model.evaluation.verdict import verdict
+from hma_model.evaluation.wholeness import Left, continued, left_at, left_words
+from hma_model.generation.decode import default_prompt
+from hma_model.network.model import HMA
 
 START, ROBOTS = "embedded-lab", HELD_OUT  # the trunk, and robots that it has not seen
 RECIPE = "demo"
@@ -201,13 +206,6 @@ def roll_out(made: DemoRun) -> None:
 
     The robots run in parallel, each in one thread, because a second thread speeds up small products little.
     """
-    from hma_data.tokenizers.network import single_threads
-    from hma_model.evaluation.evaluate import EvaluationSettings, measure
-    from hma_model.evaluation.rollout_video import lively_windows, rollout_video
-    from hma_model.evaluation.verdict import verdict
-    from hma_model.evaluation.wholeness import continued, left_at, left_words
-    from hma_model.generation.decode import default_prompt
-    from hma_model.network.model import HMA
 
     def roll(robot: str) -> tuple[dict[str, Any], RolloutVideo, dict[str, Left]]:
         shards = made.sets[robot]

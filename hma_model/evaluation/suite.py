@@ -102,8 +102,6 @@ def evaluate_all(
     _once([as_text(item) for item in checkpoints], "checkpoint")
     _once([shards.embodiment.id for shards in sets], "embodiment")
     names = [shards.embodiment.id for shards in sets]
-    from hma_model.network.model import HMA
-
     work: list[_Work] = []
     for checkpoint in checkpoints:  # all are checked before the first is measured
         model = HMA.from_pretrained(checkpoint, embodiments=names, device=device).eval()

@@ -26,7 +26,7 @@ from hma_data.tokenizers.base import Tokenizer, reopened
 from hma_model.arrays import Float32s, Images
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.calibration import Meter, meter_of
-from hma_model.generation.commands import Commands, described
+from hma_model.generation.commands import Commands, card, described
 from hma_model.generation.decode import decode
 from hma_model.generation.engine import products_in
 from hma_model.generation.rollout import Rollout
@@ -98,10 +98,9 @@ class World:
             embodiment: an id.
             changes: fields in which the drawing of the frames differs from `decoding`.
         """
-        source = self.model.source
-        card = source.card(embodiment) if source and embodiment in source.embodiments else {}
         way = replace(self.decoding, **changes)
-        return meter_of(self.model.config, card, way.unmask_steps, way.temperature, way.order)
+        facts = card(self.model, embodiment)
+        return meter_of(self.model.config, facts, way.unmask_steps, way.temperature, way.order)
 
     @property
     def one_pass(self) -> bool:
@@ -346,7 +345,5 @@ def load_world(
         device: of the network and of the tokenizer.
         settings: of `World`.
     """
-    from hma_model.network.model import HMA
-
     model = HMA.from_pretrained(checkpoint, embodiments, device=device)
     return World(model, reopened(model.config.tokenizer, device), **settings)
