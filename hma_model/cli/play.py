@@ -18,7 +18,6 @@ from hma_model.cli.options import Compile, Device, Precision, device_name, embed
 
 if TYPE_CHECKING:
     from hma_data.shards.reader import ShardSet
-    from hma_data.tokenizers.base import Tokenizer
     from hma_model.checkpoint.folder import Checkpoint
 
 
@@ -59,6 +58,7 @@ def play(
     import asyncio
 
     from hma_data.shards.reader import ShardSet
+    from hma_data.tokenizers.base import reopened
     from hma_model.checkpoint.folder import BUNDLED, EMBEDDED, Checkpoint
     from hma_model.hub.publish import located
     from hma_model.worlds.images import read_image
@@ -70,7 +70,7 @@ def play(
     opened, device = located(checkpoint)[0], device_name(device)
     sets = sets or trained_on(opened)
     every = [Checkpoint.open(part) for part in BUNDLED.values()] if opened.folder == EMBEDDED else [opened]
-    tokenizers = [cache(partial(_tokenizer, part, device)) for part in every]
+    tokenizers = [cache(partial(reopened, part.config.tokenizer, device)) for part in every]
     parted = _by_checkpoint(sets, every)
     driven = [drivable(*part, images) for part in zip(every, parted, tokenizers, strict=True)]
     robots = {key: robot for part in driven for key, robot in part.items()}
@@ -100,12 +100,6 @@ def play(
         asyncio.run(serve(parts, name, listener, host, token, ready, **settings))
     except KeyboardInterrupt:
         print("stopped; unsaved sessions are lost")
-
-
-def _tokenizer(checkpoint: "Checkpoint", device: str) -> "Tokenizer":
-    from hma_data.tokenizers.base import reopened
-
-    return reopened(checkpoint.config.tokenizer, device)
 
 
 def _by_checkpoint(sets: "list[ShardSet]", every: "list[Checkpoint]") -> "list[list[ShardSet]]":

@@ -41,11 +41,6 @@ class DemoRun:
     sizes: dict[str, int] = field(default_factory=dict)  # name of a file or folder -> bytes
 
     @property
-    def tokenizer(self) -> str:
-        """Return the name of the trunk's tokenizer."""
-        return str(self.start.config.tokenizer["name"])
-
-    @property
     def run(self) -> "TrainResult":
         """Return the result of the finetuning, which later stages need."""
         assert self.result is not None

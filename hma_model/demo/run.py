@@ -148,7 +148,8 @@ def record_and_convert(made: DemoRun, episodes: int, seed: int) -> None:
                 counts[number, event[0]] = event[1]
                 update(sum(counts.values()))
 
-        work = partial(_worker, made.out, made.tokenizer, episodes, seed)
+        tokenizer = str(made.start.config.tokenizer["name"])
+        work = partial(_worker, made.out, tokenizer, episodes, seed)
         results = list(run_local(ROBOTS, work, workers, show))
     for robot, recording, refused in sorted(results):
         folder = made.out / "shards" / robot

@@ -111,8 +111,7 @@ def correlations(one: Floats, other: Floats, seed: int = 0) -> dict[str, Estimat
     Returns:
         "pearson" and "spearman".
     """
-    reason = _too_little(one, other)
-    if reason:
+    if reason := _too_little(one, other):
         return dict.fromkeys(("pearson", "spearman"), Estimate(None, reason=reason))
     measures = {"pearson": pearson, "spearman": spearman}
     means = one.mean(axis=1), other.mean(axis=1)
@@ -155,10 +154,7 @@ def mmrv(true: Floats, made: Floats, seed: int = 0) -> Estimate:
     A resample draws episodes, jointly for all policies and both judgements; the policies stay. Noise can only
     add violations, so the interval is widened to hold the value.
     """
-    reason = _too_few(true.shape)
-    if not reason and np.ptp(true.mean(axis=1)) < 1e-12:
-        reason = "all policies are equal in the simulator"
-    if reason:
+    if reason := _too_little(true):
         return Estimate(None, reason=reason)
     value = float(rank_violation(true.mean(axis=1), made.mean(axis=1)))
     drawn = _drawn_episodes(true.shape[1], seed)  # sums of outcomes are exact, so equal policies stay equal
@@ -173,19 +169,14 @@ def _drawn_episodes(count: int, seed: int) -> Floats:
     return drawn.astype(float)
 
 
-def _too_few(shape: tuple[int, ...]) -> str:
-    policies, episodes = shape
+def _too_little(*judged: Floats) -> str:
+    """Say why judgements (M, N), of the simulator and perhaps of the model, tell nothing; "" if they do."""
+    policies, episodes = judged[0].shape
     if policies < MIN_POLICIES:
         return f"{policies} of at least {MIN_POLICIES} policies"
     if episodes < MIN_EPISODES:
         return f"{episodes} of at least {MIN_EPISODES} episodes"
-    return ""
-
-
-def _too_little(one: Floats, other: Floats) -> str:
-    if reason := _too_few(one.shape):
-        return reason
-    for values, where in ((one, "the simulator"), (other, "the model")):
+    for values, where in zip(judged, ("the simulator", "the model")):
         if np.ptp(values.mean(axis=1)) < 1e-12:
             return f"all policies are equal in {where}"
     return ""

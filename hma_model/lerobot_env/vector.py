@@ -6,7 +6,7 @@ N environments, S pixels a side, S' values of a state, A action dims.
 import logging
 import time
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from hma_data.errors import UsageError
 from hma_data.lab.simulator import simulated
-from hma_data.shards.reader import ShardSet
 from hma_data.sources.lerobot.writer import SYNTHETIC
 from hma_model.arrays import Float32s, Ints
 from hma_model.checkpoint.folder import Checkpoint
@@ -55,12 +54,9 @@ def state_source(checkpoint: Checkpoint, embodiment: str) -> Callable[[World, Te
     for shards in checkpoint.shards():
         known = shards.embodiment.id == embodiment and shards.embodiment.state is not None
         if known and shards.manifest.splits["train"]["episodes"] >= EPISODES_NEEDED:
-            return partial(_recorded, shards, tuple(camera_names(checkpoint, embodiment)))
+            cameras = tuple(camera_names(checkpoint, embodiment))
+            return lambda world, tell: recorded_reader(world.tokenizer, shards, cameras, 0, tell)
     return None
-
-
-def _recorded(shards: ShardSet, cameras: tuple[str, ...], world: World, tell: Tell) -> Reader | None:
-    return recorded_reader(world.tokenizer, shards, cameras, 0, tell)
 
 
 def progress_log(embodiment: str) -> Tell:

@@ -11,7 +11,6 @@ B batch, k places, S places of a frame, F digits of a place, V values of one, C 
 
 from collections.abc import Callable
 from itertools import accumulate
-from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -98,11 +97,6 @@ class Copying:
         self.token_digits = gain.token_digits
         self.gains, self.before = gain.gains(features, before), before
         self.in_square = self.in_token = torch.zeros_like(before[..., 0])
-
-    @classmethod
-    def of(cls, gain: CopyGain | None, features: Tensor, before: Tensor | None) -> Self | None:
-        """Return the copying of a frame; None without the module, or without a frame before."""
-        return None if gain is None or before is None else cls(gain, features, before)
 
     def chosen(self, choose: Callable[[Tensor, int], Tensor], scores: Tensor, first: int) -> Tensor:
         """Choose digits (B, f, k) from the scores (B, f, k, V) of the digits from `first` on, and gains."""

@@ -173,8 +173,8 @@ class TokenReadout(nn.Module):
 
         `before` (B, k, F) are those of the frame before, or -1; by default no frame is before.
         """
-        if copying := Copying.of(self.copy, features, before):
-            choose = partial(copying.chosen, choose)
+        if self.copy is not None and before is not None:
+            choose = partial(Copying(self.copy, features, before).chosen, choose)
         alone = self._alone(features)
         if self.chain is None:
             return choose(self.split(alone).transpose(1, 2), 0)

@@ -16,7 +16,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.resources import files
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 from urllib.parse import parse_qs, quote, urlsplit
 
 import anyio
@@ -40,7 +40,6 @@ from hma_model.play.session import Frame, Session
 from hma_model.play.stepper import Stepper
 from hma_model.worlds.scenes import Drivable
 
-T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 FIRST_ROBOT = "pusht_fast"  # the robot that a page opens with: its T stays whole, and it is easy to drive
 PARTS = {"page.css": "text/css", "controls.js": "text/javascript"}  # that the page shares with exported pages
@@ -162,7 +161,7 @@ class Server:
         session = self.stepper.sessions.get(name)
         if session is None or kind not in FILE_KINDS:
             return PlainTextResponse("there is no such session, or no such kind of file\n", 404)
-        frames = await self._in_stepper(session.film)
+        frames = await asyncio.wrap_future(self.stepper.call(session.film))
         if len(frames) < 2:
             return PlainTextResponse("nothing was driven yet\n", 409)
         tell = told_by(session, kind)
@@ -202,9 +201,6 @@ class Server:
         if reason := connection.fault.encode()[:120].decode(errors="ignore"):
             with contextlib.suppress(*_GONE), anyio.fail_after(SEND_S):
                 await websocket.close(1008, reason)
-
-    async def _in_stepper(self, function: Callable[[], T]) -> T:
-        return await asyncio.wrap_future(self.stepper.call(function))
 
 
 class Connection:
@@ -356,7 +352,7 @@ class Connection:
 
     def _show_all(self, session: Session) -> None:
         self.tell(session.opened())
-        self.show(session.last(), {})
+        self.show(session.last, {})
 
     def _change(self, session: Session, message: messages.Message) -> None:
         """Do what a message says, in the stepper's thread."""
@@ -378,7 +374,7 @@ class Connection:
                     session.due = session.touched
                 case messages.StepMessage(do="sync"):
                     session.sync()
-                    self.show(session.last(), {})  # in the place of an older one that still waits
+                    self.show(session.last, {})  # in the place of an older one that still waits
                 case messages.SwitchMessage(do="run"):
                     session.paused = not message.on
                     session.due = session.touched

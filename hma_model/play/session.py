@@ -75,6 +75,7 @@ class Session:
         viewer: who watches; without one the session stands still.
         due: the time of the next step.
         touched: when a person did something last.
+        last: the frame to be seen now: the newest one, or that from which the model was restarted.
     """
 
     def __init__(
@@ -131,7 +132,7 @@ class Session:
 
     def _set_start(self) -> None:
         """Take the prompt's last frame as the tokenizer shows it, which the model cannot surpass."""
-        self.start = self._last = self._restarted(
+        self.start = self.last = self._restarted(
             Frame(0, b"", None, np.zeros((0, 0), np.float32), self._state, None)
         )
 
@@ -160,7 +161,7 @@ class Session:
             raise UsageError("sync", "the true frames are unknown here", "reset first, or drive a simulator")
         self.steps = 0  # a step asked for before is not one from the true frames
         self.world.reset(self.row, *self._history())
-        self._last = self._restarted(self._last)
+        self.last = self._restarted(self.last)
 
     def _history(self) -> tuple[Images, Float32s]:
         """Return the true last frames, and the chunks between them."""
@@ -187,10 +188,6 @@ class Session:
         self._chunks.append(chunk)
         return chunk
 
-    def end(self) -> None:
-        """Give the place in the world back."""
-        self.world.close(self.row)
-
     def take(self, image: Images, now: float, took: float) -> None:
         """Take the model's image (H, W, 3) of the step, which took so many seconds, and show it."""
         self.steps = max(0, self.steps - 1)
@@ -214,7 +211,7 @@ class Session:
         true = None if self._truth is None else jpeg(self._truth)
         frame = Frame(self.count, jpeg(image), true, actions, self._state, score, still)
         self.frames.append(frame)
-        self._last = frame
+        self.last = frame
         if self.replays:
             self.touched = now
             self.held = actions[-1].copy()
@@ -265,10 +262,6 @@ class Session:
         about = {"session": self.name, "robot": describe(self.robot), "held": self.held.tolist()}
         about |= {"input": self.input}
         return self.status() | about | {"kind": "opened", "scores": scores}
-
-    def last(self) -> Frame:
-        """Return what is to be seen now: the newest frame, or that from which the model was restarted."""
-        return self._last
 
     def film(self) -> list[Frame]:
         """Return the frames that are kept, after the prompt's last one if they begin there."""

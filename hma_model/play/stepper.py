@@ -149,7 +149,7 @@ class Stepper:
     def close(self, name: str, reason: str = "") -> None:
         """Close a session, and tell its viewer why."""
         session = self.sessions.pop(name)
-        session.end()
+        session.world.close(session.row)
         if session.viewer and reason:
             session.viewer.tell({"kind": "closed", "text": reason})
 
