@@ -5,7 +5,6 @@ so the same command continues.
 """
 
 import json
-import os
 import re
 import shlex
 import subprocess
@@ -158,16 +157,18 @@ def _write_page(folder: Path, shards: Path, film: Path, done: list[list[str]]) -
     from hma_data.episodes.sheets import webp_bytes
     from hma_data.inspection.shard_findings import kept_findings
     from hma_data.shards.reader import ShardSet
+    from hma_data.sources.common.video_file import VideoFile
     from hma_data.storage.files import write_atomic
     from hma_model.evaluation.pages import Page
     from hma_model.evaluation.verdict import verdict
 
     [found] = json.loads((folder / "evaluation" / "results.json").read_bytes())["results"]
     page = Page("Your robot in the model", f"The model {verdict(found)}.")
-    frames, fps = _frames(film)
+    video, recorded = VideoFile(film), ShardSet(shards)
+    frames = video.frames(range(len(video)))
     caption = "Recorded frames, decoded from tokens; predicted from the recorded actions; from other actions."
-    page.picture(webp_bytes(frames, fps), "webp", caption)
-    for found in kept_findings(ShardSet(shards)):
+    page.picture(webp_bytes(frames, recorded.embodiment.effective_hz), "webp", caption)
+    for found in kept_findings(recorded):
         page.text(f"Tokens of {found}.")
     page.section("Files", f"{film.name} is this video. evaluation/report.html has all figures and charts.")
     page.section("Commands")
@@ -175,13 +176,3 @@ def _write_page(folder: Path, shards: Path, film: Path, done: list[list[str]]) -
     path = folder / "index.html"
     write_atomic(path, page.html())
     return path
-
-
-def _frames(film: Path) -> tuple[Any, float]:
-    import av
-    import numpy as np
-
-    with av.open(os.fspath(film)) as file:
-        stream = file.streams.video[0]
-        frames = np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(stream)])
-        return frames, float(stream.average_rate or 1)
