@@ -25,7 +25,6 @@ from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.config import POLICY
-from hma_model.generation.chunks import prompt_chunks, step_chunk
 from hma_model.generation.engine import Engine
 from hma_model.generation.passes import Passes
 from hma_model.generation.state import RowState, Snapshot
@@ -35,7 +34,7 @@ from hma_model.generation.unmask import (
     TokenFrame,
     masked_after,
 )
-from hma_model.network.conditioning import Groups
+from hma_model.network.conditioning import ActionConditioning, Groups
 from hma_model.network.copying import known_digits
 from hma_model.network.network import Network
 from hma_model.network.stem import split_tokens, unpatchify
@@ -137,7 +136,7 @@ class Rollout:
         if len(values) != len(chosen):
             raise HMAError("prompt", f"has {len(values)} samples", f"give {len(chosen)}, one for each row")
         names = list(embodiments or [self.state.embodiments[row] for row in chosen])
-        given = prompt_chunks(self.model, names, actions, known, values.shape[1])
+        given = _prompt_chunks(self.model, names, actions, known, values.shape[1])
         last = slice(max(values.shape[1] - self.config.frames, 0), None)
         self.state.begin(chosen, names, values[:, last], given.frames(last), seeds)
         self.told = self.told or actions is not None
@@ -336,10 +335,10 @@ class Rollout:
             known = known.to(self.model.device, torch.bool).view(len(rows), -1)
         now, then = (None, None) if known is None else (known[:, 0], known[:, -1])
         names = [self.state.embodiments[row] for row in rows]
-        values = step_chunk(self.model, names, chunk)
+        values = _step_chunk(self.model, names, chunk)
         if self.config.action_alignment == "current":
             self.state.put_chunk(rows, 1, values, now)
-            now, values = then, values if following is None else step_chunk(self.model, names, following)
+            now, values = then, values if following is None else _step_chunk(self.model, names, following)
         self.state.put_chunk(rows, 0, values, now)
 
     # -- in and out ---------------------------------------------------------------------------------------
@@ -360,3 +359,48 @@ class Rollout:
         latents = unpatchify(values.unsqueeze(1), config.patch, config.token_grid)
         shown = latents.squeeze(1) / config.latent_scale
         return shown.round() if config.pixels else shown  # the scale is not exact in float32
+
+
+# -- the actions that callers give
+
+
+def _prompt_chunks(
+    model: Network, names: Sequence[str], actions: Tensor | None, known: Tensor | None, frames: int
+) -> ActionConditioning:
+    """Return the chunk at each of P known frames.
+
+    Where actions align with the current frame, the last frame has none yet: a step gives it.
+
+    Args:
+        names: n embodiments.
+        actions: (n, P - 1 or more, K) raw; None for no actions.
+        known: (n, P - 1 or more) bool; None if all are.
+        frames: P.
+
+    Raises:
+        HMAError: the shapes are others.
+    """
+    batch, width, device = len(names), model.widest_chunk(names), model.device
+    chunks = torch.zeros(batch, frames, width, device=device)
+    given = ActionConditioning(chunks, torch.zeros(batch, frames, dtype=torch.bool, device=device))
+    if actions is None or frames == 1:
+        return given
+    if actions.shape[0] != batch or actions.shape[1] < frames - 1 or actions.shape[2] < width:
+        fault = f"actions have the shape {tuple(actions.shape)} for a prompt of {frames} frames"
+        raise HMAError("prompt", fault, f"give ({batch}, {frames - 1} or more, {width})")
+    if known is not None and (known.shape[0] != batch or known.shape[1] < frames - 1):
+        fault = f"known has the shape {tuple(known.shape)} for a prompt of {frames} frames"
+        raise HMAError("prompt", fault, f"give ({batch}, {frames - 1} or more)")
+    late = int(model.config.action_alignment == "previous")
+    conditioned = given.frames(slice(late, frames - 1 + late))  # a view
+    conditioned.chunks[:] = actions[:, : frames - 1, :width].to(device).float()
+    conditioned.known[:] = True if known is None else known[:, : frames - 1].to(device)
+    return given
+
+
+def _step_chunk(model: Network, names: Sequence[str], chunk: Tensor) -> Tensor:
+    """Return the chunk (n, K) of a step on the model's device; raise HMAError if its shape is another."""
+    width = model.widest_chunk(names)
+    if chunk.dim() != 2 or chunk.shape[0] != len(names) or chunk.shape[1] < width:
+        raise HMAError("step", f"a chunk has the shape {tuple(chunk.shape)}", f"give ({len(names)}, {width})")
+    return chunk[:, :width].to(model.device).float()
