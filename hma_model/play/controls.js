@@ -11,6 +11,8 @@
 //   takeOver()                       a person begins to drive
 //   drive(action, number)            the action from now on
 //   buttons                          key -> id of the button that it presses
+//
+// Both pages have the elements note, meter, help, about, close and left, which are served here too.
 
 const CARD = `
   <header><h2>Drive</h2><span class="hint" id="rate"></span></header>
@@ -31,6 +33,21 @@ export function fill(slider, origin) {  // colours a slider from the origin to i
   const share = (value) => 100 * (value - slider.min) / (slider.max - slider.min);
   const ends = [share(origin), share(slider.value)].sort((a, b) => a - b);
   slider.style.setProperty("--from", ends[0] + "%"); slider.style.setProperty("--to", ends[1] + "%");
+}
+
+let noteTimer = 0;
+export function note(text, stay = 4500) {  // says something for a while; with 0 it stays
+  const place = document.getElementById("note");
+  clearTimeout(noteTimer);
+  place.textContent = text; place.hidden = !text;
+  if (text && stay) noteTimer = setTimeout(() => note(""), stay);
+}
+
+export function showMeter(found, title, absent) {  // the error that the model expects of itself
+  const warns = Boolean(found && found.warns), meter = document.getElementById("meter");
+  for (const place of [meter, document.getElementById("stage")]) place.classList.toggle("warns", warns);
+  meter.textContent = found ? (warns ? "unsure: " : "") + "error ≈ " + found.px.toFixed(1) + " px" : absent;
+  meter.title = title;
 }
 
 function shape(name, values) {
@@ -281,6 +298,11 @@ export class Controls {
     addEventListener("pointerdown", () => { clicked = true; }, true);
     addEventListener("keydown", () => { clicked = false; }, true);
     addEventListener("change", () => { if (clicked) stage.focus({ preventScroll: true, focusVisible: false }); });
+    const [help, close, about, left] = ["help", "close", "about", "left"].map((id) => document.getElementById(id));
+    help.onclick = () => { this.release(); about.showModal(); about.scrollTop = 0; };
+    close.onclick = () => { about.close(); stage.focus({ preventScroll: true, focusVisible: false }); };
+    about.onclick = (event) => { if (event.target === about) about.close(); };  // beside it
+    for (const radio of document.querySelectorAll("input[name=pixels]")) radio.onchange = () => left.classList.toggle("crisp", radio.value === "crisp");
   }
 
   keyDown(event) {

@@ -1,6 +1,6 @@
 // The page of an exported model: choose a robot and a start, and drive.
 
-import { Controls, cap, fill } from "./controls.js";
+import { Controls, cap, fill, note, showMeter } from "./controls.js";
 import { Table, paint } from "./family.js";
 import { Loader, Session, World, fetchRuntime, openReplays, readManifest, startRuntime } from "./world.js";
 
@@ -141,8 +141,8 @@ async function openRobot() {
   replays = null;
   canvas = background;
   $("scene").hidden = robot.pictures.length < 2;
-  if (robot.simulator && !canvas) note(robot.simulator.canvas + " cannot be loaded, so the true simulator is not shown: copy the exported folder again");
-  else if (!robot.follows) note(robot.id + " does not follow its actions in this model: drive another robot to see it answer.");
+  if (robot.simulator && !canvas) note(robot.simulator.canvas + " cannot be loaded, so the true simulator is not shown: copy the exported folder again", 9000);
+  else if (!robot.follows) note(robot.id + " does not follow its actions in this model: drive another robot to see it answer.", 9000);
   await begin(0);
   const found = await openReplays(robot, loader).catch(() => null);  // the page drives without them too
   if (turn !== opening) return;
@@ -232,12 +232,8 @@ async function show(current, made, { number, chunk, followed, shapes, error, beg
   document.dispatchEvent(new CustomEvent("frame", { detail: { number: frame, chunk, image, ms: now - begunAt } }));
 }
 
-function metered(found = world.metered(robot.meter)) {  // the error that the model expects of itself
-  const warns = Boolean(found && found.warns);
-  $("stage").classList.toggle("warns", warns);
-  $("meter").classList.toggle("warns", warns);
-  $("meter").textContent = found ? (warns ? "unsure: " : "") + "error ≈ " + found.px.toFixed(1) + " px" : "no error meter";
-  $("meter").title = robot.meter ? robot.meter.verdict : robot.unmetered;
+function metered(found = world.metered(robot.meter)) {
+  showMeter(found, robot.meter ? robot.meter.verdict : robot.unmetered, "no error meter");
 }
 
 function size(width, height) { const view = $("view"); if (view.width !== width || view.height !== height) { view.width = width; view.height = height; } }
@@ -318,14 +314,6 @@ function fail(fault) {
   veil(fault.message || String(fault), true);
 }
 
-let noteTimer = 0;
-function note(text) {
-  clearTimeout(noteTimer);
-  $("note").textContent = text;
-  $("note").hidden = !text;
-  if (text) noteTimer = setTimeout(() => note(""), 9000);
-}
-
 // -- buttons
 
 $("robot").onchange = () => { robot = manifest.robots.find((one) => one.id === $("robot").value); openRobot().catch(fail); };
@@ -340,9 +328,5 @@ $("temperature").oninput = () => {
   fill($("temperature"), 0);
   if (world) world.temperature = Number($("temperature").value);
 };
-for (const radio of document.querySelectorAll("input[name=pixels]")) radio.onchange = () => $("left").classList.toggle("crisp", radio.value === "crisp");
-$("help").onclick = () => { controls.release(); $("about").showModal(); };
-$("close").onclick = () => { $("about").close(); $("stage").focus({ preventScroll: true, focusVisible: false }); };
-$("about").onclick = (event) => { if (event.target === $("about")) $("about").close(); };  // beside it
 fill($("temperature"), 0);
 main().catch(fail);
