@@ -172,7 +172,11 @@ class WorldModelEnv(gymnasium.Env[Images, Float32s]):
 
     def step(self, action: Float32s) -> tuple[Images, float, bool, bool, dict[str, Any]]:
         """Send an action, or a chunk; between chunks the last image is shown."""
-        return self.finish(self.world.step(self.queue(self.checked(action))))
+        return self.finish(self.world.step(self.take(action)))
+
+    def take(self, action: Any) -> dict[int, Float32s]:
+        """Take an action; return the session's chunk for the world once it is whole."""
+        return self.queue(self.checked(action))
 
     def queue(self, actions: Float32s) -> dict[int, Float32s]:
         """Take actions as `checked` returns them; return the session's chunk once it is whole."""
