@@ -1,8 +1,7 @@
 """Save what was driven: as a film, or as a LeRobotDataset of one episode that converts like any recording."""
 
-import io
+import shutil
 import time
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -67,7 +66,7 @@ def film(
             home, embodiment, [episode], lambda done, words: on_progress(words, done, total), made_by
         )
         on_progress("packing the files", total, total)
-        return _zipped(home)
+        return Path(shutil.make_archive(str(home), "zip", home.parent, home.name)).read_bytes()
 
 
 def told_by(session: Session, kind: str) -> Told:
@@ -202,12 +201,3 @@ def embodiment_of(
     if with_state:
         own["state"] = {"components": packed_components(values["state"], "observation.state")}
     return Embodiment.from_values(own, f"embodiment {robot.id}")
-
-
-def _zipped(folder: Path) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in sorted(folder.rglob("*")):
-            if path.is_file():
-                archive.write(path, path.relative_to(folder.parent))
-    return buffer.getvalue()

@@ -1,6 +1,6 @@
 """Make policies from the words of a command: scripted, random, still, a function, one of lerobot, a model."""
 
-import importlib
+import pkgutil
 import re
 import sys
 from pathlib import Path
@@ -63,12 +63,10 @@ def read_policy(words: str, scenes: Scenes, world: World | None = None) -> Polic
 
 def _named(words: str) -> Any:
     """Return the object that MODULE:NAME names; modules of the working folder are found."""
-    module, _, name = words.partition(":")
+    module = words.partition(":")[0]
     sys.path.insert(0, str(Path.cwd()))
     try:
-        found: Any = importlib.import_module(module)
-        for part in name.split("."):
-            found = getattr(found, part)
+        return pkgutil.resolve_name(words)
     except Exception as fault:
         remedy = POLICY_FORMS
         if isinstance(fault, ModuleNotFoundError) and fault.name == module.partition(".")[0]:
@@ -78,4 +76,3 @@ def _named(words: str) -> Any:
         ) from fault
     finally:
         sys.path.pop(0)
-    return found

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.console import human_seconds
+from hma_data.console import human_count, human_seconds
 from hma_data.storage.files import read_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import Checkpoint, training_checkpoints
@@ -81,7 +81,7 @@ def write_report(out: StrPath) -> None:
     for line in read_metrics(out):
         (steps.add if line["kind"] == "train" else evaluations.append)(line)
     recipe, ground = read_json(out / RECIPE), read_json(out / ENVIRONMENT)
-    sets = f"{len(recipe['data'])} shard set{'s' * (len(recipe['data']) != 1)}"
+    sets = human_count(len(recipe["data"]), "shard set")
     facts = [sets, ground["device"], f"torch {ground['torch']}"]
     if revision := ground["git_revision"]:
         facts.append(f"revision {revision[:10]}")
