@@ -270,7 +270,7 @@ class Colours:
 def judge(*given: Any, **named: Any) -> StateJudge:
     """Stand for the training of a judge."""
     probe: Any = Colours()
-    return StateJudge(ROBOT, task_of(ROBOT, "moved=2"), probe, 2.0, Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24))
+    return StateJudge(task_of(ROBOT, "moved=2"), probe, 2.0, Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24))
 
 
 def small_batches(patch: pytest.MonkeyPatch) -> None:

@@ -173,8 +173,7 @@ def unconditional_baseline(
     }
     means = Means()
     for batch in batches:
-        assert batch.tokens is not None
-        for name, tokens in zip(batch.embodiment, batch.tokens[:, 1:].numpy()):
+        for name, tokens in zip(batch.embodiment, batch.stored[:, 1:].numpy()):
             nats, rest = np.zeros(tokens.shape), tokens.copy()
             for digit in scores[name]:
                 nats -= digit[rest % len(digit)]

@@ -153,16 +153,14 @@ def teacher_forced(model: HMA, batch: Batch) -> tuple[Tensor, Tensor]:
     Returns:
         nats (B, T-1) float32 a token, averaged over the frame, and accuracy (B, T-1) of whole tokens.
     """
-    assert batch.tokens is not None
     config, held = model.config, model.config.frames
     first = _part(batch, slice(held))
     parts = [_scored(model, first, _at_once(model, first))]
-    for t in range(held, batch.tokens.shape[1]):  # the past of such a frame begins after the first frame
+    for t in range(held, batch.stored.shape[1]):  # the past of such a frame begins after the first frame
         own = _part(batch, slice(t + 1 - held, t + 1))
-        assert own.tokens is not None
-        seen = own.tokens.clone()
+        seen = own.stored.clone()
         seen[:, -1] = config.vocab_size  # the mask's id
-        logits = model.video_logits(seen, own.actions, own.embodiment, own.action_mask, own.tokens)
+        logits = model.video_logits(seen, own.actions, own.embodiment, own.action_mask, own.stored)
         parts.append(_scored(model, own, logits[:, -1:]))
     nats, hits = (torch.cat(part, dim=1) for part in zip(*parts, strict=True))
     return nats, hits
@@ -184,9 +182,8 @@ def masked_scores(
         a window without a masked token.
     """
     batch, config = _part(batch, slice(model.config.frames)), model.config
-    assert batch.tokens is not None
     output = model(batch, "forward", generator)
-    true = model.frame_values(batch.tokens).unflatten(2, config.token_grid)
+    true = model.frame_values(batch.stored).unflatten(2, config.token_grid)
     masked = output.masked.flatten(1)
     counts = masked.sum(dim=1)
     scores = (rule(output.video_logits, true, config.digits) for rule in (token_nats, token_hits))
@@ -196,8 +193,7 @@ def masked_scores(
 
 def _at_once(model: HMA, batch: Batch) -> Tensor:
     """Return scores (B, T-1, h, w, F, V) of the masked frames, computed in one pass."""
-    assert batch.tokens is not None
-    config, frames = model.config, model.frame_values(batch.tokens)
+    config, frames = model.config, model.frame_values(batch.stored)
     count, groups = frames.shape[1], Groups.of(batch.embodiment, len(frames))
     layout = Layout.pairs(model, count, past=count)
     given = align(config, batch.actions, batch.action_mask, count).frames(layout.frames)
@@ -211,15 +207,13 @@ def _at_once(model: HMA, batch: Batch) -> Tensor:
 
 
 def _part(batch: Batch, frames: slice) -> Batch:
-    assert batch.tokens is not None
     known = batch.action_mask[:, frames]
-    return replace(batch, tokens=batch.tokens[:, frames], actions=batch.actions[:, frames], action_mask=known)
+    return replace(batch, tokens=batch.stored[:, frames], actions=batch.actions[:, frames], action_mask=known)
 
 
 def _scored(model: HMA, batch: Batch, logits: Tensor) -> tuple[Tensor, Tensor]:
     """Score the last frames of a batch, as many as `logits` has."""
-    assert batch.tokens is not None
-    config, last = model.config, batch.tokens[:, -logits.shape[1] :]
+    config, last = model.config, batch.stored[:, -logits.shape[1] :]
     true = model.frame_values(last).unflatten(2, config.token_grid)
     nats = token_nats(logits, true, config.digits).mean(dim=(2, 3))
     return nats, token_hits(logits, true, config.digits).float().mean(dim=(2, 3))

@@ -126,7 +126,6 @@ class StateJudge:
         held_out: its accuracy on true episodes that neither the probe nor the limit has seen.
     """
 
-    robot: str
     task: Task
     probe: Probe
     limit: float
@@ -203,7 +202,7 @@ def train_judge(
     looked = (
         set(range(frames)) if task.name == "reached" else {0, *range(max(frames - END_FRAMES, 1), frames)}
     )
-    judge = StateJudge(robot, task, probe, task.limit, accuracy(np.ones(1, bool), np.ones(1, bool)))
+    judge = StateJudge(task, probe, task.limit, accuracy(np.ones(1, bool), np.ones(1, bool)))
 
     def make() -> Arrays:
         scores = np.empty((2, examples))

@@ -57,7 +57,7 @@ def probe() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as monkeypatch:
         known: Any = KnownPlaces(monkeypatch)
         sure = Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24)
-        judge = StateJudge(ROBOT, task_of(ROBOT, "reached"), known, -12.0, sure)
+        judge = StateJudge(task_of(ROBOT, "reached"), known, -12.0, sure)
         monkeypatch.setattr(planning, "ROUNDS", 1)
         monkeypatch.setattr(planning, "CANDIDATES", 5)
         monkeypatch.setattr(running, "train_probe", lambda *given: known)

@@ -128,7 +128,7 @@ def test_a_judge_tells_its_accuracy_on_episodes_that_it_was_not_fitted_to(episod
 
 def test_a_judge_reads_each_image_of_an_episode_once() -> None:
     sure = Accuracy(1.0, 1.0, 1.0, 1.0, 20, 10)
-    made = StateJudge("rails_03", task_of("rails_03"), WrittenPlaces(), 5.0, sure)  # type: ignore[arg-type]
+    made = StateJudge(task_of("rails_03"), WrittenPlaces(), 5.0, sure)  # type: ignore[arg-type]
     parts = np.cumsum(np.random.default_rng(0).uniform(0, 3, (12, 3, 2)), axis=0) + 20
     images = written(parts)
     in_turn, other = made.begun(), made.begun()

@@ -77,7 +77,7 @@ class KnownPlaces:
 
 def made_judge(patch: pytest.MonkeyPatch) -> StateJudge:
     known: Any = KnownPlaces(patch)
-    return StateJudge(ROBOT, task_of(ROBOT, "moved=2"), known, 2.0, Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24))
+    return StateJudge(task_of(ROBOT, "moved=2"), known, 2.0, Accuracy(1.0, 1.0, 1.0, 1.0, 48, 24))
 
 
 @pytest.fixture
