@@ -120,7 +120,6 @@ def ends_of(ends: Floats, digits: int = 4) -> list[float] | None:
 
 def over_datasets(
     sets: Sequence[NDArray[Any]],
-    seed: int = 0,
     episodes: Sequence[Episodes] | None = None,
     within: tuple[float, float] = ANY,
 ) -> tuple[float, list[float] | None]:
@@ -134,7 +133,7 @@ def over_datasets(
         None if one is None else np.asarray(one)[k] for one, k in zip(episodes or [None] * len(sets), kept)
     ]
     sets = [values[k] for values, k in zip(sets, kept)]
-    means = [resampled_means(v, seed + n, e) for n, (v, e) in enumerate(zip(sets, own))]
+    means = [resampled_means(v, n, e) for n, (v, e) in enumerate(zip(sets, own))]
     low, high = np.percentile(np.mean(means, axis=0), LEVELS).clip(*within)
     ends = [float(low), float(high)] if np.isfinite(low) else None
     return float(np.mean([values.mean() for values in sets])), ends
