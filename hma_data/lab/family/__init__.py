@@ -10,7 +10,7 @@ or more from its first place. T frames, A actions, Q axes, B blocks.
 """
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.lab.family.bodies import Body
-from hma_data.lab.family.driver import Driver, Reacher
+from hma_data.lab.family.driver import CHANCES, Driver, Reacher
 from hma_data.lab.family.look import SIZE
 from hma_data.lab.family.mechanisms import MAKERS, Axis
 from hma_data.lab.family.table import BlockTable, start
@@ -144,11 +144,20 @@ def write_file(part: Path, body: Body, demos: Iterable[Demo]) -> None:
 
 
 def episode(
-    body: Body, seed: int, number: int, reach: Reacher | None = None, seconds: float = SECONDS
+    body: Body,
+    seed: int,
+    number: int,
+    reach: Reacher | None = None,
+    seconds: float = SECONDS,
+    chances: Sequence[float] = CHANCES,
 ) -> Demo:
-    """Simulate an episode, with random manoeuvres or a reach; the same arguments give the same bytes."""
+    """Simulate an episode; the same arguments give the same bytes.
+
+    Args:
+        reach: the commander; by default one of random manoeuvres, drawn by `chances` (see `MANOEUVRES`).
+    """
     world, rng = start(body, seed, number)
-    drive = driver(world, rng, reach)
+    drive = driver(world, rng, reach or Driver(body, world.pose, rng, chances))
     return block_demo(world, drive, round(seconds * body.hz), MOVED, seed)
 
 
@@ -159,8 +168,8 @@ def begin(robot: str, seed: int, number: int) -> tuple[BlockTable, Callable[[], 
 
 
 def driver(
-    world: BlockTable, rng: np.random.Generator, reach: Reacher | None = None
+    world: BlockTable, rng: np.random.Generator, drive: Driver | Reacher | None = None
 ) -> Callable[[], NDArray[np.float32]]:
     """Return the recorder's driver, which returns the next action (A,)."""
-    drive = reach or Driver(world.body, world.pose, rng)
+    drive = drive or Driver(world.body, world.pose, rng)
     return lambda: drive(world.pose, world.blocks, world.held >= 0).astype(np.float32)

@@ -5,7 +5,7 @@ velocity turn back at their limits. A gripper closes round a block in its reach,
 `Reacher` has one aim, the block that lies nearest, and looks at each step: a task that can be learned.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from hma_data.lab.family.mechanisms import wrapped
 
 MANOEUVRES = ("block", "anywhere", "hold", "weave", "rest")
 CHANCES = (0.27, 0.26, 0.22, 0.15, 0.1)
+PUSHING = (0.55, 0.17, 0.14, 0.09, 0.05)  # recordings in which blocks move half as often again, or twice
 Manoeuvre = Callable[[Floats], Floats]  # pose (Q,) -> velocities (A,)
 GAIN, NUDGE, DAMPING = 2.0, 1e-4, 1.0  # of a reach: 1/s; of a pose, in widths of its limits; px²
 
@@ -22,8 +23,10 @@ GAIN, NUDGE, DAMPING = 2.0, 1e-4, 1.0  # of a reach: 1/s; of a pose, in widths o
 class Driver:
     """The commander of a body in one episode."""
 
-    def __init__(self, body: Body, pose: Floats, rng: np.random.Generator) -> None:
-        self._body, self._rng = body, rng
+    def __init__(
+        self, body: Body, pose: Floats, rng: np.random.Generator, chances: Sequence[float] = CHANCES
+    ) -> None:
+        self._body, self._rng, self._chances = body, rng, chances
         self._tops = np.array([axis.speed for axis in body.commands])
         self._follows = np.array([axis.target for axis in body.commands])
         self._turns = np.array([axis.turns for axis in body.axes])
@@ -38,9 +41,8 @@ class Driver:
         """Return the next action (A,) at a pose (Q,) among blocks (B, 2)."""
         lost = self._goal is None and not self._visible(pose)
         if self._left == 0 or lost:
-            self._begin(
-                pose, blocks, holding, "anywhere" if lost else str(self._rng.choice(MANOEUVRES, p=CHANCES))
-            )
+            kind = "anywhere" if lost else str(self._rng.choice(MANOEUVRES, p=self._chances))
+            self._begin(pose, blocks, holding, kind)
         self._left -= 1
         velocity = np.clip(self._manoeuvre(pose) * self._sign, -self._tops, self._tops)
         if not self._body.car:

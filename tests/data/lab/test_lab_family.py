@@ -16,6 +16,7 @@ from hma_data.errors import UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.family import HELD_OUT, TRUNK, embodiment, episode
 from hma_data.lab.family.bodies import Body
+from hma_data.lab.family.driver import CHANCES, PUSHING
 from hma_data.lab.family.look import SIZE
 from hma_data.lab.family.mechanisms import MAKERS
 from hma_data.lab.family.table import BlockTable, start
@@ -140,6 +141,15 @@ def test_most_robots_push_a_block_in_some_of_their_episodes() -> None:
     assert sum(pushed) >= 20
 
 
+def test_pushing_moves_blocks_further() -> None:
+    body = Body.of("mover_10")
+    moved = [
+        sum(episode(body, SEED, number, chances=chances).rewards.sum() for number in range(8))
+        for chances in (CHANCES, PUSHING)
+    ]
+    assert moved[1] > 1.3 * moved[0]
+
+
 @pytest.mark.parametrize(("robot", "hold", "release"), [("arm2_07", 0.0, 1.0), ("crane_01", 1.0, 0.0)])
 def test_what_is_held_moves_with_the_tip_until_it_is_released(robot, hold, release) -> None:
     world, _ = start(Body.of(robot), SEED, 1)
@@ -191,12 +201,16 @@ def test_name_that_is_no_kind_is_refused(tmp_path: Path) -> None:
         record("arm5_01", tmp_path, 1)
 
 
-def test_recipe_leaves_shards_and_no_recording(tmp_path: Path, block_tokenizer: BlockTokenizer) -> None:
+@pytest.mark.parametrize("pushing", [False, True])
+def test_recipe_leaves_shards_and_no_recording(
+    tmp_path: Path, block_tokenizer: BlockTokenizer, pushing: bool
+) -> None:
     spec = spec_from_file_location("record_world", shipped("recipes") / "world" / "record.py")
     assert spec and spec.loader
     recipe = module_from_spec(spec)
     spec.loader.exec_module(recipe)
-    work = recipe.make_work(tmp_path, 2, SEED, block_tokenizer, Settings(frames="strided"), "cpu", 1)
+    settings = Settings(frames="strided")
+    work = recipe.make_work(tmp_path, 2, SEED, block_tokenizer, settings, "cpu", pushing, 1)
     line = work("arm1_02", lambda event: None, FIRST_ATTEMPT)
     assert "80 frames" in line and not list((tmp_path / "recordings").iterdir())
     assert (tmp_path / "shards" / "arm1_02" / MANIFEST).is_file()
