@@ -19,7 +19,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/episodes": (1_671, 14_652, 9),
     "hma_data/hub": (524, 3_912, 3),
     "hma_data/inspection": (2_151, 20_090, 8),
-    "hma_data/lab": (3_327, 30_594, 16),
+    "hma_data/lab": (3_338, 30_657, 16),
     "hma_data/loading": (1_281, 10_980, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_559, 19_567, 11),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_710, 30_468, 20),
     "hma_model/worlds": (1_528, 11_384, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 66_023, 523_550
-TEST_LINES = 49_733
+PRODUCT_LINES, PRODUCT_NODES = 66_034, 523_613
+TEST_LINES = 49_747
 DOC_WORDS = 41_750
 
 
