@@ -226,8 +226,8 @@ class _Draft:
         self.states = chosen_states(numbers, () if rh20t else self.action.keys)
         if not self.action.keys:
             raise _lacks(found, "has nothing that could be an action", self.seen.keys)
-        self.clock = infer_topics.clock_of([*self.seen.keys, *self.action.keys, *self.states])
-        if self.clock.reason:  # what is proposed is measured by the clock that is proposed
+        self.by_receipt = infer_topics.why_by_receipt([*self.seen.keys, *self.action.keys, *self.states])
+        if self.by_receipt:  # what is proposed is measured by the clock that is proposed
             self.seen = replace(self.seen, keys=_all_by_receipt(self.seen.keys))
             self.action = replace(self.action, keys=_all_by_receipt(self.action.keys))
             self.states = _all_by_receipt(self.states)
@@ -338,11 +338,8 @@ class _Draft:
         tolerance = infer_topics.tolerance_ms(self.offsets.values())
         skew = infer_topics.max_skew_ms(self.seen.keys[1:], self.action.keys, self.states)
         sync |= {"tolerance_ms": tolerance} if tolerance else {}
-        return (
-            sync
-            | ({"max_skew_ms": skew} if skew else {})
-            | ({"stamp": "receive"} if self.clock.reason else {})
-        )
+        sync |= {"max_skew_ms": skew} if skew else {}
+        return sync | ({"stamp": "receive"} if self.by_receipt else {})
 
     def _instruction(self) -> str | None:
         facts = self.found.facts
@@ -387,10 +384,8 @@ class _Draft:
             if gaps:
                 factor = f"{infer_topics.MARGIN:g} times the longest interval held"
                 said["max_skew_ms"] = f"{factor}; intervals, measured: {gaps}"
-            if self.clock.asks:
-                said["stamp"] = f"{TODO}: {self.clock.reason}; may streams be aligned by receive times?"
-            elif self.clock.reason:
-                said["stamp"] = self.clock.reason
+            if self.by_receipt:
+                said["stamp"] = f"{TODO}: {self.by_receipt}; may streams be aligned by receive times?"
             if pause := self._pause():
                 said["segments"] = str(pause)
         return said

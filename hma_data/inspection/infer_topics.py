@@ -3,7 +3,7 @@
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from hma_data.episodes.offset import Offset
 from hma_data.inspection.infer_choices import (
@@ -168,32 +168,22 @@ def about(keys: Iterable[KeyInfo]) -> list[TopicInfo]:
     return list(dict.fromkeys(key.topic for key in keys if key.topic))
 
 
-@dataclass(frozen=True)
-class ClockChoice:
-    """Whether the topics of an embodiment are timed by receipt, and why.
+def why_by_receipt(keys: Sequence[KeyInfo]) -> str:
+    """Return why receipt may time all these topics, for the user to confirm; empty where header stamps do.
 
-    Attributes:
-        reason: empty where header stamps are the clock.
-        asks: whether the reason is no proof, so that the user must choose.
+    The first key is the primary camera's.
     """
-
-    reason: str = ""
-    asks: bool = False
-
-
-def clock_of(keys: Sequence[KeyInfo]) -> ClockChoice:
-    """Return the clock that times all these topics; the first key is the primary camera's."""
     used = about(keys)
     if not used or any(topic.receipt_goes_back for topic in used):
-        return ClockChoice()  # receipt cannot replace the header stamps
+        return ""  # receipt cannot replace the header stamps
     if back := [topic.name for topic in used if topic.goes_back]:
         # Receipt joins the runs before and after; `segments` would keep them apart.
-        return ClockChoice(f"header stamps of {shown(back)} go back in time", asks=True)
+        return f"header stamps of {shown(back)} go back in time"
     period_s = 1 / keys[0].hz if keys[0].hz else 0.0
     for topic in used[1:]:
         if reason := apart(_clock(used[0]), _clock(topic), period_s):
-            return ClockChoice(reason, asks=True)
-    return ClockChoice()
+            return reason
+    return ""
 
 
 def _clock(topic: TopicInfo) -> Clock:
