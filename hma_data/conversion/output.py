@@ -112,12 +112,24 @@ class ShardHolder:
         self._embodiment, self._spec, self._uri = embodiment, spec, uri
 
     def clear(self) -> None:
-        """Delete the shard set."""
-        clear(self.folder)
+        """Delete the shard set; keep what lies beside it.
+
+        The next `hma hub push-data` writes README.md anew, but it may also be the user's own.
+        """
+        out = self.folder
+        _refuse_foreign(out)
+        if isinstance(out, RemotePath):
+            for name in out.listing().keys() - FILES_BESIDE:
+                (out / name).unlink(missing_ok=True)
+            return
+        for item in out.iterdir():
+            if item.name not in FILES_BESIDE and not item.name.startswith(LOCK):
+                shutil.rmtree(item) if item.is_dir() else item.unlink()
 
     def base(self) -> Manifest | None:
         """Return the set's manifest."""
-        return base_manifest(self.folder)
+        _refuse_foreign(self.folder)
+        return Manifest.load(self.folder) if (self.folder / MANIFEST).is_file() else None
 
     def finished(self, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
         """Return the names of the shards that are there."""
@@ -180,21 +192,6 @@ def yaml_change(before: Embodiment, now: Embodiment) -> str:
 # -- what is there
 
 
-def clear(out: Path) -> None:
-    """Delete the shard set of a folder; keep what lies beside it.
-
-    The next `hma hub push-data` writes README.md anew, but it may also be the user's own.
-    """
-    _refuse_foreign(out)
-    if isinstance(out, RemotePath):
-        for name in out.listing().keys() - FILES_BESIDE:
-            (out / name).unlink(missing_ok=True)
-        return
-    for item in out.iterdir():
-        if item.name not in FILES_BESIDE and not item.name.startswith(LOCK):
-            shutil.rmtree(item) if item.is_dir() else item.unlink()
-
-
 def _refuse_foreign(out: Path) -> None:
     names = {item.name for item in out.iterdir()} - OURS - FILES_BESIDE
     foreign = sorted(name for name in names if not (name.endswith(PART) or name.startswith(WORKING)))
@@ -205,12 +202,6 @@ def _refuse_foreign(out: Path) -> None:
     if foreign:
         fault = f"is not a shard set: it holds {', '.join(foreign[:3])}"
         raise OutputError(out, fault, "choose an empty or new --out")
-
-
-def base_manifest(out: Path) -> Manifest | None:
-    """Return the manifest of the set in a folder; None where there is none."""
-    _refuse_foreign(out)
-    return Manifest.load(out) if (out / MANIFEST).is_file() else None
 
 
 def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:

@@ -162,15 +162,15 @@ def _read(folder: Path, settings: dict[str, Any]) -> None:
 
 def _resume(folder: Path, settings: dict[str, Any]) -> None:
     """Plan each recording again, look which shards are there and whole, and check the derived files."""
-    from hma_data.conversion.output import base_manifest, finished_shards
-    from hma_data.shards.manifest import damaged_files
+    from hma_data.conversion.output import finished_shards
+    from hma_data.shards.manifest import Manifest, damaged_files
 
     for robot, _, plan in _planned(settings):
         out = folder / robot.id
         if out.is_dir():
-            manifest = base_manifest(out)
+            manifest = Manifest.load(out)
             done = finished_shards(out, plan, None, False)
-            if manifest is None or len(done) < len(plan.units) or damaged_files(out, manifest):
+            if len(done) < len(plan.units) or damaged_files(out, manifest):
                 raise RuntimeError(f"{out} is not whole")
 
 
