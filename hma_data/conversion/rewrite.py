@@ -170,7 +170,8 @@ def _rows_of(index: int, views: Mapping[str, dict[str, NDArray[Any]]], layout: R
     """Return the rows of an episode from its columns by camera."""
     tokens = token_column(layout.tokenizer)[0]
     first, *further = layout.token_columns.items()
-    own = {key: value for key, value in views[first[0]].items() if layout.stateful or "state" not in key}
+    stateless = layout.embodiment.state is None
+    own = {key: value for key, value in views[first[0]].items() if not (stateless and "state" in key)}
     return EpisodeRows(
         episode_index=index,
         timestamps=own["timestamp"],

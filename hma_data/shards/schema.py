@@ -300,20 +300,10 @@ class RowLayout:
         return {name: f"{first}_{name}" if i else first for i, name in enumerate(self.cameras)}
 
     @property
-    def strided(self) -> bool:
-        """Check whether rows leave out recorded steps, and an action value holds several recorded actions."""
-        return self.frame_stride > 1
-
-    @property
     def widths(self) -> dict[str, int]:
         """Return "action" and, if there is one, "state" -> values of one recorded step."""
         state = self.embodiment.state
         return {"action": self.embodiment.action_dim} | ({"state": state.dims} if state else {})
-
-    @property
-    def stateful(self) -> bool:
-        """Check whether rows hold the robot's state."""
-        return "state" in self.widths
 
     @property
     def schema(self) -> pa.Schema:

@@ -241,7 +241,7 @@ def _stats_problems(columns: dict[str, NDArray[Any]], footer: Footer, manifest: 
         said = footer.stats.get(name)
         if said is None or len(said.mean) != len(own.mean):
             found.append(f"its footer has no statistics of {name}")
-        elif manifest.layout.strided:
+        elif manifest.layout.frame_stride > 1:
             masked = int((~columns[MASK_COLUMNS[name]]).sum()) if MASK_COLUMNS[name] in columns else 0
             if not own.count <= said.count <= stride * (own.count + len(footer.episodes) + masked):
                 counted = f"count {said.count} steps, its rows {own.count}"
