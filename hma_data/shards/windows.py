@@ -40,7 +40,6 @@ class WindowIndex:
         count: number of windows.
         short_episodes: number of episodes left out because they, or all their pieces, are too short.
         padded_episodes: number of short pieces that are padded and give one window.
-        divided_episodes: number of episodes that a pause divides.
         edges: (G+1,) first row of each row group.
         groups: (G, 2) shard index and row group in it.
     """
@@ -51,7 +50,6 @@ class WindowIndex:
     count: int
     short_episodes: int
     padded_episodes: int
-    divided_episodes: int
     edges: Ints
     groups: Ints
     _starts: Ints  # (N,) first row of each piece that has windows
@@ -95,7 +93,6 @@ class WindowIndex:
             count=int(before[-1]),
             short_episodes=int((~used).sum()),
             padded_episodes=int(padded.sum()),
-            divided_episodes=len(np.unique(owner[1:][np.diff(owner) == 0])),
             edges=edges,
             groups=groups,
             _starts=starts[keep],

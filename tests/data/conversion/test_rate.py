@@ -93,7 +93,7 @@ def test_no_window_crosses_a_pause(frames, tmp_path: Path) -> None:
     span = 5 * 2 // step
     first = windows.index.first_rows(np.arange(len(windows)))
     wanted = [*range(cut - span + 1), *range(cut, rows - span + 1)]
-    assert first.tolist() == wanted and windows.index.divided_episodes == 1
+    assert first.tolist() == wanted
     assert windows.batch(range(len(windows))).frame.tolist() == wanted
     export(out, tmp_path / "flat", split="train")
     ids = np.fromfile(tmp_path / "flat/segment_ids.bin", "<i4")
