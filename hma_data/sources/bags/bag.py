@@ -13,6 +13,8 @@ from operator import itemgetter
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
+import zstandard
+
 from hma_data.errors import EpisodeError, OutputError
 from hma_data.sources.bags.container import (
     ALL,
@@ -189,15 +191,10 @@ class Bag:
 
 
 def _unpack_file(packed: BinaryIO, plain: BinaryIO, limit: int) -> None:
-    import zstandard
-
-    try:
-        for piece in zstandard.ZstdDecompressor().read_to_iter(packed):
-            plain.write(piece)
-            if plain.tell() > limit:
-                raise ValueError(f"it unpacks to more than {MAX_EXPANSION} times its size")
-    except zstandard.ZstdError as fault:
-        raise ValueError(str(fault)) from fault
+    for piece in zstandard.ZstdDecompressor().read_to_iter(packed):
+        plain.write(piece)
+        if plain.tell() > limit:
+            raise ValueError(f"it unpacks to more than {MAX_EXPANSION} times its size")
 
 
 def _require_space(path: Path, folder: Path) -> None:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+import zstandard
 from mcap.exceptions import McapError
 
 from hma_data.errors import EpisodeError
@@ -33,7 +34,7 @@ FOREVER = 2**64
 KEPT_FROM = 2048  # bytes of a message of a remote file that is kept in memory for `payloads`
 FAULTS = (
     struct.error, ValueError, LookupError, OverflowError, RecursionError, EOFError, OSError, RuntimeError,
-    MemoryError, sqlite3.Error, McapError,
+    MemoryError, sqlite3.Error, McapError, zstandard.ZstdError,
 )  # fmt: skip
 
 log = logging.getLogger(__name__)
@@ -362,17 +363,12 @@ def unzstd(data: Data, limit: int) -> bytes:
     """Unpack zstd data; return at most `limit` + 1 bytes.
 
     Raises:
-        ValueError: the data is not zstd.
+        zstandard.ZstdError: the data is not zstd.
     """
-    import zstandard
-
-    try:
-        if zstandard.get_frame_parameters(data).content_size == limit:
-            return zstandard.ZstdDecompressor().decompress(data, max_output_size=limit)
-        with zstandard.ZstdDecompressor().stream_reader(bytes(data)) as stream:
-            unpacked: bytes = stream.read(limit + 1)
-    except zstandard.ZstdError as fault:
-        raise ValueError(str(fault)) from fault
+    if zstandard.get_frame_parameters(data).content_size == limit:
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=limit)
+    with zstandard.ZstdDecompressor().stream_reader(bytes(data)) as stream:
+        unpacked: bytes = stream.read(limit + 1)
     return unpacked
 
 
