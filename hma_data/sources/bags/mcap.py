@@ -92,11 +92,8 @@ class McapFile(IndexedFile):
     # -- the index
 
     def _data_end(self, file: BinaryIO) -> int:
-        """Return the offset of the footer, after checking both ends of the file."""
+        """Return the offset of the footer, after checking that the file ends with the magic bytes."""
         size = file.seek(0, 2)
-        file.seek(0)
-        if file.read(len(MAGIC)) != MAGIC:
-            raise damaged(self.path, "does not begin with MCAP's magic bytes" if size else "is empty")
         end = size - len(MAGIC) - FOOTER_SIZE
         file.seek(size - len(MAGIC))
         if end < len(MAGIC) or file.read(len(MAGIC)) != MAGIC:
