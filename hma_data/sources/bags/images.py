@@ -74,11 +74,9 @@ def content_kind(message: Any, kind: str | None) -> str | None:
 
 
 def codec(message: Any, kind: str) -> str:
-    """Return how the image is stored: jpeg, png, raw, h264 …"""
+    """Return how the image, which is no video, is stored: jpeg, png, raw …"""
     if kind == RAW:
         return "raw"
-    if kind == VIDEO:
-        return video_codec(message)
     stated = str(child(message, "format")).lower() if "format" in field_names(message) else ""
     for name in ("jpeg", "png", "webp", "avif"):
         if name in stated.replace("jpg", "jpeg"):
