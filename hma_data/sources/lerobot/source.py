@@ -148,14 +148,9 @@ class LeRobotSource:
 open = LeRobotSource
 
 
-def _pairs_by_index(embodiment: Embodiment) -> bool:
-    """Check whether the embodiment says that row i has frame i."""
-    return (embodiment.source.layout or {}).get("pairing") == "index"
-
-
 def _check_rate(meta: Metadata, embodiment: Embodiment) -> None:
-    if _pairs_by_index(embodiment):
-        return  # then fps is the film's rate, and the rows have another
+    if (embodiment.source.layout or {}).get("pairing") == "index":
+        return  # row i has frame i: fps is the film's rate, and the rows have another
     stated = embodiment.frequency_hz
     if isinstance(stated, float) and abs(stated - meta.fps) > RATE_TOLERANCE * meta.fps:
         raise SourceError(
