@@ -175,12 +175,6 @@ def file_system(uri: str) -> tuple[Any, str]:
     return files, path
 
 
-def protocol(files: Any) -> str:
-    """Return the first name of a file system: file, memory, s3, gs, https."""
-    name: str = files.protocol if isinstance(files.protocol, str) else files.protocol[0]
-    return name
-
-
 def is_local(files: Any) -> bool:
     """Check whether a file system's paths are on this machine."""
     return "file" in files.protocol
@@ -188,7 +182,7 @@ def is_local(files: Any) -> bool:
 
 def is_listless(files: Any) -> bool:
     """Check whether a file system's folders cannot be listed."""
-    return protocol(files) in NO_LISTING
+    return "http" in files.protocol
 
 
 # -- reading
