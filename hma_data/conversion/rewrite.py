@@ -7,7 +7,7 @@ T frames of an episode, A values of an action.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -231,8 +231,8 @@ def _joined(
     tables: Sequence[pa.Table], refused: Sequence[Sequence[Refused]]
 ) -> tuple[pa.Table, list[Refused]]:
     """Return the episodes and the refused of several sets, with ids that are unique; see `merge`."""
-    several = chain((_texts(item.id for item in some) for some in refused), *(t["id"].chunks for t in tables))
-    counts = pa.chunked_array(several, pa.string()).value_counts()
+    lost = (pa.array([item.id for item in some], pa.string()) for some in refused)
+    counts = pa.chunked_array(chain(lost, *(t["id"].chunks for t in tables)), pa.string()).value_counts()
     again = counts.field("values").filter(pc.greater(counts.field("counts"), pa.scalar(1, pa.int64())))
     found = []
     for number, table in enumerate(tables):
@@ -251,10 +251,6 @@ def _joined(
         for item in some
     ]
     return pa.concat_tables(found), listed
-
-
-def _texts(values: Iterable[str]) -> pa.Array:
-    return pa.array(list(values), pa.string())
 
 
 def split(
