@@ -14,10 +14,11 @@ from functools import cache, reduce
 from pathlib import Path
 from typing import Any, Protocol
 
-import google_crc32c
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+
+from hma_data.sources.rlds.records import masked_crc
 
 DISTRO = "jazzy"  # of ROS
 EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps
@@ -249,13 +250,8 @@ def _varint(value: int) -> bytes:
 
 def _record(data: bytes) -> bytes:
     length = struct.pack("<Q", len(data))
-    return length + _masked_crc(length) + data + _masked_crc(data)
-
-
-def _masked_crc(data: bytes) -> bytes:
-    """Return TFRecord's checksum: CRC-32C rotated right by 15 bits, with a constant added."""
-    crc = google_crc32c.value(data)
-    return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)
+    head, tail = struct.pack("<I", masked_crc(length)), struct.pack("<I", masked_crc(data))
+    return length + head + data + tail
 
 
 # -- MCAP
