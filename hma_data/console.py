@@ -22,7 +22,6 @@ class Update(Protocol):
 
     def __call__(self, done: float, extra: str = "", total: float | None = None) -> None:
         """Show the amount done so far, a few words beside the bar, and the total once it is known."""
-        ...
 
 
 def run_script(main: Callable[[], None]) -> None:

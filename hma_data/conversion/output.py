@@ -85,23 +85,18 @@ class Holder(Protocol):
 
     def clear(self) -> None:
         """Delete what an earlier conversion made; refuse what is not one's."""
-        ...
 
     def base(self) -> Manifest | None:
         """Return the manifest of a set that may be extended; None where there is none."""
-        ...
 
     def finished(self, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
         """Return the names of the plan's units that are there and whole; see `finished_shards`."""
-        ...
 
     def noting(self, share: "Share | None") -> AbstractContextManager[Callable[["Made"], None]]:
         """Give what notes each unit when it is made."""
-        ...
 
     def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Finished:
         """Complete what is made; all units are there, and `changed` says whether some may be new."""
-        ...
 
 
 class ShardHolder:

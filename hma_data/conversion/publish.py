@@ -32,22 +32,18 @@ class Place(Protocol):
 
     def files(self) -> dict[str, int]:
         """Return the sizes of the place's files, by name."""
-        ...
 
     def holds(self, name: str) -> bool:
         """Check whether there is such a file now; a place whose files are many need not list them for it."""
-        ...
 
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
         """Check whether what `files` saw has this content under this name."""
-        ...
 
     def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
         """Write files, delete those whose value is None, and return the place's address.
 
         If somebody else changed the place first, `changes` is called again.
         """
-        ...
 
 
 def publish(

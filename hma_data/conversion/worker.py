@@ -49,11 +49,9 @@ class Output(Protocol):
 
     def frames(self, episode: ReadEpisode, report: Report | None) -> Iterator[Frames]:
         """Yield the frames of an episode as this output takes them; add what they show to its flags."""
-        ...
 
     def make(self, unit: ShardUnit, items: Iterator[Item], report: Report) -> Made:
         """Write the unit, whole or not at all."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ class Stream(Protocol):
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return the pictures (n, H, W, 3) RGB of those indices; decode no others."""
-        ...
 
 
 @runtime_checkable
@@ -37,7 +36,6 @@ class OneByOne(Protocol):
 
         With `least`, JPEG is decoded at a reduced size, as `hma_data.episodes.images.decode_image` does.
         """
-        ...
 
 
 @dataclass(frozen=True)

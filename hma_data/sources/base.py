@@ -59,19 +59,15 @@ class Source(Protocol):
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """Return what the recording holds; sample the values and frames of `episodes` episodes."""
-        ...
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> Sequence[EpisodeRef]:
         """Return the episodes in a stable order, without decoding any; millions of them as `Records`."""
-        ...
 
     def episode_ids(self, uri: StrPath) -> list[str]:
         """Return the ids of the episodes."""
-        ...
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
         """Return one episode; its frames are decoded on demand."""
-        ...
 
 
 @runtime_checkable
@@ -80,7 +76,6 @@ class LaidOut(Protocol):
 
     def inspect_as(self, uri: StrPath, embodiment: Embodiment, episodes: int = SAMPLE) -> Inspection:
         """Return what the recording holds, as `Source.inspect`, with the episodes of the robot's layout."""
-        ...
 
 
 @runtime_checkable
@@ -89,7 +84,6 @@ class Expecting(Protocol):
 
     def expect(self, uri: StrPath, episode_ids: Sequence[str]) -> None:
         """State the episodes that will be read, in their order; an error of it is ignored."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -117,11 +117,9 @@ class Tokenizer(Protocol):
 
     def encode(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
         """Encode (N, S, S, 3) uint8 RGB to (N, h, w) uint32 ids, or to (N, c, h, w) float16 latents."""
-        ...
 
     def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
         """Decode what `encode` returns to (N, S, S, 3) uint8 RGB."""
-        ...
 
 
 def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, device: str = "cpu") -> Tokenizer:

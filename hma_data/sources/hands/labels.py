@@ -44,7 +44,6 @@ class LabelSet(Protocol):
         Raises:
             EpisodeError: they are damaged.
         """
-        ...
 
 
 def open_labels(layout: HandsLayout, uri: str) -> LabelSet:
