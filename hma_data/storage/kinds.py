@@ -6,6 +6,7 @@ Only names and first bytes are looked at, and only after something else has fail
 import os
 from collections import Counter
 from collections.abc import Iterable
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
@@ -25,7 +26,7 @@ _USE = {
 
 def kind_of(path: Path) -> str:
     """Return what is at a path of this machine, one of `_USE`; empty where it is nothing of these."""
-    try:
+    with suppress(OSError):
         if path.suffix.lower() in (".yaml", ".yml") and path.is_file():
             return "" if path.name == "metadata.yaml" else "a YAML file"
         if (path / "trunk.safetensors").is_file() or any(path.glob("checkpoints/step-*")):
@@ -36,8 +37,6 @@ def kind_of(path: Path) -> str:
         described = any((path / name).is_file() for name in _DESCRIBED)
         if described or any(file.suffix.lower() in _RECORDED or ".tfrecord" in file.name for file in files):
             return "a recording"
-    except OSError:
-        pass
     return ""
 
 

@@ -110,9 +110,9 @@ def encoding(message: Any, kind: str) -> str:
     """
     if kind == RAW:
         return str(child(message, "encoding")).lower()
-    before, separator, _ = (
-        str(child(message, "format")).lower().partition(";") if kind == STILL_IMAGE else ("",) * 3
-    )
+    if kind != STILL_IMAGE:
+        return ""
+    before, separator, _ = str(child(message, "format")).lower().partition(";")
     return before if separator else ""
 
 
@@ -171,9 +171,9 @@ def is_grey(message: Any, kind: str) -> bool:
     """Check whether a raw or still image has one channel; a mosaic has three."""
     if kind == RAW:
         return encoding(message, kind) in ("mono8", "8uc1", MONO16)
-    if kind == STILL_IMAGE and _mosaic(message):
+    if kind != STILL_IMAGE or _mosaic(message):
         return False
-    return kind == STILL_IMAGE and (encoding(message, kind) == MONO16 or one_channel(payload(message)))
+    return encoding(message, kind) == MONO16 or one_channel(payload(message))
 
 
 def wide_grey(message: Any, kind: str, where: str) -> NDArray[np.uint16]:
