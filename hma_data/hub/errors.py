@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from hma_data.errors import HMAError, HubError
-from hma_data.storage.fetch import SECRET, causes
+from hma_data.storage.fetch import causes, hidden, without_secrets
 
 TRANSIENT = (408, 429, 500, 502, 503, 504)
 LOG_IN = "log in with hf auth login, or set HF_TOKEN"
@@ -22,7 +22,7 @@ def explained(where: str) -> Iterator[None]:
     except HMAError:
         raise
     except Exception as fault:  # the client and its libraries raise exceptions of any kind
-        raise explain(where, without_token(fault)) from fault
+        raise explain(where, without_secrets(fault, _hidden)) from fault
 
 
 def explain(where: str, fault: BaseException) -> HubError:
@@ -152,11 +152,4 @@ def _hidden(text: str) -> str:
     from huggingface_hub import get_token
 
     token = get_token()
-    return SECRET.sub(r"\1…", text.replace(token, "…") if token else text)
-
-
-def without_token(fault: BaseException) -> BaseException:
-    """Return the error after removing the token from its text and from the texts of its causes."""
-    for link in causes(fault):
-        link.args = tuple(_hidden(part) if isinstance(part, str) else part for part in link.args)
-    return fault
+    return hidden(text.replace(token, "…") if token else text)

@@ -88,14 +88,19 @@ def may_pass(fault: BaseException) -> bool:
 
 def said(fault: BaseException) -> str:
     """Return an exception as one line of text, without a token that a server repeats."""
-    text = SECRET.sub(r"\1…", " ".join(str(fault).split()))
+    text = hidden(" ".join(str(fault).split()))
     return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
 
 
-def without_secrets(fault: BaseException) -> BaseException:
+def hidden(text: str) -> str:
+    """Return a text without the tokens in it."""
+    return SECRET.sub(r"\1…", text)
+
+
+def without_secrets(fault: BaseException, hide: Callable[[str], str] = hidden) -> BaseException:
     """Return the error after removing tokens from its text and from the texts of its causes."""
     for link in causes(fault):
-        link.args = tuple(SECRET.sub(r"\1…", part) if isinstance(part, str) else part for part in link.args)
+        link.args = tuple(hide(part) if isinstance(part, str) else part for part in link.args)
     return fault
 
 
