@@ -291,8 +291,6 @@ def frames_of(
 def _language(clip: Clip) -> list[dict[str, Any]]:
     """Return what is said about the moments of a clip; what held before it begins holds from its start."""
     items = clip.episode.metadata.get("language", ())
-    if not items:
-        return []
     camera, indices = next(iter(clip.frame_indices.items()))
     times = clip.episode.streams[camera].timestamps
     start = float(times[indices[0]] - times[0])
