@@ -1,5 +1,6 @@
 """Run `hma tokenizer`: list, train and measure tokenizers."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -70,9 +71,6 @@ def tokenizer_train(
             raise UsageError(text, "is not an override", "write KEY=VALUE, for example training.steps=100")
         changes[key] = parse_yaml(value, text, RecipeError)
 
-    def report(line: str) -> None:
-        say(line, err=True)
-
     def kept() -> str:
         state = out.with_name(out.name + ".state")
         if not state.is_file():
@@ -83,7 +81,7 @@ def tokenizer_train(
     with interruptible(kept):
         from hma_data.tokenizers.training.train import train
 
-        facts = train(recipe, out, changes, device=device, workers=workers, report=report)
+        facts = train(recipe, out, changes, device=device, workers=workers, report=partial(say, err=True))
     print(f"wrote {out}: " + ", ".join(f"{key} {value}" for key, value in facts.items()))
 
 
