@@ -7,11 +7,11 @@ mechanism from a generator, for a model frame of so many seconds.
 Lengths are px of the 128 × 128 frame with y downward, angles radians clockwise from +x, times seconds.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
@@ -44,23 +44,22 @@ class Axis:
         return self.unit if self.target or not self.unit else f"{self.unit}/s"
 
 
-class Mechanism(Protocol):
+@dataclass(frozen=True)
+class Mechanism(ABC):
     """The moving parts of a kind."""
 
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """Return the Q axes of the pose."""
-
-    @property
-    def commands(self) -> tuple[Axis, ...]:
-        """Return the A axes of the action."""
+    axes: tuple[Axis, ...]  # the Q axes of the pose
+    commands: tuple[Axis, ...]  # the A axes of the action
 
     def fixed(self) -> list[Shape]:
         """Return the parts that never move, drawn below everything else."""
+        return []
 
+    @abstractmethod
     def shapes(self, pose: Floats) -> list[Shape]:
         """Return the moving parts, the lowest first."""
 
+    @abstractmethod
     def tip(self, pose: Floats) -> tuple[Floats, float]:
         """Return the point (2,) that pushes or holds blocks, and its direction."""
 
@@ -85,11 +84,9 @@ def _targets(rng: np.random.Generator, axes: list[Axis], low: float = 0.15, high
 
 
 @dataclass(frozen=True)
-class Arm:
+class Arm(Mechanism):
     """J links in a chain seen from above, and perhaps a gripper of two fingers at its tip."""
 
-    axes: tuple[Axis, ...]
-    commands: tuple[Axis, ...]
     base: Floats  # (2,)
     facing: float  # direction of the first link at angle 0
     lengths: Floats  # (J,)
@@ -172,17 +169,12 @@ def _arm(
 
 
 @dataclass(frozen=True)
-class Mover:
+class Mover(Mechanism):
     """A disc, square or triangle that moves in the plane."""
 
-    axes: tuple[Axis, ...]
-    commands: tuple[Axis, ...]
     form: str
     radius: float
     colors: tuple[Color, ...]
-
-    def fixed(self) -> list[Shape]:
-        return []
 
     def shapes(self, pose: Floats) -> list[Shape]:
         heading, place, r = float(pose[2]) if len(pose) > 2 else -np.pi / 2, pose[:2], self.radius
@@ -230,11 +222,9 @@ def _mover(rng: np.random.Generator, frame: float, colors: list[Color], joint: C
 
 
 @dataclass(frozen=True)
-class Gantry:
+class Gantry(Mechanism):
     """A bridge over the whole width, a trolley on it, and perhaps a hook that is lowered to push."""
 
-    axes: tuple[Axis, ...]
-    commands: tuple[Axis, ...]
     upright: bool  # whether the bridge spans from top to bottom, and moves along x
     width: float  # half that of the bridge
     trolley: float  # half the side of the trolley
@@ -280,11 +270,9 @@ def _gantry(rng: np.random.Generator, frame: float, colors: list[Color], joint: 
 
 
 @dataclass(frozen=True)
-class Rails:
+class Rails(Mechanism):
     """Sliders on parallel rails."""
 
-    axes: tuple[Axis, ...]
-    commands: tuple[Axis, ...]
     upright: bool
     places: Floats  # (J,) of the rails
     size: tuple[float, float]  # half the length and half the width of a slider
@@ -327,11 +315,9 @@ def _rails(rng: np.random.Generator, frame: float, colors: list[Color], joint: C
 
 
 @dataclass(frozen=True)
-class Crane:
+class Crane(Mechanism):
     """A jib that slews about a mast, a trolley along it, and perhaps a magnet."""
 
-    axes: tuple[Axis, ...]
-    commands: tuple[Axis, ...]
     base: Floats  # (2,)
     length: float
     width: float  # half that of the jib
