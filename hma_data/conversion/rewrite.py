@@ -7,7 +7,7 @@ T frames of an episode, A values of an action.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -49,7 +49,7 @@ from hma_data.shards.schema import (
     to_numpy,
     token_column,
 )
-from hma_data.shards.verify import REMAKE, shard_problems
+from hma_data.shards.verify import REMAKE, OnProgress, shard_problems
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.storage.locks import locked
@@ -58,7 +58,6 @@ from hma_data.storage.records import Records
 from hma_data.storage.remote import parquet_input, place
 from hma_data.tokenizers.base import TokenizerSpec
 
-OnProgress = Callable[[int, int], None]
 CONVERT_AGAIN = "run the same hma convert again"
 SYNTHETIC_MARKS = (
     "synthetic",

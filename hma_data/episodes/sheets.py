@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.images import opencv
+from hma_data.episodes.images import Images, opencv
 from hma_data.storage.files import atomic_path
 
-Images = NDArray[np.uint8]
 GAP, LABEL = 4, 18  # pixels between the pictures of a grid, and of a row's label
 INK, PAPER = (30, 30, 30), (250, 250, 250)
 BAR, NEGATIVE = (0, 114, 178), (213, 94, 0)  # safe without colour vision

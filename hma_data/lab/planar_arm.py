@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.lab import imported
-from hma_data.lab.family.look import SCALE, SIZE, Color, Shape, draw, shrunk
+from hma_data.lab.family.look import SCALE, SIZE, Color, Floats, Shape, draw, shrunk
 from hma_data.lab.writers import Demo, block_demo, write_hdf5
 from hma_data.registry.embodiment import find
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
@@ -28,7 +28,6 @@ from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 if TYPE_CHECKING:
     import pymunk
 
-Floats = NDArray[np.float64]
 Manoeuvre = Callable[["PlanarArm"], Floats]  # returns velocities (J,)
 
 TASK = "shove the blocks about"

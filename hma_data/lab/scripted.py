@@ -20,9 +20,8 @@ from hma_data.lab import FAMILY, planar_arm, pusht
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.driver import Driver, Reacher
 from hma_data.lab.family.table import REACH, BlockTable
-from hma_data.lab.simulator import Simulation
+from hma_data.lab.simulator import Floats, Simulation
 
-Floats = NDArray[np.float64]
 PUSHER = "pusht_fast"
 STARTS, ROUNDS = 24, 8  # random poses that a first search begins from, and steps of a search
 DAMPING, NUDGE = 1.0, 1e-3  # px² of the search; of a pose whose axes are scaled to the width of their limits

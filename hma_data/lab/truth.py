@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from hma_data.lab import pusht
 from hma_data.lab.family.look import SIZE as SIZE
-from hma_data.lab.simulator import LabSimulator, Simulation
+from hma_data.lab.simulator import Floats, LabSimulator, Simulation
 
-Floats = NDArray[np.float64]
 PUSHERS = ("pusht_fast", "pusht_slow")
 
 

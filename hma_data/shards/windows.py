@@ -18,12 +18,10 @@ from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.shards.reader import EpisodeIndex, ShardSet
+from hma_data.shards.reader import EpisodeIndex, Ints, ShardSet
 from hma_data.shards.schema import flag_pauses
 
-Ints = NDArray[np.int64]
 Short = Literal["drop", "pad"]
 
 WINDOW = 12  # frames of the model's window, by default
