@@ -36,13 +36,39 @@ class Body:
     description: str
 
     @staticmethod
+    @cache
     def of(name: str) -> "Body":
         """Return the body of a name.
 
         Raises:
             UsageError: the name is not a kind of MAKERS, an underscore and a number.
         """
-        return _body(name)
+        kind, _, number = name.partition("_")
+        if kind not in MAKERS or not number.isdecimal():
+            known = ", ".join(MAKERS)
+            raise UsageError(name, "is not a robot of the family", f"write <kind>_<number>; kinds: {known}")
+        rng = np.random.default_rng(zlib.crc32(name.encode()))
+        hz = int(rng.choice(list(STRIDES)))
+        stride = int(rng.choice(STRIDES[hz]))
+        canvas, tones = background(rng)
+        colors: list[Color] = []
+        for _ in range(8):
+            colors.append(vivid(rng, tones, colors))
+        frame = stride / hz
+        joint = DARK if contrast(DARK, tones[0]) > 60 else LIGHT
+        mechanism, text = MAKERS[kind](rng, frame, colors, joint)
+        grips = mechanism.axes[-1].name == "gripper"
+        blocks = tuple(
+            Block(
+                str(rng.choice(("disc", "box", "tee"))),
+                rng.uniform(5.2, 5.7) if grips else rng.uniform(6.0, 8.5),
+                rng.uniform(-np.pi, np.pi),
+                colors[-1 - i],
+            )
+            for i in range(int(rng.integers(1, 4)))
+        )
+        draw(canvas, mechanism.fixed())
+        return Body(name, kind, hz, stride, mechanism, blocks, canvas, text)
 
     @property
     def axes(self) -> tuple[Axis, ...]:
@@ -97,33 +123,3 @@ class Body:
             pose = pose + np.clip(velocity, -speed, speed) * step
         turning = np.array([a.turns for a in self.axes])
         return np.where(turning, wrapped(pose), np.clip(pose, *self.limits))
-
-
-@cache
-def _body(name: str) -> Body:
-    kind, _, number = name.partition("_")
-    if kind not in MAKERS or not number.isdecimal():
-        known = ", ".join(MAKERS)
-        raise UsageError(name, "is not a robot of the family", f"write <kind>_<number>; kinds: {known}")
-    rng = np.random.default_rng(zlib.crc32(name.encode()))
-    hz = int(rng.choice(list(STRIDES)))
-    stride = int(rng.choice(STRIDES[hz]))
-    canvas, tones = background(rng)
-    colors: list[Color] = []
-    for _ in range(8):
-        colors.append(vivid(rng, tones, colors))
-    frame = stride / hz
-    joint = DARK if contrast(DARK, tones[0]) > 60 else LIGHT
-    mechanism, text = MAKERS[kind](rng, frame, colors, joint)
-    grips = mechanism.axes[-1].name == "gripper"
-    blocks = tuple(
-        Block(
-            str(rng.choice(("disc", "box", "tee"))),
-            rng.uniform(5.2, 5.7) if grips else rng.uniform(6.0, 8.5),
-            rng.uniform(-np.pi, np.pi),
-            colors[-1 - i],
-        )
-        for i in range(int(rng.integers(1, 4)))
-    )
-    draw(canvas, mechanism.fixed())
-    return Body(name, kind, hz, stride, mechanism, blocks, canvas, text)
