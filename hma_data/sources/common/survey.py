@@ -458,7 +458,7 @@ def _plain(text: str) -> str:
 
 
 def sampled(count: int, wanted: int) -> list[int]:
-    """Return the indices of `wanted` episodes, spread evenly over all `count`."""
+    """Return the indices of `wanted` episodes or frames, spread evenly over all `count`."""
     return [int(i) for i in np.unique(np.linspace(0, count - 1, min(wanted, count)).astype(np.int64))]
 
 

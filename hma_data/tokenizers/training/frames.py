@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.images import Filter, prepare, resize
 from hma_data.errors import EpisodeError, RecipeError, SourceError, TokenizerError
+from hma_data.sources.common.survey import sampled
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import TokenizerSpec
@@ -131,7 +132,7 @@ def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
         return
     try:
         video = VideoFile(path)
-        for index in _evenly(len(video), frames):
+        for index in sampled(len(video), frames):
             yield video.frames([index])[0]
     except EpisodeError as fault:
         raise TokenizerError(path, fault.fault, fault.remedy) from fault
@@ -159,7 +160,7 @@ def recording_films(
 
     source = open_source(embodiment.source.format)
     ids = [ref.id for ref in source.index(uri, embodiment)]
-    spread = _evenly(len(ids), EPISODES)
+    spread = sampled(len(ids), EPISODES)
     others = [index for index in range(len(ids)) if index not in set(spread)]
     read, fault = 0, "it holds no episode"
     for index in spread + others:
@@ -169,7 +170,7 @@ def recording_films(
             episode = source.read(uri, ids[index], embodiment)
             for camera in embodiment.cameras:
                 stream = episode.streams[camera.name]
-                drawn = (stream.frames([at]) for at in _evenly(len(stream.timestamps), frames))
+                drawn = (stream.frames([at]) for at in sampled(len(stream.timestamps), frames))
                 film = [prepare(frame, camera, spec.image_size, spec.resize_filter) for frame in drawn]
                 yield np.concatenate(film)
             read += 1
@@ -178,11 +179,6 @@ def recording_films(
             on_skip(fault)
     if not read:
         raise SourceError(as_text(uri), f"no frame could be read: {fault}")
-
-
-def _evenly(count: int, wanted: int) -> list[int]:
-    """Return at most `wanted` different indices below `count`, evenly spaced."""
-    return np.unique(np.linspace(0, count - 1, min(wanted, count)).astype(int)).tolist()
 
 
 # -- crops to train on
