@@ -160,11 +160,6 @@ def _footer(path: Path, state: State) -> _Footer:
     return _Footer(metadata, columns, ranges[:, 0], ranges[:, 1])
 
 
-@lru_cache(maxsize=8)  # version 3: the episodes of a file come one after the other
-def _column_of_group(path: Path, state: State, group: int, key: str) -> pa.Array:
-    return _read(path, state, group, key)
-
-
 def _state(path: Path) -> State:
     found = path.stat()
     return found.st_size, found.st_mtime_ns
@@ -185,6 +180,10 @@ def _read(path: Path, state: State, group: int, key: str) -> pa.Array:
     column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     # Another library may have registered a type for matrices: its storage is plain lists.
     return column.storage if isinstance(column, pa.ExtensionArray) else column
+
+
+# In version 3 the episodes of a file come one after the other.
+_column_of_group = lru_cache(maxsize=8)(_read)
 
 
 def _is_list(kind: Any) -> bool:
