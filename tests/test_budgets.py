@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_528, 11_384, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_907, 522_943
-TEST_LINES = 49_746
+TEST_LINES = 49_748
 DOC_WORDS = 41_750
 
 

@@ -114,7 +114,7 @@ def from_inspection(found: Inspection, embodiment_id: str) -> str:
     if found.format == "hands":  # videos hold nothing that could be an action
         values = find("hand_video").to_dict() | {"id": embodiment_id}
         head = "A copy of hand_video, which reads any video of two hands: use it as it is, or change this one"
-        beside = [f"# {one}\n" for one in found.findings if "beside them are" in one.message]
+        beside = [f"# {one}\n" for one in found.findings if "next to them are" in one.message]
         return f"# {head}\n{''.join(beside)}{_yaml_text(values)}"
     values = _Draft(found).values(embodiment_id)
     head = f"# Inferred from source.uri; answer every {TODO}, then: hma registry validate FILE\n"

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from skimage import data
 
+from hma_data.inspection.infer import infer
 from hma_data.inspection.inspect import inspect_recording
 from hma_data.sources.base import Inspection, open_source
 from hma_data.sources.common import checks
@@ -319,6 +320,7 @@ def test_tables_beside_videos_are_told(tmp_path: Path) -> None:
     (finding,) = [one for one in inspect_recording(str(tmp_path))["findings"] if one["check"] == "files"]
     assert finding["severity"] == "info" and "next to them are 1 .csv" in finding["message"]
     assert "HDF5 with separate videos" in finding["remedy"]
+    assert "next to them are 1 .csv" in infer(str(tmp_path), "my_arm").splitlines()[1]
 
 
 def test_events_have_no_pauses() -> None:
