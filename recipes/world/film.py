@@ -1,6 +1,6 @@
 """Film a robot that is driven in `hma play`: the world model and the true simulator under the same actions.
 
-    python recipes/world/film.py arm2_02 --scene 2 --out docs/drive.webp    # the film of the README
+    python recipes/world/film.py arm2_07 --scene 1 --out docs/drive.webp    # the film of the README
 
 The simulator's own driver acts. The film begins with the last frame of the prompt.
 """
