@@ -72,12 +72,12 @@ def train_on_a_small_disk(recipe, out: Path) -> None:
         print(type(fault).__name__, fault)
 
 
-@pytest.mark.parametrize("writer", ["run", "logging", "report"])
+@pytest.mark.parametrize("writer", ["run.write_atomic", "logging.atomic_path", "report.write_atomic"])
 def test_whatever_cannot_be_written_is_one_error(recipe, tmp_path, monkeypatch, writer):
-    def write(path, content):
+    def write(path, *content):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(f"hma_model.training.{writer}.write_atomic", write)
+    monkeypatch.setattr(f"hma_model.training.{writer}", write)
     with pytest.raises(OutputError, match="cannot be written: No space left on device"):
         train(recipe(report=True, steps=1), out=tmp_path / "run", show=False)
 
