@@ -1,8 +1,8 @@
 """Compute the cross-entropy of many digits a few rows at a time, and never hold all scores.
 
-A window of colours has twenty million scores, ten times what the trunk computes of it, and torch passes over
-them a dozen times. A few rows stay in the processor's cache; the backward pass computes their scores again.
-On a CPU this takes half of the time of torch's operations, a third in bf16.
+A step of 16 windows of colours has twenty million scores, and torch passes over them a dozen times. A few
+rows stay in the processor's cache; the backward pass computes their scores again. On a CPU this takes half of
+the time of torch's operations, a third in bf16.
 
 M rows, D width, F digits, V values of a digit.
 """
