@@ -36,7 +36,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/generation": (1_629, 13_169, 9),
     "hma_model/hub": (1_074, 8_300, 6),
     "hma_model/lerobot_env": (635, 4_760, 3),
-    "hma_model/network": (3_499, 30_701, 18),
+    "hma_model/network": (3_499, 30_726, 18),
     "hma_model/play": (1_640, 11_975, 8),
     "hma_model/policies": (2_806, 19_929, 14),
     "hma_model/released": (822, 7_096, 4),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_710, 30_468, 20),
     "hma_model/worlds": (1_528, 11_384, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_907, 522_943
+PRODUCT_LINES, PRODUCT_NODES = 65_907, 522_968
 TEST_LINES = 49_748
 DOC_WORDS = 41_750
 

@@ -25,14 +25,14 @@ def has_kernel(linear: nn.Module, features: Tensor) -> bool:
 
 
 def cross_entropy(
-    features: Tensor, linear: nn.Linear, gains: Tensor | None, before: Tensor, digits: Tensor
+    features: Tensor, linear: nn.Linear, gains: Tensor | None, before: Tensor | None, digits: Tensor
 ) -> Tensor:
     """Return the cross-entropy (M,) float32, summed over digits, of features (M, D) through a linear map.
 
     Args:
         linear: its outputs (M, F·V) are the scores of the digits' values, digit after digit.
-        gains: (M, F) float32, what the scores of the digits `before` gain.
-        before: (M, F) int64 those of the frame before, from 0.
+        gains: (M, F) float32, what the scores of the digits `before` gain; None for no gains.
+        before: (M, F) int64 those of the frame before, from 0; not used without gains.
         digits: (M, F) int64 the true ones.
     """
     values: tuple[Tensor, ...] = features, linear.weight, linear.bias
@@ -51,12 +51,12 @@ class _CrossEntropy(torch.autograd.Function):
         weight: Tensor,
         bias: Tensor,
         gains: Tensor | None,
-        before: Tensor,
+        before: Tensor | None,
         digits: Tensor,
     ) -> Tensor:
         totals = torch.empty(digits.shape)  # the logarithms of the sums of a digit's probabilities
         true = torch.empty_like(totals)
-        for rows, scores in _scores(features, weight, bias, gains, before):
+        for rows, scores in _scores(features, weight, bias, digits.shape[1], gains, before):
             totals[rows] = scores.logsumexp(-1)
             true[rows] = scores.gather(-1, digits[rows].unsqueeze(-1)).squeeze(-1)
         ctx.save_for_backward(features, weight, bias, gains, before, digits, totals)
@@ -69,12 +69,12 @@ class _CrossEntropy(torch.autograd.Function):
         of_features = torch.empty_like(features)
         of_weight, of_bias = (torch.zeros_like(each, dtype=torch.float32) for each in (weight, bias))
         of_gains = None if gains is None else torch.empty_like(gains)
-        for rows, scores in _scores(features, weight, bias, gains, before):
+        for rows, scores in _scores(features, weight, bias, digits.shape[1], gains, before):
             shares = scores.sub_(totals[rows].unsqueeze(-1)).exp_()
             places = digits[rows].unsqueeze(-1)
             shares.scatter_add_(-1, places, shares.new_full((), -1.0).expand(places.shape))
             shares *= grad[rows, None, None]
-            if of_gains is not None:
+            if before is not None and of_gains is not None:
                 of_gains[rows] = shares.gather(-1, before[rows].unsqueeze(-1)).squeeze(-1)
             of_scores = shares.flatten(1)
             of_bias += of_scores.sum(0)
@@ -85,16 +85,16 @@ class _CrossEntropy(torch.autograd.Function):
 
 
 def _scores(
-    features: Tensor, weight: Tensor, bias: Tensor, gains: Tensor | None, before: Tensor
+    features: Tensor, weight: Tensor, bias: Tensor, count: int, gains: Tensor | None, before: Tensor | None
 ) -> Iterator[tuple[slice, Tensor]]:
-    """Yield rows, and their scores (rows, F, V) float32."""
+    """Yield rows, and the scores (rows, F, V) float32 of their `count` digits."""
     for first in range(0, len(features), ROWS):
         rows = slice(first, first + ROWS)
         if features.dtype == torch.float32:
             scores = product(features[rows], weight, bias)
         else:
             scores = F.linear(features[rows], weight, bias).float()
-        scores = scores.unflatten(-1, (before.shape[-1], -1))
-        if gains is not None:
+        scores = scores.unflatten(-1, (count, -1))
+        if gains is not None and before is not None:
             scores.scatter_add_(-1, before[rows].unsqueeze(-1), gains[rows].unsqueeze(-1))
         yield rows, scores

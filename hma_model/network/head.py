@@ -228,7 +228,7 @@ class TokenReadout(nn.Module):
         if self.copy is not None and before is not None:
             gains, before = self.copy.gains(features, before)[..., 0], before.clamp(min=0)
         features = features * self.multiplier if self.multiplier != 1 else features
-        return cross_entropy(features, self.linear, gains, digits if before is None else before, digits)
+        return cross_entropy(features, self.linear, gains, before, digits)
 
 
 class LatentReadout(nn.Module):

@@ -134,7 +134,7 @@ def _in_order(rows: Rows, index: int) -> Rows:
 
 @dataclass(frozen=True)
 class _Footer:
-    """What a parquet file of G row groups says of them.
+    """The footer of a parquet file of G row groups.
 
     Attributes:
         columns: names of all columns.
