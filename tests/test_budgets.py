@@ -16,14 +16,14 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data": (701, 3_999, 7),
     "hma_data/cli": (1_549, 11_105, 8),
     "hma_data/conversion": (4_239, 31_586, 15),
-    "hma_data/episodes": (1_668, 14_638, 9),
+    "hma_data/episodes": (1_682, 14_826, 9),
     "hma_data/hub": (517, 3_861, 3),
     "hma_data/inspection": (2_136, 20_030, 8),
     "hma_data/lab": (3_313, 30_478, 16),
     "hma_data/loading": (1_281, 10_980, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_544, 19_492, 11),
-    "hma_data/sources": (12_630, 105_706, 50),
+    "hma_data/sources": (12_626, 105_574, 50),
     "hma_data/storage": (1_690, 11_059, 11),
     "hma_data/tokenizers": (3_516, 26_105, 18),
     "hma_model": (532, 3_311, 4),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_710, 30_468, 20),
     "hma_model/worlds": (1_528, 11_384, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_907, 522_968
+PRODUCT_LINES, PRODUCT_NODES = 65_917, 523_024
 TEST_LINES = 49_748
 DOC_WORDS = 41_750
 

@@ -188,6 +188,13 @@ def stacked(pictures: Iterable[NDArray[np.uint8]], count: int, where: str = "") 
     return found
 
 
+def all_of(stream: OneByOne, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Return the pictures (n, H, W, 3) of indices in any order; each is decoded once, in rising order."""
+    distinct, places = np.unique(np.asarray(indices, np.int64), return_inverse=True)
+    found = stacked(stream.each(distinct), len(distinct))
+    return found if np.array_equal(places, np.arange(len(found))) else found[places]
+
+
 def rate_times(length: int, hz: float) -> Floats:
     """Return the times (length,) in seconds of frames that tick at a fixed rate."""
     return np.arange(length, dtype=np.float64) / hz

@@ -91,7 +91,14 @@ class FrameToRGB:
         # Two, because FFmpeg keeps the matrix of the frame before, and a video may change what it states.
         self._usual, self._stated = VideoReformatter(), VideoReformatter()
 
-    def __call__(self, frame: Any) -> Any:
+    def __call__(self, frame: Any) -> Images:
+        """Return the frame's image (H, W, 3), a view of FFmpeg's memory."""
+        rgb = self._converted(frame)
+        plane = rgb.planes[0]
+        lines = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: rgb.height, : rgb.width * 3]
+        return lines.reshape(rgb.height, rgb.width, 3)
+
+    def _converted(self, frame: Any) -> Any:
         """Return the frame as one of PyAV in rgb24."""
         full, kind = frame.color_range == FULL, frame.format
         other = frame.colorspace in OTHER_MATRICES

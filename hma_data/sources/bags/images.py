@@ -7,14 +7,14 @@ foxglove, in any encoding of messages; and FFMPEGPacket. T messages; H×W pixels
 import base64
 import re
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats, of_one_size, stacked
+from hma_data.episodes.episode import Floats, all_of, of_one_size
 from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images, decode_image, image_codec, opencv
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.bag import Bag
@@ -351,15 +351,14 @@ class VideoDecoder:
         self._lost = False  # whether an image since the last key frame is missing
         self._incomplete: set[int] = set()  # messages that may depend on a missing image
 
-    def frames(self, indices: Sequence[int]) -> dict[int, Images]:
-        """Return the image (H, W, 3) of each of those indices.
+    def each(self, indices: Iterable[int]) -> Iterator[Images]:
+        """Yield the image (H, W, 3) of each of those rising indices.
 
         Raises:
             EpisodeError: one of them, or one it builds on, cannot be decoded.
         """
-        found: dict[int, Images] = {}
         packets: Iterator[bytes] | None = None
-        for index in sorted(set(indices)):
+        for index in indices:
             if index not in self._ready and self._must_begin(index):
                 self._begin(index)
                 packets = None
@@ -374,8 +373,7 @@ class VideoDecoder:
             if frame is None:
                 fault = f"frame {index} of the video is damaged, or depends on one that is damaged or lost"
                 raise EpisodeError(self._where, fault)
-            found[index] = self._to_rgb(frame).to_ndarray()
-        return found
+            yield self._to_rgb(frame)
 
     def _must_begin(self, index: int) -> bool:
         skips = bool(self._keyframes[self._next + 1 : index + 1].any())
@@ -507,9 +505,7 @@ class StillStream:
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """See episode.Stream."""
-        distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
-        found = stacked(self.each(distinct), len(distinct))
-        return found if np.array_equal(inverse, np.arange(len(found))) else found[inverse]
+        return all_of(self, indices)
 
     def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""
@@ -542,11 +538,12 @@ class VideoStream:
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """See episode.Stream."""
-        wanted = [int(i) + self._lead for i in indices]
-        found = self._decoder.frames(wanted)
-        distinct = list(found)
-        images = stacked(found.values(), len(found), self._messages.where)
-        return images[[distinct.index(i) for i in wanted]]
+        return all_of(self, indices)
+
+    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
+        """See episode.OneByOne."""
+        shown = (int(index) + self._lead for index in indices)
+        return of_one_size(self._decoder.each(shown), self._messages.where)
 
     def _from(self, start: int) -> Iterator[bytes]:
         for block in range(start, self._count, BLOCK):

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats, stacked
+from hma_data.episodes.episode import Floats, all_of, of_one_size
 from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images
 from hma_data.errors import EpisodeError
 from hma_data.storage.kinds import unreadable
@@ -175,10 +175,12 @@ class VideoFile:
             raise IndexError(
                 f"{self.path} has {len(self)} frames, asked for {wanted.min()} to {wanted.max()}"
             )
-        unique, places = np.unique(wanted, return_inverse=True)
+        return all_of(self, wanted)
+
+    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
+        """Yield the image (H, W, 3) of each of those frames; rising indices are fastest. See OneByOne."""
         with _explained(str(self.path)):
-            found = stacked(map(self._image, unique.tolist()), len(unique), str(self.path))
-        return found if np.array_equal(places, np.arange(len(found))) else found[places]
+            yield from of_one_size(map(self._image, map(int, indices)), str(self.path))
 
     def close(self) -> None:
         """Close the file; the next `frames` opens it again."""
@@ -200,7 +202,7 @@ class VideoFile:
             frame = self._frame(index)
         if self._spoilt:
             raise EpisodeError(self.path, f"frame {index} is damaged, or depends on a damaged one")
-        return self._to_rgb(frame)
+        return np.rot90(self._converter(frame), _quarters(frame))
 
     def _count(self) -> None:
         """Identify frames only by their decoding order from here on.
@@ -273,13 +275,6 @@ class VideoFile:
             return -1
         raise EpisodeError(self.path, f"gives a frame at {frame.pts} ticks, which no packet states")
 
-    def _to_rgb(self, frame: Any) -> Images:
-        """Return a frame's image (H, W, 3)."""
-        rgb = self._converter(frame)
-        plane = rgb.planes[0]  # its bytes are copied once, into the array that `frames` returns
-        lines = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: rgb.height, : rgb.width * 3]
-        return np.rot90(lines.reshape(rgb.height, rgb.width, 3), _quarters(frame))
-
 
 class FilmRows:
     """A camera's Stream: `rows` frames of a video file, at times (T,) of the recording's own.
@@ -296,6 +291,10 @@ class FilmRows:
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
         """See episode.Stream."""
         return self._file.frames(self._indices[np.asarray(indices, np.int64)])
+
+    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
+        """See episode.OneByOne."""
+        return self._file.each(self._indices[np.asarray(indices, np.int64)])
 
 
 def _quarters(frame: Any) -> int:

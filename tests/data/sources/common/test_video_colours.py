@@ -96,13 +96,13 @@ def h264_messages(path: Path) -> list[bytes]:
         return [bytes(out) for packet in container.demux(stream) for out in to_messages.filter(packet)]
 
 
-def from_bag(messages: list[bytes], first_of: tuple[int, ...] = (0,)) -> dict[int, np.ndarray]:
+def from_bag(messages: list[bytes], first_of: tuple[int, ...] = (0,)) -> list[np.ndarray]:
     keyframes = np.isin(np.arange(len(messages)), first_of)
 
     def fetch(start: int) -> Iterator[bytes]:
         return iter(messages[start:])
 
-    return VideoDecoder("h264", keyframes, fetch, "v.mcap /video").frames(range(len(messages)))
+    return list(VideoDecoder("h264", keyframes, fetch, "v.mcap /video").each(range(len(messages))))
 
 
 MATRICES = [UNSTATED, BT709, BT470, SMPTE170M, SMPTE240M, BT2020]
