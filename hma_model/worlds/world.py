@@ -231,6 +231,8 @@ class World:
     def stored(self, session: int) -> NDArray[Any]:
         """Return the newest frame of a session as shards store it: tokens (h, w) or latents (c, h, w)."""
         frame = self._newest(session)[0].cpu().numpy()
+        if self.model.config.pixels:
+            frame = frame.clip(0, 255)  # a cast would wrap around
         return frame.astype(self.tokenizer.spec.dtype)
 
     def snapshot(self, session: int) -> Snapshot:

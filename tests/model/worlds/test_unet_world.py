@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
@@ -54,6 +55,19 @@ def test_stored_pixels_of_a_prompt_are_shown_as_images(world: World) -> None:
     stored = world.tokenizer.encode(images)
     assert stored.dtype == np.uint8
     assert np.array_equal(world.shown(stored), images) and world.shown(images) is images
+
+
+def test_a_frame_beyond_black_and_white_is_stored_as_it_is_shown(world: World) -> None:
+    drawn = world.model.config.replace(
+        trunk="transformer", video_loss="diffusion", told_noise=False, copy_previous=False, action_waves=0
+    )
+    torch.manual_seed(0)
+    other = World(_of_robot(HMA(drawn), family.embodiment(ROBOT), False), world.tokenizer)
+    session = other.open(ROBOT, np.full((2, 64, 64, 3), 128, np.uint8))
+    shown = other.step({session: np.zeros(other.model.embodiments[ROBOT].chunk_dim)})[session]
+    values = other._newest(session)
+    assert values.min() < 0 and values.max() > 255
+    assert np.array_equal(world.tokenizer.decode(other.stored(session)[None])[0], shown)
 
 
 def test_how_unsure_it_is_is_not_measured_rather_than_nothing(world: World) -> None:
