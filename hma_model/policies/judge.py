@@ -50,7 +50,8 @@ def moved(parts: Floats, driven: int) -> Floats:
 
 def reached(parts: Floats, driven: int) -> Floats:
     """Return how near an own part comes to the first place of a loose part, negative; (N,) px."""
-    gap = parts[:, 1:, :driven, None] - parts[:, :1, None, driven:]
+    later = parts[:, 1:] if parts.shape[1] > 1 else parts  # of one frame, nobody has moved yet
+    gap = later[..., :driven, None, :] - parts[:, :1, None, driven:]
     near: Floats = np.linalg.norm(gap, axis=-1).min(axis=(1, 2, 3))
     return -near
 

@@ -63,6 +63,7 @@ def test_scores_are_of_the_loose_part_that_moves_most_and_of_the_nearest_approac
     parts[0, 3:, 2] += (3, 4)
     parts[0, 2, 0] = (50, 44)
     assert moved(parts, 1) == pytest.approx([5]) and reached(parts, 1) == pytest.approx([-6])
+    assert reached(parts[:, :1], 1) == pytest.approx([-(3200**0.5)])  # of an episode that has just begun
 
 
 def test_the_goal_is_where_a_planned_push_of_the_simulator_ends() -> None:
