@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import Images, opencv
 from hma_data.storage.files import atomic_path
 
+CELL = 128  # pixels of a side of a picture in a sample, about
 GAP, LABEL = 4, 18  # pixels between the pictures of a grid, and of a row's label
 INK, PAPER = (30, 30, 30), (250, 250, 250)
 BAR, NEGATIVE = (0, 114, 178), (213, 94, 0)  # safe without colour vision
@@ -37,6 +38,11 @@ def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = ()
             left = GAP + j * (width + GAP)
             sheet[top + label_height : top + label_height + height, left : left + width] = picture
     return sheet
+
+
+def cell_scale(side: int) -> tuple[int, int]:
+    """Return by how much a picture is enlarged for a sample, and which of its pixels are then kept."""
+    return max(1, -(-CELL // side)), max(1, side // CELL)
 
 
 def first_of_grid(sheet: Images, height: int, width: int) -> Images | None:

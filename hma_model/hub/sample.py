@@ -16,7 +16,7 @@ from hma_model.checkpoint.folder import FILM, SAMPLE, Checkpoint, require_tokeni
 if TYPE_CHECKING:
     from hma_data.shards.reader import ShardSet
 
-COLUMNS, SIDE = 6, 128  # frames in a row of the image, and pixels of a side
+COLUMNS = 6  # frames in a row of the image
 
 
 def add_samples(checkpoint: StrPath | Checkpoint, data: Iterable[StrPath]) -> list[Path]:
@@ -60,7 +60,7 @@ def at_hand(checkpoint: Checkpoint, embodiments: Iterable[str] | None = None) ->
 
 def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
     """Return a PNG of recorded and predicted frames, and a GIF of both with their actions."""
-    from hma_data.episodes.sheets import gif_bytes, grid, png_bytes
+    from hma_data.episodes.sheets import cell_scale, gif_bytes, grid, png_bytes
     from hma_data.loading.dataset import WindowDataset
     from hma_data.shards.preview import tokenizer_of
     from hma_model.evaluation.rollout_video import rollout_video
@@ -84,9 +84,7 @@ def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
         "recorded, decoded from tokens": true.truth[0],
         f"predicted from frame {true.prompt} on": true.predicted[0],
     }
-    # Small frames are enlarged, large ones subsampled, to about SIDE pixels.
-    side = true.truth.shape[2]
-    scale, every = max(1, -(-SIDE // side)), max(1, side // SIDE)
+    scale, every = cell_scale(true.truth.shape[2])
     shown = [
         [frame.repeat(scale, 0).repeat(scale, 1)[::every, ::every] for frame in frames[picks]]
         for frames in rows.values()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import decode_image, resize
-from hma_data.episodes.sheets import first_of_grid
+from hma_data.episodes.sheets import cell_scale, first_of_grid
 from hma_data.errors import EpisodeError, HMAError, UsageError
 from hma_data.loading.views import FIRST_CAMERA, Cameras
 from hma_data.registry.embodiment import Embodiment
@@ -113,6 +113,10 @@ def sample_image(checkpoint: Checkpoint, embodiment: str) -> Images | None:
     path = checkpoint.folder / "embodiments" / embodiment / SAMPLE
     if not path.is_file():
         return None
-    sheet = read_image(path)
-    (height, width, _) = image_shape(checkpoint.config)
-    return first_of_grid(sheet, height, width)
+    side, views = image_shape(checkpoint.config)[0], checkpoint.config.views
+    scale, every = cell_scale(side)
+    cell = side * scale // every
+    shown = first_of_grid(read_image(path), cell, views * cell)
+    if shown is None:
+        return None
+    return np.concatenate([*resize(np.stack(np.split(shown, views, axis=1)), side)], axis=1)

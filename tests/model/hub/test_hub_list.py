@@ -18,6 +18,7 @@ from hma_model.config import HMAConfig
 from hma_model.hub import publish as hub
 from hma_model.hub.listing import survey
 from hma_model.hub.sample import add_samples
+from hma_model.worlds.images import sample_image
 from tests.hub_server import connect, serve
 from tests.model.robots import Blocks, make_model, save
 from tests.model.shards import make_shards
@@ -137,6 +138,9 @@ def test_a_sample_shows_truth_and_predictions_over_time(folder, tmp_path, painte
     picture = np.asarray(Image.open(path))
     height, width = picture.shape[:2]
     assert width > height > 2 * 128 and len(np.unique(picture)) > 5
+    first = sample_image(Checkpoint.open(folder), "arm")  # a frame of the model's size, as it was painted
+    assert first is not None and first.shape == (16, 16, 3)
+    assert np.array_equal(first.repeat(8, 0).repeat(8, 1), picture[22 : 22 + 128, 4 : 4 + 128])
     with Image.open(film) as opened:  # four frames at 5 Hz: truth, true actions, other actions
         assert (opened.format, opened.n_frames, opened.info["duration"]) == ("GIF", 4, 200)
         assert opened.size[0] > 3 * 192
