@@ -246,10 +246,10 @@ class Rollout:
         if len(values) != len(chosen):
             raise HMAError("observe", f"gets {len(values)} frames", f"give {len(chosen)}, one for each row")
         self._make_room(chosen)
+        self._take(chosen, chunk, None, known)  # before the cache, whose tokens it decides
         if self.caching:
             with self.engine.computing(len(chosen)):
                 self.passes.catch_up(chosen)
-        self._take(chosen, chunk, None, known)
         self.state.put_seen(chosen, values)
 
     @torch.no_grad()
@@ -272,8 +272,11 @@ class Rollout:
         own = self._begun(rows)
         if self.config.action_alignment == "current":
             self.state.put_chunk(own, 1, None, None)  # it is the one that is asked for
+        pending = list(self.state.pending)
         with self.engine.computing(len(own)):
             features = self.passes.newest_features(own)
+        if self.passes.passive is None and not self.told:  # the step to come decides the cache's tokens
+            self.state.pending = pending
         names = [self.state.embodiments[row] for row in own]
         groups = Groups.of(names, len(own))
         pooled = groups.sort(self.model.action_features(features.clone()))

@@ -68,6 +68,36 @@ def test_video_and_actions_roll_out_together_with_and_without_a_cache(layout: st
     assert runs[0][0][:, 1, HAND.chunk_dim :].abs().max() == 0 and runs[0][0].shape[2] == ARM.chunk_dim
 
 
+@pytest.mark.parametrize("absent", ["embedding", "skip", "tokens"])
+@pytest.mark.parametrize("first", ["observe", "act"])
+def test_what_comes_before_a_first_step_without_actions_leaves_the_cache_right(
+    first: str, absent: str
+) -> None:
+    model = small_model(conditioning=("concat", "modulation"), action_tokens=2, absent_action=absent, **ACTS)
+    batch = small_batch(model.config, NAMES, frames=4)
+    runs = []
+    for cache in (True, False):
+        rollout = Rollout(model, NAMES, 2, cache=cache, unmask_steps=2, temperature=0.0)
+        rollout.prompt(batch.tokens[:, :3], None, seeds=[1, 2])
+        if first == "act":
+            rollout.act()
+        else:
+            rollout.observe(batch.tokens[:, 3])
+        runs.append(torch.stack([rollout.step(None) for _ in range(4)]))
+    assert torch.equal(*runs)
+
+
+def test_a_model_that_acts_from_one_frame_may_then_be_told_its_actions() -> None:
+    model = small_model(absent_action="skip", **ACTS)
+    batch = small_batch(model.config, NAMES, frames=1)
+    runs = []
+    for cache in (True, False):
+        rollout = Rollout(model, NAMES, 2, cache=cache, temperature=0.0)
+        rollout.prompt(batch.tokens, None, seeds=[1, 2])
+        runs.append(torch.stack([rollout.step(rollout.act()) for _ in range(4)]))
+    assert torch.equal(*runs)
+
+
 def test_acting_leaves_no_trace_in_the_video() -> None:
     model = small_model(**ACTS)
     batch = small_batch(model.config, NAMES, frames=8)
