@@ -69,7 +69,7 @@ class Scenes:
         robot = found or (LabSimulator(embodiment).embodiment if simulated(embodiment) else None)
         if robot is None:
             raise HMAError(embodiment, "has no YAML, which describes its actions", "load a checkpoint")
-        return cls(LabRobot(robot, {"action": action}), numbers, seed)
+        return cls(LabRobot(robot, {"action": action}, world.image_shape[0]), numbers, seed)
 
     @property
     def name(self) -> str:

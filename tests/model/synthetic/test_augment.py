@@ -134,7 +134,7 @@ def test_the_first_frames_of_latents_are_the_simulators_at_their_own_size(latent
     reader = EpisodeReader(shards, shards.columns())
     for row, prompt in zip(shards.episodes.to_pylist(), true.prompts, strict=True):
         stored = reader.episode(row, shards.manifest.cameras[0])["latents"].reshape(-1, 3, 8, 8)
-        means = prompt.frames.reshape(-1, 8, 16, 8, 16, 3).astype(np.float32).mean(axis=(2, 4)) / 17
+        means = prompt.frames.reshape(-1, 8, 8, 8, 8, 3).astype(np.float32).mean(axis=(2, 4)) / 17
         np.testing.assert_allclose(stored[: len(means)], means.transpose(0, 3, 1, 2), atol=0.06)
 
 

@@ -12,6 +12,7 @@ from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint import io as checkpoint
 from hma_model.config import HMAConfig
 from hma_model.network.model import HMA
+from hma_model.policies.acting import Follower
 from hma_model.policies.arenas import Scenes, TrueArena
 from hma_model.policies.planning import Cost
 from hma_model.simulate import World, WorldModelEnv
@@ -86,6 +87,17 @@ def test_how_unsure_a_model_of_colours_is_is_measured(colored: World) -> None:
     assert colored.uncertainty[session] > 0
     colors = np.frombuffer(bytes.fromhex(colored.tokenizer.spec.colors), np.uint8).reshape(-1, 3)
     assert {*map(tuple, made[session].reshape(-1, 3))} <= {*map(tuple, colors)}
+
+
+def test_a_policy_of_few_images_follows_scenes_of_the_worlds_size(world: World) -> None:
+    arena = TrueArena(Scenes.of(world, ROBOT, 2, 0), 64)
+    assert {prompt.frames.shape[1:] for prompt in arena.prompts} == {world.image_shape}
+    follower = Follower(world, arena.scenes, "it", memory=2)
+    follower.begin(arena)
+    for _ in range(arena.scenes.stride):
+        arena.step(follower.take(arena.held))
+    follower.look(arena)
+    assert np.array_equal(follower._prompts[0].frames[-1], arena.images[0])
 
 
 def test_synthetic_episodes_are_all_kept_without_an_uncertainty(world: World, tmp_path: Path) -> None:
