@@ -32,7 +32,7 @@ class Frame:
     """A frame that was driven to: JPEG images of the model and of the truth, and the actions before it.
 
     Attributes:
-        actions: (stride, A).
+        actions: (stride, A); where nobody knows the recorded ones, the last known one held.
         state: (S,) of the simulator after it, or None.
         psnr: of the two images in dB, or None.
         still: PSNR of an image that stands still since the beginning or the last sync, or None.
@@ -207,7 +207,9 @@ class Session:
             still = psnr(self._still, self._truth)
             self._divergence.look(self.count, image, self._truth)
         stride = self.robot.embodiment.stride
-        actions = self._chunks[-1].reshape(stride, -1)
+        actions: Float32s = self._chunks[-1].reshape(stride, -1)
+        if np.isnan(actions).any():
+            actions = np.tile(self.held, (stride, 1))
         true = None if self._truth is None else jpeg(self._truth)
         frame = Frame(self.count, jpeg(image), true, actions, self._state, score, still)
         self.frames.append(frame)

@@ -172,7 +172,10 @@ def at_rest(dims: Sequence[Dimension], held: NDArray[Any]) -> Float32s:
 
 
 class RecordedRobot:
-    """A robot of a shard set; its scenes are windows of held-out episodes, or of all if none is held out."""
+    """A robot of a shard set; its scenes are windows of held-out episodes, or of all if none is held out.
+
+    Recorded actions that are unknown are NaN.
+    """
 
     source = "recordings"
 
@@ -182,6 +185,7 @@ class RecordedRobot:
         self.embodiment = shards.embodiment
         self.key = f"{self.embodiment.id}:recordings"
         self.dimensions = dimensions(self.embodiment, stats)
+        self._mean = np.array(stats["action"]["mean"])
         self._shards = shards
         self._tokenizer = tokenizer
         self._cameras = cameras
@@ -213,9 +217,11 @@ class RecordedRobot:
         windows = self._windows
         batch = windows.batch([number * apart(len(windows)) % len(windows)])
         frames = decode(self._tokenizer(), batch.stored)[0]
-        chunks = batch.actions[0].numpy().astype(np.float32)
+        chunks, known = batch.actions[0].numpy().astype(np.float32), batch.action_mask[0].numpy()
+        chunks[~known] = np.nan
         prompt = Prompt(frames[:PROMPT_FRAMES], chunks[: PROMPT_FRAMES - 1])
-        held = prompt.chunks[-1, -len(self.dimensions) :]
+        before = prompt.chunks[known[: PROMPT_FRAMES - 1], -len(self.dimensions) :]
+        held = before[-1] if len(before) else self._mean
         # The chunk after the last frame leads to no frame that is known.
         rest = frames[PROMPT_FRAMES:], chunks[PROMPT_FRAMES - 1 : -1]
         return RecordedScene(prompt, at_rest(self.dimensions, held), *rest)

@@ -202,6 +202,51 @@ def test_no_scene_of_a_recording_crosses_a_pause(shards: ShardSet, block_tokeniz
         robot.scene(0)
 
 
+class StillWorld(TrueWorld):
+    """A model of any robot, whose images stay black."""
+
+    def open(self, embodiment: str, frames: Any, chunks: Any = None, *, seed: int = 0) -> int:
+        self.begun.append((frames, chunks))
+        return 0
+
+    def image(self, session: int) -> np.ndarray:
+        return np.zeros_like(self.begun[0][0][0])
+
+
+def test_recorded_actions_that_nobody_knows_reach_the_model_as_unknown_and_nobody_else(
+    shards: ShardSet, block_tokenizer: BlockTokenizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, world = (
+        RecordedRobot(shards, lambda: block_tokenizer, shards.manifest.stats, "first"),
+        StillWorld(),
+    )
+    robot.dimensions = tuple(replace(dim, kind="target") for dim in robot.dimensions)
+    whole, windows, unknown = robot.scene(0), robot._windows, [2, 4]
+    plain = windows.batch
+
+    def masked(numbers: list[int]) -> Any:
+        batch = plain(numbers)
+        batch.action_mask[:, unknown] = False
+        return batch
+
+    monkeypatch.setattr(windows, "batch", masked)
+    session = Session("s", robot, 0, world, Decoding(2, 0.0), 0.0)
+    np.testing.assert_array_equal(world.begun[0][1][:2], whole.prompt.chunks[:2])
+    assert np.isnan(world.begun[0][1][2]).all()
+    np.testing.assert_array_equal(session.held, whole.prompt.chunks[1, -3:])
+    session.replays, shown = True, []
+    session.viewer = SimpleNamespace(show=lambda frame, facts: shown.append(facts["action"]))  # type: ignore
+    chunks = []
+    for now in range(2):
+        chunks.append(session.next_chunk())
+        session.take(world.image(0), float(now), 0.0)
+    assert np.isfinite(chunks[0]).all() and np.isnan(chunks[1]).all()
+    assert shown == [chunks[0][-3:].tolist()] * 2 and session.held.tolist() == shown[0]
+    assert np.isfinite(lerobot_episode(robot, session.film())[0].action).all()
+    unknown[:] = [0, 1, 2]
+    np.testing.assert_allclose(robot.scene(0).action, shards.manifest.stats["action"]["mean"], rtol=1e-6)
+
+
 def test_new_scenes_come_to_every_window_once_before_any_comes_again() -> None:
     for count in range(1, 201):
         assert {number * apart(count) % count for number in range(count)} == {*range(count)}
