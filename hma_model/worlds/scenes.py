@@ -341,6 +341,8 @@ def drivable(
             found[name] = LabRobot(embodiment, stats, image_shape(checkpoint.config)[0])
         elif not begun and name not in recorded and (sample := sample_image(checkpoint, name)) is not None:
             begun = [sample]
+        if len({image.shape for image in begun}) > 1:
+            raise UsageError("--prompt", "its images differ in size", "give images of one size")
         if begun:
             shown = fitted(np.stack(begun), checkpoint.config, embodiment)
             imaged = ImageRobot(embodiment, stats, shown, cameras)

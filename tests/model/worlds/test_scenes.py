@@ -279,6 +279,8 @@ def test_a_robot_without_simulator_begins_from_its_sample_or_from_images(tmp_pat
     assert list(robots) == ["arm_a:images", "arm_b:images"]
     begun = robots["arm_b:images"].scene(1).prompt
     assert np.array_equal(begun.frames, images[:2]) and np.isnan(begun.chunks).all()
+    with pytest.raises(UsageError, match="--prompt: its images differ in size — give images of one size"):
+        drivable(opened, (), pytest.fail, [images[0], large[0]])
 
 
 def test_a_saved_dataset_names_the_cameras_that_the_model_shows(block_tokenizer, tmp_path) -> None:
