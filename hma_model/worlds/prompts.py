@@ -257,7 +257,10 @@ def _of_lerobot(model: HMA, embodiment: str, folder: StrPath, part: EpisodePart)
 
 
 def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
-    """Return an embodiment that finds its action and its cameras, in their order, in a LeRobotDataset."""
+    """Return an embodiment that finds its action and its cameras in a LeRobotDataset.
+
+    A camera has the key that ends with its name; those without one have the other keys in their order.
+    """
     keys = [key.key for key in open_source("lerobot").inspect(folder, 1).keys if key.kind == "camera"]
     if len(keys) < len(robot.cameras):
         raise HMAError(folder, f"has {len(keys)} cameras, {robot.id} has {len(robot.cameras)}", PROMPT_FORMS)
@@ -266,11 +269,16 @@ def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
         {"key": "action", "dims": part.dims, "slice": [span.start, span.stop]}
         for part, span in robot.action.spans()
     ]
+    named = {key.rpartition(".")[2]: key for key in keys}
+    paired = {camera.name: named[camera.name] for camera in robot.cameras if camera.name in named}
+    rest = (key for key in keys if key not in paired.values())
     cameras = [
-        {"name": camera.name, "key": key, "resize": camera.resize} for camera, key in zip(robot.cameras, keys)
+        {"name": camera.name, "key": paired.get(camera.name) or next(rest), "resize": camera.resize}
+        for camera in robot.cameras
     ]
     action = {"space": robot.action.space, "components": parts}
-    changed = {"action": action, "cameras": cameras, "source": {"format": "lerobot"}, "state": None}
+    changed: dict[str, Any] = {"action": action, "cameras": cameras, "source": {"format": "lerobot"}}
+    changed |= {"state": None, "sync": {"primary": robot.sync.primary}}
     kept = {key: value for key, value in values.items() if key not in ("state", "sync", "quality")}
     return Embodiment.from_values({**kept, **changed}, f"{folder}, as {robot.id}")
 

@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,15 @@ import pytest
 from hma_data.episodes.sheets import write_png
 from hma_data.errors import HMAError
 from hma_data.lab import record
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.cli import main
 from hma_model.network.model import HMA
 from hma_model.simulate import read_prompt, starting_window
+from hma_model.worlds import prompts
+from tests.data import cameras as three
 from tests.model.network_parts import small_model
 from tests.model.shards import make_shards, state_pauses
 from tests.model.true_world import trained_on
@@ -77,8 +81,8 @@ def test_images_come_as_arrays_files_and_from_environments(model: HMA, tmp_path:
 
     one = [images[0], tmp_path / "0.png", str(tmp_path / "0.png"), Environment()]
     several = [images[:2], [tmp_path / "0.png", tmp_path / "1.png"], {"frames": images[:2]}]
-    for prompts, count in ((one, 1), (several, 2)):
-        for prompt in prompts:
+    for given, count in ((one, 1), (several, 2)):
+        for prompt in given:
             frames, chunks = read_prompt(model, RAILS, prompt)
             assert np.array_equal(frames, images[:count])
             assert len(chunks) == count - 1 and np.isnan(chunks).all()
@@ -100,6 +104,27 @@ def test_a_lerobot_episode_is_a_prompt_of_the_same_robot_recorded_elsewhere(arm,
     assert np.array_equal(found, chunks) and np.abs(frames.astype(int) - images).mean() < 8  # lossy video
     other, _ = read_prompt(arm, ARM, {"lerobot": dataset, "episode": 1, "start": 3})
     assert other.shape == frames.shape and np.abs(other.astype(int) - images).mean() > 8
+
+
+def test_cameras_recorded_elsewhere_are_paired_by_name_and_the_primary_one_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    values = three.arm().to_dict() | {"sync": {"primary": "wrist"}}
+    ends = ("front", "wrist", "side", "top", "other")
+    keys = [SimpleNamespace(kind="camera", key=f"observation.images.{end}") for end in ends]
+    source = SimpleNamespace(inspect=lambda folder, episodes: SimpleNamespace(keys=keys))
+    monkeypatch.setattr(prompts, "open_source", lambda name: source)
+
+    def paired(**names: str) -> dict[str, str]:
+        cameras = [one | {"name": names.get(one["name"], one["name"])} for one in values["cameras"]]
+        sync = {"primary": names.get("wrist", "wrist")}
+        robot = Embodiment.from_values(values | {"cameras": cameras, "sync": sync}, "an arm")
+        found = prompts._as_lerobot(robot, "a folder")
+        assert found.primary_camera.name == sync["primary"]
+        return {camera.name: camera.key.rpartition(".")[2] for camera in found.cameras}
+
+    assert paired() == {"top": "top", "side": "side", "wrist": "wrist"}
+    assert paired(top="above", wrist="hand") == {"above": "front", "side": "side", "hand": "wrist"}
 
 
 @pytest.mark.parametrize(
