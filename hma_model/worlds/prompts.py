@@ -117,6 +117,8 @@ def read_prompt(model: HMA, embodiment: str, prompt: Any = None, *, seed: int = 
         return _of_mapping(model, embodiment, prompt)
     if hasattr(prompt, "render"):
         prompt = prompt.render()
+        if prompt is None:
+            raise HMAError("prompt", "its render() returned no image", 'make it with render_mode="rgb_array"')
     if isinstance(prompt, str | PathLike):
         folder = as_path(prompt)
         if (folder / MANIFEST).is_file():

@@ -132,6 +132,7 @@ def test_cameras_recorded_elsewhere_are_paired_by_name_and_the_primary_one_stays
     [
         ({"images": 3}, "has the keys images — give an image or images"),
         ({"lerobot": "data", "episde": 1}, "has the keys lerobot, episde"),
+        (SimpleNamespace(render=lambda: None), 'returned no image — make it with render_mode="rgb_array"'),
         ([np.zeros((8, 8, 3), np.uint8), np.zeros((9, 8, 3), np.uint8)], "its images differ in size"),
         ("tests", "tests: is a folder, not an image — give an image or images"),
         ("README.md", "README.md: is not an image — give an image or images"),
