@@ -86,10 +86,13 @@ def recorded_cameras(robot: Embodiment) -> list[str]:
 
 
 def fitted(images: NDArray[Any], config: HMAConfig, robot: Embodiment | None) -> Images:
-    """Return images (P, H, W, 3) uint8 as (P, S, V·S, 3), resized as in a conversion.
+    """Return images (P, H, W, 3) uint8 as (P, S, V·S, 3), cropped and resized as in a conversion.
+
+    They are upright and RGB already, so the camera's flip, rotation and colour order do not count. Its crop
+    counts for images of the camera's size, or where that is not stated, for those that it fits in.
 
     Args:
-        robot: whose camera they are of; None crops them to squares.
+        robot: whose primary camera they are of; None crops them to squares.
 
     Raises:
         HMAError: they are no such images, or show several views in another size.
@@ -104,8 +107,14 @@ def fitted(images: NDArray[Any], config: HMAConfig, robot: Embodiment | None) ->
     if config.views > 1:
         fault = f"images are {images.shape[2]}×{images.shape[1]}"
         raise HMAError("prompt", fault, f"give {config.views} views side by side, {shape[1]}×{shape[0]}")
-    rule = "short_side_crop" if robot is None else robot.primary_camera.resize
-    return resize(images, spec.image_size, rule, spec.resize_filter)
+    if robot is None:
+        return resize(images, spec.image_size, resize_filter=spec.resize_filter)
+    camera, size = robot.primary_camera, images.shape[1:3]
+    x, y, width, height = camera.crop or (0, 0, size[1], size[0])
+    stated = camera.size and camera.size[:: -1 if camera.rotate in (90, 270) else 1]
+    if stated in (None, size) and y + height <= size[0] and x + width <= size[1]:
+        images = images[:, y : y + height, x : x + width]
+    return resize(images, spec.image_size, camera.resize, spec.resize_filter)
 
 
 def sample_image(checkpoint: Checkpoint, embodiment: str) -> Images | None:

@@ -26,10 +26,11 @@ from hma_model.generation.unmask import Decoding
 from hma_model.play.pads import Pad, describe, hint, labels, pads
 from hma_model.play.save import film, lerobot_episode
 from hma_model.play.session import Frame, Session, jpeg
+from hma_model.worlds.images import fitted
 from hma_model.worlds.scenes import PROMPT_FRAMES, LabRobot, RecordedRobot, apart, drivable
 from tests.conftest import BlockTokenizer
 from tests.data import cameras as three
-from tests.model.robots import save
+from tests.model.robots import CONFIG, save, yaml
 from tests.model.shards import state_pauses
 from tests.model.true_world import TrueWorld, lab_robots
 
@@ -281,6 +282,25 @@ def test_a_robot_without_simulator_begins_from_its_sample_or_from_images(tmp_pat
     assert np.array_equal(begun.frames, images[:2]) and np.isnan(begun.chunks).all()
     with pytest.raises(UsageError, match="--prompt: its images differ in size — give images of one size"):
         drivable(opened, (), pytest.fail, [images[0], large[0]])
+
+
+@pytest.mark.parametrize(
+    ("camera", "cropped"),
+    [
+        ({}, True),  # the crop fits in the image
+        ({"size": [24, 40]}, True),
+        ({"size": [40, 24], "rotate": 90}, True),
+        ({"size": [240, 400]}, False),  # it is of larger images
+        ({"crop": [20, 2, 40, 20]}, False),
+        ({"flip": "vertical", "color": "bgr"}, True),  # images are upright and RGB
+    ],
+)
+def test_images_are_cropped_as_those_of_a_conversion(camera: dict[str, Any], cropped: bool) -> None:
+    values = Embodiment.from_yaml(yaml("arm")).to_dict()
+    values["cameras"][0] |= {"crop": [3, 2, 20, 20]} | camera
+    images = np.random.default_rng(0).integers(0, 256, (2, 24, 40, 3), dtype=np.uint8)
+    wanted = resize(images[:, 2:22, 3:23] if cropped else images, 16)
+    assert np.array_equal(fitted(images, CONFIG, Embodiment.from_values(values, "an arm")), wanted)
 
 
 def test_a_saved_dataset_names_the_cameras_that_the_model_shows(block_tokenizer, tmp_path) -> None:
