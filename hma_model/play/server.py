@@ -101,7 +101,7 @@ class Server:
         host: the address that it listens on.
         token: what every request must carry, or None.
         first: the key of the robot that a page opens with; None for the best known one.
-        holdings: how long robots stay with the truth, by id.
+        holdings: how long robots stay with the truth, by key.
     """
 
     def __init__(
@@ -226,10 +226,7 @@ class Connection:
         self._latest: tuple[Frame, dict[str, Any]] | None = None
         self._sent = self._shown = 0  # serial numbers of frames
         self._heard = time.monotonic()
-        held = {
-            key: server.holdings.get(robot.embodiment.id, UNKNOWN)
-            for key, robot in self.stepper.robots.items()
-        }
+        held = {key: server.holdings.get(key, UNKNOWN) for key in self.stepper.robots}
         robots = [
             describe(self.stepper.robots[key]) | {"holds": known.words, "follows": known.follows is not False}
             for key, known in sorted(held.items(), key=lambda pair: pair[1].rank)
@@ -464,7 +461,8 @@ async def serve(
         world = World(load(part.checkpoint, names, device), part.tokenizer, **settings)
         worlds |= dict.fromkeys(part.robots, world)
         robots |= part.robots
-        held |= holdings(part.checkpoint)
+        known = holdings(part.checkpoint)
+        held |= {key: known[robot.embodiment.id] for key, robot in part.robots.items()}
     confidence = ("confidence",) if all(part.checkpoint.config.kind == "discrete" for part in parts) else ()
     stepper = Stepper(worlds, robots, orders=("random", *confidence))
     stepper.start()

@@ -1,9 +1,11 @@
 """The server of `hma play`: messages, frames, and what it refuses."""
 
+import asyncio
 import json
 import struct
 from collections.abc import Iterator
 from io import BytesIO
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -38,6 +40,31 @@ def test_robots_are_listed_by_how_long_they_hold(stepper: Stepper) -> None:
         listed = PageViewer(socket).message("hello")["robots"]
     said = [(one["id"], one["holds"], one["follows"]) for one in listed]
     assert said == [("arm2_12", "holds 8 s", True), ("mover_04", "does not follow its actions", False)]
+
+
+def test_a_robot_of_two_checkpoints_holds_as_long_as_in_the_one_that_drives_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known, listed = {"one": Holding(1.0, False, True), "two": Holding(2.0, False, True)}, dict[str, Holding]()
+    monkeypatch.setattr("hma_model.checkpoint.io.load", lambda *given: None)
+    monkeypatch.setattr("hma_model.worlds.world.World", lambda *given: TrueWorld())
+    monkeypatch.setattr(server, "holdings", lambda part: {"mover_04": known[part.name]})
+
+    def listing(stepper: Any, name: str, host: str, token: None, first: None, held: Any) -> Any:
+        listed.update(held)
+        return SimpleNamespace(app=None)
+
+    async def run(*given: Any) -> None: ...
+
+    monkeypatch.setattr(server, "Server", listing)
+    monkeypatch.setattr(server, "run", run)
+    (robot,) = lab_robots("mover_04").values()
+    parts = [
+        server.Part(SimpleNamespace(name=name, config=SimpleNamespace(kind="discrete")), None, {key: robot})  # type: ignore
+        for name, key in (("one", "mover_04"), ("two", "mover_04:recordings"))
+    ]
+    asyncio.run(server.serve(parts, "models", None, "", None, lambda: None))  # type: ignore[arg-type]
+    assert listed == {"mover_04": known["one"], "mover_04:recordings": known["two"]}
 
 
 @pytest.fixture
