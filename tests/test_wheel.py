@@ -13,6 +13,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from hma_data import __version__
+from hma_model.checkpoint.folder import BUNDLED
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -62,9 +63,7 @@ def test_it_holds_registry_recipes_and_weights(installed: Path) -> None:
         "hma_data/py.typed",
         "hma_model/py.typed",
     } <= files
-    assert {
-        f"hma_model/{name}/trunk.safetensors" for name in ("embedded", "embedded-lab", "embedded-pusht")
-    } <= files
+    assert {f"hma_model/{name}/trunk.safetensors" for name in BUNDLED} <= files
     assert not any(name.startswith(("tests/", "docs/")) for name in files)
 
 

@@ -39,10 +39,10 @@ PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card is last: its presence means 
 SAMPLE, FILM = "sample.png", "sample.gif"
 PICTURES = (SAMPLE, FILM)  # optional, shown in the model card
 EMBEDDED_NAME = "embedded"
-BUNDLED = {
-    name: Path(__file__).parents[1] / name for name in (EMBEDDED_NAME, "embedded-lab", "embedded-pusht")
+BUNDLED = {  # the later, the better with a robot that several have
+    name: Path(__file__).parents[1] / name
+    for name in ("embedded-fsq", "embedded-lab", "embedded-lab2", "embedded-pusht")
 }
-EMBEDDED = BUNDLED[EMBEDDED_NAME]
 _OTHER_TRUNK = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was interrupted: run it again"
 _OTHER_YAML = "restore the one that it was trained with; change descriptions in the card instead"
@@ -128,7 +128,7 @@ class Checkpoint:
         for name in wanted:
             check_id(name, self.name)
             if name not in self.embodiments:
-                parts = BUNDLED.values() if self.folder == EMBEDDED else ()
+                parts = BUNDLED.values() if self.folder == BUNDLED["embedded-fsq"] else ()
                 there = sorted({*self.embodiments}.union(*map(embodiments_in, parts)) - {name})
                 known = f"it has: {', '.join(there) or 'none'}"
                 raise CheckpointError(self.name, f"has no embodiment {name!r}", known)
@@ -219,19 +219,22 @@ def _require_version(values: Mapping[str, Any], where: object) -> None:
         raise CheckpointError(where, fault, "update hma-toolkit, or save the checkpoint again")
 
 
-def resolve(folder: StrPath, embodiments: Iterable[str] | None = None) -> Path:
+def resolve(folder: StrPath, embodiments: Iterable[str] | None = None, tokenizer: str | None = None) -> Path:
     """Return the folder of a checkpoint: the path itself, or the newest of a run's `checkpoints/`.
 
     Args:
-        folder: str or path of it, or the name of a checkpoint bundled with the package. With robots of
-            `embedded-lab` or `embedded-pusht`, the name `embedded` stands for these networks.
+        folder: str or path of it, or the name of a checkpoint bundled with the package. The name `embedded`
+            stands for the best of these that has the embodiments, and is of the tokenizer if one is.
         embodiments: ids of the robots that are wanted.
+        tokenizer: name of that of the data.
     """
     folder = as_path(folder)
     if (folder / CONFIG).is_file():
         return folder
     if str(folder) in BUNDLED and not folder.exists():
-        return _bundled(str(folder), list(embodiments or ()))
+        return BUNDLED[str(folder)]
+    if str(folder) == EMBEDDED_NAME and not folder.exists():
+        return _best(list(embodiments or ()), tokenizer)
     steps = training_checkpoints(folder)
     if steps:
         return steps[-1]
@@ -241,19 +244,18 @@ def resolve(folder: StrPath, embodiments: Iterable[str] | None = None) -> Path:
     raise CheckpointError(folder, fault, "give a checkpoint, or the folder of a training run")
 
 
-def _bundled(name: str, embodiments: list[str]) -> Path:
-    """Return the bundled checkpoint of a name; for `embedded`, the best one that has the embodiments."""
-    if name != EMBEDDED_NAME or not embodiments:
-        return BUNDLED[name]
-    there = {part: embodiments_in(path) for part, path in BUNDLED.items()}
-    homes = {one: [part for part in there if one in there[part]] for one in embodiments}
-    shared = [part for part in BUNDLED if all(part in parts for parts in homes.values())]
-    if shared:
-        return BUNDLED[shared[-1]]
-    if all(homes.values()):
-        where = " and ".join(f"{one} is in {parts[-1]}" for one, parts in homes.items())
-        raise CheckpointError(name, f"{where}: no network has all of them", "name robots of one network")
-    return BUNDLED[name]
+def _best(embodiments: list[str], tokenizer: str | None) -> Path:
+    """Return the bundled checkpoint that the name `embedded` stands for."""
+    homes = {one: [f for f in BUNDLED.values() if one in embodiments_in(f)] for one in embodiments}
+    shared = [folder for folder in BUNDLED.values() if all(folder in found for found in homes.values())]
+    if not shared and all(homes.values()):
+        where = " and ".join(f"{one} is in {found[-1].name}" for one, found in homes.items())
+        fault = f"{where}: no network has all of them"
+        raise CheckpointError(EMBEDDED_NAME, fault, "name robots of one network")
+    if tokenizer is not None:
+        of = {f: parse_config(read_json(f / CONFIG), f / CONFIG).tokenizer["name"] for f in shared}
+        shared = [folder for folder in shared if of[folder] == tokenizer] or shared
+    return shared[-1] if shared and embodiments else (shared or [*BUNDLED.values()])[0]
 
 
 def embodiments_in(folder: Path) -> tuple[str, ...]:

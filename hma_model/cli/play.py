@@ -59,7 +59,7 @@ def play(
 
     from hma_data.shards.reader import ShardSet
     from hma_data.tokenizers.base import reopened
-    from hma_model.checkpoint.folder import BUNDLED, EMBEDDED, Checkpoint
+    from hma_model.checkpoint.folder import BUNDLED, EMBEDDED_NAME, Checkpoint
     from hma_model.hub.publish import located
     from hma_model.worlds.images import read_image
     from hma_model.worlds.scenes import drivable, opening, trained_on
@@ -69,7 +69,9 @@ def play(
     require_checkpoint(checkpoint)
     opened, device = located(checkpoint)[0], device_name(device)
     sets = sets or trained_on(opened)
-    every = [Checkpoint.open(part) for part in BUNDLED.values()] if opened.folder == EMBEDDED else [opened]
+    every = [opened]
+    if opened.bundled and checkpoint == EMBEDDED_NAME:
+        every = [Checkpoint.open(part) for part in BUNDLED.values()]
     tokenizers = [cache(partial(reopened, part.config.tokenizer, device)) for part in every]
     parted = _by_checkpoint(sets, every)
     driven = [drivable(*part, images) for part in zip(every, parted, tokenizers, strict=True)]
@@ -96,7 +98,8 @@ def play(
 
     settings: dict[str, Any] = {"device": device, "precision": precision, "compile": compile, "first": first}
     try:
-        parts = [Part(one, made(), own) for one, made, own in zip(every, tokenizers, driven, strict=True)]
+        chosen = zip(every, tokenizers, driven, strict=True)
+        parts = [Part(one, made(), own) for one, made, own in chosen if own]
         asyncio.run(serve(parts, name, listener, host, token, ready, **settings))
     except KeyboardInterrupt:
         print("stopped; unsaved sessions are lost")

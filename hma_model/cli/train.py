@@ -125,7 +125,7 @@ def finetune(
     options: dict[str, Any] = {"out": out, "freeze_trunk": freeze_trunk, "recipe": recipe, "force": force}
     from hma_model.training.recipe import recipe_for
 
-    _refuse_early(recipe or recipe_for(source), [_data(folders), *overrides])
+    _refuse_early(recipe or recipe_for(source, folders[0]), [_data(folders), *overrides])
     with interruptible(lambda: STOPPED):
         from hma_model.training.loop import finetune as run
         from hma_model.training.parallel import report_once

@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,11 +19,15 @@ from typer import Argument, Option
 from hma_data.cli.options import choice_option, robot_option
 from hma_data.console import CONTINUE, say
 from hma_data.cpu import usable_cores
-from hma_data.errors import Interrupted, RegistryError, UsageError
+from hma_data.errors import EpisodeError, Interrupted, RegistryError, UsageError
 from hma_model.cli.options import embedded_robots
 
-BUNDLED = "embedded"  # the model to begin with
-TOKENIZER = "fsq-lab"  # the one that it was trained on
+BUNDLED = "embedded"  # the model to begin with: the one of the tokenizer
+PHOTOGRAPHED, DRAWN = "fsq-lab", "palette-64"  # tokenizers of the bundled transformer and of the U-Net
+FLAT = (
+    0.85  # share of pixels with their left neighbour's colour; measured: drawn 0.88 to 0.95, others to 0.82
+)
+LOOKED_AT = 8  # episodes that are tried, and images of the first that can be read
 PROMPT, LONGEST_FILM = 2, 24  # frames that are given, and that are predicted at most
 UNLIMITED_STEPS = 1_000_000  # the time ends the training
 
@@ -70,7 +75,17 @@ def try_recording(
         _answer(yaml, answer or [])
         embodiment = str(yaml)
     chosen = [word for name in only or () for word in ("--only", name)]
-    step("convert", data, "-e", embodiment, "--tokenizer", TOKENIZER, *chosen, "--out", shards)
+    step(
+        "convert",
+        data,
+        "-e",
+        embodiment,
+        "--tokenizer",
+        _tokenizer(data, embodiment),
+        *chosen,
+        "--out",
+        shards,
+    )
     time_limit = (f"cpu_seconds={cpu_seconds}", f"steps={UNLIMITED_STEPS}")
     again = ("--force",) if run.is_dir() else ()  # with more --minutes, a run goes on
     step("finetune", shards, "--from", BUNDLED, *time_limit, "--out", run, *again)
@@ -79,6 +94,30 @@ def try_recording(
     shown = film.is_file() and film.stat().st_mtime > (run / "checkpoints").stat().st_mtime
     step("generate", run, shards, *frames, "--unmask-steps", 8, "--out", film, there=shown)
     say(f"open {_write_page(folder, shards, film, done)}")
+
+
+def _tokenizer(data: str, embodiment: str) -> str:
+    """Return the tokenizer that suits the images of a recording; both are those of a bundled model."""
+    import numpy as np
+
+    from hma_data.episodes.align import to_clip
+    from hma_data.episodes.images import prepared
+    from hma_data.registry.embodiment import find
+    from hma_data.sources.base import open_source
+    from hma_data.tokenizers.base import get_tokenizer
+
+    robot, colors = find(embodiment), get_tokenizer(DRAWN)
+    source, camera, spec = open_source(robot.source.format), robot.primary_camera, colors.spec
+    for episode in source.episode_ids(data)[:LOOKED_AT]:
+        with suppress(EpisodeError):  # the conversion says what is wrong with it
+            clip = to_clip(source.read(data, episode, robot), robot)
+            rows = clip.frame_indices[camera.name][np.linspace(0, len(clip) - 1, LOOKED_AT).astype(int)]
+            stream = clip.episode.streams[camera.name]
+            images = prepared(stream, rows, camera, spec.image_size, spec.resize_filter)
+            shown = colors.decode(colors.encode(images))
+            same = (shown[:, :, 1:] == shown[:, :, :-1]).all(axis=-1).mean()
+            return DRAWN if same > FLAT else PHOTOGRAPHED
+    return PHOTOGRAPHED
 
 
 def _run(words: list[str]) -> None:

@@ -34,6 +34,7 @@ from hma_data.storage.kept import KeptParts
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import Tokenizer
 from hma_model.arrays import Floats
+from hma_model.checkpoint.folder import EMBEDDED_NAME, resolve
 from hma_model.checkpoint.io import record_locally
 from hma_model.evaluation.evaluate import EvaluationSettings, WindowPlan, measure
 from hma_model.evaluation.perceptual import Networks
@@ -104,7 +105,10 @@ def evaluate_all(
     names = [shards.embodiment.id for shards in sets]
     work: list[_Work] = []
     for checkpoint in checkpoints:  # all are checked before the first is measured
-        model = HMA.from_pretrained(checkpoint, embodiments=names, device=device).eval()
+        named = checkpoint
+        if as_text(checkpoint) == EMBEDDED_NAME:
+            named = resolve(checkpoint, names, sets[0].spec.name)
+        model = HMA.from_pretrained(named, embodiments=names, device=device).eval()
         work += [_Work.of(as_text(checkpoint), model, shards, settings) for shards in sets]
     parts, done = [], 0
     shown = short_paths(list(dict.fromkeys(one.label for one in work)))

@@ -22,7 +22,6 @@ from hma_model.checkpoint import weights
 from hma_model.checkpoint.folder import (
     CARD,
     CONFIG,
-    EMBEDDED,
     EMBEDDED_NAME,
     PARTS,
     PICTURES,
@@ -55,7 +54,7 @@ def make_env(n_envs=1, use_async_envs=False, cfg=None):
 MAX_NAMED = 50  # ids that an error lists
 _ADD_ONE = (
     f"Add one: hma finetune SHARDS --from {EMBEDDED_NAME} --out RUN, "
-    "with shards of hma convert --tokenizer {name}"
+    "with shards of hma convert --tokenizer palette-64 (drawn images) or fsq-lab (photographs)"
 )
 
 
@@ -259,8 +258,7 @@ def located(
     except CheckpointError as fault:
         if not checkpoint.bundled:
             raise
-        remedy = f"{fault.remedy}. {_ADD_ONE.format(**Checkpoint.open(EMBEDDED).config.tokenizer)}"
-        raise CheckpointError(fault.where, fault.fault, remedy) from fault
+        raise CheckpointError(fault.where, fault.fault, f"{fault.remedy}. {_ADD_ONE}") from fault
 
 
 def _pull(

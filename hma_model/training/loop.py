@@ -119,14 +119,14 @@ def finetune(
 
     Args:
         source: str or path of a checkpoint or a run's folder, a URI, or a hub repository, also
-            `org/name@revision`.
+            `org/name@revision`; `embedded` is the bundled one of the data's tokenizer.
         data: str or path of folders of shards, made with the checkpoint's tokenizer; for a tuned trunk of
             colours also with other colours.
         out: str or path of the run's folder; by default the one that the overrides name.
         freeze_trunk: train only the stems and heads.
         overrides: `key=value` strings that override the recipe.
-        recipe: name, or str or path of a YAML; by default `finetune_tiny` for `embedded`,
-            `finetune_colors` for the other bundled models, else `finetune`.
+        recipe: name, or str or path of a YAML; by default `finetune_tiny` for the bundled
+            transformer, `finetune_colors` for the bundled U-Nets, else `finetune`.
         options: `show`, `force`, `on_progress` of `train`.
 
     Raises:
@@ -142,7 +142,7 @@ def finetune(
         "freeze": "trunk" if freeze_trunk else "nothing",
     }
     ours = [f"{key}={yaml.safe_dump(value, default_flow_style=True)}" for key, value in given.items()]
-    return train(load_recipe(recipe or recipe_for(source), [*ours, *overrides]), out=out, **options)
+    return train(load_recipe(recipe or recipe_for(source, data[0]), [*ours, *overrides]), out=out, **options)
 
 
 def _loop(

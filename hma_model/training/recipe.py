@@ -11,6 +11,7 @@ from them and cannot be given. All faults are reported at once, before any shard
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
@@ -26,12 +27,13 @@ from pydantic import (
     create_model,
 )  # fmt: skip
 
-from hma_data.errors import RecipeError, UsageError
+from hma_data.errors import HMAError, RecipeError, UsageError
 from hma_data.loading.views import view_count
+from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath, as_text, shipped
 from hma_data.storage.yaml_io import parse_yaml, plain_fault, read_yaml
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model.checkpoint.folder import BUNDLED, EMBEDDED_NAME
+from hma_model.checkpoint.folder import BUNDLED, EMBEDDED_NAME, resolve
 from hma_model.config import MOST_IDS, HMAConfig
 
 # keys that may change when a run is resumed: places and intervals, but nothing that changes the weights
@@ -310,12 +312,18 @@ def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
     raise RecipeError(name, "no such recipe", remedy)
 
 
-def recipe_for(source: StrPath) -> str:
-    """Return the name of the recipe by which a model is finetuned where none is given."""
+def recipe_for(source: StrPath, data: StrPath) -> str:
+    """Return the name of the recipe by which a model is finetuned on a shard set where none is given."""
     name = as_text(source)
+    folder = BUNDLED.get(name)
     if name == EMBEDDED_NAME:
+        tokenizer = None
+        with suppress(HMAError):  # the run says what is wrong with the shards
+            tokenizer = ShardSet(data).spec.name
+        folder = resolve(name, tokenizer=tokenizer)
+    if folder == BUNDLED["embedded-fsq"]:
         return "finetune_tiny"
-    return "finetune_colors" if name in BUNDLED else "finetune"
+    return "finetune_colors" if folder in BUNDLED.values() else "finetune"
 
 
 def parse_overrides(overrides: Sequence[str], base: Mapping[str, Any] | None = None) -> dict[str, Any]:

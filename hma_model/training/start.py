@@ -70,7 +70,8 @@ class Start:
         source, revision = addressed(recipe.start)
         local = not is_repository(source) and "://" not in source
         if local:
-            found = Checkpoint.open(resolve(Path(source).expanduser()))
+            tokenizer = next(iter(sets.values())).spec.name
+            found = Checkpoint.open(resolve(Path(source).expanduser(), tokenizer=tokenizer))
             _config_for(found, recipe, sets, found.folder)
             found.trunk()
             source = str(found.folder)

@@ -123,12 +123,12 @@ def measure_frames(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def embedded(settings: dict[str, Any]) -> "HMA":
-    """Return the embedded model, on the device of the settings."""
+    """Return the bundled transformer, on the device of the settings."""
     from hma_model.network.model import HMA
     from hma_model.training.runtime import choose_device
 
     set_threads(settings)
-    return HMA.from_pretrained("embedded", device=choose_device(settings["device"]))
+    return HMA.from_pretrained("embedded-fsq", device=choose_device(settings["device"]))
 
 
 class Frames:

@@ -1,6 +1,6 @@
 """Measure how long the robots of a checkpoint stay with the truth, as `hma play` sees it.
 
-    python recipes/bench/holding.py embedded          # into hma_model/play/holding.json
+    python recipes/bench/holding.py embedded-lab          # into hma_model/play/holding.json
 
 Each robot with a simulator replays the recorder's actions in the model until model and truth have parted
 (`hma_model.play.session`), in several scenes. The lower median over scenes is the time that it holds.

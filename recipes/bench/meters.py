@@ -1,6 +1,6 @@
 """Calibrate the uncertainty of a bundled model's robots, and record the meters in its cards.
 
-    python recipes/bench/meters.py embedded    # all its robots, or name some; then the other bundled models
+    python recipes/bench/meters.py embedded-lab   # all robots, or name some
 
 The measurement is that of `hma benchmark`, which records the meters of other checkpoints itself.
 """

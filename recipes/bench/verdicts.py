@@ -1,6 +1,6 @@
 """Judge each robot of a bundled model on new recordings, and write the verdicts into its cards.
 
-    python recipes/bench/verdicts.py embedded # six minutes of one core; what is finished in --work is kept
+    python recipes/bench/verdicts.py embedded-lab  # what is finished in --work is kept
 
 The laboratory records 40 episodes of each robot with another seed than those of the training. Those that the
 recording holds out, at most eight, are judged as `hma evaluate --windows 8` does.

@@ -4,9 +4,11 @@ import shutil
 from pathlib import Path
 
 import av
+import h5py
+import numpy as np
 import pytest
 
-from hma_data.lab import record
+from hma_data.lab import family, record
 from hma_data.registry.embodiment import Embodiment
 from hma_data.storage.yaml_io import read_yaml, write_yaml
 from hma_model.cli import trial
@@ -42,6 +44,20 @@ def test_what_the_recording_cannot_say_is_asked_and_answered_by_flags(
     assert (robot.id, robot.action.space) == ("my_arm", "joint_delta")
     assert [words[0] for words in ran].count("registry") == 1, "what was inferred is kept"
     fails(hma("try", "nowhere.hdf5"), 1, "does not exist")
+
+
+def test_the_images_decide_the_tokenizer(tmp_path: Path) -> None:
+    recording, yaml = recorded(tmp_path, 2), tmp_path / "robot.yaml"
+    yaml.write_text(family.embodiment("mover_04").to_yaml())
+    assert trial._tokenizer(str(recording), str(yaml)) == "palette-64"
+    key = family.embodiment("mover_04").cameras[0].key
+    with h5py.File(recording, "a") as file:
+        for number, demo in enumerate(file["data"].values()):
+            frames = demo[key][:]
+            noise = np.random.default_rng(0).integers(0, 40, frames.shape, np.uint8)
+            del demo[key]
+            demo[key] = frames // 2 + noise if number else frames[:1]  # the first episode is damaged
+    assert trial._tokenizer(str(recording), str(yaml)) == "fsq-lab"
 
 
 @pytest.mark.parametrize(("said", "cropped"), [("", True), ("n", False)])

@@ -24,7 +24,7 @@ from hma_model.benchmark.planning import difference, plan, verdict
 from hma_model.benchmark.report import compared, read_results, rows, write_report
 from hma_model.benchmark.run import QUICK, RESULTS, WORK, benchmark
 from hma_model.checkpoint import io as checkpoints
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.cli import main
 from hma_model.evaluation.agreement import Accuracy
 from hma_model.evaluation.calibration import NO_UNCERTAINTY
@@ -121,7 +121,7 @@ def test_the_calibration_is_recomputed_from_what_is_written(
 
 def test_meters_are_recorded_in_the_cards_of_a_checkpoint_of_this_machine(tmp_path: Path) -> None:
     folder = tmp_path / "model"
-    shutil.copytree(EMBEDDED, folder)
+    shutil.copytree(BUNDLED["embedded-fsq"], folder)
     source = Checkpoint.open(folder)
     meter = {"verdict": "uncertainty warns of a state error of 1.7 px", "limit": 2.0}
     checkpoints.record_locally("org/name", source, "mover_04", meter, "meter")  # a copy of what is on the hub

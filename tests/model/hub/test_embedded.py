@@ -7,6 +7,7 @@ import pytest
 from hma_data.errors import CheckpointError
 from hma_data.lab.family import HELD_OUT
 from hma_data.shards.reader import ShardSet
+from hma_data.tokenizers.shapes import get_spec
 from hma_model.checkpoint import folder
 from hma_model.cli import main
 from hma_model.network.model import HMA
@@ -16,7 +17,7 @@ from tests.model.shards import make_shards
 def test_it_is_loaded_by_its_name() -> None:
     model = HMA.from_pretrained("embedded")
     assert sorted(model.embodiments) == sorted(
-        path.name for path in (folder.EMBEDDED / "embodiments").iterdir()
+        path.name for path in (folder.BUNDLED["embedded-fsq"] / "embodiments").iterdir()
     )
 
 
@@ -24,12 +25,9 @@ def test_for_a_robot_that_it_lacks_the_command_that_adds_one_is_named(tmp_path, 
     shards = make_shards(tmp_path / "shards", "my_arm")
     assert main(["evaluate", "embedded", str(shards)]) == 1
     said = capsys.readouterr().err
-    assert "embedded: has no embodiment 'my_arm' — it has: arm1_02, " in said and "pusht_fast" in said
+    assert "embedded-fsq: has no embodiment 'my_arm' — it has: arm1_02, " in said and "pusht_fast" in said
     assert "hma finetune SHARDS --from embedded --out RUN" in said
-    assert f"hma convert --tokenizer {HMA.from_pretrained('embedded', []).config.tokenizer['name']}" in said
-
-    assert main(["evaluate", "embedded-pusht", str(shards)]) == 1
-    assert "with shards of hma convert --tokenizer fsq-lab" in capsys.readouterr().err
+    assert "hma convert --tokenizer palette-64 (drawn images) or fsq-lab" in said
 
 
 def test_a_robot_with_a_checkpoint_to_itself_is_published_by_the_name_embedded(tmp_path) -> None:
@@ -48,11 +46,19 @@ def test_of_a_bundled_checkpoint_with_its_own_colours_the_option_that_takes_them
         folder.require_tokenizer(own.config, shards.spec, "shards")
 
 
+def test_the_name_embedded_stands_for_the_network_of_the_tokenizer_of_the_shards(tmp_path) -> None:
+    shards = make_shards(tmp_path / "shards", "my_arm", spec=get_spec("palette-64"))
+    given = ["--data", str(shards), "steps=1", "batch_size=1", "--out", str(tmp_path / "run")]
+    assert main(["finetune", "--from", "embedded", *given]) == 0
+    assert main(["finetune", "--from", "embedded", *given]) == 0  # it goes on
+    begun = folder.Checkpoint.open(tmp_path / "run" / ".start")
+    assert begun.trunk_sha256 == folder.Checkpoint.open("embedded-lab").trunk_sha256
+
+
 ROBOTS = {
     *("arm1_02", "arm1_03", "arm2_02", "arm2_07", "arm3_04", "arm4_01", "crane_04", "gantry_04", "mover_04"),
     *("mover_10", "rails_03", "rails_09", "pendulum", "planar_arm", "pusht_slow"),
 }
-LAB = {"arm2_02", "arm2_07", "arm3_04", "arm4_01", "crane_04", "mover_10", "planar_arm", "pusht_slow"}
 
 
 @pytest.mark.parametrize("name", folder.BUNDLED)
@@ -64,29 +70,37 @@ def test_every_bundled_checkpoint_is_whole_and_small(name) -> None:
 
 
 @pytest.mark.parametrize(
-    ("robots", "part"),
+    ("robots", "tokenizer", "part"),
     [
-        ([], "embedded"),
-        (["arm2_02"], "embedded-lab"),
-        (["arm2_02", "planar_arm"], "embedded-lab"),
-        (["arm2_02", "rails_03"], "embedded"),
-        (["pusht_fast"], "embedded-pusht"),
-        (["nobody"], "embedded"),
+        ([], None, "embedded-fsq"),
+        ([], "palette-64", "embedded-lab"),
+        ([], "fsq-lab", "embedded-fsq"),
+        ([], "vae-8", "embedded-fsq"),
+        (["arm2_02", "planar_arm"], None, "embedded-lab"),
+        (["arm2_02", "planar_arm"], "fsq-lab", "embedded-fsq"),
+        (["arm2_02", "planar_arm"], "vae-8", "embedded-lab"),
+        (["rails_03"], "palette-64", "embedded-lab2"),
+        (["arm2_02", "rails_03"], None, "embedded-fsq"),
+        (["pusht_fast"], None, "embedded-pusht"),
+        (["pusht_fast"], "fsq-lab", "embedded-pusht"),
+        (["nobody"], "palette-64", "embedded-fsq"),
     ],
 )
-def test_the_best_network_that_has_all_robots_is_found_by_the_name_embedded(robots, part) -> None:
-    assert folder.resolve("embedded", robots) == folder.BUNDLED[part]
-    assert set(folder.embodiments_in(folder.BUNDLED["embedded-lab"])) == LAB < ROBOTS
+def test_the_best_network_that_has_all_robots_is_found_by_the_name_embedded(robots, tokenizer, part) -> None:
+    assert folder.resolve("embedded", robots, tokenizer) == folder.BUNDLED[part]
 
 
-def test_the_embedded_trunk_is_the_one_of_the_recipe() -> None:
+def test_no_network_has_seen_the_robots_of_the_demo() -> None:
+    known = {one for name in folder.BUNDLED for one in folder.Checkpoint.open(name).embodiments}
+    assert known == {*ROBOTS, "pusht_fast"} and not known & set(HELD_OUT)
+
+
+def test_the_embedded_transformer_is_the_one_of_the_recipe() -> None:
     # `hma train world`, carried over to the present fsq-lab, trained on in six parts, the last two averaged,
     # and trained on in a seventh, on a GPU: see docs/results.md
-    own = folder.Checkpoint.open("embedded")
+    own = folder.Checkpoint.open("embedded-fsq")
     own.trunk()
     assert own.trunk_sha256 == "0dbaf3ccf33b191e75fce74be7d36d0a0af175063303d57488ff5c8df70d1634"
-    assert set(own.embodiments) == ROBOTS
-    assert not set(own.embodiments) & set(HELD_OUT)
     for embodiment in own.embodiments:
         own.check(embodiment)
     assert sum(path.stat().st_size for path in own.folder.rglob("*") if path.is_file()) <= 8_000_000

@@ -10,7 +10,7 @@ import pytest
 
 from hma_data.episodes.sheets import write_png
 from hma_data.lab import record
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.cli import main
 from tests.hostile import flip
 from tests.hub_server import Hub
@@ -50,15 +50,16 @@ def test_a_published_checkpoint_is_fetched(published, served, image, address) ->
 def test_the_bundled_model_is_played_with_all_its_checkpoints(served) -> None:
     assert main(["play", "-e", "pusht_fast", "--no-browser"]) == 0
     ((parts, name, *_, settings),) = served
-    assert [part.checkpoint.name for part in parts] == ["embedded", "embedded-lab", "embedded-pusht"]
+    assert [part.checkpoint.name for part in parts] == list(BUNDLED)
     assert name == "the bundled model" and settings["first"] == "pusht_fast"
     robots = [set(part.robots) for part in parts]
-    assert "rails_03" in robots[0] and "arm2_02" in robots[1] and robots[2] == {"pusht_fast"}
+    assert robots[0] == {"arm1_03", "gantry_04", "pendulum", "rails_09"} and robots[3] == {"pusht_fast"}
+    assert "arm2_02" in robots[1] and "rails_03" in robots[2]
     assert sum(map(len, robots)) == len(set.union(*robots)) == 16
 
 
 def test_a_folder_of_the_bundled_models_name_is_played_alone(tmp_path, served, monkeypatch) -> None:
-    shutil.copytree(EMBEDDED, tmp_path / "embedded")
+    shutil.copytree(BUNDLED["embedded-fsq"], tmp_path / "embedded")
     monkeypatch.chdir(tmp_path)
     assert main(["play", "--no-browser"]) == 0
     (([part], name, *_),) = served

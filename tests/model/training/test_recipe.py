@@ -12,6 +12,7 @@ from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.shapes import get_spec
 from hma_model.training.recipe import differences, load_recipe, make_recipe, parse_overrides, recipe_for
 from tests.model.robots import SPEC
+from tests.model.shards import make_shards
 
 
 @pytest.fixture
@@ -260,11 +261,19 @@ def test_every_kind_of_recipe_is_shipped():
 
 
 @pytest.mark.parametrize(
-    ("source", "name"),
-    [("embedded", "finetune_tiny"), ("embedded-lab", "finetune_colors"), ("org/name", "finetune")],
+    ("source", "tokenizer", "name"),
+    [
+        ("embedded", "fsq-lab", "finetune_tiny"),
+        ("embedded", "palette-64", "finetune_colors"),
+        ("embedded", "vae-8", "finetune_tiny"),  # the run names the tokenizers
+        ("embedded-fsq", "fsq-lab", "finetune_tiny"),
+        ("embedded-lab", "palette-64", "finetune_colors"),
+        ("org/name", "palette-64", "finetune"),
+    ],
 )
-def test_bundled_models_are_finetuned_by_recipes_of_their_own(source, name):
-    assert recipe_for(source) == name and name in SHIPPED
+def test_bundled_models_are_finetuned_by_recipes_of_their_own(tmp_path, source, tokenizer, name):
+    shards = make_shards(tmp_path / "shards", "my_arm", spec=get_spec(tokenizer))
+    assert recipe_for(source, shards) == name and name in SHIPPED
 
 
 TOKENIZERS = {

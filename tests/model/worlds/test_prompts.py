@@ -30,7 +30,7 @@ RAILS, MOVER, ARM, RECORDED = "rails_03", "mover_04", "planar_arm", "arm"
 
 @pytest.fixture(scope="module")
 def model() -> HMA:
-    return HMA.from_pretrained("embedded", [RAILS, MOVER])
+    return HMA.from_pretrained("embedded-fsq", [RAILS, MOVER])
 
 
 @pytest.fixture(scope="module")

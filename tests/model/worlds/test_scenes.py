@@ -21,7 +21,7 @@ from hma_data.lab import family
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
-from hma_model.checkpoint.folder import BUNDLED, EMBEDDED, Checkpoint
+from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.generation.unmask import Decoding
 from hma_model.play.pads import Pad, describe, hint, labels, pads
 from hma_model.play.save import film, lerobot_episode
@@ -141,9 +141,9 @@ def test_what_truly_happens_is_shown_in_the_size_of_the_models_images(size: int)
         def image(self, session: int) -> np.ndarray:
             return resize(super().image(session)[None], size)[0]
 
-    robots = drivable(Checkpoint.open(EMBEDDED), (), pytest.fail)
+    robots = drivable(Checkpoint.open("embedded-fsq"), (), pytest.fail)
     plain = robots["mover_04"]
-    robot = LabRobot(plain.embodiment, Checkpoint.open(EMBEDDED).stats("mover_04"), size)
+    robot = LabRobot(plain.embodiment, Checkpoint.open("embedded-fsq").stats("mover_04"), size)
     scene = robot.scene(0)
     found = scene.advance(None)
     assert scene.prompt.frames.shape == (PROMPT_FRAMES, size, size, 3) and found[1].shape == (size, size, 3)
@@ -256,7 +256,7 @@ def test_new_scenes_come_to_every_window_once_before_any_comes_again() -> None:
 
 def test_a_robot_without_simulator_and_shards_of_another_model_are_refused(shards) -> None:
     with pytest.raises(UsageError, match="does not know the robot toy_arm"):
-        drivable(Checkpoint.open(EMBEDDED), [shards], pytest.fail)
+        drivable(Checkpoint.open("embedded-fsq"), [shards], pytest.fail)
 
 
 def test_a_robot_without_simulator_begins_from_its_sample_or_from_images(tmp_path: Path) -> None:
