@@ -45,8 +45,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_561, 11_848, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 66_016, 524_139
-TEST_LINES = 49_969
-DOC_WORDS = 41_910
+TEST_LINES = 49_971
+DOC_WORDS = 41_990
 
 
 @cache

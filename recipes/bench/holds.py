@@ -5,6 +5,7 @@ Objects are told by their colours, in the truth and in the model alike. A row gi
 
     left        pixels of loose objects, as a share of the true ones; 1 keeps them, 0 has melted them
     limbs       the same of the robot's own parts
+    …_whole     share of objects, or of the robot's parts, that have 0.8 to 1.2 of their true pixels
     shape       overlap (intersection over union) with the true object after the best shift and turn
     off         distance of a pushed object's centre from the true one, as a share of how far that moved
     overlap     overlap as it lies, of objects that moved; `repeat`, that of the first frame repeated
@@ -29,6 +30,7 @@ from hma_data.lab import truth
 from hma_data.lab.simulator import embodiment
 from hma_model.evaluation.wholeness import (
     FEWEST,
+    WHOLE,
     Found,
     best_overlap,
     centre,
@@ -107,9 +109,12 @@ def sentence(marks: dict[str, dict[str, Any]]) -> str:
     for mark, row in marks.items():
         parts = []
         if row["limbs"] is not None:
-            parts.append(f"{row['limbs']:.0%} of the robot's pixels")
+            parts.append(
+                f"{row['limbs']:.0%} of the robot's pixels ({row['limbs_whole']:.0%} of its parts whole)"
+            )
         if row["left"] is not None:
-            parts.append(f"{row['left']:.0%} of the pixels of loose objects")
+            whole = f"({row['left_whole']:.0%} of them whole)"
+            parts.append(f"{row['left']:.0%} of the pixels of loose objects {whole}")
         if row["shape"] is not None:
             parts.append(f"their shapes overlap the true ones by {row['shape']:.0%}")
         said.append(f"after {mark} frames {', '.join(parts) or 'nothing was large enough to judge'}")
@@ -127,6 +132,8 @@ def _row(found: Found, mark: int) -> dict[str, Any]:
     )
     kept = shares(true, made)
     seen = np.isfinite(kept)
+    # a mean share is 1 too where one rollout has lost what another has doubled
+    whole = np.where(seen, (kept >= WHOLE[0]) & (kept <= WHOLE[1]), np.nan)
     moved, shapes, offs, overlaps, repeats = 0, [], [], [], []
     for color, rollout in zip(*np.nonzero(seen[: len(loose)]), strict=True):
         was, now, got = first[color, rollout], true[color, rollout], made[color, rollout]
@@ -148,7 +155,9 @@ def _row(found: Found, mark: int) -> dict[str, Any]:
         "robot": found.robot,
         "frame": mark,
         "left": mean_of(kept[: len(loose)]),
+        "left_whole": mean_of(whole[: len(loose)]),
         "limbs": mean_of(kept[len(loose) :]),
+        "limbs_whole": mean_of(whole[len(loose) :]),
         "shape": mean_of(shapes),
         "off": mean_of(offs),
         "overlap": mean_of(overlaps),

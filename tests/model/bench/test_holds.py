@@ -43,6 +43,7 @@ def test_a_film_that_is_the_truth_holds_in_every_figure() -> None:
     truth = row(scene(PLACES))
     assert (truth["left"], truth["limbs"], truth["shape"], truth["off"], truth["overlap"]) == (1, 1, 1, 0, 1)
     assert truth["moved"] == 1 and truth["repeat"] == 0 and truth["static_db"] == 99
+    assert truth["left_whole"] == truth["limbs_whole"] == 1
 
 
 def test_an_object_that_lies_elsewhere_keeps_its_shape_and_is_off() -> None:
@@ -57,6 +58,7 @@ def test_an_object_that_is_turned_keeps_its_shape_and_one_that_lost_a_limb_does_
     assert row(turned)["shape"] > 0.9
     limb = row(scene(PLACES, bar=False))
     assert limb["shape"] < 0.75 and limb["left"] == pytest.approx(64 / 96, abs=0.01)
+    assert limb["left_whole"] == 0 and limb["limbs_whole"] == 1
 
 
 def test_what_is_left_is_said_with_whether_it_stays_whole() -> None:

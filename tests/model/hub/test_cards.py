@@ -80,17 +80,17 @@ def test_a_card_opens_with_the_verdict_of_the_evaluation(folder: Path, tmp_path:
 
 
 def test_a_card_says_what_is_left_of_objects_and_evaluating_again_keeps_it(folder: Path) -> None:
-    rows = [
-        {"robot": "arm", "frame": 20, "limbs": 0.97, "left": 0.18, "shape": 0.15, "off": 1.2, "moved": 9},
-        {"robot": "arm", "frame": 60, "limbs": 0.9, "left": 0.1, "shape": 0.1, "off": 1.9, "moved": 9},
-    ]
+    keys = ("frame", "limbs", "limbs_whole", "left", "left_whole", "shape", "off", "moved")
+    figures = (20, 0.97, 1.0, 0.18, 0.05, 0.15, 1.2, 9), (60, 0.9, 0.5, 0.1, 0.0, 0.1, 1.9, 9)
+    rows = [{"robot": "arm", **dict(zip(keys, one, strict=True))} for one in figures]
     holds.record(str(folder), rows, rollouts=12)
     record_evaluation(Checkpoint.open(folder), "arm", {"verdict": NOT_YET, "follows": False})
     text = ModelCard.load(folder / "README.md").text
     assert "> **arm** does not follow its actions yet" in text
     assert (
-        "> **arm** in closed loop keeps after 20 frames 97% of the robot's pixels, 18% of the pixels of loose"
-        " objects, their shapes overlap the true ones by 15%." in text
+        "> **arm** in closed loop keeps after 20 frames 97% of the robot's pixels \\(100% of its parts "
+        "whole\\), 18% of the pixels of loose objects \\(5% of them whole\\), their shapes overlap the true "
+        "ones by 15%." in text
     )
     kept = Checkpoint.open(folder).card("arm")["holds"]
     assert (kept["rollouts"], list(kept["frames"]), kept["frames"]["20"]["off"]) == (12, ["20"], 1.2)

@@ -122,7 +122,7 @@ def test_features_are_read_from_the_checkpoint() -> None:
     ("given", "said"),
     [
         ({}, "embodiment: is not given — give --env.embodiment=ID; the model has: arm1_02"),
-        ({"embodiment": "nobody"}, "embedded: has no embodiment 'nobody'"),
+        ({"embodiment": "nobody"}, "embedded-fsq: has no embodiment 'nobody'"),
         ({"embodiment": ROBOT, "judge": "liked"}, "judge: 'liked' is not a task"),
         ({"embodiment": ROBOT, "horizon": 0}, "horizon: is 0 — give 1 or more"),
     ],

@@ -302,4 +302,4 @@ print(env.step(env.action_space.sample())[0].shape)
 env.close()
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=280)
-    assert done.stdout.strip() == "(2, 128, 128, 3)", done.stderr
+    assert done.stdout.strip() == "(2, 64, 64, 3)", done.stderr
