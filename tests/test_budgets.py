@@ -29,7 +29,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model": (532, 3_311, 4),
     "hma_model/benchmark": (841, 7_246, 5),
     "hma_model/checkpoint": (936, 7_099, 5),
-    "hma_model/cli": (1_783, 11_316, 12),
+    "hma_model/cli": (1_772, 11_321, 12),
     "hma_model/demo": (477, 4_030, 4),
     "hma_model/evaluation": (4_581, 36_766, 24),
     "hma_model/export": (1_189, 9_414, 9),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_719, 30_560, 20),
     "hma_model/worlds": (1_561, 11_848, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 66_016, 524_139
+PRODUCT_LINES, PRODUCT_NODES = 66_005, 524_144
 TEST_LINES = 49_971
 DOC_WORDS = 41_990
 

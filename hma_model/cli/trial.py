@@ -24,9 +24,7 @@ from hma_model.cli.options import embedded_robots
 
 BUNDLED = "embedded"  # the model to begin with: the one of the tokenizer
 PHOTOGRAPHED, DRAWN = "fsq-lab", "palette-64"  # tokenizers of the bundled transformer and of the U-Net
-FLAT = (
-    0.85  # share of pixels with their left neighbour's colour; measured: drawn 0.88 to 0.95, others to 0.82
-)
+FLAT = 0.85  # share of pixels with their left neighbour's colour: drawn 0.88 to 0.95, others up to 0.82
 LOOKED_AT = 8  # episodes that are tried, and images of the first that can be read
 PROMPT, LONGEST_FILM = 2, 24  # frames that are given, and that are predicted at most
 UNLIMITED_STEPS = 1_000_000  # the time ends the training
@@ -75,17 +73,8 @@ def try_recording(
         _answer(yaml, answer or [])
         embodiment = str(yaml)
     chosen = [word for name in only or () for word in ("--only", name)]
-    step(
-        "convert",
-        data,
-        "-e",
-        embodiment,
-        "--tokenizer",
-        _tokenizer(data, embodiment),
-        *chosen,
-        "--out",
-        shards,
-    )
+    tokenizer = _tokenizer(data, embodiment)
+    step("convert", data, "-e", embodiment, "--tokenizer", tokenizer, *chosen, "--out", shards)
     time_limit = (f"cpu_seconds={cpu_seconds}", f"steps={UNLIMITED_STEPS}")
     again = ("--force",) if run.is_dir() else ()  # with more --minutes, a run goes on
     step("finetune", shards, "--from", BUNDLED, *time_limit, "--out", run, *again)
