@@ -310,9 +310,9 @@ def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -
     differing = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key)]
     if differing:
         key, name = differing[0], ours.get("name")
-        fault = f"was trained on tokenizer {name!r}, this is {spec.name!r}"
+        fault = f"the model was trained on tokenizer {name!r}, the data is of {spec.name!r}"
         if key == "colors" and "name" not in differing:
-            fault = f"was trained on other colours of {name!r}"
+            fault = f"the model was trained on other colours of {name!r}"
         if key == "colors" or "name" in differing:
             remedy = f"convert the recordings with --tokenizer {name}"
             raise CheckpointError(where, fault, remedy + (_own_colors(config) if ours.get("colors") else ""))

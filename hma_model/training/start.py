@@ -72,7 +72,7 @@ class Start:
         if local:
             tokenizer = next(iter(sets.values())).spec.name
             found = Checkpoint.open(resolve(Path(source).expanduser(), tokenizer=tokenizer))
-            _config_for(found, recipe, sets, found.folder)
+            _config_for(found, recipe, sets, found.name)
             found.trunk()
             source = str(found.folder)
         wanted, likes = _robots(recipe, sets, source, revision, local)

@@ -144,7 +144,7 @@ CODED = TokenizerSpec(**{**SPEC.to_json(), "name": "coded", "weights_sha256": "a
     ("name", "shards", "changes", "fault", "said"),
     [
         ("arm", {"dims": 5}, (), CheckpointError, "has arm with action_dim 2, the shards have 5"),
-        ("leg", {"spec": CODED}, (), CheckpointError, "tokenizer 'raw', this is 'coded'"),
+        ("leg", {"spec": CODED}, (), CheckpointError, "tokenizer 'raw', the data is of 'coded'"),
         ("leg", {}, ("model.width=32",), RecipeError, r"model\.width.*is 32, .* has 16"),
         ("leg", {}, ("digits=64",), RecipeError, r"gives digits of \(64,\), the checkpoint has \(8, 8\)"),
         ("leg", {}, ("model.layers=3",), RecipeError, r"model\.layers"),

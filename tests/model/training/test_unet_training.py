@@ -83,7 +83,7 @@ def test_another_trunk_than_the_checkpoints_is_refused(base, shards, tmp_path, c
 def test_latents_of_another_size_or_tokenizer_are_refused(base, tmp_path):
     for name, grid, said in (
         ("raw", (8, 8), "grid is .4, 4"),
-        ("vae", (4, 4), "tokenizer 'raw', this is 'vae'"),
+        ("vae", (4, 4), "tokenizer 'raw', the data is of 'vae'"),
     ):
         spec = TokenizerSpec(name, 1, "continuous", 16, grid, channels=2, dtype="float16")
         made = make_shards(tmp_path / name, "arm", spec=spec)
