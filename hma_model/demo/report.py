@@ -28,7 +28,7 @@ OWN_DATA = """
 hma inspect DATA                                          # what is in the recording
 hma registry infer DATA --id my_arm --out my_arm.yaml     # its YAML; answer the TODOs in it
 hma registry validate my_arm.yaml
-hma convert DATA -e my_arm.yaml --tokenizer fsq-lab --out shards/my_arm
+hma convert DATA -e my_arm.yaml --tokenizer palette-64 --out shards/my_arm
 hma shards verify shards/my_arm
 hma shards preview shards/my_arm                          # sheet.png and preview.mp4 from the tokens
 hma finetune shards/my_arm --from embedded --out runs/my_arm
@@ -52,8 +52,8 @@ def write_report(made: DemoRun) -> Path:
     page.table(["what", "size"], [[name, human_bytes(size)] for name, size in made.sizes.items()])
     page.table(["stage", "wall time"], [[name, human_seconds(s)] for name, s in made.seconds.items()])
     about = (
-        "Every step above is one command; DATA is a file, folder or URI. These start with the bundled "
-        "transformer, whose tokens also show photographs; the demo starts with embedded-lab."
+        "Every step above is one command; DATA is a file, folder or URI. With palette-64, for drawn images, "
+        "the model begins as the demo's does; for photographs, fsq-lab and a transformer are better."
     )
     page.section("The same on your own data", about)
     page.commands(OWN_DATA)
