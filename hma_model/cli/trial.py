@@ -24,7 +24,7 @@ from hma_model.cli.options import embedded_robots
 
 BUNDLED = "embedded"  # the model to begin with: the one of the tokenizer
 PHOTOGRAPHED, DRAWN = "fsq-lab", "palette-64"  # tokenizers of the bundled transformer and of the U-Net
-FLAT = 0.85  # share of pixels with their left neighbour's colour: drawn 0.88 to 0.95, others up to 0.82
+FLAT = 0.65  # share of pixels with their left neighbour's colour: drawn from 0.88, photographs up to 0.55
 LOOKED_AT = 8  # episodes that are tried, and images of the first that can be read
 PROMPT, LONGEST_FILM = 2, 24  # frames that are given, and that are predicted at most
 UNLIMITED_STEPS = 1_000_000  # the time ends the training
