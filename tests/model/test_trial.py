@@ -54,7 +54,7 @@ def test_the_images_decide_the_tokenizer(tmp_path: Path) -> None:
     with h5py.File(recording, "a") as file:
         for number, demo in enumerate(file["data"].values()):
             frames = demo[key][:]
-            noise = np.random.default_rng(0).integers(0, 40, frames.shape, np.uint8)
+            noise = np.random.default_rng(0).integers(0, 128, frames.shape, np.uint8)
             del demo[key]
             demo[key] = frames // 2 + noise if number else frames[:1]  # the first episode is damaged
     assert trial._tokenizer(str(recording), str(yaml)) == "fsq-lab"
