@@ -99,12 +99,10 @@ def _note_skip(report: pytest.TestReport | pytest.CollectReport) -> None:
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Note why a test is skipped."""
     _note_skip(report)
 
 
 def pytest_collectreport(report: pytest.CollectReport) -> None:
-    """Note why a module is skipped."""
     _note_skip(report)
 
 
@@ -175,7 +173,6 @@ class BlockTokenizer:
 
 @pytest.fixture(scope="session")
 def block_tokenizer() -> BlockTokenizer:
-    """See BlockTokenizer."""
     return BlockTokenizer()
 
 

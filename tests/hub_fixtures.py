@@ -15,7 +15,6 @@ from tests.hub_state import REPO, TOKEN
 
 @pytest.fixture
 def token() -> str:
-    """One that may write."""
     return TOKEN
 
 
@@ -36,7 +35,6 @@ _pushed: dict[Path, tuple] = {}  # a checkpoint -> what a hub holds after its pu
 
 @pytest.fixture
 def published(server: Hub, source: Path) -> Hub:
-    """The hub with that checkpoint in REPO."""
     from hma_model.hub import publish as hub
 
     if source not in _pushed:

@@ -56,7 +56,6 @@ class Hub(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_address[1]}"
 
     def create(self, name: str, kind: str = "models", private: bool = False) -> Repository:
-        """A new repository with what the hub puts into each."""
         made = Repository(name, private)
         made.commit({".gitattributes": b"*.safetensors filter=lfs\n"}, "initial commit")
         self.repositories[f"{kind}/{name}"] = made
@@ -68,7 +67,6 @@ class Hub(ThreadingHTTPServer):
         return kept.commit_folder(folder, branch).id
 
     def served(self) -> list[str]:
-        """Names of the files that were sent, in their order."""
         sent = [asked.path for asked in self.log if asked.method == "GET" and asked.sent]
         return [re.sub(_PLACE, "", path) for path in sent]
 
@@ -80,7 +78,6 @@ class Hub(ThreadingHTTPServer):
         self.faults.append(Fault(request, status, **facts))
 
     def sent(self, pattern: str = "") -> dict[str, int]:
-        """Bytes of files sent, by path in the repository."""
         totals: dict[str, int] = {}
         for asked in self.log:
             if asked.method == "GET" and asked.sent and re.search(pattern, asked.path):
@@ -89,11 +86,9 @@ class Hub(ThreadingHTTPServer):
         return totals
 
     def count(self, request: str) -> int:
-        """Return how many requests matched."""
         return sum(re.search(request, f"{asked.method} {asked.path}") is not None for asked in self.log)
 
     def await_count(self, request: str, times: int) -> None:
-        """Wait until so many requests have matched."""
         with self.changed:
             assert self.changed.wait_for(lambda: self.count(request) >= times, 60)
 

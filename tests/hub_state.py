@@ -40,13 +40,11 @@ class Habits:
     empty: bool = True
 
     def by_lfs(self, path: str, size: int) -> bool:
-        """Check whether a file goes by LFS."""
         if self.lfs != "kinds":
             return self.lfs == "all"
         return size > LFS_BYTES or path.endswith(LFS_KINDS)
 
     def entry(self, path: str, content: bytes) -> dict[str, Any]:
-        """A file in a listing."""
         entry: dict[str, Any] = {"type": "file", "path": path, "size": len(content), "oid": oid(content)}
         if self.by_lfs(path, len(content)):
             entry["lfs"] = {"oid": sha256(content), "size": len(content), "pointerSize": 134}
@@ -91,7 +89,6 @@ class Repository:
         return made
 
     def commit_to(self, branch: str, files: dict[str, bytes | None], message: str) -> Commit:
-        """Add a commit to a branch other than main, below all others."""
         head = self.at(branch)
         assert head is not None
         newest = self.commits[-1]
@@ -103,13 +100,11 @@ class Repository:
         return made
 
     def at(self, revision: str) -> Commit | None:
-        """The commit of a branch, tag or id."""
         wanted = self.commits[-1].id if revision == "main" else self.refs.get(revision, revision)
         return next((commit for commit in self.commits if commit.id == wanted), None)
 
     @property
     def files(self) -> dict[str, bytes]:
-        """Return what is there now."""
         return self.commits[-1].files
 
 

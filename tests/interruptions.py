@@ -167,13 +167,11 @@ def result(folder: Path) -> Disk:
 
 
 def toy(data: Path) -> None:
-    """Four episodes of two cameras in HDF5, and their YAML."""
     write_toy(data / "toy.hdf5", [14, 15, 16, 17])
     (data / "arm.yaml").write_text(ARM_YAML)
 
 
 def three(data: Path) -> None:
-    """Three episodes of three cameras in HDF5, and their YAML."""
     cameras.write_hdf5(data / "three.hdf5")
     (data / "three.yaml").write_text(cameras.arm().to_yaml())
 
@@ -211,7 +209,6 @@ def finetuned(data: Path) -> None:
 
 
 def rails(data: Path, *objectives: str) -> None:
-    """A checkpoint of a laboratory robot."""
     own = family.embodiment(ROBOT)
     ends = {"mean": 0.0, "std": 30.0, "min": -60.0, "max": 60.0}
     stats = {key: [value] * own.action_dim for key, value in ends.items()}

@@ -17,7 +17,6 @@ TINY += ["model.layers=1", "model.width=32", "model.heads=2"]
 
 
 def hdf5_arm(folder: Path) -> Path:
-    """Three episodes in robomimic's layout."""
     draw = np.random.default_rng(0)
     with h5py.File(folder / "friday.hdf5", "w") as file:
         for i in range(3):
@@ -29,14 +28,12 @@ def hdf5_arm(folder: Path) -> Path:
 
 
 def ros2_bags(folder: Path) -> Path:
-    """Three bags with a camera, joint states and commands."""
     for i in range(3):
         write_ros2(folder / "bags" / f"run_{i}", make_recording(frames=40, seed=i), "MCAP")
     return folder / "bags"
 
 
 def lerobot_dataset(folder: Path) -> Path:
-    """A LeRobotDataset v3.0."""
     return make_v3(folder, (40, 36, 44))
 
 

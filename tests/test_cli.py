@@ -144,9 +144,6 @@ def test_infer_writes_a_yaml_whose_questions_validate_lists(toy_yaml: Path, tmp_
     )
 
 
-# -- bad input: one clear line each
-
-
 def test_wrong_usage_is_exit_code_two() -> None:
     fails(hma("inspect"), 2, "Missing argument")
     fails(hma("convert", "--nonsense"), 2, "--nonsense")

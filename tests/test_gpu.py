@@ -39,7 +39,6 @@ KINDS = ["discrete", "continuous"]
 
 
 def frames_of(batch: Batch, kind: str = "discrete") -> torch.Tensor:
-    """Return a batch's tokens, or its latents."""
     frames = batch.tokens if kind == "discrete" else batch.latents
     assert frames is not None
     return frames

@@ -92,8 +92,6 @@ def each(quick: int, slow: int = MOST) -> pytest.MarkDecorator:
 
 
 def signalled(at: int, number: int) -> Callable[[int, object], None]:
-    """Send this process a signal at a point."""
-
     def send(point: int, moved: object) -> None:
         if point == at:
             os.kill(os.getpid(), number)
@@ -109,7 +107,6 @@ def test_a_killed_command_given_again_ends_with_the_same_bytes(name, most, cases
 
 
 def killed(name: str, data: Path, place: Path, at: int) -> None:
-    """Be a process that is killed at a point."""
     with watched(place, signalled(at, signal.SIGKILL)):
         ALL[name].run(data, place)
 

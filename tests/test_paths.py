@@ -54,7 +54,6 @@ FORMS: dict[str, Given] = {"str": str, "Path": Path, "PathLike": lambda path: Ba
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one small thing of each kind that users read."""
     folder = tmp_path_factory.mktemp("paths")
     (folder / "toy_arm.yaml").write_text(ARM_YAML)
     write_toy(folder / "toy.hdf5", (5, 6))
@@ -129,9 +128,6 @@ def test_any_form_of_a_path_gives_the_same(made: Path, tmp_path: Path, case: str
         (out := tmp_path / form).mkdir()
         results[form] = repr(CASES[case](made, given, out)).replace(str(out), "")
     assert results["str"] == results["Path"] == results["PathLike"]
-
-
-# -- what a path object says
 
 
 @pytest.mark.parametrize(

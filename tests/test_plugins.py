@@ -55,7 +55,6 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
 @pytest.fixture
 def toy_robot(install: Install) -> None:
-    """The package of docs/extending.md."""
     project = tomllib.loads(FILES["pyproject.toml"])["project"]
     modules = {name: text for name, text in FILES.items() if name.endswith(".py")}
     install(project["name"], modules, project["entry-points"])
@@ -63,7 +62,6 @@ def toy_robot(install: Install) -> None:
 
 @pytest.fixture
 def episodes(tmp_path: Path) -> Path:
-    """A folder with the YAML of docs/extending.md, and `episodes` of its format."""
     draw = np.random.default_rng(0)
     (tmp_path / "episodes").mkdir()
     for i in range(3):

@@ -53,7 +53,6 @@ class Item(NamedTuple):
 
 
 def make_recording(frames: int = 10, seed: int = 0) -> Recording:
-    """A recording of that many pictures."""
     draw = np.random.default_rng(seed)
     return Recording(
         START_NS + np.arange(frames) * 100_000_000,
@@ -66,7 +65,6 @@ def make_recording(frames: int = 10, seed: int = 0) -> Recording:
 
 
 def items(recording: Recording) -> Iterator[Item]:
-    """Its messages in order of receipt."""
     stamps = recording.picture_ns
     if recording.stamp_shift_ns is not None:
         stamps = stamps + recording.stamp_shift_ns
@@ -119,7 +117,6 @@ def write_by_rosbags(
 
 
 def write_ros1(path: Path, recording: Recording, compression: str | None = None) -> Path:
-    """A ROS 1 bag by rosbags."""
     store, writer = get_typestore(Stores.ROS1_NOETIC), Ros1Writer(path)
     if compression:
         writer.set_compression(Ros1Writer.CompressionFormat[compression])
@@ -130,7 +127,6 @@ def write_ros1(path: Path, recording: Recording, compression: str | None = None)
 def write_ros2(
     path: Path, recording: Recording, plugin: str, mode: CompressionMode = CompressionMode.NONE
 ) -> Path:
-    """A ROS 2 bag folder by rosbags."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     writer = Ros2Writer(path, version=9, storage_plugin=StoragePlugin[plugin])
     writer.set_compression(mode, CompressionFormat.ZSTD)
@@ -165,14 +161,12 @@ def write_mcap(path: Path, recording: Recording, how: dict[str, Encoded], **opti
 
 
 def as_ros1() -> dict[str, Encoded]:
-    """ROS 1 messages."""
     store = get_typestore(Stores.ROS1_NOETIC)
     names = {kind: kind.replace("/msg/", "/") for kind in ROS_TYPES.values()}
     return as_ros(store, "ros1msg", "ros1", store.serialize_ros1, names)
 
 
 def as_cdr() -> dict[str, Encoded]:
-    """ROS 2 messages."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     return as_ros(store, "ros2msg", "cdr", store.serialize_cdr, {}, ros_version=2)
 
@@ -201,7 +195,6 @@ def as_ros(
 
 
 def as_json() -> dict[str, Encoded]:
-    """JSON, the pictures as PNG."""
     return {
         CAMERA: Encoded("foxglove.CompressedImage", "jsonschema", b"{}", "json", _json_picture),
         STATE: Encoded("JointState", "jsonschema", b"{}", "json", _json_joints),
@@ -261,7 +254,6 @@ def protobuf_types(layout: dict[str, list[tuple[str, int, int]]]) -> tuple[bytes
 
 
 def as_protobuf() -> dict[str, Encoded]:
-    """Protobuf, the pictures raw."""
     sizes = [(name, UINT32, ONE) for name in ("width", "height", "step")]
     layout = {
         "RawImage": [*sizes, ("encoding", TEXT, ONE), ("data", BLOB, ONE)],
@@ -335,5 +327,4 @@ SOURCE = open_source("rosbag")
 
 
 def read(path: Path, embodiment: Embodiment) -> Episode:
-    """The first bag at that path."""
     return SOURCE.read(str(path), SOURCE.episode_ids(str(path))[0], embodiment)

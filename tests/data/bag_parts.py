@@ -56,7 +56,6 @@ class Run:
     stamps: np.ndarray | None = None
 
     def messages(self) -> list[Said]:
-        """All, in order of receipt."""
         pictures = [Said(CAMERA, float(t) + LATE_NS / 1e9, i) for i, t in enumerate(self.times)]
         return sorted([*pictures, *self.said], key=lambda item: item.at_s)
 
@@ -96,7 +95,6 @@ def _used(run: Run) -> list[str]:
 
 
 def ros1(folder: Path, run: Run, compression: str | None = None, chunk: int = 4096) -> Path:
-    """A ROS 1 bag of many small chunks."""
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = Ros1Writer(folder / "run.bag")
     writer.chunk_threshold = chunk
@@ -118,7 +116,6 @@ def ros1_without_index(folder: Path, run: Run) -> Path:
 
 
 def sqlite(folder: Path, run: Run) -> Path:
-    """A ROS 2 bag folder."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Ros2Writer(folder / "run", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         made = {t: writer.add_connection(t, TYPES[t], typestore=store) for t in _used(run)}
@@ -171,7 +168,6 @@ KINDS: dict[str, Callable[[Path, Run], Path]] = {
 
 
 def parted(segments: str, more: str = "") -> Embodiment:
-    """An embodiment whose bags are parted so."""
     return arm(f"""
 id: parted
 kind: real

@@ -20,12 +20,10 @@ JOINTS = ["wrist"] + [f"{f}_{i}" for f in ("thumb", "index", "middle", "ring", "
 
 
 def place(side: str, frame: int) -> tuple[float, float]:
-    """Centre of a hand in a frame, as fractions."""
     return (0.1 + 0.01 * frame, 0.25) if side == "left" else (0.75, 0.2 + 0.01 * frame)
 
 
 def expected(frames: Iterable[int]) -> np.ndarray:
-    """(n, 4) left x, y and right x, y of those frames."""
     return np.array([[*place("left", i), *place("right", i)] for i in frames], np.float32)
 
 
@@ -55,12 +53,10 @@ Seen = Callable[[str, int], bool]
 
 
 def always(side: str, frame: int) -> bool:
-    """Both hands are in every frame."""
     return True
 
 
 def rows(video: str, length: int, seen: Seen = always) -> list[dict[str, Any]]:
-    """Rows of a table of hands."""
     return [
         {"video": video, "frame": i, "side": side, "x": place(side, i)[0], "y": place(side, i)[1]}
         for i in range(length)
@@ -70,7 +66,6 @@ def rows(video: str, length: int, seen: Seen = always) -> list[dict[str, Any]]:
 
 
 def write_table(path: Path, table: list[dict[str, Any]]) -> Path:
-    """A table as parquet or CSV, by the file's name."""
     if path.suffix == ".parquet":
         pq.write_table(pa.Table.from_pylist(table), path)
     else:
@@ -110,7 +105,6 @@ def epic_message(number: int, hands: Iterable[tuple[str, float, tuple[float, flo
 
 
 def epic_messages(length: int, seen: Seen = always, score: float = 0.9) -> list[bytes]:
-    """One message a frame, numbered from 1."""
     return [
         epic_message(i + 1, [(side, score, place(side, i)) for side in ("left", "right") if seen(side, i)])
         for i in range(length)
@@ -127,7 +121,6 @@ def ego4d_box(kind: str, x: float, y: float) -> dict[str, Any]:
 
 
 def ego4d_action(frames: Iterable[int], text: str, **said: Any) -> dict[str, Any]:
-    """A narrated action with both hands in those frames, and an object."""
     return {
         "uid": text,
         "narration_text": text,

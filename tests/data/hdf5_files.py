@@ -11,7 +11,6 @@ T, H, W = 9, 12, 16
 
 
 def embodiment(**changes: Any) -> Embodiment:
-    """An arm of robomimic's layout, with changes by `section__key`."""
     values: dict[str, Any] = {
         "id": "test_arm",
         "kind": "simulation",
@@ -34,7 +33,6 @@ def pictures(length: int = T, seed: int = 0) -> np.ndarray:
 
 
 def fill(group: h5py.Group, length: int = T, seed: int = 0) -> None:
-    """An episode of robomimic's layout."""
     group["actions"] = np.random.default_rng(seed).normal(size=(length, 3))
     group["rewards"] = np.zeros(length)
     group["dones"] = np.arange(length) == length - 1

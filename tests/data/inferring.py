@@ -35,7 +35,6 @@ def questions(values: dict[str, Any]) -> dict[str, str]:
 
 
 def answered(values: Any) -> Any:
-    """With every question answered."""
     if isinstance(values, dict):
         return {key: _answer(key, value) for key, value in values.items()}
     return [answered(value) for value in values] if isinstance(values, list) else values
@@ -164,7 +163,6 @@ def trajectory() -> Message:
 def bag(
     path: Path, topics: dict[str, tuple[Message, float]], form: str = "ros2", seconds: float = 1.0
 ) -> Path:
-    """A bag of those topics, each at its rate."""
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
     writer: Any = Ros1Writer(path) if form == "ros1" else None
     plugin = StoragePlugin.SQLITE3 if form == "sqlite" else StoragePlugin.MCAP

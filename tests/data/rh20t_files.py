@@ -66,7 +66,6 @@ def write_scene(
 
 
 def robot(**changes: Any) -> Embodiment:
-    """An embodiment of such scenes: pose and width of the next sample, with two cameras."""
     values: dict[str, Any] = {
         "id": "test_rh20t",
         "kind": "real",

@@ -49,7 +49,6 @@ PROTO = _example_class()
 
 
 def encode(features: dict) -> bytes:
-    """Lists of bytes, floats or ints by name -> a serialized Example."""
     example = PROTO()
     for name, values in features.items():
         values = list(np.ravel(values)) if isinstance(values, np.ndarray) else values

@@ -19,13 +19,11 @@ Sent = tuple[str, Any, int]  # topic, message, time of receipt
 
 
 def define(name: str, text: str) -> Any:
-    """Register a message type; return its class."""
     TYPES.register(get_types_from_msg(text, name))
     return TYPES.types[name]
 
 
 def write(path: Path, messages: Iterable[Sent], mcap: bool = False) -> Path:
-    """A bag's folder with those messages in that order."""
     shutil.rmtree(path, ignore_errors=True)
     plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
     with Writer(path, version=9, storage_plugin=plugin) as writer:
@@ -76,6 +74,5 @@ def array(values: Sequence[float]) -> Any:
 
 
 def numbers(clip: Clip, camera: str = "cam") -> list[int]:
-    """The numbers that the frames of a clip carry."""
     frames = clip.episode.streams[camera].frames(clip.frame_indices[camera])
     return [round((float(np.median(frame)) - 40) / LEVELS) for frame in frames]

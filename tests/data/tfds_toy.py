@@ -89,8 +89,6 @@ def step(index: int, last: bool, rng: np.random.Generator) -> dict[str, Any]:
 
 
 class Toy(tfds.core.GeneratorBasedBuilder):
-    """Thirteen episodes over three splits."""
-
     __module__ = "tests"  # in a deeper one TFDS looks for importlib_resources, which it does not install
 
     VERSION = tfds.core.Version("1.2.3")
@@ -117,7 +115,6 @@ class Toy(tfds.core.GeneratorBasedBuilder):
 
 
 def build(folder: Path, shards: int = 3, file_format: str = "tfrecord") -> Path:
-    """Write the dataset; the version's folder."""
     config = tfds.download.DownloadConfig(num_shards=shards)
     builder = Toy(data_dir=folder, file_format=file_format)
     builder.download_and_prepare(download_config=config)
@@ -125,7 +122,6 @@ def build(folder: Path, shards: int = 3, file_format: str = "tfrecord") -> Path:
 
 
 def episodes(folder: Path, split: str) -> list[dict[str, Any]]:
-    """Episodes as TFDS reads them, each with `steps` as a list."""
     config = tfds.ReadConfig(interleave_cycle_length=1)
     data = tfds.builder_from_directory(str(folder)).as_dataset(
         split=split, shuffle_files=False, read_config=config

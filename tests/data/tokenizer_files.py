@@ -57,7 +57,6 @@ def stop_at(step: int) -> Callable[[str], None]:
 
 
 def frames(count: int, seed: int = 0, size: int = 256) -> np.ndarray:
-    """(N, S, S, 3) uint8: smooth random blobs."""
     noise = np.random.default_rng(seed).integers(0, 256, (count, 8, 8, 3), np.uint8)
     grown = nn.functional.interpolate(
         torch.from_numpy(noise).permute(0, 3, 1, 2).float(), size=(size, size), mode="bilinear"
@@ -84,7 +83,6 @@ def magvit2_state(config: Magvit2Config = TINY_MAGVIT2, seed: int = 0) -> dict[s
 
 
 def write_magvit2(path: Path, config: Magvit2Config = TINY_MAGVIT2, seed: int = 0) -> Path:
-    """A safetensors file of them."""
     save_file(magvit2_state(config, seed), path)
     return path
 
@@ -123,7 +121,6 @@ def tiny_halves(
 
 
 def write_tiny_pair(folder: Path, name: str = "taesd", **sizes: int) -> Path:
-    """`<name>_encoder.pth` and `<name>_decoder.pth`."""
     for half, state in zip(("encoder", "decoder"), tiny_halves(**sizes), strict=True):
         torch.save(state, folder / f"{name}_{half}.pth")
     return folder

@@ -26,7 +26,6 @@ def picture(number: int) -> np.ndarray:
 
 
 def number_of(frame: np.ndarray) -> int:
-    """The number a decoded picture shows."""
     return round((float(np.median(frame)) - 8) / STEP)
 
 
@@ -78,12 +77,10 @@ TASKS = ("push the block", "lift the block")
 
 
 def actions_of(episode: int, length: int) -> np.ndarray:
-    """(length, 2) float32 that name their episode and row."""
     return np.stack([np.full(length, episode), np.arange(length)], axis=1).astype(np.float32)
 
 
 def _info(version: str, fps: int, lengths: Sequence[int], codec: str) -> dict[str, Any]:
-    """Return what meta/info.json says."""
     chunk = "chunk-{episode_chunk:03d}"
     paths = {
         "data_path": f"data/{chunk}/episode_{{episode_index:06d}}.parquet",

@@ -29,19 +29,16 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def arm_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six episodes of a robot of two action dims; the last one is held out."""
     return make_shards(tmp_path_factory.mktemp("shards") / "arm", "arm")
 
 
 @pytest.fixture(scope="session")
 def hand_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same of a robot of three action dims."""
     return make_shards(tmp_path_factory.mktemp("shards") / "hand", "hand", dims=3, seed=1)
 
 
 @pytest.fixture(scope="session")
 def data(arm_shards: Path, hand_shards: Path) -> list[str]:
-    """Both shard sets, as a recipe names them."""
     return [str(arm_shards), str(hand_shards)]
 
 
@@ -57,14 +54,12 @@ def recipe(data: list[str]) -> Callable[..., Recipe]:
 
 @pytest.fixture(scope="session")
 def tiny_run(data: list[str], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
-    """Six steps on both robots."""
     recipe = make_recipe({**TINY, "data": data, "model": {**TINY["model"], "mup": True, "base_width": 8}})
     return train(recipe, out=tmp_path_factory.mktemp("tiny") / "run", show=False)
 
 
 @pytest.fixture(scope="session")
 def finished(data: list[str], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
-    """The run of the tiny recipe without a change, from its first step to its last."""
     recipe = make_recipe({**TINY, "data": data})
     return train(recipe, out=tmp_path_factory.mktemp("finished") / "run", show=False)
 
@@ -79,5 +74,4 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(source: Path, tmp_path: Path) -> Path:
-    """A copy of that checkpoint."""
     return Path(shutil.copytree(source, tmp_path / "model"))

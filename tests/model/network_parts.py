@@ -13,7 +13,6 @@ HAND = ActionSpace("hand.v1", 2, 1, (0.0, 3.0), (1.0, 0.0), (True, True))
 
 
 def seeded(value: int = 0) -> torch.Generator:
-    """A generator of random numbers on the CPU."""
     return torch.Generator().manual_seed(value)
 
 
@@ -41,7 +40,6 @@ def small_model(seed: int = 0, **changes: Any) -> HMA:
 
 
 def small_batch(config: HMAConfig, embodiment: list[str], seed: int = 0, frames: int | None = None) -> Batch:
-    """Windows of random tokens, latents and actions."""
     generator = torch.Generator().manual_seed(seed)
     b, t = len(embodiment), frames or config.frames
     actions = torch.randn(b, t, ARM.chunk_dim, generator=generator)

@@ -137,5 +137,4 @@ def _rank(work: Callable[[int], Any], rank: int, ranks: int, port: int) -> None:
 
 
 def errors(said: str) -> list[str]:
-    """The lines of errors in what ranks have said."""
     return [line for line in said.splitlines() if line.startswith("error: ")]

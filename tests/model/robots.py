@@ -50,12 +50,10 @@ license: apache-2.0
 
 
 def stats(dims: int = 2) -> dict[str, Any]:
-    """stats.json's values."""
     return {"action": {"mean": [0.25] * dims, "std": [2.0 + i for i in range(dims)], "count": 7}}
 
 
 def make_model(names: dict[str, int], seed: int = 0, config: HMAConfig = CONFIG) -> HMA:
-    """A model with an embodiment for each name, of so many action dims."""
     torch.manual_seed(seed)
     model = HMA(config)
     for name, dims in names.items():
@@ -65,7 +63,6 @@ def make_model(names: dict[str, int], seed: int = 0, config: HMAConfig = CONFIG)
 
 
 def save(folder: Path, names: dict[str, int], seed: int = 0, **given: Any) -> HMA:
-    """A saved checkpoint, and its model."""
     model = given.pop("model", None) or make_model(names, seed)
     checkpoint.save(
         model,

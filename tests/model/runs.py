@@ -30,13 +30,11 @@ def kill_at(step: int) -> Callable[[dict[str, Any]], None]:
 
 
 def train_until(recipe: Recipe, out: Path, step: int) -> None:
-    """Train, and be killed after a step."""
     with pytest.raises(KeyboardInterrupt):
         train(recipe, out=out, show=False, on_progress=kill_at(step))
 
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
-    """Every tensor of a checkpoint, by file and name."""
     return {
         f"{path.relative_to(folder)}:{name}": value
         for path in sorted(folder.rglob("*.safetensors"))
@@ -45,6 +43,5 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
 
 
 def same(one: Path, other: Path) -> bool:
-    """Check whether two checkpoints have the same tensors, bit for bit."""
     a, b = weights(one), weights(other)
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)

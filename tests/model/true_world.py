@@ -99,8 +99,6 @@ class TrueWorld:
 
 
 class Watcher:
-    """A viewer that keeps everything."""
-
     def __init__(self) -> None:
         self.frames: list[Frame] = []
         self.told: list[dict[str, Any]] = []
@@ -143,7 +141,6 @@ class BlockLatents(BlockTokenizer):
 
 
 def latent_model(robot: str) -> HMA:
-    """Return a model of `BlockLatents` that knows nothing of a robot of the family."""
     torch.manual_seed(0)
     config = HMAConfig(
         kind="continuous", layers=1, width=32, heads=2, frames=4, grid=(8, 8), channels=3, patch=4,

@@ -150,9 +150,6 @@ def test_a_wrong_word_in_the_rule_names_what_is_allowed() -> None:
     assert "'refuse' or 'flag'" in problem
 
 
-# -- the thresholds
-
-
 def check(frames: np.ndarray) -> PictureCheck:
     seen = PictureCheck()
     seen.add(resize(frames, 256))
@@ -190,9 +187,6 @@ def test_noise_does_not_hide_a_frozen_camera_and_a_small_motion_does_not_look_fr
     for i, frame in enumerate(scene):
         frame[100:108, 60 + 2 * i : 68 + 2 * i] = 255
     assert not check(scene).still
-
-
-# -- shards that exist
 
 
 def test_doctor_names_the_blank_and_still_episodes_that_were_kept(tmp_path, block_tokenizer) -> None:

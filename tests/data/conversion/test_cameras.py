@@ -31,7 +31,6 @@ EVERY = Settings(val_fraction=0.3, cameras=("all",))
 
 
 def frames(folder: Path, camera: str) -> list[np.ndarray]:
-    """The pictures of each episode as one camera recorded it."""
     shards = ShardSet(folder)
     reader = EpisodeReader(shards, shards.columns())
     episodes = [reader.episode(row, camera) for row in shards.episodes.to_pylist()]

@@ -59,9 +59,6 @@ def test_a_choice_that_matches_nothing_is_one_error(only: list[str], exclude: li
     assert words in str(fault.value)
 
 
-# -- conversion
-
-
 @pytest.fixture
 def arm_yaml(tmp_path: Path) -> Path:
     path = tmp_path / "toy_arm.yaml"

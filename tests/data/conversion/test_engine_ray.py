@@ -135,8 +135,6 @@ def test_workers_that_cannot_be_made_are_one_error(cluster, tmp_path, monkeypatc
 
 
 class Unreadable:
-    """Stands for work whose module a node does not have."""
-
     def __reduce__(self):
         return _not_there, ()
 
@@ -177,7 +175,6 @@ def test_a_node_that_is_lost_takes_no_unit_along(cluster, tmp_path: Path) -> Non
 
 @pytest.fixture
 def whole(toy_arm, toy_recording, tmp_path: Path) -> dict[str, bytes]:
-    """Return what the local engine makes."""
     convert(toy_arm, str(toy_recording), "raw", tmp_path / "whole", settings=SETTINGS)
     return contents(tmp_path / "whole")
 

@@ -33,7 +33,6 @@ def shards(folder: Path) -> dict[str, bytes]:
 
 
 def grow(path: Path, lengths: list[int], begun: int) -> None:
-    """More demos at the end of an HDF5 file, as a recorder adds them."""
     beside = path.with_name("more.hdf5")
     write_toy(beside, [1] * begun + lengths)
     with h5py.File(beside) as source, h5py.File(path, "a") as file:
@@ -122,9 +121,6 @@ def test_a_known_episode_that_cannot_be_read_any_more_is_refused_by_its_name(
         run(toy_arm, recording, tmp_path / "out", extend=True)
 
 
-# -- what is kept must be there
-
-
 @pytest.mark.parametrize("name", ["episodes.parquet", "quarantine.jsonl", "embodiment.yaml"])
 @pytest.mark.parametrize("damage", ["gone", "blank", "other"])
 def test_what_follows_from_the_shards_is_written_anew_or_told_before_it_is_extended(
@@ -189,9 +185,6 @@ def test_records_in_another_order_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="re-recorded, first 'train/000000'"):
         run(rlds_robot(), folder, out, extend=True)
     assert json.loads((out / "manifest.json").read_text())["totals"]["episodes"] == 3
-
-
-# -- files beside the set
 
 
 def test_files_of_a_hub_and_of_macos_may_lie_beside_a_set(tmp_path: Path, toy_arm: Embodiment) -> None:

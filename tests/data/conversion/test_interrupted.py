@@ -30,14 +30,10 @@ IN_PROCESS = pytest.mark.parametrize("out", ["folder", "memory"], indirect=True)
 
 @pytest.fixture
 def out(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The output of a conversion: in a folder, in a store of this process, or on a server of S3."""
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
     if request.param == "s3":
         return request.getfixturevalue("s3_out")
     return tmp_path / "out" if request.param == "folder" else place(f"memory://{uuid.uuid4().hex}/set")
-
-
-# -- shares
 
 
 @pytest.mark.parametrize("out", ["folder"], indirect=True)
@@ -56,9 +52,6 @@ def test_shares_run_side_by_side_and_one_of_them_finishes(toy_arm, toy_file, out
     job = Conversion(toy_arm, toy_file, BlockTokenizer(), out, settings=SMALL)
     at_once(job.run_share, [Share(i, 3) for i in range(3)])
     assert files(out) == whole
-
-
-# -- killed
 
 
 @pytest.mark.parametrize("out", [S3], indirect=True)

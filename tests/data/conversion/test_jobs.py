@@ -54,9 +54,6 @@ def test_a_device_that_workers_lack_is_one_error(toy_arm, toy_recording, tmp_pat
     assert not contents(tmp_path / "out")
 
 
-# -- shares
-
-
 @pytest.mark.slow
 def test_workers_without_a_shard_are_told_before_the_work_and_by_a_dry_run(toy_arm, tmp_path) -> None:
     (tmp_path / "toy_arm.yaml").write_text(toy_arm.to_yaml())
@@ -134,9 +131,6 @@ def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(
         with pytest.raises(OutputError, match="another job is writing it"):
             run(toy_arm, toy_recording, out)
     assert not out.exists()
-
-
-# -- faults
 
 
 def test_a_read_error_that_goes_away_costs_nothing(

@@ -59,7 +59,6 @@ def dataset(tmp_path: Path) -> Path:
 
 
 def said(folder: Path) -> list[tuple[Any, Any]]:
-    """The language columns of every row, as lerobot gives them."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     columns = "language_persistent", "language_events"

@@ -134,7 +134,6 @@ def test_a_share_of_a_finished_set_writes_nothing_where_nothing_has_changed(toy_
 
 
 def first_day(folder: Path) -> Path:
-    """A folder of recordings, with that of monday."""
     (folder / "recorded").mkdir()
     write_toy(folder / "recorded/monday.hdf5", range(20, 26))
     return folder / "recorded"

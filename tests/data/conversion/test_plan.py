@@ -103,9 +103,6 @@ def test_episodes_cut_from_one_recording_share_a_split() -> None:
     assert set(splits) == {"train", "val"}
 
 
-# -- workers without a shard
-
-
 @pytest.mark.parametrize(
     ("frames", "workers", "tasks", "longest"),
     [

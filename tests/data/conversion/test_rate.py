@@ -30,7 +30,6 @@ WHOLE = Settings(val_fraction=0.2, shard_frames=60)
 
 
 def timed(folder: Path, rates: list[float]) -> Path:
-    """An HDF5 file with an episode of 30 frames for each rate in Hz."""
     path = folder / "toy.hdf5"
     write_toy(path, [30] * len(rates))
     with h5py.File(path, "a") as file:

@@ -49,9 +49,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make(tmp_path_factory.mktemp("made") / "set", [14, 15, 16, 17, 18, 9, 30])
 
 
-# -- split
-
-
 def test_split_is_what_converting_with_that_seed_gives(made: Path, tmp_path: Path) -> None:
     other = Settings(val_fraction=0.5, seed=3, shard_frames=40)
     expected = make(tmp_path / "set", [14, 15, 16, 17, 18, 9, 30], other)
@@ -92,9 +89,6 @@ def test_split_refuses_what_it_cannot_do(made: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds the shard set"):
         split(made, made / "train")
     assert not (tmp_path / "a").exists()
-
-
-# -- merge
 
 
 def test_merge_holds_every_episode_of_every_set(made: Path, tmp_path: Path) -> None:
@@ -232,7 +226,6 @@ def test_a_set_extended_beyond_its_limit_is_split_whole(tmp_path: Path) -> None:
 
 
 def test_masks_go_along(tmp_path: Path) -> None:
-    """Masked rows are put into a set by hand; merged and split they are the same."""
     yaml = ARM_YAML + "sync: {beyond: mask, max_skew_ms: 50}\n"
     folder = make(tmp_path / "set", [14, 15, 16], yaml=yaml)
     mask_some(folder)

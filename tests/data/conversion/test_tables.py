@@ -39,9 +39,6 @@ def recordings(draw: st.DrawFn, splits: st.SearchStrategy = NONE) -> list[Episod
     ]
 
 
-# -- plain loops
-
-
 def splits_by_hand(refs: Sequence[EpisodeRef], fraction: float, seed: int) -> list[str]:
     if any(ref.split for ref in refs):
         return [ref.split or "train" for ref in refs]
@@ -92,9 +89,6 @@ def together_by_hand(rows: Sequence[EpisodeRow], by: str) -> list[str]:
             if value:
                 leader[find(("id", row.id))] = find((kind, value))
     return ["/".join(find(("id", row.id))) for row in rows]
-
-
-# -- the same of tables
 
 
 @given(

@@ -22,7 +22,6 @@ BOTH = Settings(shard_frames=12, cameras=("all",), val_fraction=0.3)
 def two_runs(
     robot: Embodiment, data: Path, folder: Path, settings: Settings = BOTH, tokenizer: str = "fsq-8"
 ) -> None:
-    """Write `shards` and `set` one after the other."""
     wide = {"settings": settings, "max_quarantine": 1}
     convert(robot, str(data), tokenizer, folder / "shards", **wide)
     convert(robot, str(data), tokenizer, folder / "set", to="lerobot", **wide)
@@ -31,7 +30,6 @@ def two_runs(
 def one_run(
     robot: Embodiment, data: Path, folder: Path, settings: Settings = BOTH, tokenizer: str = "fsq-8", **more
 ) -> None:
-    """Write `shards` and `set` in one pass."""
     options = {"settings": settings, "max_quarantine": 1, "lerobot": folder / "set", **more}
     convert(robot, str(data), tokenizer, folder / "shards", **options)
 

@@ -77,7 +77,6 @@ def rlds(folder: Path) -> tuple[Path, Embodiment]:
 
 
 def hdf5(folder: Path) -> tuple[Path, Embodiment]:
-    """Three episodes of three cameras of three sizes."""
     return write_hdf5(folder / "three.hdf5"), three_cameras()
 
 
@@ -106,7 +105,6 @@ def opened(folder: Path) -> Any:
 
 
 def frame(item: dict, key: str) -> np.ndarray:
-    """A frame (1, H, W, 3) as lerobot decodes it."""
     return (item[key].numpy().transpose(1, 2, 0)[None] * 255).round().astype(np.uint8)
 
 
@@ -154,7 +152,6 @@ def test_lerobot_reads_what_the_shards_hold(kind: str, frames: str, tmp_path: Pa
 
 
 def numbered(folder: Path) -> list[dict]:
-    """The rows of the dataset's episodes.parquet."""
     rows = pq.read_table(folder / "episodes.parquet").to_pylist()
     assert [row["episode_index"] for row in rows] == list(range(len(rows)))
     return rows

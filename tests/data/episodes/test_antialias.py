@@ -67,9 +67,6 @@ def test_a_letterbox_has_black_borders() -> None:
     assert not made[:, :4].any() and not made[:, 12:].any()
 
 
-# -- JPEG at a reduced size
-
-
 def jpeg(height: int, width: int) -> bytes:
     smooth = cv2.resize(noise(1, 6, 8)[0], (width, height), interpolation=cv2.INTER_CUBIC)
     return cv2.imencode(".jpg", smooth, [cv2.IMWRITE_JPEG_QUALITY, JPEG])[1].tobytes()

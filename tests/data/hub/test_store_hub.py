@@ -285,7 +285,6 @@ def test_an_upload_cut_at_any_request_is_ended_by_the_same_command(
 
 
 def other_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Let staging folders lie elsewhere from here on."""
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "hma of another"))
 
 

@@ -30,8 +30,6 @@ def sound(file: h5py.File) -> None:
 
 
 def set_all(key: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[h5py.File], None]:
-    """Change one dataset of every episode."""
-
     def apply(file: h5py.File) -> None:
         for demo in file["data"].values():
             values = change(demo[key][:])

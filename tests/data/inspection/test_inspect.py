@@ -88,11 +88,7 @@ def test_every_format_tells_the_range_of_its_numbers(name: str, tmp_path: Path) 
     assert vectors and all(key["low"] <= key["high"] for key in vectors)
 
 
-# -- defects
-
-
 def found(inspection: Inspection) -> dict[str, list[str]]:
-    """Messages by check."""
     said: dict[str, list[str]] = {}
     for finding in inspection.findings:
         said.setdefault(finding.check, []).append(str(finding))
@@ -247,11 +243,7 @@ def test_a_still_picture_key_in_lerobot_is_told(tmp_path: Path) -> None:
     assert "100% of neighbouring images are equal" in said["still"][0]
 
 
-# -- red and blue
-
-
 def decoded(picture: np.ndarray) -> np.ndarray:
-    """As it comes out of a JPEG."""
     stored = cv2.imdecode(cv2.imencode(".jpg", picture[..., ::-1])[1], cv2.IMREAD_COLOR)
     assert stored is not None
     return np.asarray(stored[..., ::-1], np.uint8)
@@ -284,9 +276,6 @@ def test_pictures_that_never_were_jpeg_are_no_proof() -> None:
 def test_no_real_camera_is_suspected(real_data: Path, recording: str) -> None:
     report = inspect_recording(str(real_data / recording), episodes=5)
     assert report["checks"]["colour"] == "ok"
-
-
-# -- clocks
 
 
 def test_a_clock_counts_what_was_done_to_it() -> None:

@@ -54,9 +54,6 @@ def inferred(recording: Path) -> dict[str, Any]:
     return dict(parse_yaml(infer(recording, "arm"), "inferred"))
 
 
-# -- the part that moves
-
-
 def test_a_small_robot_is_given_a_square_crop_that_holds_it(tmp_path: Path) -> None:
     values = inferred(record(tmp_path / "arm.hdf5", 200))
     x, y, wide, tall = values["cameras"][0]["crop"]
@@ -92,9 +89,6 @@ def test_a_camera_whose_key_holds_no_images_is_a_finding_and_no_crash(tmp_path: 
     path = robot(recording)
     path.write_text(path.read_text().replace("key: obs/image", "key: actions"))
     assert any(one.severity == "error" for one in examine(recording, path))
-
-
-# -- what tokens keep of it
 
 
 def test_tokens_that_lose_the_robot_are_a_warning_and_with_the_crop_they_keep_it(tmp_path: Path) -> None:

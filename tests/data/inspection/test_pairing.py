@@ -32,7 +32,6 @@ class Case:
 
 
 def each(delay_ns: np.ndarray | int, said: str, tolerance_ms: float | None) -> Case:
-    """One command for each image."""
     return Case(np.arange(FRAMES) * PERIOD + delay_ns, np.arange(FRAMES), said, tolerance_ms)
 
 
@@ -95,7 +94,6 @@ def test_a_bag_gives_the_actions_of_the_same_recording_in_hdf5(tmp_path: Path, n
 
 
 def yaml_of(tmp_path: Path, bag: Path, **sync: Any) -> Path:
-    """The inferred YAML with another `sync`."""
     values = answered(inferred(bag)) | {"id": "mine"}
     kept = {key: value for key, value in values["sync"].items() if key != "tolerance_ms"}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(values | {"sync": kept | sync}))

@@ -40,9 +40,6 @@ def visible() -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
-# -- files that are not what they seem
-
-
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_git_lfs_pointer_is_called_one(name: str, tmp_path: Path) -> None:
     recording = FORMATS[name](tmp_path)
@@ -99,9 +96,6 @@ def test_a_preview_that_may_not_be_written_is_one_line(visible: Path, toy_arm: E
             preview(visible / "set", out, tokenizer=BlockTokenizer())
 
 
-# -- one thing in the place of another
-
-
 @pytest.fixture
 def things(tmp_path: Path, toy_arm: Embodiment) -> Path:
     write_toy(tmp_path / "toy.hdf5", [14, 15])
@@ -139,9 +133,6 @@ def test_doctor_and_validate_call_it_what_it_is(things: Path) -> None:
     assert (told.severity, told.check) == ("error", "readable") and "is a checkpoint" in told.message
     done = hma("registry", "validate", "toy.hdf5", cwd=things)
     assert done.returncode == 1 and "toy.hdf5: is a recording, not a YAML file" in done.stdout
-
-
-# -- verdicts
 
 
 def test_shards_without_a_window_are_an_error(tmp_path: Path, toy_arm: Embodiment) -> None:

@@ -34,14 +34,12 @@ EPISODES = 3
 
 @pytest.fixture(scope="module")
 def fast(tmp_path_factory: pytest.TempPathFactory) -> Iterator[h5py.File]:
-    """An open recording of pusht_fast."""
     with h5py.File(record("pusht_fast", tmp_path_factory.mktemp("fast"), EPISODES, seed=3)) as file:
         yield file
 
 
 @pytest.fixture(scope="module")
 def slow(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The bags of a recording of pusht_slow."""
     return sorted(record("pusht_slow", tmp_path_factory.mktemp("slow"), EPISODES, seed=3).iterdir())
 
 
@@ -63,9 +61,6 @@ def hashes(path: Path) -> list[str]:
 
 def arena(start: str = "near", seed: int = 0) -> PushArena:
     return PushArena(SLOW_LOOK, start, np.random.default_rng(seed))
-
-
-# -- pusht_fast
 
 
 def test_masks_hold_out_five_demos_of_a_small_recording() -> None:
@@ -165,9 +160,6 @@ def test_pictures_show_the_state_they_are_recorded_with(fast: h5py.File) -> None
         assert np.linalg.norm(seen - demo["obs/agent_pos"][t]) < 6
 
 
-# -- pusht_slow
-
-
 @pytest.mark.slow
 def test_any_mcap_reader_decodes_the_bags_by_their_own_schemas(slow: list[Path]) -> None:
     topics = bag(slow[0])
@@ -240,9 +232,6 @@ def test_pusher_does_not_come_down_onto_the_tee() -> None:
     assert world.raised
 
 
-# -- policy
-
-
 @pytest.mark.parametrize("contact", [0, 9, 20, 33])
 def test_planner_predicts_what_the_physics_do(contact: int) -> None:
     world = arena(seed=contact)
@@ -272,9 +261,6 @@ def test_episodes_end_well_and_badly(fast: h5py.File, slow: list[Path]) -> None:
             facts = {item.name: item.metadata for item in make_reader(file).iter_metadata()}["episode"]
             outcomes.add(facts["success"])
     assert outcomes == {"true", "false"}
-
-
-# -- recorders
 
 
 @pytest.mark.slow

@@ -57,7 +57,6 @@ def still(world: BlockTable) -> np.ndarray[Any, Any]:
 
 
 def driven(robot: str, command: str, steps: int) -> tuple[BlockTable, list[np.ndarray[Any, Any]]]:
-    """Return a world some steps from its start at the lowest, highest or still command, and its pictures."""
     world, _ = start(Body.of(robot), SEED, 0)
     pictures = [world.picture()]
     for _ in range(steps):

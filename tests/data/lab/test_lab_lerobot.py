@@ -27,7 +27,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def theirs(recorded: Path) -> Any:
-    """The recording, opened by lerobot's own reader."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     return LeRobotDataset("lab/arm", root=recorded, video_backend="pyav", return_uint8=True)

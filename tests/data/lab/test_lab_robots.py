@@ -26,8 +26,6 @@ RECORDERS = {"pendulum": pendulum, "planar_arm": planar_arm}
 
 @dataclass(frozen=True)
 class Recorded:
-    """A robot's recording, read by the source of its format."""
-
     robot: Embodiment
     path: Path
     episodes: list[Episode]
@@ -122,9 +120,6 @@ def test_a_missing_simulator_says_how_to_install_it(robot, module, said, tmp_pat
     assert "\n" not in str(found.value) and list(tmp_path.iterdir()) == []
 
 
-# -- pendulum
-
-
 def test_gymnasium_replays_the_pendulum(recordings: dict[str, Recorded]) -> None:
     import gymnasium
 
@@ -170,9 +165,6 @@ def test_pendulum_needs_no_display(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("DISPLAY", ":987")
     record("pendulum", tmp_path, 1)
     assert not pygame.display.get_init()
-
-
-# -- planar arm
 
 
 def test_joints_move_as_commanded(recordings: dict[str, Recorded]) -> None:

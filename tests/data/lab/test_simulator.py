@@ -20,7 +20,6 @@ SEED, EPISODE = 5, 1
 
 
 def recorded(robot: Embodiment, folder: Path) -> tuple[Clip, NDArray[np.uint8]]:
-    """Record two episodes, and read the second with its pictures as conversion resizes them."""
     path = str(record(robot.id, folder, 2, SEED))
     source, camera = open_source(robot.source.format), robot.cameras[0]
     clip = to_clip(source.read(path, source.episode_ids(path)[EPISODE], robot), robot)

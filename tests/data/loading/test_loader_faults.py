@@ -25,7 +25,6 @@ FIRST = "train/shard-00000.parquet"
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two embodiments of four shards, five row groups a shard."""
     folder = tmp_path_factory.mktemp("faults")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(writer, "ROW_GROUP", 300)
@@ -36,12 +35,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def sets(made: Path, tmp_path: Path) -> list[Path]:
-    """A copy whose shards are files of their own."""
     return [Path(shutil.copytree(made / str(i), tmp_path / str(i))) for i in range(2)]
 
 
 def rewrite(folder: Path, change: Callable[[str, np.ndarray], np.ndarray], shard: str = FIRST) -> None:
-    """The same shard with other values in its columns of lists."""
     file = pq.ParquetFile(folder / shard)
     size = file.metadata.row_group(0).num_rows
     table = file.read()

@@ -24,7 +24,6 @@ WORKERS = "forkserver"  # forking this process, which has threads, may stop the 
 
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two embodiments, one of them small."""
     folder = tmp_path_factory.mktemp("workers")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(writer, "ROW_GROUP", 300)
@@ -39,7 +38,6 @@ def dataset(sets: Sequence[str | Path], **others: Any) -> MixtureDataset:
 
 
 def seen(batches: Iterator[Batch], count: int) -> list[list[tuple[str, int, int]]]:
-    """Return which windows each batch holds."""
     return [windows_of(batch) for batch in islice(batches, count)]
 
 

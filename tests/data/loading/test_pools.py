@@ -27,7 +27,6 @@ SMALL = BENCH.defaults | {
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """6,000 frames in row groups of 300."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(writer, "ROW_GROUP", 300)
         return make_set(tmp_path_factory.mktemp("pools") / "set", 0, SMALL)

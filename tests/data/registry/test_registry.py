@@ -22,7 +22,6 @@ source: {{format: rlds}}
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A registry of the test's own, with a cache of its own."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
     (tmp_path / "registry").mkdir()
@@ -43,9 +42,6 @@ def own(folder: Path) -> dict[str, Any]:
         for entry in entries()
         if folder in entry.path.parents
     }
-
-
-# -- the index
 
 
 def test_a_rewritten_file_is_seen_though_size_and_times_are_the_same(folder: Path) -> None:
@@ -122,9 +118,6 @@ def test_what_is_no_file_is_refused_and_the_rest_listed(folder: Path) -> None:
         "is larger than 1,000,000 bytes",
         "no such file",
     ]
-
-
-# -- exports
 
 
 def robot(format: str, **changes: Any) -> Embodiment:

@@ -147,7 +147,6 @@ def feature(kind: str) -> Any:
 
 
 def tree(steps: dict[str, str]) -> dict[str, Any]:
-    """Flat paths as nested features."""
     nested: dict[str, Any] = {}
     for path, kind in steps.items():
         *parents, last = path.split("/")
@@ -165,7 +164,6 @@ def wrap(item: dict[str, Any]) -> dict[str, Any]:
 
 
 def values(path: str, kind: str, count: int) -> Any:
-    """Distinct numbers a step, small images, a text."""
     stated = feature(kind)
     if kind == "text":
         return [b"push it"] * count

@@ -36,7 +36,6 @@ def digest(value: Any) -> str:
 
 
 def summary(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Mean, std, min, max of footers' statistics."""
     n, mean, m2 = 0, 0.0, 0.0
     parts = [part for part in parts if part["count"]]
     for part in parts:
@@ -98,7 +97,6 @@ class Reader:
         return values | {"tokens": values[f"tokens_{name}" if camera else "tokens"]}
 
     def windows(self, split: str, frames: int, camera: int = 0) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """(T, h, w) tokens and (T, s·A) chunks."""
         s, (h, w) = self.stride, self.manifest["tokenizer"]["grid"]
         for row in self.episodes:
             if row["split"] == split:
@@ -109,9 +107,6 @@ class Reader:
                         values["tokens"][rows][::s].reshape(frames, h, w),
                         values["action"][rows].reshape(frames, -1),
                     )
-
-
-# -- what it reads
 
 
 @pytest.fixture(scope="module", params=["all", "strided"])
@@ -178,9 +173,6 @@ def test_row_groups_hold_whole_episodes_where_they_fit(made: Path) -> None:
         assert max(sizes) <= 2048
 
 
-# -- other readers
-
-
 def counts(made: Path) -> tuple[int, int]:
     manifest = Reader(made).manifest
     return manifest["splits"]["train"]["rows"], manifest["splits"]["train"]["episodes"]
@@ -225,9 +217,6 @@ def test_hugging_face_datasets_reads_it(made: Path, tmp_path: Path) -> None:
     loaded = datasets.load_dataset("parquet", data_files=files, cache_dir=str(tmp_path))
     assert loaded["train"].num_rows == counts(made)[0]
     assert loaded["train"][0]["tokens"] == first_tokens(made)[1]
-
-
-# -- size
 
 
 def test_random_tokens_of_18_bits_cost_less_than_600_bytes_a_frame(tmp_path: Path) -> None:

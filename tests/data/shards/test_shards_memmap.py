@@ -33,8 +33,6 @@ class HalfTokenizer:
 
 
 class PixelTokenizer:
-    """Pixels, small."""
-
     spec = TokenizerSpec("pixels", 1, "continuous", 64, (64, 64), channels=3, dtype="uint8")
 
     def encode(self, frames):

@@ -27,13 +27,11 @@ SMALL = Settings(val_fraction=0.3, shard_frames=40)
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sound set of several shards; not to be changed."""
     return toy_shards(tmp_path_factory.mktemp("made") / "set", [14, 15, 16, 17, 18], SMALL)
 
 
 @pytest.fixture
 def sound(made: Path, tmp_path: Path) -> Path:
-    """A copy that may be damaged."""
     return Path(shutil.copytree(made, tmp_path / "set"))
 
 
@@ -49,9 +47,6 @@ def one(problems: list[str], *words: str) -> str:
 
 def files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if path.is_file())
-
-
-# -- damage
 
 
 def test_a_sound_set_has_no_problems_however_it_is_verified(made: Path) -> None:
@@ -117,9 +112,6 @@ def test_a_file_that_is_missing_cut_or_foreign_is_one_problem(sound: Path, case:
     one(verify(sound, quick=True), *said)
 
 
-# -- the manifest
-
-
 def test_without_a_manifest_it_says_how_to_rebuild_it(sound: Path, made: Path) -> None:
     (sound / MANIFEST).unlink()
     one(verify(sound), "has no manifest.json", "hma convert", "hma shards restat")
@@ -183,9 +175,6 @@ def test_a_manifest_that_says_something_false_is_found(sound: Path, said: str) -
     assert verify(sound) == []
     reseal(sound, CHANGES[said])
     assert any(said in problem for problem in verify(sound)), verify(sound)
-
-
-# -- shards that are whole, hashed and wrong
 
 
 def footer(path: Path) -> dict[bytes, bytes]:
@@ -268,9 +257,6 @@ def test_the_hash_of_a_plan_is_over_everything_in_it(made: Path) -> None:
     plan = Manifest.load(made).plan
     assert plan_hash(plan) == plan["hash"]
     assert plan_hash(plan | {"frames": "strided"}) != plan["hash"]
-
-
-# -- restat
 
 
 def test_restat_refuses_when_shards_are_missing_and_no_manifest_tells(sound: Path) -> None:

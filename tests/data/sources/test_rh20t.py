@@ -96,9 +96,6 @@ def test_a_film_with_fewer_frames_than_times_is_counted_and_one_with_more_refuse
         read(tmp_path, SCENE.replace("0001", "0002", 1))
 
 
-# -- hostile scenes
-
-
 def table(name: str, change: Callable[[Any], object]) -> Edit:
     """Return an edit of the first camera's samples in a table of the first scene."""
 
@@ -158,9 +155,6 @@ def scenes(tmp_path_factory):
 def test_a_hostile_scene_goes_to_quarantine_and_the_other_becomes_shards(case, scenes, tmp_path):
     folder = shutil.copytree(scenes, tmp_path / "set")
     check_refused(ONE[case], folder, robot(), tmp_path / "out", one=True)
-
-
-# -- what is told
 
 
 def test_every_file_that_is_used_changes_the_fingerprint(recording):

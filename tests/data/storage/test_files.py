@@ -10,14 +10,12 @@ from hma_data.storage.files import PARTIAL, new_folder
 
 
 def left(tmp_path: Path, name: str) -> Path:
-    """Make what a killed writer left of the folder `out`, or of another one."""
     (tmp_path / name).mkdir()
     (tmp_path / name / "file").write_text("left")
     return tmp_path / name
 
 
 def mark(tmp_path: Path) -> str:
-    """Return what a writer of this machine puts between a folder's name and its process id."""
     with new_folder(tmp_path / "any") as folder:
         name = folder.name
     (tmp_path / "any").rmdir()

@@ -29,7 +29,6 @@ def a_disk_with(monkeypatch: pytest.MonkeyPatch, free: int, total: int) -> None:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """No waiting between tries, and a cache of its own on a disk with room."""
     monkeypatch.setattr(store, "WAITS_S", (0.0, 0.0, 0.0))
     a_disk_with(monkeypatch, free=1 << 40, total=1 << 41)
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
@@ -50,9 +49,6 @@ def both(toy_set: Path, tmp_path: Path, bucket: RemotePath) -> tuple[Path, Remot
         if path.is_file():
             put_file(path, bucket / "set" / path.relative_to(tmp_path / "set"))
     return tmp_path / "set", bucket / "set"
-
-
-# -- paths
 
 
 def test_a_uri_is_a_path_that_is_joined_listed_and_pickled(bucket: RemotePath) -> None:
@@ -90,9 +86,6 @@ def test_a_remote_path_is_never_taken_for_one_of_this_machine(bucket: RemotePath
         (bucket / "x").open("w")
 
 
-# -- bytes
-
-
 def test_any_read_of_a_range_file_gives_the_bytes_that_are_there(bucket: RemotePath) -> None:
     data = np.random.default_rng(0).bytes(3 << 20)
     put_bytes(data, bucket / "x")
@@ -123,9 +116,6 @@ def test_reading_is_tried_again_and_ends_in_one_error(bucket, monkeypatch) -> No
         StorageAwayError, match=r"/x: cannot be read: ConnectionResetError: cut — the network failed"
     ):
         (bucket / "x").read_bytes()
-
-
-# -- shard sets
 
 
 @pytest.mark.parametrize("cache", [True, False])
@@ -163,7 +153,6 @@ def test_a_remote_set_reads_as_the_local_one(both: tuple[Path, RemotePath], cach
 
 
 def damaged_shard(folder: RemotePath) -> str:
-    """Change a byte of the first shard; return its path in the set."""
     name = ShardSet(folder).manifest.shards[0].path
     data = bytearray((folder / name).read_bytes())
     data[100] ^= 1
@@ -187,9 +176,6 @@ def test_a_set_that_is_not_there_is_one_clear_error(bucket: RemotePath) -> None:
     put_bytes(b"x", bucket / "begun/train/shard-00000.parquet")
     with pytest.raises(ShardError, match=f"{bucket}/begun: has no manifest.json"):
         ShardSet(f"{bucket}/begun")
-
-
-# -- copies kept here
 
 
 def test_a_copy_with_other_bytes_than_the_manifest_says_is_refused(both: tuple[Path, RemotePath]) -> None:

@@ -28,7 +28,6 @@ from tests.hostile import at_once
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """No waiting, and a cache of its own."""
     monkeypatch.setattr(store, "WAITS_S", (0.0, 0.0, 0.0))
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
 
@@ -38,9 +37,6 @@ def out() -> RemotePath:
     path = place(f"memory://{uuid.uuid4().hex}/set")
     assert isinstance(path, RemotePath)
     return path
-
-
-# -- the same bytes
 
 
 def test_a_store_gets_the_bytes_that_a_folder_gets(toy_arm, toy_file, out, whole) -> None:
@@ -83,9 +79,6 @@ def test_a_manifest_is_restored_in_place(toy_arm, toy_file, out, whole) -> None:
     restat(Path(str(out)))
     assert set(out.listing()) == set(whole)
     assert verify(out) == []
-
-
-# -- faults
 
 
 def test_uploads_that_fail_now_and_then_change_nothing(
@@ -144,12 +137,8 @@ def test_a_store_that_refuses_is_one_error(toy_arm, toy_recording, out, monkeypa
         run(toy_arm, toy_recording, out)
 
 
-# -- several jobs
-
-
 @pytest.fixture
 def other(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
-    """Return what a job of another plan writes."""
     run(toy_arm, toy_recording, tmp_path / "other", settings=replace(SMALL, seed=3))
     return files(tmp_path / "other")
 

@@ -24,9 +24,6 @@ def out(s3_out: RemotePath) -> RemotePath:
     return s3_out
 
 
-# -- the same bytes
-
-
 def test_s3_gets_the_bytes_that_a_folder_gets_and_gives_them_back(
     toy_arm, toy_file, out, whole, toy_set
 ) -> None:
@@ -86,9 +83,6 @@ def test_forked_readers_of_a_dataloader_see_the_same_batches(toy_arm, toy_file, 
     )
     for found, expected in zip(list(batches)[:5], (ours[i] for i in range(5))):
         assert torch.equal(found.tokens, expected.tokens)
-
-
-# -- faults
 
 
 def test_busy_answers_and_lost_connections_change_nothing(

@@ -20,7 +20,6 @@ KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFA
 
 @pytest.fixture(autouse=True)
 def requests(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """Collect what is asked of the S3 driver."""
     asked, call = [], s3fs.S3FileSystem._call_s3
 
     def request(self: object, method: str, *args: object, **options: object) -> object:

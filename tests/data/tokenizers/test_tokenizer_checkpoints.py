@@ -101,9 +101,6 @@ def test_a_config_that_is_no_object_is_refused(tmp_path, text):
         stated_scale(tmp_path, 1.0)
 
 
-# -- where they are found
-
-
 def test_a_path_that_is_not_there_is_named(tmp_path):
     with pytest.raises(TokenizerError, match=r"gone\.ckpt: no such file"):
         get_tokenizer("magvit2", weights=str(tmp_path / "gone.ckpt"))

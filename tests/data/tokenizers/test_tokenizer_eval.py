@@ -37,7 +37,6 @@ RUNNER = CliRunner()
 
 @pytest.fixture
 def pictures(tmp_path: Path) -> Path:
-    """A folder of three drawn pictures."""
     rng = np.random.default_rng(3)
     for index in range(3):
         write_png(tmp_path / "pictures" / f"{index}.png", draw_scene(rng, 160))
@@ -47,9 +46,6 @@ def pictures(tmp_path: Path) -> Path:
 @pytest.fixture
 def arm(toy_yaml: Path) -> tuple[Embodiment, Path]:
     return Embodiment.load(toy_yaml), toy_yaml.with_name("toy.hdf5")
-
-
-# -- frames
 
 
 def test_a_recording_gives_every_camera_as_a_conversion_would(arm, block_tokenizer):
@@ -133,9 +129,6 @@ def test_an_episode_that_cannot_be_read_is_told_and_replaced(arm, block_tokenize
     told: list[str] = []
     frames = list(films_of(path, block_tokenizer.spec, embodiment=robot, frames=2, on_skip=told.append))
     assert sum(map(len, frames)) == 4 and "is broken" in told[0]
-
-
-# -- measures
 
 
 def test_moments_of_latents_are_those_of_all_batches_together():
@@ -230,9 +223,6 @@ def test_a_report_holds_table_numbers_and_the_worst_frames(tmp_path, block_token
     assert json.loads((tmp_path / "eval.json").read_text())["noise"]["frames"] == 3
 
 
-# -- command
-
-
 def test_eval_prints_json_and_writes_a_report(pictures, tmp_path):
     done = RUNNER.invoke(
         tokenizer_app,
@@ -251,9 +241,6 @@ def test_eval_measures_a_recording_by_its_robot(arm, tmp_path):
     )
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)[str(arm[1])]["frames"] == 6
-
-
-# -- catalogue
 
 
 def test_every_tokenizer_of_the_catalogue_has_a_licence_and_a_description():

@@ -50,9 +50,6 @@ def test_ids_and_pictures_are_those_of_the_released_code(real_data):
     assert np.abs(decoded - known["decoded"]).max() < 1e-4
 
 
-# -- against other statements
-
-
 def test_bit_c_of_an_id_is_the_sign_of_channel_c():
     network = Magvit2(TINY_MAGVIT2)
     latents = np.random.default_rng(0).normal(size=(2, 18, 3, 5)).astype(np.float32)
@@ -78,7 +75,6 @@ def swish(x: Tensor) -> Tensor:
 
 
 def norm(state: dict[str, Tensor], name: str, x: Tensor) -> Tensor:
-    """Group norm of 32 groups, from its definition."""
     grouped = x.view(x.shape[0], 32, -1)
     mean, variance = grouped.mean(2, keepdim=True), grouped.var(2, unbiased=False, keepdim=True)
     whole = ((grouped - mean) / (variance + 1e-6).sqrt()).view_as(x)
@@ -99,7 +95,6 @@ def block(state: dict[str, Tensor], name: str, x: Tensor) -> Tensor:
 
 
 def stated_encoder(state: dict[str, Tensor], config: Magvit2Config, x: Tensor) -> Tensor:
-    """The released encoder, written out from the names of its weights."""
     x = conv(state, "encoder.conv_in", x)
     for level in range(len(config.mult)):
         for i in range(config.res_blocks):
@@ -112,7 +107,6 @@ def stated_encoder(state: dict[str, Tensor], config: Magvit2Config, x: Tensor) -
 
 
 def stated_decoder(state: dict[str, Tensor], config: Magvit2Config, codes: Tensor) -> Tensor:
-    """The released decoder, likewise."""
     x = conv(state, "decoder.conv_in", codes)
     for i in range(config.res_blocks):
         x = block(state, f"decoder.mid_block.{i}", x)
@@ -188,9 +182,6 @@ def test_names_are_those_of_the_release():
     assert "decoder.up.0.upsample.conv1.weight" not in names
 
 
-# -- contract
-
-
 def test_it_keeps_the_contract(tiny):
     spec = tiny.spec
     assert isinstance(tiny, Tokenizer) and TokenizerSpec.from_json(spec.to_json()) == spec
@@ -234,9 +225,6 @@ def test_a_frame_has_the_same_ids_in_any_company_and_on_any_number_of_threads(ti
         torch.set_num_threads(before)
 
 
-# -- checkpoints
-
-
 def test_a_trainers_checkpoint_is_stripped_to_the_network(tmp_path, tiny):
     state = magvit2_state()
     named = {f"module.{name}": tensor for name, tensor in state.items()}
@@ -272,9 +260,6 @@ def test_halves_are_computed_with_as_floats(tmp_path, weights, tiny):
     save_file(halves, tmp_path / "half.safetensors")
     network = read_network(tmp_path / "half.safetensors")
     assert all(torch.equal(p, halves[name].float()) for name, p in network.named_parameters())
-
-
-# -- bad weights
 
 
 def altered(**changes: Tensor | None) -> dict[str, Tensor]:
@@ -318,9 +303,6 @@ def test_weights_of_another_network_are_refused_by_name(tmp_path, state, named):
     assert "other.safetensors" in str(caught.value) and caught.value.remedy
 
 
-# -- bad frames and tokens
-
-
 @pytest.mark.parametrize(
     "bad",
     [
@@ -344,9 +326,6 @@ def test_ids_outside_the_vocabulary_are_refused(tiny, bad):
 def test_tokens_of_another_kind_are_refused(tiny, bad):
     with pytest.raises(TokenizerError, match="decodes"):
         tiny.decode(bad)
-
-
-# -- in shards
 
 
 @pytest.mark.slow

@@ -47,7 +47,6 @@ def test_the_tables_of_a_cpu_give_what_the_network_gives(seed: int, count: int) 
 
 
 def drawn(rng: np.random.Generator, count: int) -> Colors:
-    """Return different colours (K, 3)."""
     numbers = rng.choice(2**24, count, replace=False)
     return np.stack([numbers >> 16, numbers >> 8 & 255, numbers & 255], axis=1).astype(np.uint8)
 

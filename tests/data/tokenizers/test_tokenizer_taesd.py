@@ -38,9 +38,6 @@ def psnr_db(true: np.ndarray, made: np.ndarray) -> np.ndarray:
     return 10 * np.log10(255**2 / squared)
 
 
-# -- real weights
-
-
 def square(picture: np.ndarray) -> np.ndarray:
     import cv2
 
@@ -92,9 +89,6 @@ def test_taef2_gives_photographs_of_hands_back(real_data, taef2):
     paths = sorted((real_data / "hands" / "images").glob("*.jpg"))[:2]
     true = np.stack([square(cv2.imread(str(path))[..., ::-1]) for path in paths])
     assert psnr_db(true, taef2.decode(taef2.encode(true))).min() > 26
-
-
-# -- against other statements
 
 
 @pytest.mark.parametrize("pooled", [0, 16])
@@ -157,9 +151,6 @@ def test_both_layouts_are_one_network(tmp_path, tiny):
         assert np.array_equal(other.decode(latents), tiny.decode(latents))
 
 
-# -- contract
-
-
 def test_it_keeps_the_contract(tiny):
     spec = tiny.spec
     assert isinstance(tiny, Tokenizer) and TokenizerSpec.from_json(spec.to_json()) == spec
@@ -199,9 +190,6 @@ def test_the_scale_of_a_config_beside_diffusers_weights_is_kept(tmp_path):
     write_tiny_whole(tmp_path / "diffusion_pytorch_model.safetensors")
     (tmp_path / "config.json").write_text(json.dumps({"scaling_factor": 0.5, "act_fn": "relu"}))
     assert get_tokenizer("taesd", weights=str(tmp_path)).spec.latent_scale == 0.5
-
-
-# -- bad input
 
 
 @pytest.mark.parametrize("stated", [{"scaling_factor": 0}, {"scaling_factor": "one"}])
@@ -276,9 +264,6 @@ def test_latents_too_large_to_store_are_refused(tmp_path, weights):
     save_file(state, tmp_path / "loud.safetensors")
     with pytest.raises(TokenizerError, match="too large for float16"):
         get_tokenizer("taesd", weights=str(tmp_path / "loud.safetensors")).encode(frames(1))
-
-
-# -- in shards
 
 
 @pytest.mark.slow

@@ -28,9 +28,6 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-# -- the distance
-
-
 def test_the_distance_is_that_of_scipys_matrix_root() -> None:
     one, other = (
         rng(1).normal(size=(90, 12)),
@@ -56,9 +53,6 @@ def test_equal_and_constant_features_are_no_distance_apart() -> None:
         assert frechet_distance(still, still) == 0 and frechet_distance(still, moved) == pytest.approx(12)
 
 
-# -- the videos
-
-
 def test_videos_are_scaled_as_scipy_interpolates() -> None:
     pictures = torch.tensor(rng().uniform(0, 255, (2, 3, 24, 40)))
     found = as_video(pictures)
@@ -77,9 +71,6 @@ def test_short_videos_are_stretched_to_sixteen_frames() -> None:
     assert stretched(10).tolist() == list(range(10))
     six = stretched(6)
     assert len(six) == 16 and set(six) == set(range(6)) and (np.diff(six) >= 0).all()
-
-
-# -- files
 
 
 class Means(nn.Module):

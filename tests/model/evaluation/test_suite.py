@@ -229,9 +229,6 @@ def test_json_is_one_object_a_line(made: Path, capsys: pytest.CaptureFixture[str
     assert "3 windows of 4 frames" in shown and "loss, shuffled" in shown and "not measured" in shown
 
 
-# -- the laboratory
-
-
 def test_the_simulator_answers_commands_that_are_given() -> None:
     robot, frames, stride = "rails_03", 5, 2
     own = episode(robot, frames, stride, 0, 3)

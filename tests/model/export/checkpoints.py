@@ -24,18 +24,15 @@ ROBOT = "rails_03"
 
 
 def save_tokens(folder: Path) -> Path:
-    """Save a discrete transformer that is decoded in two passes."""
     return _save(tiny_model(ROBOT), folder)
 
 
 def save_pixels(folder: Path) -> Path:
-    """Save a U-Net of pixels whose frames move."""
     spec = get_spec("raw-64")
     return _save_unet(folder, {**PIXELS, "grid": spec.grid, "patch": 8, "tokenizer": spec.to_json()})
 
 
 def save_colors(folder: Path) -> Path:
-    """Save a U-Net of colours whose frames move; most of their ids need 32 bits."""
     spec = get_spec("palette-64")
     values = {**COLORS, "grid": spec.grid, "factored": spec.factored, "tokenizer": spec.to_json()}
     return _save_unet(folder, values)
@@ -85,7 +82,6 @@ class Driver:
         self.begin(self.draws(np.random.default_rng(0)))
 
     def begin(self, draws: dict[str, NDArray[Any]]) -> None:
-        """Begin anew from the start."""
         self.state = {one["name"]: np.zeros(one["shape"], one["dtype"]) for one in self.about["state"]}
         self._before = np.full(self.chunks.shape[1], np.nan, np.float32)
         for frame, chunk in zip(self.frames, self.chunks):
@@ -94,7 +90,6 @@ class Driver:
         self.put(self.frames[-1])
 
     def put(self, frame: NDArray[Any]) -> None:
-        """Replace the newest frame."""
         self.state["frame"] = frame.astype(self.state["frame"].dtype)
 
     def draws(self, generator: np.random.Generator) -> dict[str, NDArray[Any]]:
@@ -108,7 +103,6 @@ class Driver:
         return made
 
     def advance(self, chunk: NDArray[Any], draws: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
-        """Return the next image."""
         (actions,) = self.stem.run(None, {"chunks": np.stack([self._before, chunk])})
         image, *after = self.step.run(None, {"actions": actions, **self.state, **draws})
         self.uncertainty = float(after.pop()[0]) if len(after) > len(self.state) else float("nan")

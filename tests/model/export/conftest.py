@@ -10,7 +10,6 @@ from tests.model.export.checkpoints import save_colors, save_pixels, save_tokens
 
 
 def exported(folder: Path, save: Callable[[Path], object]) -> Path:
-    """Export a checkpoint that `save` writes; it lies beside the export."""
     save(folder / "model")
     export_checkpoint(str(folder / "model"), [], folder / "page", None)
     return folder / "page"
@@ -18,17 +17,14 @@ def exported(folder: Path, save: Callable[[Path], object]) -> Path:
 
 @pytest.fixture(scope="session")
 def tokens(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A discrete transformer, exported."""
     return exported(tmp_path_factory.mktemp("tokens"), save_tokens)
 
 
 @pytest.fixture(scope="session")
 def colors(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A U-Net of colours, exported."""
     return exported(tmp_path_factory.mktemp("colors"), save_colors)
 
 
 @pytest.fixture(scope="session")
 def pixels(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A U-Net of pixels, exported."""
     return exported(tmp_path_factory.mktemp("pixels"), save_pixels)

@@ -63,7 +63,6 @@ def closed_loop(
 
 
 def unwrapped(frame: NDArray[Any]) -> NDArray[Any]:
-    """Return tokens int32 as the ids that they hold, and other frames as they are."""
     return frame.view(np.uint32).astype(np.int64) if frame.dtype == np.int32 else frame
 
 

@@ -16,7 +16,6 @@ from tests.conftest import contents
 
 @pytest.fixture
 def page(tmp_path: Path) -> Path:
-    """An older export."""
     made = tmp_path / "page"
     (made / "robots").mkdir(parents=True)
     (made / "manifest.json").write_text('{"format": "hma-export"}')
@@ -27,8 +26,6 @@ def page(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def export(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Export nothing, to a disk that is full."""
-
     def full(*given: Any, **named: Any) -> None:
         raise OSError(28, "No space left on device")
 

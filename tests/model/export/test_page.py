@@ -58,7 +58,6 @@ SHORTER, LONGER = "const told = (asked) => 1e6 - 1e6 / asked;", "const told = (a
 
 @pytest.fixture(scope="session")
 def runtime(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The npm package onnxruntime-web."""
     if stated := os.environ.get("HMA_ORT_WEB"):
         return Path(stated)
     if not shutil.which("npm"):
@@ -240,7 +239,6 @@ def simulated(robot: dict[str, Any], chunks: Any) -> BlockTable:
 
 
 def true_image(page: "Page") -> Any:
-    """Return what stands still on the canvas of the truth."""
     taken = [""]
     while len(taken) < 2 or taken[-1] != taken[-2]:
         page.wait_for_timeout(1000)

@@ -22,7 +22,6 @@ NAME = "team/drive"
 
 @pytest.fixture(scope="module")
 def tokens(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A checkpoint, and a folder that stands for its page."""
     folder = tmp_path_factory.mktemp("tokens")
     save_tokens(folder / "model")
     (folder / "page").mkdir()

@@ -12,7 +12,6 @@ ort = pytest.importorskip("onnxruntime")
 def model_of(
     kernel: np.ndarray, sides: tuple[int, int], *, bias: bool = True, **given: object
 ) -> "onnx.ModelProto":
-    """Return a graph of one convolution of an image of these sides."""
     helper = onnx.helper
     inputs = ["image", "kernel", *["bias"] * bias]
     weights = {"kernel": kernel, "bias": np.linspace(-1, 1, len(kernel), dtype=np.float32)}

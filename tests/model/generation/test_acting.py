@@ -17,7 +17,6 @@ NAMES, TOTAL, PROMPTS = ["arm", "hand.v1"], 9, (3, 1)
 def wanted(
     model: HMA, frames: torch.Tensor, chunks: torch.Tensor, known: torch.Tensor, row: int
 ) -> torch.Tensor:
-    """Return the chunk (K,) after frames (T, ...), by `predict_actions`."""
     seen = known[: len(frames)].clone()
     seen[-1] = False  # the chunk that is asked for
     given = [part[None, : len(frames)] for part in (frames, chunks, seen)]

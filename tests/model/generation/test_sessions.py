@@ -33,7 +33,6 @@ class Session:
         self.known = torch.rand(40, 1, generator=drawn) < 0.7
 
     def begin(self, rollout: Rollout, row: int) -> None:
-        """Start the session in a row."""
         rollout.reset([row], self.frames, self.before, self.known_before, [self.seed], [self.name])
 
 
@@ -48,7 +47,6 @@ def advance(rollout: Rollout, sessions: dict[int, Session]) -> None:
 
 
 def alone(model: HMA, session: Session, how: dict[str, Any]) -> list[torch.Tensor]:
-    """Return the frames of a session in a rollout of its own."""
     rollout = Rollout(model, session.name, **how)
     session.begin(rollout, 0)
     steps = zip(session.chunks, session.known)

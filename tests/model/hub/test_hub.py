@@ -25,7 +25,6 @@ MEMORY = "memory://hub/team/model"
 
 @pytest.fixture
 def source(folder: Path) -> Path:
-    """A checkpoint that a test may damage."""
     return folder
 
 
@@ -49,7 +48,6 @@ def published(target) -> list[str]:
 
 
 def other_robot(source: Path, out: Path, name: str, dims: int, seed: int) -> Path:
-    """A checkpoint of another robot on the same trunk, as finetuning gives it."""
     model = checkpoint.load(source, [])
     torch.manual_seed(seed)
     space = make_model({name: dims}, seed).embodiments[name]

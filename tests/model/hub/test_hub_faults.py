@@ -29,9 +29,6 @@ def kinds(server: Hub) -> list[str]:
     return [commit.message for commit in server.model(REPO).commits][1:]
 
 
-# -- hubs that do it otherwise
-
-
 @pytest.mark.parametrize(
     "habits",
     [
@@ -128,9 +125,6 @@ def test_a_push_cut_at_any_request_is_ended_by_the_same_command(server, source, 
     assert 5 < at < 200 - step
 
 
-# -- downloads
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("step", EVERY)
 def test_a_pull_cut_at_any_request_is_ended_by_the_same_command(
@@ -194,9 +188,6 @@ def test_pulls_at_once_fetch_every_byte_once(published, source):
     assert len(folders) == 1 and published.sent() == sizes(source, ARM)
 
 
-# -- answers
-
-
 @pytest.mark.parametrize("sha", ["../../escaped", "..", "a/b", "main", ""])
 def test_a_commit_of_a_strange_name_is_refused(published, sha):
     facts = {"id": REPO, "sha": sha, "private": False, "siblings": []}
@@ -211,9 +202,6 @@ def test_an_embodiment_that_is_not_whole_is_told_before_anything_is_fetched(publ
         hub.pull(REPO)
     assert set(published.sent()) == {"config.json"}
     assert list(checkpoint.load(hub.pull(REPO, ["hand"])).embodiments) == ["hand"]
-
-
-# -- folders
 
 
 @pytest.fixture

@@ -32,9 +32,6 @@ def files_of(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-# -- pushing
-
-
 def test_one_embodiment_is_one_commit_that_touches_its_folder_and_the_card_only(server, source):
     assert hub.push(source, f"hf://{REPO}", ["arm"]) == f"{server.url}/{REPO}"
     first = server.model(REPO).files
@@ -117,9 +114,6 @@ def test_a_hub_that_never_answers_is_given_up(server, source, monkeypatch, reque
 def test_a_new_repository_can_be_private(server, source):
     hub.push(source, REPO, private=True)
     assert server.model(REPO).private
-
-
-# -- pulling
 
 
 def test_one_embodiment_brings_config_trunk_and_its_own_files_byte_for_byte(published, source):
@@ -253,9 +247,6 @@ def test_a_full_disk_says_so_and_the_pull_goes_on_later(published, tmp_path, mon
     assert checkpoint.load(hub.pull(REPO, ["arm"]), ["arm"])
 
 
-# -- what is not there, not allowed, or something else
-
-
 def test_without_a_token_nothing_is_pushed(server, source, monkeypatch):
     monkeypatch.delenv("HF_TOKEN")
     with pytest.raises(HubError, match=r"needs a token.*hf auth login|HF_TOKEN"):
@@ -344,9 +335,6 @@ def test_names_that_lead_elsewhere_are_left_there(published, tmp_path, name):
     assert [row["embodiment"] for row in list_embodiments(REPO)] == ["arm", "hand"]
     assert all(path.name != "x" and "escaped" not in str(path) for path in tmp_path.rglob("*"))
     assert not list(tmp_path.rglob("*.pkl"))
-
-
-# -- the token, and the command
 
 
 @pytest.mark.slow

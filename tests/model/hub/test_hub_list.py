@@ -33,7 +33,6 @@ def painted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def shelf(folder: Path, tmp_path: Path) -> Path:
-    """A folder hub with a model of ours, one of the release, and something else."""
     hub.push(folder, tmp_path / "shelf/team/model")
     released = tmp_path / "shelf/liruiw/hma-base"
     released.mkdir(parents=True)
@@ -128,9 +127,6 @@ def test_a_released_repository_is_listed_without_its_weights_being_sent(shelf, t
         server.create("liruiw/hma-base").commit({name: (released / name).read_bytes() for name in names})
         (facts,) = survey("liruiw/hma-base")
         assert facts["format"] == "released" and set(server.sent()) == {"config.json"}
-
-
-# -- the sample picture
 
 
 def test_a_sample_shows_truth_and_predictions_over_time(folder, tmp_path, painted):

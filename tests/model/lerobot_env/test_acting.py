@@ -30,7 +30,6 @@ ROBOT = "rails_03"
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A checkpoint that acts."""
     return saved(tmp_path / "run", "policy")
 
 

@@ -11,7 +11,6 @@ from hma_model.network.trunks.transformer import PRODUCT_KEYS, attend
 
 
 def _attended(dtype: torch.dtype, length: int, masked: str) -> list[Tensor]:
-    """Return the result of attention over random sequences, and the gradients of its inputs, in float32."""
     drawn = torch.randn(3, 4, 2, length, 16, generator=torch.Generator().manual_seed(1))
     q, k, v = (part.to(dtype).requires_grad_() for part in drawn)
     mask = torch.ones(4, 1, length, length, dtype=torch.bool).tril(3) if masked == "mask" else None

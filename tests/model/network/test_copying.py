@@ -25,7 +25,6 @@ CHANGES = [
 
 
 def _model(**changes):
-    """Return a small model whose gains are not zero."""
     model = small_model(copy_previous=True, **changes)
     gain = model.token_readout.copy
     with torch.no_grad():

@@ -36,7 +36,6 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def batch(shards: Path) -> Batch:
-    """Windows of four frames of which some chunks are known and some not."""
     windows = WindowDataset(shards, "train", 4)
     batch = windows.batch(range(2, 14))
     assert 0 < int(batch.action_mask.sum()) < batch.action_mask.numel()

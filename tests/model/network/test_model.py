@@ -87,7 +87,6 @@ def test_gradients_reach_exactly_the_stems_present(objective: str) -> None:
 
 
 def _overfit(objective: str, steps: int, **changes: Any) -> list[float]:
-    """The losses of four small windows, learned by heart."""
     torch.manual_seed(0)
     values = {"layers": 1, "frames": 3, "grid": (2, 2), "corrupt_max": 0.0, "history_probability": 0.0}
     model = HMA(small_config(**(values | {"label_smoothing": 0.0} | changes)))

@@ -88,7 +88,6 @@ def test_a_predicted_past_keeps_the_frame_before(nothing_more):
 
 @pytest.fixture
 def targets(monkeypatch):
-    """What the heads are to draw, in the order of the calls."""
     seen, loss = [], DiffusionHead.loss
 
     def spy(self, target, condition, generator=None):

@@ -316,7 +316,6 @@ def test_a_configuration_that_does_not_fit_is_refused(changes: dict[str, Any], n
 
 
 def test_times_have_no_future() -> None:
-    """A frame's features do not change with frames after it."""
     model = unet()
     x, actions = torch.randn(1, 4, 16, 16), torch.randn(1, 4, 16)
     times: TimePositions = model.time_positions(4)

@@ -46,8 +46,6 @@ def address(stepper: Stepper) -> Iterator[str]:
 
 
 class StillWorld(TrueWorld):
-    """A model in which nothing moves."""
-
     def open(self, embodiment: str, frames: Any, chunks: Any = None, *, seed: int = 0) -> int:
         self._count += 1
         self.rows[self._count] = frames[-1]
@@ -111,7 +109,6 @@ def page(browser: "Browser", address: str) -> Iterator["Page"]:
 
 
 def opened(page: "Page", address: str, robot: str = "mover_04") -> "Page":
-    """Open the page with a robot, and let errors fail the test."""
     page.on("pageerror", lambda fault: pytest.fail(str(fault)))
     page.goto(address)
     page.wait_for_selector("body[data-frame='0']")
@@ -126,7 +123,6 @@ def session_of(stepper: Stepper, page: "Page") -> Any:
 
 
 def frames(page: "Page", least: int) -> None:
-    """Wait until so many frames are shown."""
     for _ in range(400):
         if int(page.get_attribute("body", "data-frame") or 0) >= least:
             return

@@ -22,7 +22,6 @@ pytest_plugins = ["tests.hub_fixtures"]
 
 @pytest.fixture
 def served(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
-    """Keep the arguments of `serve`."""
     kept: list[tuple[Any, ...]] = []
 
     async def serve(*given: Any, **settings: Any) -> None:

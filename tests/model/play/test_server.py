@@ -74,8 +74,6 @@ def client(stepper: Stepper) -> Iterator[TestClient]:
 
 
 class PageViewer:
-    """A page, as far as its websocket goes."""
-
     def __init__(self, socket: WebSocketTestSession) -> None:
         self.socket = socket
 
@@ -83,7 +81,6 @@ class PageViewer:
         self.socket.send_text(json.dumps({"do": do, **values}))
 
     def message(self, kind: str) -> dict[str, Any]:
-        """Return the next message of a kind."""
         while True:
             received = self.socket.receive()
             if received["type"] == "websocket.close":
@@ -92,7 +89,6 @@ class PageViewer:
                 return message
 
     def frame(self) -> tuple[dict[str, Any], list[np.ndarray[Any, Any]]]:
-        """Return the header and the images of the next frame."""
         while True:
             data = self.socket.receive().get("bytes")
             if data:
@@ -111,7 +107,6 @@ class PageViewer:
         self.send("seen", serial=header["serial"])
 
     def works(self) -> None:
-        """Make a frame."""
         self.send("step")
         header, _ = self.frame()
         self.see(header)

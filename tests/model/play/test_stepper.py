@@ -19,8 +19,6 @@ ROBOTS = ("mover_04", "arm3_04", "pendulum")
 
 
 class Bench:
-    """An stepper that is stepped by hand."""
-
     def __init__(self, **settings: Any) -> None:
         self.world = TrueWorld()
         robots = lab_robots(*ROBOTS)

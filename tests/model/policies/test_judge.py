@@ -41,8 +41,6 @@ def written(parts: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Episodes of three parts, in half of which a loose one moves."""
-
     def episode(
         robot: str, frames: int, stride: int, seed: int, number: int, drawn: Any, wander: bool
     ) -> truth.TrueEpisode:

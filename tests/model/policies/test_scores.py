@@ -87,7 +87,6 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> StateJudge:
 
 @pytest.fixture(scope="module")
 def still(model: HMA) -> PolicyEvaluation:
-    """Eight episodes of the policy that stands still."""
     with pytest.MonkeyPatch.context() as patch:
         given: Any = {"world": World(model, get_tokenizer("fsq-8")), "judge": made_judge(patch)}
         return evaluate_policies(ROBOT, ["still"], episodes=8, frames=4, **given)
@@ -169,14 +168,12 @@ UNABLE = replace(METER, chooses=False)
 
 
 def scored_as(name: str, model: np.ndarray, replayed: np.ndarray, limit: float = 5.0) -> Scored:
-    """Return a policy with these scores (N,), whose true outcomes are those under the same actions."""
     images = np.zeros((len(model), 1, 8, 8, 3), np.uint8)
     values = np.stack([replayed, model, replayed])
     return Scored(name, values, values >= limit, np.zeros(1, int), images, images, np.arange(len(model)) / 4)
 
 
 def evaluation(judge: StateJudge, policies: list[Scored], **asked: Any) -> PolicyEvaluation:
-    """Return what `evaluate_policies` makes of these results."""
     made = {one.policy: one for one in policies}
     with pytest.MonkeyPatch.context() as patch:
         arrays = {name: dict(vars(one)) for name, one in made.items()}

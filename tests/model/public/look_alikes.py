@@ -78,7 +78,6 @@ def dino_wm(folder: Path, episodes: int = 6, frames: int = 24) -> Path:
 
 
 def iws(folder: Path, episodes: int = 6, frames: int = 20) -> Path:
-    """Write train and val, an HDF5 file an episode."""
     for seed, part in enumerate(("train", "val")):
         (folder / part).mkdir(parents=True)
         for number in range(episodes):

@@ -22,7 +22,6 @@ pytestmark = pytest.mark.real
 
 @pytest.fixture(scope="module")
 def imported(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The folders of the three imported checkpoints, by name."""
     out = tmp_path_factory.mktemp("imported")
     names = ("discrete", "discrete_mup", "continuous")
     return {

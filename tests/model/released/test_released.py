@@ -45,7 +45,6 @@ LAYOUTS: dict[str, dict[str, Any]] = {
 
 
 def _model(seed: int = 0, **changes: Any) -> HMA:
-    """A model in a layout that the release has, everything stirred."""
     torch.manual_seed(seed)
     model = HMA(small_config(**(RELEASED | changes)))
     model.add_embodiment(ActionSpace("arm", 3, 2, (1.0, -2.0, 0.5), (2.0, 0.5, 0.0), (True,) * 3, "divide"))
@@ -229,9 +228,6 @@ def test_a_repository_of_the_hub_comes_in(tmp_path: Path, monkeypatch: pytest.Mo
         repository.commit({"config.json": None})
         with pytest.raises(HubError, match=r"has no config\.json"):
             hub.import_released("liruiw/hma-base-disc", tmp_path / "again")
-
-
-# -- what is refused
 
 
 def _truncate(folder: Path) -> None:

@@ -222,7 +222,6 @@ def test_no_episode_continues_one_that_pauses(world: World, real: Path, tmp_path
 
 @pytest.fixture
 def real(world: World, tmp_path: Path) -> Path:
-    """One recorded episode, as shards of the world's tokenizer."""
     recording = record(ROBOT, tmp_path, 1)
     settings = Settings(val_fraction=0)
     convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "real", settings=settings)

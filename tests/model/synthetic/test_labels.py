@@ -189,7 +189,6 @@ def test_film_that_cannot_be_read_goes_to_quarantine(world, real, tmp_path, monk
 
 
 def grey(folder: Path, **levels: int) -> None:
-    """Write videos of eight grey images at 10 Hz, by name."""
     folder.mkdir(exist_ok=True)
     for name, level in levels.items():
         write_mp4(folder / f"{name}.mp4", [np.full((128, 128, 3), level, np.uint8)] * 8, 10)

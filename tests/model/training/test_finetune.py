@@ -44,7 +44,6 @@ def tune(base, leg, out, *changes, freeze=True, **options) -> TrainResult:
 
 @pytest.fixture(scope="module", params=[True, False], ids=["frozen", "tuned"])
 def tuned(tiny_run, request, tmp_path_factory) -> tuple[bool, TrainResult]:
-    """Four steps on a new robot; whether the trunk was frozen."""
     folder = tmp_path_factory.mktemp("tuned")
     leg, before = make_shards(folder / "leg", "leg", dims=4, seed=2), files(tiny_run.out)
     result = tune(tiny_run.out, leg, folder / "run", freeze=request.param)

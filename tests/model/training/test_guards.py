@@ -26,7 +26,6 @@ EPISODE, ROW = 2, 10
 
 
 def make_hurt(folder: Path) -> Path:
-    """The shards of `make_shards`, but for one action: a number that no loss stays one with."""
     with pytest.MonkeyPatch.context() as patch:
         plain = ShardWriter.add
 

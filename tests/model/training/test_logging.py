@@ -47,12 +47,10 @@ def seen(data, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def run(seen, painter, tmp_path) -> Path:
-    """A copy of that folder."""
     return shutil.copytree(seen, tmp_path / "run")
 
 
 def events(path: Path) -> list[Event]:
-    """Return what TensorBoard's own reader finds in an event file, checksums compared."""
     reader, found = PyRecordReader_New(str(path)), []
     while True:
         try:
@@ -64,9 +62,6 @@ def events(path: Path) -> list[Event]:
 
 def values(found: list[Event], tag: str) -> list[float]:
     return [v.simple_value for event in found for v in event.summary.value if v.tag == tag]
-
-
-# -- trackers
 
 
 def test_event_files_have_a_version_every_step_and_every_evaluation(run):
@@ -111,7 +106,6 @@ def test_an_event_file_that_cannot_be_written_is_one_error(data, tmp_path):
 
 @pytest.fixture(params=["trackio", "wandb"])
 def package(request, monkeypatch) -> ModuleType:
-    """A stand-in that notes its calls."""
     module = ModuleType(request.param)
     module.calls = []
     module.init = lambda **given: module.calls.append(("init", given))
@@ -146,9 +140,6 @@ def test_a_package_that_is_missing_is_said_with_how_to_install_it(
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingDependencyError, match=f"{name} is not installed — {install}"):
         train(make_recipe({**TINY, "data": data, "track": [name]}), out=tmp_path / "run", show=False)
-
-
-# -- pictures and the report
 
 
 def test_evaluations_leave_pictures_and_the_card_shows_the_last(run):
@@ -200,8 +191,6 @@ def test_the_report_of_a_run_without_a_step_or_with_losses_that_are_no_numbers_c
 
 
 class Line(dict):
-    """A line of metrics.jsonl in memory."""
-
     alive = most = 0
 
     def __init__(self, text: str) -> None:
@@ -257,9 +246,6 @@ def test_the_run_folder_has_its_recipe_and_ground(run):
     ground = json.loads((run / "environment.json").read_text())
     assert {"git_revision", "torch", "python", "device", "ranks"} <= ground.keys()
     assert json.loads((run / "recipe.json").read_text())["steps"] == 6
-
-
-# -- the console
 
 
 def facts(step: int, loss: float = 2.0, **given) -> dict:

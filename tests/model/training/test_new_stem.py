@@ -39,7 +39,6 @@ def base(tmp_path_factory) -> TrainResult:
 
 @pytest.fixture
 def twin(tmp_path) -> Path:
-    """The same recordings as arm's, under another name."""
     return make_shards(tmp_path / "twin", "twin", seed=0)
 
 

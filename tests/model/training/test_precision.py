@@ -24,14 +24,12 @@ UNET = {
 
 @pytest.fixture
 def bfloat16(monkeypatch):
-    """A processor with fast products of bfloat16."""
     monkeypatch.setattr(runtime, "has_bfloat16", lambda: True)
     monkeypatch.setattr(runtime, "bfloat16_pays", lambda: True)
 
 
 @pytest.fixture
 def no_bfloat16(monkeypatch):
-    """A processor without."""
     monkeypatch.setattr(runtime, "has_bfloat16", lambda: False)
 
 

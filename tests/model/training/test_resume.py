@@ -29,7 +29,6 @@ def recipe(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(recipe, tmp_path_factory):
-    """A run that was never cut."""
     return train(recipe(), out=tmp_path_factory.mktemp("whole") / "run", show=False).out
 
 

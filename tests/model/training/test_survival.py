@@ -27,7 +27,6 @@ def train_quietly(recipe, out: Path) -> None:
 
 @pytest.fixture
 def full(monkeypatch):
-    """The disk is full from the second checkpoint on."""
     from hma_model.checkpoint import weights as files
 
     plain, calls = files.write_tensors, []

@@ -20,11 +20,7 @@ def losses(recipe, out, **changes) -> list[float]:
     return [loss for _, loss in train(recipe(**changes), out=out, show=False).losses]
 
 
-# -- gradients
-
-
 def gradients(recipe, out, batches) -> dict[str, torch.Tensor]:
-    """Of one step whose passes see the given batches."""
     out.mkdir()
     run = Run(recipe, out, torch.device("cpu"))
     run.prepare(None)
@@ -37,7 +33,6 @@ def gradients(recipe, out, batches) -> dict[str, torch.Tensor]:
 
 
 def part(batch, rows: slice):
-    """Some windows of a batch."""
     cut = {k: v[rows] if v is not None else None for k, v in vars(batch).items()}
     return type(batch)(**cut)
 
@@ -96,9 +91,6 @@ def test_bf16_stays_near_full_precision_with_weights_in_float32(recipe, finished
     assert all(t.dtype != torch.bfloat16 for t in weights(result.checkpoint).values())
 
 
-# -- averages
-
-
 def test_the_average_moves_by_its_decay():
     model = torch.nn.Linear(1, 1, bias=False)
     model.weight.data.fill_(0.0)
@@ -133,9 +125,6 @@ def test_the_evaluation_is_that_of_the_averaged_weights(recipe, tmp_path):
     assert run.evaluate()["loss"] == pytest.approx(found, abs=1e-6)
 
 
-# -- what a step says
-
-
 def test_time_memory_and_waiting_are_in_the_log(recipe, tmp_path):
     train(recipe(steps=2), out=tmp_path / "run", show=False)
     line = next(read_metrics(tmp_path / "run"))
@@ -152,9 +141,6 @@ def test_what_is_trained_is_what_is_evaluated(recipe, tmp_path, objective):
 
 def test_long_lists_of_windows_are_cut():
     assert listed(["a", "b"]) == "a; b" and listed(list("abcdefg")) == "a; b; c; d and 3 more"
-
-
-# -- how a step is shared
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from tests.model.shards import make_shards
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of a run: a checkpoint, two lines of a log, and a recipe that names its shards."""
     shards = make_shards(tmp_path / "arm", "arm")
     folder = tmp_path / "run"
     save(folder / "checkpoints" / "step-00000002", {"arm": 2})

@@ -156,7 +156,6 @@ def test_a_policy_of_gym_pusht_runs_unchanged(world: World) -> None:
     import gym_pusht  # noqa: F401
 
     def policy(image: np.ndarray) -> np.ndarray:
-        """Go to the darkest place of the image."""
         y, x = np.unravel_index(image.sum(axis=-1).argmin(), image.shape[:2])
         return (np.array([x, y]) * (512 / len(image))).astype(np.float32)
 

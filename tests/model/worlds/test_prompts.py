@@ -40,7 +40,6 @@ def arm() -> HMA:
 
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Episode 0 and 1 of the robot on rails, recorded and converted."""
     folder = tmp_path_factory.mktemp("rails")
     yaml = folder / f"{RAILS}.yaml"
     yaml.write_text(Checkpoint.open("embedded").embodiment(RAILS).to_yaml())

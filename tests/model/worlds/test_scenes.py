@@ -204,8 +204,6 @@ def test_no_scene_of_a_recording_crosses_a_pause(shards: ShardSet, block_tokeniz
 
 
 class StillWorld(TrueWorld):
-    """A model of any robot, whose images stay black."""
-
     def open(self, embodiment: str, frames: Any, chunks: Any = None, *, seed: int = 0) -> int:
         self.begun.append((frames, chunks))
         return 0

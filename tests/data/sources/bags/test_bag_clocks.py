@@ -15,7 +15,6 @@ SECOND = 10**9
 
 
 def shifted(tmp_path: Path, shift_s: np.ndarray) -> Path:
-    """A bag whose camera's header stamps, and no others, are off by that many seconds."""
     shift = np.round(shift_s * SECOND).astype(np.int64)
     return write_ros1(tmp_path / "run.bag", replace(make_recording(FRAMES), stamp_shift_ns=shift))
 

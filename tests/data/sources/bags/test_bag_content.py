@@ -37,7 +37,6 @@ STREAMS = {
 
 
 def packets(name: str) -> list[tuple[int, bytes]]:
-    """The frame and the bytes of each packet, in the order of the stream."""
     encoder, options = STREAMS[name]
     context = av.CodecContext.create(encoder, "w")
     context.width = context.height = 96

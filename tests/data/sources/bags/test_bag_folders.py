@@ -21,7 +21,6 @@ METADATA = "rosbag2_bagfile_information:\n  relative_file_paths: [{}]\n  topics_
 
 
 def part(target: Path, frames: range, later_ns: int = 0, packed: bool = False) -> Path:
-    """One file of a split recording, with those frames."""
     messages = []
     for i in frames:
         ns = at(i) + later_ns

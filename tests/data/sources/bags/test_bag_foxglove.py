@@ -47,7 +47,6 @@ def png(picture: np.ndarray) -> np.ndarray:
 
 
 def packets(pictures: np.ndarray) -> list[bytes]:
-    """The pictures as H.264, a packet each."""
     import av
 
     encoder = av.CodecContext.create("libx264", "w")
@@ -62,7 +61,6 @@ def packets(pictures: np.ndarray) -> list[bytes]:
 
 
 def values(name: str, pictures: np.ndarray) -> list[dict[str, Any]]:
-    """The fields of each message but its time."""
     if name == "RawImage":
         height, width = pictures.shape[1:3]
         about = {"width": width, "height": height, "encoding": "rgb8", "step": width * 3}
@@ -95,7 +93,6 @@ def ros_encoder(name: str, encoding: str) -> tuple[str, str, bytes, Callable[[in
 
 
 def protobuf_encoder(name: str) -> tuple[str, str, bytes, Callable[[int, dict[str, Any]], bytes]]:
-    """The same of foxglove's protobuf schemas."""
     kinds = {"string": TEXT, "uint32": UINT32, "uint8[]": BLOB}
     lines = [line.split() for line in FIELDS[name].splitlines()]
     schema, types = protobuf_types({name: [(field, kinds[kind], ONE) for kind, field in lines]})
@@ -109,7 +106,6 @@ def protobuf_encoder(name: str) -> tuple[str, str, bytes, Callable[[int, dict[st
 
 
 def write(path: Path, name: str, encoding: str, pictures: np.ndarray) -> Path:
-    """An MCAP file of those pictures as /video, a second apart, and of numbers as /n."""
     made = protobuf_encoder(name) if encoding == "protobuf" else ros_encoder(name, encoding)
     kind, schema_encoding, schema, encode = made
     with path.open("wb") as file:

@@ -78,7 +78,6 @@ def test_a_hostile_bag_is_one_line(case: str, bags: dict[str, Path], tmp_path: P
 
 @pytest.fixture(scope="module")
 def whole(bags: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The bytes of a bag of each kind, of one episode and of two."""
     paths = {kind: bags[kind] for kind in SINGLE}
     run = bag_parts.make_run(20, pause_after=(10,))
     for kind, make in bag_parts.KINDS.items():

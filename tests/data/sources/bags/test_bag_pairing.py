@@ -49,7 +49,6 @@ def bag(
     order: Sequence[int] = range(FRAMES),
     mcap: bool = False,
 ) -> Path:
-    """A camera with header stamps beside actions, with or without."""
     messages = []
     for i in order:
         messages.append(("/cam", ros2.image(header(i), i), received(i)))
@@ -59,7 +58,6 @@ def bag(
 
 
 def pairs(path: Path, embodiment: Embodiment, episode: str = "") -> list[tuple[int, int]]:
-    """The number in each frame, and the action beside it."""
     name = episode or SOURCE.episode_ids(str(path))[0]
     clip = to_clip(SOURCE.read(str(path), name, embodiment), embodiment)
     return list(zip(ros2.numbers(clip), clip.actions[:, 0].astype(int).tolist(), strict=True))
@@ -109,9 +107,6 @@ def test_headers_of_one_simulated_clock_pair_with_each_other(tmp_path: Path) -> 
 def test_a_first_stamp_of_zero_leaves_the_topic_to_receipt(tmp_path: Path) -> None:
     path = bag(tmp_path / "run", lambda i: at(i) - 20_000_000 if i else 0)
     assert pairs(path, robot()) == IN_ORDER
-
-
-# -- the order
 
 
 def swapped(i: int) -> int:
@@ -182,9 +177,6 @@ def test_parts_stored_in_another_order_are_sorted() -> None:
     assert sorted_by(times, np.zeros(40, np.int64)) is None
 
 
-# -- what infer proposes
-
-
 def test_infer_measures_on_the_clock_that_it_proposes(tmp_path: Path) -> None:
     path = bag(tmp_path / "run", restarted, stamped=True)
     values = parse_yaml(infer(str(path), "x"), "x")
@@ -199,9 +191,6 @@ def test_infer_asks_where_clocks_differ(tmp_path: Path) -> None:
     assert values["sync"]["stamp"] == "receive"
     asked = values["provenance"]["stamp"]
     assert asked.startswith("TODO") and "0.3 s ahead of receipt" in asked
-
-
-# -- an action that is held from before the first frame
 
 
 @pytest.mark.parametrize("count", [1, 3])

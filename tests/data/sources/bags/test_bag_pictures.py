@@ -140,7 +140,6 @@ def write_video(
     drop: int = 0,
     kind: str = "foxglove.CompressedVideo",
 ) -> np.ndarray:
-    """An MCAP of CompressedVideo, one frame a message; the pictures that went in."""
     import base64
 
     import av

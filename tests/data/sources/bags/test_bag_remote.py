@@ -34,7 +34,6 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small blocks, as the files are small."""
     monkeypatch.setattr(blocks, "BLOCK", 4096)
     monkeypatch.setattr(blocks, "BLOCKS_AHEAD", 2)
     monkeypatch.setattr(blocks, "BLOCKS_KEPT", 16)
@@ -42,7 +41,6 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def ranges(small: None, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
-    """The ranges of bytes that were read from stores."""
     found: list[tuple[int, int]] = []
     plain = MemoryFileSystem.cat_file
 
@@ -56,7 +54,6 @@ def ranges(small: None, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]
 
 
 def put(path: Path, name: str) -> str:
-    """Upload a bag to memory://; return its URI."""
     uri = f"memory://{name}/{path.name}"
     fsspec.filesystem("memory").put(str(path), uri, recursive=path.is_dir())
     return uri

@@ -17,7 +17,6 @@ RECORDING = "{start: {key: /state.data, equals: true}, stop: {key: /state.data, 
 
 
 def states(*changes: tuple[float, bool]) -> list[Said]:
-    """The state published at 5 Hz for seven seconds, changing at those times."""
     said = []
     for at in np.arange(0, 7, 0.2).tolist():
         value = [value for since, value in ((-1, False), *changes) if since <= at + 1e-6][-1]
@@ -164,11 +163,7 @@ def test_each_episode_has_the_instruction_said_nearest_to_its_beginning(tmp_path
     assert told == ["reach", "push", "pull"]
 
 
-# -- cost
-
-
 def read_bytes() -> int:
-    """Return what this process has read from files so far."""
     for line in Path("/proc/self/io").read_text().splitlines():
         if line.startswith("rchar"):
             return int(line.split()[1])

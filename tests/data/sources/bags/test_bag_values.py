@@ -90,9 +90,6 @@ def test_a_list_of_other_texts_names_nothing() -> None:
     assert value_names([{"values": [1, 2]}, {"joint_names": ["a", "b"]}], 2) == ("a", "b")
 
 
-# -- what moves
-
-
 def motors_bag(path: Path) -> Path:
     messages = []
     for i in range(FRAMES):
@@ -114,9 +111,6 @@ def test_a_field_of_a_list_is_read_from_each_and_may_be_sliced(tmp_path: Path) -
     episode = SOURCE.read(str(path), "run", Embodiment.from_values(values, ""))
     expected = [[i + 0.01, i + 0.02] for i in range(FRAMES)]
     np.testing.assert_allclose(episode.actions[0].values, expected, atol=1e-5)
-
-
-# -- two types on one topic
 
 
 def mcap_of_two_types(path: Path) -> Path:

@@ -30,7 +30,6 @@ each_format = pytest.mark.parametrize("name", MADE)
 
 @pytest.fixture
 def elsewhere(tmp_path: Path, name: str) -> Path:
-    """A folder with one recording of the format."""
     found = tmp_path / "elsewhere"
     found.mkdir()
     MADE[name](found)

@@ -31,7 +31,6 @@ def video(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def in_order(path: Path) -> np.ndarray:
-    """Every frame as PyAV gives them from first to last."""
     with av.open(str(path)) as container:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
@@ -173,9 +172,6 @@ def test_a_real_video_strided_equals_decoding_in_order(real_data: Path, name: st
 def test_pictures_survive_their_codec(video: Path) -> None:
     off = np.abs(VideoFile(video).frames([7])[0].astype(int) - picture(7))
     assert np.median(off) <= 1
-
-
-# -- a camera's YAML
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,6 @@ def frame_of(path: Path) -> av.VideoFrame:
 
 
 def by_ffmpeg(path: Path) -> np.ndarray:
-    """The first frame as FFmpeg's filter `scale` converts it."""
     frame, graph = frame_of(path), av.filter.Graph()
     steps = (
         graph.add_buffer(width=SIDE, height=SIDE, format=frame.format, time_base=frame.time_base),
@@ -83,13 +82,11 @@ def by_ffmpeg(path: Path) -> np.ndarray:
 
 
 def colours_of(picture: np.ndarray) -> np.ndarray:
-    """The colour in the middle of each patch."""
     width = SIDE // len(COLOURS)
     return picture[SIDE // 2, width // 2 :: width].astype(int)
 
 
 def h264_messages(path: Path) -> list[bytes]:
-    """The packets of a video as a bag's messages hold them."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         to_messages = av.BitStreamFilterContext("h264_mp4toannexb", stream)

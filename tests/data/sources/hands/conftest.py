@@ -11,13 +11,11 @@ LENGTH = 30
 
 @pytest.fixture(scope="session")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A video of 30 frames at 10 Hz, each showing its number."""
     return encode(tmp_path_factory.mktemp("clip") / "a.mp4", range(LENGTH))
 
 
 @pytest.fixture
 def folder(tmp_path: Path, clip: Path) -> Path:
-    """A folder with a copy of that video."""
     (tmp_path / "set").mkdir()
     (tmp_path / "set" / "a.mp4").write_bytes(clip.read_bytes())
     return tmp_path / "set"

@@ -48,9 +48,6 @@ def check_run(folder: Path, robot, episode_id: str, frames: range) -> None:
     np.testing.assert_allclose(np.diff(aligned.timestamps), np.diff(frames[:-1]) / 10, atol=1e-9)
 
 
-# -- every form of label gives the same episode
-
-
 @pytest.mark.parametrize("name", ["hands.parquet", "hands.csv", "landmarks.parquet"])
 def test_a_table_in_any_form(folder: Path, name: str) -> None:
     made.write_table(folder / name, made.rows("a.mp4", LENGTH))
@@ -162,9 +159,6 @@ def test_labels_of_pictures_of_another_size(folder: Path) -> None:
     np.testing.assert_allclose(values[1] * 2, values[0], atol=1e-6)
 
 
-# -- runs
-
-
 def test_hold_keeps_the_last_place_for_so_many_frames(folder: Path) -> None:
     table = made.rows("a", LENGTH, lambda side, i: side == "left" or i not in (0, 10, 11, 20, 21, 22, 23))
     made.write_table(folder / "hands.csv", table)
@@ -247,9 +241,6 @@ def test_labels_of_every_third_frame_run_on_and_a_missing_one_ends_the_run() -> 
     assert [runs.labels.frames[slice(*span)].tolist() for span in runs.spans] == [[3, 6, 9], [15, 18, 21, 24]]
 
 
-# -- clocks
-
-
 def test_a_grid_of_its_own_resamples_pictures_and_hands(folder: Path) -> None:
     made.write_table(folder / "hands.csv", made.rows("a", LENGTH))
     robot = made.hand_video("landmarks", hz=None)
@@ -258,9 +249,6 @@ def test_a_grid_of_its_own_resamples_pictures_and_hands(folder: Path) -> None:
     shown = [number_of(p) for p in aligned.frames_at("primary", np.arange(len(aligned)))]
     np.testing.assert_allclose(aligned.actions, made.expected(np.arange(len(aligned)) // 2 + 1), atol=1e-6)
     assert set(shown) == set(range(LENGTH - 1)) and shown == sorted(shown)
-
-
-# -- the whole road
 
 
 def test_a_conversion_makes_the_same_shards_twice(folder: Path, tmp_path: Path, block_tokenizer) -> None:

@@ -52,7 +52,6 @@ RAISED = {
 
 @pytest.fixture(scope="module")
 def models(real_data: Path) -> Path:
-    """The folder of the real models."""
     return real_data / "hands" / "models"
 
 
@@ -73,7 +72,6 @@ def short(real_data: Path, models: Path, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.fixture(autouse=True)
 def apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cache what is found in the test's own folder."""
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("HMA_HAND_MODELS", raising=False)
 
@@ -173,9 +171,6 @@ def test_there_is_at_most_one_hand_a_side(p_right: list[float], sides: list[str 
     assert choose_sides(p_right) == sides
 
 
-# -- real pictures
-
-
 @pytest.mark.real
 def test_raised_hands_are_found_on_their_side_with_the_wrist_below(real_data, finder) -> None:
     for name, side in RAISED.items():
@@ -214,9 +209,6 @@ def test_no_frame_of_the_clip_loses_both_hands(real_data: Path, finder: MediaPip
     for side in ("left", "right"):  # a hand goes on from frame to frame
         mine = wrists[np.array(found["side"].to_pylist()) == side]
         assert np.linalg.norm(np.diff(mine, axis=0), axis=1).max() < 0.1
-
-
-# -- the source with a detector
 
 
 def robot(models: Path, **layout: str) -> Embodiment:
@@ -316,9 +308,6 @@ def test_inspection_tells_the_share_of_frames_with_hands(short, models, monkeypa
     monkeypatch.setenv("HMA_HAND_MODELS", str(models))
     facts = open_source("hands").inspect(str(short)).facts
     assert facts["frames with left hand"] == facts["frames with both"] == "100% of 12 sampled"
-
-
-# -- models that are missing or wrong
 
 
 def test_missing_models_say_where_they_are_looked_for(tmp_path: Path) -> None:

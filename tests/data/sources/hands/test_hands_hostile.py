@@ -36,14 +36,11 @@ def test_a_wrong_layout_says_where_and_what_is_allowed(layout: dict[str, Any], f
 
 
 class Touch:
-    """An object whose unpickling would run something."""
-
     def __reduce__(self):
         return Path.touch, (Path("ran"),)
 
 
 def write_labels(folder: Path, labels: str, names: Sequence[str] = NAMES, table: str = "hands.csv") -> None:
-    """Write sound labels of the videos."""
     action = made.ego4d_action(range(LENGTH), "#C C")
     if labels == "landmarks":
         made.write_table(folder / table, [row for name in names for row in made.rows(name, LENGTH)])

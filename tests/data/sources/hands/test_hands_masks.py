@@ -32,7 +32,6 @@ GONE = range(10, 13)  # frames without the right hand
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One video of 30 frames at 10 Hz, whose right hand is gone for three of them."""
     folder = tmp_path_factory.mktemp("videos")
     encode(folder / "a.mp4", range(LENGTH))
     rows = made.rows("a", LENGTH, lambda side, i: side == "left" or i not in GONE)
@@ -110,9 +109,6 @@ def test_masked_runs_against_a_plain_loop(seen: list[bool], limit: int | None, l
     assert (~there).tolist() == missing
 
 
-# -- conversions
-
-
 def test_a_masked_conversion_stores_marks_and_zeros_and_counts_known_values_only(
     folder: Path, tmp_path: Path, block_tokenizer
 ) -> None:
@@ -185,9 +181,6 @@ def test_runs_of_one_video_come_into_one_split_and_their_counts_add_up_once(
     assert all(splits[f"{i}.mp4#0"] == splits[f"{i}.mp4#1"] for i in range(6))
     assert set(splits.values()) == {"train", "val"}
     assert done.flags == {"dropped_frames": 6 * 5}  # three without the hand, and the last of each run
-
-
-# -- beside the road
 
 
 def test_a_film_is_written_frame_by_frame_as_all_at_once(tmp_path: Path) -> None:

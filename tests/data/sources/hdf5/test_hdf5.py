@@ -27,7 +27,6 @@ from tests.data.hub_cache import as_snapshot
 
 @pytest.fixture
 def demos(tmp_path: Path) -> Path:
-    """Twelve demos, two of them in the mask `valid`."""
     path = tmp_path / "demos.hdf5"
     with h5py.File(path, "w") as file:
         for i in range(12):

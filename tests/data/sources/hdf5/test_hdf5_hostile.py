@@ -18,8 +18,6 @@ FILE, KEY = "demos.hdf5", "obs/agentview_image"
 
 
 def changed(change: Callable[[h5py.Group], object]) -> Edit:
-    """Return an edit of the first demo of the file."""
-
     def edit(folder: Path) -> None:
         with h5py.File(folder / FILE, "a") as file:
             change(file["data/demo_0"])
@@ -28,8 +26,6 @@ def changed(change: Callable[[h5py.Group], object]) -> Edit:
 
 
 def put(key: str, **stored: Any) -> Edit:
-    """Return an edit that gives a key of the first demo other values."""
-
     def change(demo: h5py.Group) -> None:
         demo.pop(key, None)
         demo.create_dataset(key, **stored)
@@ -81,7 +77,6 @@ def of_another_header(folder: Path) -> None:
 
 
 def bomb() -> bytes:
-    """A PNG that claims 60,000×60,000 pixels."""
     png = bytearray(cv2.imencode(".png", pictures()[0])[1].tobytes())
     png[16:24] = (60_000).to_bytes(4, "big") * 2
     png[29:33] = zlib.crc32(png[12:29]).to_bytes(4, "big")

@@ -32,9 +32,6 @@ def shown(path: Path, indices: Any = range(T), **layout: str) -> np.ndarray:
     return open_source("hdf5").read(str(path), "demo_0", robot).streams["front"].frames(indices)
 
 
-# -- ManiSkill
-
-
 @pytest.fixture
 def maniskill(tmp_path: Path) -> Path:
     """Two trajectories with an observation after the last action, and the JSON beside."""
@@ -77,9 +74,6 @@ def test_as_many_observations_as_actions_need_nothing_dropped(tmp_path: Path) ->
     np.testing.assert_array_equal(shown(one(tmp_path, data=pictures()), last_observation="drop"), pictures())
 
 
-# -- numbers and axes of pictures
-
-
 @pytest.mark.parametrize(
     ("dtype", "pixels", "factor"),
     [
@@ -109,9 +103,6 @@ def test_axes_that_could_be_either_are_refused_until_said(tmp_path: Path) -> Non
     with pytest.raises(EpisodeError, match=r"first or last.*layout\.axes"):
         shown(path)
     assert shown(path, axes="THWC").shape == (T, 3, 4, 3) and shown(path, axes="TCHW").shape == (T, 4, 3, 3)
-
-
-# -- other recorders
 
 
 def test_robomind_pictures_and_words_are_read(tmp_path: Path) -> None:
@@ -175,9 +166,6 @@ def test_masks_by_their_names(tmp_path, masks, expected) -> None:
         assert [ref.id for ref in chosen] == [f"demo_{i}" for i in demos]
 
 
-# -- chunks
-
-
 @pytest.mark.parametrize("chunks", [(T, H, W, 3), (4, H, W, 3), (5, 5, 7, 1), (1, H, W, 3), None])
 def test_batches_in_any_order_are_the_frames_whatever_the_chunks(tmp_path, chunks) -> None:
     options = {"chunks": chunks, "compression": "gzip", "shuffle": True} if chunks else {}
@@ -205,9 +193,6 @@ def test_a_chunk_larger_than_the_usual_cache_is_read_once(tmp_path, monkeypatch)
     np.testing.assert_array_equal(stream.frames([5, 8]), pictures()[[5, 8]])
 
 
-# -- what does no harm
-
-
 def test_a_group_that_holds_itself_ends(tmp_path: Path) -> None:
     path = one(tmp_path, data=pictures())
     with h5py.File(path, "a") as file:
@@ -225,9 +210,6 @@ def test_a_json_of_the_simulator_may_be_anything(tmp_path: Path) -> None:
             file["data"].attrs["problem_info"] = value
         assert open_source("hdf5").inspect(str(path)).episodes == 1
         assert shown(path, [0]).shape == (1, H, W, 3)
-
-
-# -- groups of other names
 
 
 @pytest.mark.parametrize("names", ["trials/t{:03}", "t{:03}", "episodes/{}", "a/run_b/{}", "2026-11-{}"])

@@ -35,7 +35,6 @@ LENGTHS = (12, 9, 15)
 
 
 def embodiment(**changes: Any) -> Embodiment:
-    """The robot of the made datasets."""
     values: dict[str, Any] = {
         "id": "testbot",
         "kind": "real",
@@ -92,7 +91,6 @@ def test_the_footer_of_a_file_of_many_episodes_is_parsed_once_until_it_changes(t
 
 @pytest.fixture(scope="session", params=["v2.0", "v2.1", "v2.1 av1", "v3.0", "v3.0 av1"])
 def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of each version and codec, not to be changed."""
     version, _, codec = request.param.partition(" ")
     folder = tmp_path_factory.mktemp("lerobot")
     if version == "v3.0":
@@ -108,8 +106,6 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture
 def copy(originals: dict[str, Path], tmp_path: Path) -> Callable[[str], Path]:
-    """Gives a dataset that may be damaged."""
-
     def make(name: str) -> Path:
         return Path(shutil.copytree(originals[name], tmp_path / name))
 
@@ -119,9 +115,6 @@ def copy(originals: dict[str, Path], tmp_path: Path) -> Callable[[str], Path]:
 def change_info(folder: Path, **changes: Any) -> None:
     path = folder / "meta/info.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-
-
-# -- reading
 
 
 def test_every_frame_goes_with_its_action(whole: Path) -> None:
@@ -187,9 +180,6 @@ def test_pictures_named_by_path_are_read(copy: Callable[[str], Path]) -> None:
     pq.write_table(table.set_column(column, STILL, pa.array(named)), path)
     still = open_source("lerobot").read(str(folder), "episode_000000", embodiment()).streams["still"]
     assert [number_of(frame) for frame in still.frames([2, 11])] == [2, 11]
-
-
-# -- what is refused
 
 
 @pytest.mark.parametrize("rate", [10.05, "unknown", None])

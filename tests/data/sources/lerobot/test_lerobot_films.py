@@ -42,7 +42,6 @@ def robot(**source: Any) -> Embodiment:
 
 
 def outcome(folder: Path, **source: Any) -> list[str]:
-    """What becomes of each episode: right, shifted, or the text of its refusal."""
     arm, found = robot(**source), []
     for name in EPISODES:
         try:
@@ -201,9 +200,6 @@ def test_pairing_says_what_is_known(shared: Path) -> None:
     assert outcome(shared, layout={"pairing": "index"}) == ["right"] * 3
 
 
-# -- rows
-
-
 def data(folder: Path) -> Path:
     return folder / "data/chunk-000/file-000.parquet"
 
@@ -224,9 +220,6 @@ def test_a_row_that_is_there_twice_or_not_at_all_is_named(shared: Path) -> None:
     assert "has row 4 of episode 0 twice, by frame_index" in outcome(shared)[0]
     change_column(data(shared), "frame_index", lambda value, row: value + (value > 6))
     assert "lacks rows of episode 1 after row 6" in outcome(shared)[1]
-
-
-# -- tasks
 
 
 def instructions(folder: Path) -> list[str]:

@@ -26,8 +26,6 @@ def film(frames: int, fps: int = 10) -> Edit:
 
 
 def column(name: str, content: list[Any]) -> Edit:
-    """Return an edit of a column of the first episode's rows."""
-
     def edit(path: Path) -> None:
         table = pq.read_table(path)
         pq.write_table(table.set_column(table.column_names.index(name), name, pa.array(content)), path)

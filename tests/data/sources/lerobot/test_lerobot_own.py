@@ -62,7 +62,6 @@ def arm(**changes: Any) -> Embodiment:
 
 
 def frame_of(episode: int, row: int, features: dict[str, Any]) -> dict[str, Any]:
-    """One frame: numbers that no two frames share, pictures of noise on a moving ramp."""
     rng = np.random.default_rng([episode, row])
     ramp = (np.arange(HEIGHT)[:, None] + np.arange(WIDTH) * 2 + 5 * row) % 256
     made: dict[str, Any] = {}
@@ -83,7 +82,6 @@ def frame_of(episode: int, row: int, features: dict[str, Any]) -> dict[str, Any]
 def write(
     root: Path, features: dict[str, Any], settle: Callable[[Any], None] = lambda writer: None, **options: Any
 ) -> Path:
-    """Write a dataset with lerobot's own writer."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     writer = LeRobotDataset.create("team/arm", FPS, features, root=root, robot_type="testbot", **options)
@@ -105,7 +103,6 @@ def many_files(writer: Any) -> None:
 
 
 def encoder(codec: str) -> dict[str, Any]:
-    """Return the options that make lerobot encode so."""
     from lerobot.configs.video import RGBEncoderConfig
 
     return {"rgb_encoder": RGBEncoderConfig(vcodec={"av1": "libsvtav1"}.get(codec, codec))}
@@ -127,12 +124,10 @@ def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 @pytest.fixture(scope="module")
 def items(written: Path) -> list[Any]:
-    """Each frame as lerobot reads it."""
     return list(theirs(written))
 
 
 def theirs(root: Path) -> Any:
-    """Return lerobot's own reader over the dataset."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     return LeRobotDataset("team/arm", root=root, video_backend="pyav", return_uint8=True)
@@ -254,7 +249,6 @@ def altered(plain: Path, tmp_path: Path) -> Path:
 
 
 def change_spans(root: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    """Change `to_timestamp` of every episode."""
     (path,) = (root / "meta/episodes").rglob("*.parquet")
     table = pq.read_table(path)
     name = f"videos/{CAM}/to_timestamp"

@@ -81,7 +81,6 @@ def embodiment(**changes) -> Embodiment:
 
 
 def numbers_only(**components) -> Embodiment:
-    """An embodiment of one action component."""
     return embodiment(action={"space": "mixed", "components": [components]}, state=None)
 
 

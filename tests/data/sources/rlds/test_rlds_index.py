@@ -44,9 +44,6 @@ def number(folder: Path | str, name: str) -> float:
     return float(open_folder(str(folder)).example(name)[0].numbers("steps/a")[0])
 
 
-# -- links
-
-
 def test_links_of_the_hub_cache_and_to_the_whole_folder_are_followed(tmp_path):
     folder = dataset(tmp_path / "hub" / "snapshots" / "abc" / "toy", 4)
     blobs = tmp_path / "hub" / "blobs"
@@ -57,9 +54,6 @@ def test_links_of_the_hub_cache_and_to_the_whole_folder_are_followed(tmp_path):
     (tmp_path / "link").symlink_to(folder)
     for place in (folder, tmp_path / "link"):
         assert number(place, "train/000003") == 3
-
-
-# -- remote
 
 
 class Handler(SimpleHTTPRequestHandler):
@@ -96,7 +90,6 @@ class Handler(SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def served(tmp_path, monkeypatch):
-    """(folder that is served, its URI, the handler)."""
     monkeypatch.setattr(fetching, "WAITS_S", (0.0, 0.0, 0.0))
 
     class Own(Handler):
@@ -176,7 +169,6 @@ def test_a_server_without_ranges_is_named(served):
 
 @pytest.fixture
 def memory(tmp_path):
-    """A dataset on fsspec's file system in memory."""
     folder = dataset(tmp_path / "d", 12, 3)
     files, root = fsspec.filesystem("memory"), f"/{tmp_path.name}"
     for path in folder.iterdir():
@@ -224,9 +216,6 @@ def test_a_driver_that_is_missing_is_named_with_its_install_line(monkeypatch, pr
     monkeypatch.setattr(fsspec.core, "url_to_fs", missing)
     with pytest.raises(MissingDependencyError, match=install):
         RLDS.index(f"{protocol}://bucket/{package}/x")
-
-
-# -- shapes of files
 
 
 @pytest.mark.parametrize(

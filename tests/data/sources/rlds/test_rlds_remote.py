@@ -37,7 +37,6 @@ def ranges(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int, int]]:
 
 
 def upload(tmp_path: Path, shards: int = 3) -> tuple[Path, str]:
-    """A dataset of several shards, here and in a store."""
     files = {
         f"toy-train.tfrecord-{shard:05d}-of-{shards:05d}": [
             record(shard * EPISODES + i, LENGTH) for i in range(EPISODES)
@@ -55,7 +54,6 @@ def file_size(folder: Path) -> int:
 
 
 def settled() -> None:
-    """Wait until everything that was begun is fetched."""
     for future in list(blocks._cache(blocks.os.getpid())._blocks.values()):
         future.result()
 

@@ -40,7 +40,6 @@ NUMBERS = {
 
 @pytest.fixture(scope="module")
 def toy() -> ModuleType:
-    """The module that writes and reads the dataset with TensorFlow Datasets."""
     pytest.importorskip("tensorflow_datasets", reason="needs the dependency group tfds")
     from tests.data import tfds_toy
 
