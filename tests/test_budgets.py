@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_561, 11_848, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 66_005, 524_144
-TEST_LINES = 49_971
+TEST_LINES = 49_156
 DOC_WORDS = 41_990
 
 

@@ -158,10 +158,7 @@ def test_a_broken_source_is_told_only_where_no_other_knows_the_recording(
         (DULL.replace("bad_tokenizer", "missing"), "importing missing failed: ModuleNotFoundError"),
         (DULL.replace("load = Grey", ""), r"bad_tokenizer has no load\(\)"),
         (DULL.replace("load = Grey", "def load(name):\n    return 5"), r"load\(\) failed: TypeError"),
-        (
-            DULL.replace("load = Grey", "def load(name, **_):\n    return 5"),
-            r"load\(\) returns int, not a",
-        ),
+        (DULL.replace("load = Grey", "def load(name, **_):\n    return 5"), r"load\(\) returns int, not a"),
         (DULL.replace("Spec(name", "Spec('grey-9'"), "its spec is named 'grey-9', not 'dull'"),
     ],
 )

@@ -107,10 +107,7 @@ class Toy(tfds.core.GeneratorBasedBuilder):
             weight = {"file": f"/{split}/{episode}", "success": episode % 2 == 0, "weight": 1 / (episode + 1)}
             yield (
                 f"{split}{episode}",
-                {
-                    "steps": steps,
-                    "episode_metadata": weight | {"number": np.uint64(2**64 - 1 - episode)},
-                },
+                {"steps": steps, "episode_metadata": weight | {"number": np.uint64(2**64 - 1 - episode)}},
             )
 
 

@@ -21,9 +21,7 @@ def recorded(folder: Path, episodes: int) -> Path:
     return shutil.move(record("mover_04", folder, episodes, 0), folder / "My Arm.hdf5")
 
 
-def test_what_the_recording_cannot_say_is_asked_and_answered_by_flags(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_recording_cannot_say_is_asked_and_answered_by_flags(tmp_path, monkeypatch) -> None:
     recording = recorded(tmp_path, 2)
     ran = []
 
@@ -61,9 +59,7 @@ def test_the_images_decide_the_tokenizer(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("said", "cropped"), [("", True), ("n", False)])
-def test_a_proposed_crop_is_asked_about_in_a_terminal(
-    said: str, cropped: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_proposed_crop_is_asked_about_in_a_terminal(said, cropped, tmp_path, monkeypatch) -> None:
     camera = {"name": "front", "key": "k", "crop": [0, 0, 9, 9]}
     path = tmp_path / "robot.yaml"
     path.write_text(write_yaml({"cameras": [camera], "provenance": {"crop": "TODO: does it hold all?"}}))

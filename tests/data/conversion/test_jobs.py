@@ -121,10 +121,7 @@ def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(
 ) -> None:
     out = tmp_path / "out"
     with locked(out, "0-of-2"):
-        with (
-            pytest.raises(OutputError, match="another job is writing share 0-of-2"),
-            locked(out, "0-of-2"),
-        ):
+        with pytest.raises(OutputError, match="another job is writing share 0-of-2"), locked(out, "0-of-2"):
             pass
         with locked(out, "1-of-2"):
             pass
@@ -133,9 +130,7 @@ def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(
     assert not out.exists()
 
 
-def test_a_read_error_that_goes_away_costs_nothing(
-    toy_arm: Embodiment, toy_file: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
-) -> None:
+def test_a_read_error_that_goes_away_costs_nothing(toy_arm, toy_file, tmp_path, whole, monkeypatch) -> None:
     monkeypatch.setattr(reading, "WAITS_S", (0.0, 0.0, 0.0))
     failures = {"demo_3": [OSError(5, "Input/output error")] * 2, "demo_7": [TimeoutError("slow")] * 3}
     read = Hdf5Source.read

@@ -39,9 +39,7 @@ def one_run(
     "kind, frames, tokenizer",
     [("rlds", "all", "fsq-8"), ("hdf5", "all", "vae-8"), ("bag", "strided", "raw-64:antialias")],
 )
-def test_one_pass_writes_the_bytes_of_two_runs(
-    kind: str, frames: str, tokenizer: str, tmp_path: Path
-) -> None:
+def test_one_pass_writes_the_bytes_of_two_runs(kind, frames, tokenizer, tmp_path) -> None:
     data, robot = RECORDINGS[kind](tmp_path)
     settings = replace(BOTH, frames=frames)
     two_runs(robot, data, tmp_path / "two", settings, tokenizer)
@@ -117,9 +115,7 @@ def test_what_a_dataset_beside_shards_cannot_have_is_refused_with_what_to_do(tmp
 
 
 @pytest.mark.parametrize("out, dataset", [("a", "a/b"), ("a/b", "a"), ("a", "b/../a")])
-def test_one_folder_inside_the_other_is_refused_before_anything_is_written(
-    out: str, dataset: str, tmp_path: Path
-) -> None:
+def test_one_folder_inside_the_other_is_refused_before_anything_is_written(out, dataset, tmp_path) -> None:
     data, robot = hdf5(tmp_path)
     with pytest.raises(
         UsageError, match="--lerobot: is .*one is inside the other — give two separate folders"

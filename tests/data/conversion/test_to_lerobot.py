@@ -184,9 +184,7 @@ def test_the_dataset_converts_to_the_shards_of_its_recording(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_an_episode_that_cannot_be_read_is_in_quarantine_and_nothing_of_it_in_the_dataset(
-    tmp_path: Path,
-) -> None:
+def test_an_episode_that_cannot_be_read_is_in_quarantine_and_nothing_of_it_in_the_dataset(tmp_path) -> None:
     data, robot = hdf5(tmp_path)
     with h5py.File(data, "a") as file:
         file["data/demo_1/obs/side"][...] = 7  # one colour throughout
@@ -303,9 +301,7 @@ def test_a_store_and_an_extension_are_refused(tmp_path: Path) -> None:
         convert(robot, str(data), "raw-64", tmp_path / "out", settings=Settings(drop_idle=True))
 
 
-def test_a_tokenizer_for_frames_that_stay_as_they_are_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_tokenizer_for_frames_that_stay_as_they_are_is_refused(tmp_path, capsys) -> None:
     words = ["convert", "x.hdf5", "-e", "rails_03", "--to", "lerobot", "--out", str(tmp_path / "out")]
     assert main([*words, "--tokenizer", "fsq-lab"]) == 2
     assert "leave out --tokenizer and --weights" in capsys.readouterr().err
@@ -350,9 +346,7 @@ def test_frames_in_which_nothing_moves_are_left_out_and_counted(tmp_path: Path) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("unit", ["m/s", "m"])  # a step of so many metres, repeated, is a motion too
-def test_what_may_be_a_motion_in_a_mixed_space_moves_while_it_stays_the_same(
-    tmp_path: Path, unit: str
-) -> None:
+def test_what_may_be_a_motion_in_a_mixed_space_moves_while_it_stays_the_same(tmp_path, unit) -> None:
     data, robot = hdf5(tmp_path)
     values = robot.to_dict()
     values["action"]["space"] = "mixed"

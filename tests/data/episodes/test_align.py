@@ -272,9 +272,7 @@ def test_time_that_goes_back_is_told_with_the_place() -> None:
     ("stamp", "format_name", "advised"),
     [("header", "rosbag", True), ("receive", "rosbag", False), ("header", "rh20t", False)],
 )
-def test_other_stamps_are_advised_only_where_there_are_others(
-    stamp: str, format_name: str, advised: bool
-) -> None:
+def test_other_stamps_are_advised_only_where_there_are_others(stamp, format_name, advised) -> None:
     robot = embodiment(stamp=stamp).to_dict() | {"source": {"format": format_name}}
     with pytest.raises(AlignmentError) as fault:
         to_clip(episode(STEADY, STEADY[::-1], STEADY, STEADY, STEADY), Embodiment.from_values(robot, "other"))

@@ -201,9 +201,7 @@ def test_name_that_is_no_kind_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("pushing", [False, True])
-def test_recipe_leaves_shards_and_no_recording(
-    tmp_path: Path, block_tokenizer: BlockTokenizer, pushing: bool
-) -> None:
+def test_recipe_leaves_shards_and_no_recording(tmp_path, block_tokenizer, pushing) -> None:
     spec = spec_from_file_location("record_world", shipped("recipes") / "world" / "record.py")
     assert spec and spec.loader
     recipe = module_from_spec(spec)

@@ -124,11 +124,7 @@ def test_more_samples_than_the_passes_give_are_refused_with_how_many_there_are()
         epoch_caps([600, 400], 2, 2_001)
 
 
-@given(
-    st.lists(st.integers(1, 10**6), min_size=2, max_size=12),
-    st.floats(1.0, 5.0),
-    st.floats(0.05, 1.0),
-)
+@given(st.lists(st.integers(1, 10**6), min_size=2, max_size=12), st.floats(1.0, 5.0), st.floats(0.05, 1.0))
 def test_capped_probabilities_hold_every_cap_and_sum_to_one(counts, max_epochs, used) -> None:
     samples = max(1, int(used * max_epochs * sum(counts)))
     caps = epoch_caps(counts, max_epochs, samples)

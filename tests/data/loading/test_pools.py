@@ -43,11 +43,7 @@ def rows_of(stream: WindowSequence, start: int, count: int) -> list[float]:
     return [hash(window.tobytes()) for window in cut["actions"]]
 
 
-@given(
-    st.lists(st.integers(1, 60), min_size=1, max_size=60),
-    st.integers(1, 24),
-    st.integers(0, 2**31),
-)
+@given(st.lists(st.integers(1, 60), min_size=1, max_size=60), st.integers(1, 24), st.integers(0, 2**31))
 def test_windows_that_share_a_row_are_further_apart_than_promised(runs, span, seed) -> None:
     rows = np.concatenate([np.arange(n) + 100 * i for i, n in enumerate(runs)]).astype(np.int64)
     order, apart = spread(rows, span, np.random.default_rng(seed))

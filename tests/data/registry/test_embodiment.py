@@ -241,11 +241,7 @@ def test_an_unknown_camera_names_the_known() -> None:
             [0, 2],
             r"components\[0\]\.slice: has 2 values, but dims is 3 \(is \[0, 2\]\)",
         ),
-        (
-            "action.components.0.slice",
-            [3, 0],
-            r"components\[0\]\.slice: has -3 values, but dims is 3",
-        ),
+        ("action.components.0.slice", [3, 0], r"components\[0\]\.slice: has -3 values, but dims is 3"),
         ("action.components.0.slice", [0], r"components\[0\]\.slice\[1\]: is missing"),
         ("action.components.0.names", ["x"], r"components\[0\]\.names: has 1 values, but dims is 3"),
         ("action.components.0.sign", [1, 1], r"components\[0\]\.sign: has 2 values, but dims is 3"),

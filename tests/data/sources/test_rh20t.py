@@ -116,18 +116,9 @@ JOINT, TCP = f"{SCENE}/transformed/joint.npy", f"{SCENE}/transformed/tcp_base.np
 FILM, TIMES = (f"{SCENE}/cam_{CAMERAS[0]}/{name}" for name in ("color.mp4", "timestamps.npy"))
 FEW = r"no timestamps in whole milliseconds"
 ONE: dict[str, Row] = {
-    "no joints": (
-        of(JOINT, Path.unlink),
-        r"has no transformed/joint\.npy — transformed has",
-    ),
-    "no camera": (
-        table("tcp_base", lambda t: t.pop(CAMERAS[0])),
-        "no samples of camera .* — it has",
-    ),
-    "no pose": (
-        table("tcp_base", lambda t: t[CAMERAS[0]][3].pop("tcp")),
-        "no 'tcp' — it has timestamp",
-    ),
+    "no joints": (of(JOINT, Path.unlink), r"has no transformed/joint\.npy — transformed has"),
+    "no camera": (table("tcp_base", lambda t: t.pop(CAMERAS[0])), "no samples of camera .* — it has"),
+    "no pose": (table("tcp_base", lambda t: t[CAMERAS[0]][3].pop("tcp")), "no 'tcp' — it has timestamp"),
     "another width": (tcp(3, tcp=np.zeros(6)), "changes its number of values"),
     "lists for numbers": (tcp(3, tcp=[[1], [2]]), "holds list values, not numbers"),
     "words for times": (tcp(3, timestamp="x"), FEW),

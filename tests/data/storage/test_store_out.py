@@ -81,9 +81,7 @@ def test_a_manifest_is_restored_in_place(toy_arm, toy_file, out, whole) -> None:
     assert verify(out) == []
 
 
-def test_uploads_that_fail_now_and_then_change_nothing(
-    toy_arm, toy_file, out, whole, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_uploads_that_fail_now_and_then_change_nothing(toy_arm, toy_file, out, whole, monkeypatch) -> None:
     draws, failed = random.Random(0), 0
 
     def sometimes(name: str) -> None:

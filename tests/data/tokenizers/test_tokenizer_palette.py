@@ -124,9 +124,7 @@ def test_a_file_of_other_values_is_refused(tmp_path: Path, colors: Colors) -> No
     "colors", ["own.safetensors", "hf://team/own/own.safetensors", "0a0b0", "00" * 3, "000000" * 256, 7]
 )
 @pytest.mark.parametrize("name", ["palette-64", "fsq-16"])
-def test_colours_of_a_spec_open_no_file_and_are_never_too_many(
-    name: str, colors: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_colours_of_a_spec_open_no_file_and_are_never_too_many(name, colors, tmp_path, monkeypatch) -> None:
     write(tmp_path / "own.safetensors", OWN)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("hma_data.tokenizers.palette.Nearest", None)  # a table for millions of colours

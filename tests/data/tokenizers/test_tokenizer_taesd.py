@@ -225,10 +225,7 @@ def test_half_a_pair_is_refused(tmp_path):
         ({"quant_conv.weight": torch.zeros(2)}, r"quant_conv\.weight"),
         ({"encoder.layers.0.weight": torch.zeros(8)}, "does not hold the weights"),
         ({"encoder.layers.1.conv.2.bias": torch.full((8,), torch.inf)}, "not finite"),
-        (
-            {"decoder.layers.11.conv.2.weight": torch.zeros(8, 8, 1, 1)},
-            r"size mismatch for decoder\.layers",
-        ),
+        ({"decoder.layers.11.conv.2.weight": torch.zeros(8, 8, 1, 1)}, r"size mismatch for decoder\.layers"),
     ],
 )
 def test_weights_of_another_network_are_refused_by_name(tmp_path, weights, changes, named):

@@ -74,9 +74,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return made
 
 
-def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(
-    folders: tuple[Path, Path],
-) -> None:
+def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(folders) -> None:
     best, frozen = (read_results(folder)["measures"] for folder in folders)
     assert list(best) == [ROBOT]
     one, other = best[ROBOT], frozen[ROBOT]
@@ -92,9 +90,7 @@ def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(
     assert other["inverse"]["return_px"] == other["inverse"]["turn_px"] == 0
 
 
-def test_the_calibration_is_recomputed_from_what_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_calibration_is_recomputed_from_what_is_written(tmp_path, monkeypatch) -> None:
     uncertainty, errors = rollouts(4.0, scenes=12)
     made = np.zeros((*errors.shape, 1, 2))
     made[..., 0, 0] = errors
@@ -202,9 +198,7 @@ def test_the_results_of_other_settings_are_refused(folders: tuple[Path, Path]) -
         benchmark("it", folders[0], TINY, seed=1, world=world_of(FlawlessWorld))
 
 
-def test_the_card_the_page_and_a_comparison(
-    folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_card_the_page_and_a_comparison(folders, tmp_path, capsys) -> None:
     for folder in folders:
         found = read_results(folder)
         (page,) = folder.glob("*.html")
@@ -263,9 +257,7 @@ def test_finished_results_of_a_killed_job_still_record_meters_and_remove_its_par
     assert not (tmp_path / "out" / WORK).exists()
 
 
-def test_a_checkpoint_that_may_only_be_read_gets_no_meter_and_no_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_checkpoint_that_may_only_be_read_gets_no_meter_and_no_error(tmp_path, monkeypatch) -> None:
     def refused(*given: Any) -> None:
         raise OutputError(tmp_path, "cannot be written: Permission denied")
 

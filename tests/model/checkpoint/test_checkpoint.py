@@ -144,13 +144,7 @@ def test_a_model_with_an_embodiment_without_yaml_is_not_saved(tmp_path):
     with pytest.raises(CheckpointError, match="no embodiment YAML was given for hand"):
         robots = {"arm": yaml("arm")}
         numbers = {"arm": stats_of(2)}
-        checkpoint.save(
-            make_model(ROBOTS),
-            tmp_path / "m",
-            embodiment_yaml=robots,
-            stats=numbers,
-            cards={},
-        )
+        checkpoint.save(make_model(ROBOTS), tmp_path / "m", embodiment_yaml=robots, stats=numbers, cards={})
 
 
 def test_a_training_runs_folder_stands_for_its_newest_checkpoint(tmp_path):

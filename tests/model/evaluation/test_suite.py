@@ -69,9 +69,7 @@ def run(
 BOTH, ROBOTS = ("one", "other"), ("arm", "hand")
 
 
-def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_once(
-    evaluated: list[suite.Part],
-) -> None:
+def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_once(evaluated) -> None:
     parts = evaluated
     assert [(Path(p.checkpoint).name, p.found["embodiment"]) for p in parts] == [
         ("one", "arm"), ("one", "hand"), ("other", "arm"), ("other", "hand"),
@@ -99,9 +97,7 @@ def test_a_verdict_reaches_the_cards_of_a_checkpoint(made: Path, evaluated: list
     assert page.index("> **arm** ") < page.index("## Embodiments")
 
 
-def test_what_holds_for_every_part_is_said_of_all_and_the_rest_of_its_own(
-    made: Path, evaluated: list[suite.Part]
-) -> None:
+def test_what_holds_for_every_part_is_said_of_all_and_the_rest_of_its_own(made, evaluated) -> None:
     parts = copy.deepcopy(evaluated)
     for part in parts:
         part.found["notes"] = ["of each"]
@@ -147,9 +143,7 @@ def test_the_same_seed_gives_the_same_bytes(made: Path, evaluated: list[suite.Pa
     assert (tmp_path / "a/report.html").read_bytes() == (tmp_path / "b/report.html").read_bytes()
 
 
-def test_the_page_is_one_file_that_shows_each_robot_and_checkpoint(
-    made: Path, evaluated: list[suite.Part], tmp_path: Path
-) -> None:
+def test_the_page_is_one_file_that_shows_each_robot_and_checkpoint(made, evaluated, tmp_path) -> None:
     page = write_results(evaluated, tmp_path, "hma evaluate").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     strips = re.findall(r'alt="(The \w+ window[^"]*)"', page)

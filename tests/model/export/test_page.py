@@ -121,9 +121,7 @@ def said(page: "Page") -> str:
     return page.text_content("#veil-text") or ""
 
 
-def test_200_frames_driven_by_keys_are_those_of_onnxruntime_and_it_works_offline(
-    page: "Page", server: Any, site: Path
-) -> None:
+def test_200_frames_driven_by_keys_are_those_of_onnxruntime_and_it_works_offline(page, server, site) -> None:
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
     page.goto(address(server))
@@ -200,9 +198,7 @@ def without_simulator(folder: Path) -> Any:
     return recorded
 
 
-def test_the_simulator_in_the_page_follows_a_person_and_a_replay(
-    page: "Page", server: Any, site: Path
-) -> None:
+def test_the_simulator_in_the_page_follows_a_person_and_a_replay(page, server, site) -> None:
     page.goto(address(server))
     page.wait_for_selector("#replay:visible")
     assert page.is_visible("#true-figure")
@@ -256,9 +252,7 @@ def test_keys_are_looked_at_before_each_frame(page: "Page", server: Any) -> None
     page.wait_for_function("kept.length && kept[kept.length - 1][0].some((value) => value)", polling=50)
 
 
-def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(
-    page: "Page", server: Any, site: Path
-) -> None:
+def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(page, server, site) -> None:
     folder = site / "sub" / "page"
     graph = folder / "page-step.onnx"
     whole = graph.read_bytes()
@@ -285,22 +279,14 @@ def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(
         (f"robots/{ROBOT}/table.png", "#note", "table.png cannot be loaded"),
     ],
 )
-def test_a_missing_file_of_the_page_is_said(
-    page: "Page", server: Any, site: Path, name: str, place: str, words: str
-) -> None:
+def test_a_missing_file_of_the_page_is_said(page, server, site, name, place, words) -> None:
     (site / "sub" / "page" / name).unlink()
     page.goto(address(server))
     page.wait_for_function(f"document.querySelector('{place}').textContent.includes('{words}')")
 
 
 @pytest.mark.parametrize("trunk", ["tokens", "pixels"])
-def test_webgpu_makes_the_frames_of_wasm(
-    trunk: str,
-    request: pytest.FixtureRequest,
-    tmp_path: Path,
-    runtime: Path,
-    chromium: Callable[[tuple[str, ...]], "Browser"],
-) -> None:
+def test_webgpu_makes_the_frames_of_wasm(trunk, request, tmp_path, runtime, chromium) -> None:
     asked = ("wasm", "webgpu", "") if trunk == "pixels" else ("wasm", "webgpu")
     browser = chromium((*(flag for flag in FLAGS if flag != "--disable-gpu"), *EMULATED_GPU))
     with served(with_runtime(request.getfixturevalue(trunk), runtime, tmp_path)) as server, closing(browser):

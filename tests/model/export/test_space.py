@@ -64,9 +64,7 @@ def test_a_push_makes_a_static_space_of_the_page_and_replaces_an_older_one(
         ({"README.md": b"---\nsdk: static\n---\n", "app.js": b"theirs"}, "holds something else: app.js"),
     ],
 )
-def test_a_space_of_somebody_else_is_refused_before_anything_is_sent(
-    server: Hub, tokens: Path, files: dict[str, bytes | None], fault: str
-) -> None:
+def test_a_space_of_somebody_else_is_refused_before_anything_is_sent(server, tokens, files, fault) -> None:
     server.create(NAME, "spaces").commit(files)
     ended = hma("hub", "push", tokens.with_name("model"), "team/model", "--page", "--space", NAME)
     assert ended.returncode == 1

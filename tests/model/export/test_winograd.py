@@ -32,9 +32,7 @@ def run(model: "onnx.ModelProto", image: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("out", "into", "sides", "bias"), [(64, 48, (16, 24), True), (5, 80, (4, 4), False)])
-def test_a_rewritten_convolution_gives_the_same(
-    out: int, into: int, sides: tuple[int, int], bias: bool
-) -> None:
+def test_a_rewritten_convolution_gives_the_same(out, into, sides, bias) -> None:
     rng = np.random.default_rng(0)
     image = rng.normal(size=(1, into, *sides)).astype(np.float32)
     model = model_of(rng.normal(size=(out, into, 3, 3)).astype(np.float32), sides, bias=bias)
@@ -57,9 +55,7 @@ def test_a_rewritten_convolution_gives_the_same(
         ((64, 48, 3, 3), (16, 16), {"group": 2}),
     ],
 )
-def test_other_convolutions_stay(
-    kernel: tuple[int, ...], sides: tuple[int, int], given: dict[str, object]
-) -> None:
+def test_other_convolutions_stay(kernel, sides, given) -> None:
     model = model_of(np.ones(kernel, np.float32), sides, **given)
     before = [node.SerializeToString() for node in model.graph.node]
     assert rewrite(model) == 0

@@ -69,9 +69,7 @@ def test_video_and_actions_roll_out_together_with_and_without_a_cache(layout: st
 
 @pytest.mark.parametrize("absent", ["embedding", "skip", "tokens"])
 @pytest.mark.parametrize("first", ["observe", "act"])
-def test_what_comes_before_a_first_step_without_actions_leaves_the_cache_right(
-    first: str, absent: str
-) -> None:
+def test_what_comes_before_a_first_step_without_actions_leaves_the_cache_right(first, absent) -> None:
     model = small_model(conditioning=("concat", "modulation"), action_tokens=2, absent_action=absent, **ACTS)
     batch = small_batch(model.config, NAMES, frames=4)
     runs = []

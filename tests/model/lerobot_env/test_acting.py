@@ -88,9 +88,7 @@ def test_what_does_not_fit_is_one_line(run: Path, tmp_path: Path) -> None:
         WorldModelPolicy(WorldModelConfig(checkpoint=str(tmp_path / "dreams"), device="cpu"))
 
 
-def test_its_folder_as_the_path_of_a_policy_is_told_the_way_that_works(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_its_folder_as_the_path_of_a_policy_is_told_the_way_that_works(run, monkeypatch) -> None:
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--policy.path={run}"])
     told = f"error: --policy.path: is a checkpoint .* give --policy.type=hma --policy.checkpoint={run}"
     with pytest.raises(SystemExit, match=told):

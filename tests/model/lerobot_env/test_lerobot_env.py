@@ -77,9 +77,7 @@ def test_observations_are_what_lerobot_reads(env: vector.LeRobotVectorEnv) -> No
     np.testing.assert_array_equal(env.reset(seed=[3, 4])[0]["pixels"], seen["pixels"])
 
 
-def test_an_episode_that_has_ended_stays_as_it_is(
-    env: vector.LeRobotVectorEnv, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_episode_that_has_ended_stays_as_it_is(env, monkeypatch) -> None:
     env.reset(seed=[0, 1])
     dreamed: list[int] = []
     step = env.world.step
@@ -97,9 +95,7 @@ def test_an_episode_that_has_ended_stays_as_it_is(
     assert not env.reset()[1].get("is_success") and not env.ended.any()
 
 
-def test_the_reward_before_the_first_frame_is_the_score_of_the_start(
-    env: vector.LeRobotVectorEnv, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_reward_before_the_first_frame_is_the_score_of_the_start(env, monkeypatch) -> None:
     class Distance(Certain):
         def score(self, images: np.ndarray) -> np.ndarray:
             assert images.shape == (2, 1, *env.world.image_shape)
@@ -133,9 +129,7 @@ def test_settings_that_are_wrong(given: dict[str, Any], said: str) -> None:
     assert str(fault.value).startswith(said) and "\n" not in str(fault.value)
 
 
-def test_a_robot_without_a_start_is_refused_before_anything_is_trained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_robot_without_a_start_is_refused_before_anything_is_trained(tmp_path, monkeypatch) -> None:
     shards = ShardSet(make_shards(tmp_path / "shards", "twist_arm", spec=get_tokenizer("fsq-8").spec))
     trained_on("first", shards, tmp_path / "model")
     config = HMAEnvConfig(checkpoint=str(tmp_path / "model"), embodiment="twist_arm")
@@ -153,9 +147,7 @@ def test_a_robot_without_a_start_is_refused_before_anything_is_trained(
         ({"actions": 3}, RENAME, True, f"has 3 values of action, {ROBOT} has 2"),
     ],
 )  # fmt: skip
-def test_a_policy_that_does_not_fit(
-    inputs: dict[str, int], rename: str, state: bool, said: str, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_a_policy_that_does_not_fit(inputs, rename, state, said, tmp_path, monkeypatch) -> None:
     saved(tmp_path, **inputs)
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--policy.path={tmp_path}", rename])
     with pytest.raises(SystemExit, match="error: policy ") as fault:
@@ -184,9 +176,7 @@ def test_a_repository_is_loaded_in_the_revision_of_its_file(monkeypatch: pytest.
     assert asked == ["org/m@abc"]
 
 
-def test_how_far_a_training_is_is_logged_from_time_to_time(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_how_far_a_training_is_is_logged_from_time_to_time(monkeypatch, caplog) -> None:
     clock = iter([0.0, 5.0, 25.0, 25.0, 30.0])
     monkeypatch.setattr(vector.time, "monotonic", lambda: next(clock))
     tell = vector.progress_log(ROBOT)

@@ -189,9 +189,7 @@ def test_predicted_actions_are_raw_and_padded() -> None:
         ({"inverse": 1.0}, "policy", "act, but for inverse"),
     ],
 )
-def test_readouts_that_nothing_trained_are_refused(
-    objectives: dict[str, float], readout: str, says: str
-) -> None:
+def test_readouts_that_nothing_trained_are_refused(objectives, readout, says) -> None:
     model = small_model(objectives=objectives)
     with pytest.raises(HMAError, match=says):
         model.predict_actions(small_batch(model.config, ["arm"]).tokens, "arm", readout=readout)
@@ -270,8 +268,5 @@ def test_a_batch_of_another_tokenizer_is_refused() -> None:
     model = small_model()
     batch = small_batch(model.config, ["arm"])
     batch.tokens = batch.tokens[:, :, :2]
-    with pytest.raises(
-        HMAError,
-        match=r"a frame has the shape \(2, 4\), but the model takes \(4, 4\)",
-    ):
+    with pytest.raises(HMAError, match=r"a frame has the shape \(2, 4\), but the model takes \(4, 4\)"):
         model(batch)

@@ -61,9 +61,7 @@ def stored(model: HMA, batch: int, frames: int, seed: int = 0) -> Tensor:
 
 @pytest.mark.parametrize("changes", [{}, LATENTS, {"views": 2}, {"levels": (8,)}])
 @pytest.mark.parametrize("prompt", [1, 3, 6])
-def test_a_rollout_makes_the_frames_of_a_model_that_computes_everything_anew(
-    changes: dict[str, Any], prompt: int
-) -> None:
+def test_a_rollout_makes_the_frames_of_a_model_that_computes_everything_anew(changes, prompt) -> None:
     model = unet(**changes)
     frames, names = stored(model, 2, prompt), ["arm", "hand.v1"]
     actions = torch.randn(2, prompt + 7, 6, generator=torch.Generator().manual_seed(1))

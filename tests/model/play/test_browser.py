@@ -418,9 +418,7 @@ def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", st
     page.wait_for_selector("#sync:not(.call)")
 
 
-def test_the_border_warns_when_the_calibrated_uncertainty_does(
-    page: "Page", stepper: Stepper, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_border_warns_when_the_calibrated_uncertainty_does(page, stepper, monkeypatch) -> None:
     assert page.text_content("#meter") == "no error meter"
     assert page.get_attribute("#meter", "title") == "it is never unsure"
     session, world = session_of(stepper, page), stepper._worlds["mover_04"][0]

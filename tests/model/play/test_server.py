@@ -42,9 +42,7 @@ def test_robots_are_listed_by_how_long_they_hold(stepper: Stepper) -> None:
     assert said == [("arm2_12", "holds 8 s", True), ("mover_04", "does not follow its actions", False)]
 
 
-def test_a_robot_of_two_checkpoints_holds_as_long_as_in_the_one_that_drives_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_robot_of_two_checkpoints_holds_as_long_as_in_the_one_that_drives_it(monkeypatch) -> None:
     known, listed = {"one": Holding(1.0, False, True), "two": Holding(2.0, False, True)}, dict[str, Holding]()
     monkeypatch.setattr("hma_model.checkpoint.io.load", lambda *given: None)
     monkeypatch.setattr("hma_model.worlds.world.World", lambda *given: TrueWorld())

@@ -104,9 +104,7 @@ def judge(shards: Path, tmp_path: Path) -> Path:
     return saved(tmp_path / "reward", 0.5)
 
 
-def test_its_true_and_false_positives_are_those_of_the_held_out_episodes(
-    world: World, shards: Path, judge: Path
-) -> None:
+def test_its_true_and_false_positives_are_those_of_the_held_out_episodes(world, shards, judge) -> None:
     told: list[str] = []
     found = measured_judge(str(judge), world, ROBOT, ShardSet(shards), told.append)
     assert (found.hits, found.alarms, found.held_out.count, found.held_out.successes) == (7, 1, 16, 8)
@@ -141,9 +139,7 @@ def test_the_command_line_judges_by_a_reward_model(world: World, shards: Path, j
     assert isinstance(CliRunner().invoke(app, words).exception, UsageError)  # there is no training run
 
 
-def test_lerobots_evaluation_is_judged_by_it(
-    world: World, shards: Path, judge: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_lerobots_evaluation_is_judged_by_it(world, shards, judge, caplog) -> None:
     checkpoint = Checkpoint.open(shards.parent / "model")
     given: Any = {"judge": str(judge), "judge_from": str(shards), "prompt": str(shards), "horizon": 8}
     env = LeRobotVectorEnv(checkpoint, ROBOT, 2, world, state=False, **given)
@@ -176,16 +172,12 @@ def test_synthetic_episodes_that_it_calls_failures_are_left_out(
 
 
 @pytest.mark.parametrize("policy", ["scripted", "reach:noise=0.5"])
-def test_policies_that_need_a_simulator_are_refused(
-    world: World, shards: Path, judge: Path, policy: str
-) -> None:
+def test_policies_that_need_a_simulator_are_refused(world, shards, judge, policy) -> None:
     with pytest.raises(UsageError, match=f"policy {policy}: reads the state of a simulator"):
         evaluate_recorded(ROBOT, [policy], judge=str(judge), shards=shards, world=world)
 
 
-def test_a_judge_no_better_than_chance_and_too_few_labels_are_refused(
-    world: World, shards: Path, judge: Path
-) -> None:
+def test_a_judge_no_better_than_chance_and_too_few_labels_are_refused(world, shards, judge) -> None:
     label(shards, [bool(number % 2) for number in range(HELD_OUT)])
     always = saved(judge.parent / "always", -1.0)
     said = r"is no better than chance: true positives 8 of 8 \(63% to 100%\), false positives 8 of 8 \(63"
@@ -206,9 +198,7 @@ def test_so_many_labels_are_needed_as_is_said() -> None:
         assert bool(accuracy(true, true).too_few) == few
 
 
-def test_what_is_no_safe_reward_model_of_frames_is_refused_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_safe_reward_model_of_frames_is_refused_in_one_line(tmp_path, monkeypatch) -> None:
     def refused(folder: Path | str, *cameras: str) -> str:
         with pytest.raises(HMAError) as fault:
             RewardModel(str(folder), cameras or ("top",), ROBOT)

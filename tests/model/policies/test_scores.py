@@ -209,9 +209,7 @@ def test_no_verdict_where_single_episodes_do_not_agree(judge: StateJudge) -> Non
     assert "correlation of success rates" not in page and "correlation of success rates" in html(found)
 
 
-def test_a_model_abstains_where_it_expects_a_large_error_of_its_own(
-    judge: StateJudge, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_abstains_where_it_expects_a_large_error_of_its_own(judge, monkeypatch) -> None:
     true = np.where(np.arange(24) % 2 == 0, 8.0, 2.0)
     read = np.where(np.arange(24) < 12, true, 10 - true)  # the unsure half is wrong
     policies = [scored_as(f"p{number}", read, true) for number in range(3)]
@@ -308,9 +306,7 @@ DRAWN: list[float] = []
 
 
 @pytest.mark.parametrize("name", [f"{__name__}:noisy", "scripted:noise=0.5", "reach"])
-def test_branches_share_start_state_and_the_random_numbers_of_every_step(
-    world: World, judge: StateJudge, name: str
-) -> None:
+def test_branches_share_start_state_and_the_random_numbers_of_every_step(world, judge, name) -> None:
     scenes = Scenes.of(world, ROBOT, 2, 0)
     true = TrueArena(scenes, 128)
     policy = read_policy(name, scenes)
@@ -329,9 +325,7 @@ def test_branches_share_start_state_and_the_random_numbers_of_every_step(
 
 
 @pytest.mark.parametrize("broken", ["image", "seed", "state", "policy"])
-def test_branches_that_do_not_begin_alike_are_refused(
-    world: World, judge: StateJudge, broken: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_branches_that_do_not_begin_alike_are_refused(world, judge, broken, monkeypatch) -> None:
     name = {"seed": "random", "state": "reach", "policy": f"{__name__}:unseeded"}.get(
         broken, f"{__name__}:noisy"
     )

@@ -31,9 +31,7 @@ SETS = {"gpc": (gpc, 8), "dino_wm": (dino_wm, 4), "iws": (iws, 8)}  # frames of 
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_one_command_leads_from_the_published_files_to_figures(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_one_command_leads_from_the_published_files_to_figures(name, tmp_path, monkeypatch, capsys) -> None:
     module, frames = SETS[name]
     source = getattr(look_alikes, name)(tmp_path / "published")
     protocol = replace(module.PROTOCOL, frames=frames, size=64)

@@ -241,9 +241,7 @@ def test_the_released_code_reads_an_exported_model(tmp_path: Path, case: str) ->
         given[..., np.tile(space.std, space.stride) == 0] = 3.0
         for actions in (given, None):
             logits, chunks = _one_by_one(
-                lambda x, a, name=name: theirs.compute_logits(x, action_ids=a, domain=[name]),
-                tokens,
-                actions,
+                lambda x, a, name=name: theirs.compute_logits(x, action_ids=a, domain=[name]), tokens, actions
             )
             expected = logits.unflatten(1, (len(ours.config.factored), -1)).permute(0, 3, 4, 5, 1, 2)
             _close(ours.video_logits(tokens, actions, space.id), expected)

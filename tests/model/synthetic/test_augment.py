@@ -141,9 +141,7 @@ def test_the_first_frames_of_latents_are_the_simulators_at_their_own_size(latent
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["world", "latents"])
 @pytest.mark.filterwarnings("ignore:--keep")
-def test_the_surest_episodes_are_kept(
-    kind: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_surest_episodes_are_kept(kind, request, tmp_path, monkeypatch) -> None:
     world, measure = request.getfixturevalue(kind), {"world": "millinats", "latents": "millilatents"}[kind]
     augment(tmp_path / "all", asked(), world=world)
     augment(tmp_path / "half", asked(keep=0.5), world=world)
@@ -164,9 +162,7 @@ def test_the_surest_episodes_are_kept(
         augment(tmp_path / "none", asked(max_error=0.0), world=world)
 
 
-def test_a_choice_by_uncertainty_that_nobody_has_calibrated_is_warned_of_or_refused(
-    world: World, tmp_path: Path
-) -> None:
+def test_a_choice_by_uncertainty_that_nobody_has_calibrated_is_warned_of_or_refused(world, tmp_path) -> None:
     with pytest.warns(UserWarning, match="--keep 0.5: uncertainty is not calibrated: hma benchmark"):
         augment(tmp_path / "out", asked(keep=0.5), world=world)
     with pytest.raises(UsageError, match="--max-error: uncertainty is not calibrated"):

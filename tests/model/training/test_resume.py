@@ -67,10 +67,7 @@ def test_a_newer_releases_checkpoint_is_not_passed_over(recipe, tmp_path, whole,
     ("changes", "message"),
     [
         ({"model": {**TINY["model"], "width": 32}}, "another network: width is 32, it was 16"),
-        (
-            {"model": {**TINY["model"], "qk_norm": True}},
-            "another network: qk_norm is True, it was False",
-        ),
+        ({"model": {**TINY["model"], "qk_norm": True}}, "another network: qk_norm is True, it was False"),
     ],
 )
 def test_not_even_force_goes_on_with_another_network(recipe, whole, changes, message):

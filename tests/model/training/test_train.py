@@ -15,14 +15,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from hma_data.errors import (
-    CheckpointError,
-    OutputError,
-    RecipeError,
-    ShardError,
-    TrainingError,
-    UsageError,
-)
+from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError, TrainingError, UsageError
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint import io as checkpoint

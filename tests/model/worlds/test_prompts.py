@@ -105,9 +105,7 @@ def test_a_lerobot_episode_is_a_prompt_of_the_same_robot_recorded_elsewhere(arm,
     assert other.shape == frames.shape and np.abs(other.astype(int) - images).mean() > 8
 
 
-def test_cameras_recorded_elsewhere_are_paired_by_name_and_the_primary_one_stays(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_cameras_recorded_elsewhere_are_paired_by_name_and_the_primary_one_stays(monkeypatch) -> None:
     values = three.arm().to_dict() | {"sync": {"primary": "wrist"}}
     ends = ("front", "wrist", "side", "top", "other")
     keys = [SimpleNamespace(kind="camera", key=f"observation.images.{end}") for end in ends]

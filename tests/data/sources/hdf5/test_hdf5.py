@@ -215,10 +215,7 @@ def test_pictures_of_other_shapes_become_rgb(tmp_path: Path, shape: tuple[int, .
 # -- reading
 
 
-@given(
-    indices=st.lists(st.integers(0, 49), max_size=12),
-    chunk=st.sampled_from([None, 1, 7, 50]),
-)
+@given(indices=st.lists(st.integers(0, 49), max_size=12), chunk=st.sampled_from([None, 1, 7, 50]))
 def test_rows_are_those_asked_for(indices: list[int], chunk: int | None) -> None:
     values = np.arange(100).reshape(50, 2)
     with h5py.File("rows", "w", driver="core", backing_store=False) as file:

@@ -19,17 +19,7 @@ from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.detect import detect
 from hma_data.sources.lerobot.writer import origin_of
 from tests.data.hub_cache import as_snapshot
-from tests.data.videos import (
-    CAMERA,
-    HEIGHT,
-    STILL,
-    TASKS,
-    WIDTH,
-    actions_of,
-    make_v2,
-    make_v3,
-    number_of,
-)
+from tests.data.videos import CAMERA, HEIGHT, STILL, TASKS, WIDTH, actions_of, make_v2, make_v3, number_of
 
 LENGTHS = (12, 9, 15)
 
@@ -243,9 +233,7 @@ def test_the_real_g1_is_inspected(real_data: Path) -> None:
 @pytest.mark.parametrize(
     ("highest", "made_by"), [(1.0, {"by": "lerobot-eval", "synthetic": True}), (0.0, {})]
 )
-def test_a_recording_of_an_evaluation_in_a_model_is_synthetic(
-    highest: float, made_by: dict[str, Any], tmp_path: Path
-) -> None:
+def test_a_recording_of_an_evaluation_in_a_model_is_synthetic(highest, made_by, tmp_path) -> None:
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "info.json").write_text(json.dumps({"features": {"synthetic": {"shape": [1]}}}))
     (tmp_path / "meta" / "stats.json").write_text(json.dumps({"synthetic": {"max": [highest]}}))

@@ -321,9 +321,7 @@ def test_templates_of_version_3_are_filled_in_version_2(apart: Path, tmp_path: P
         np.testing.assert_array_equal(episode.actions[0].values[row], item["action"].numpy())
 
 
-def test_where_the_stated_rate_is_not_that_of_the_rows_infer_takes_the_measured_one(
-    apart: Path, tmp_path: Path
-) -> None:
+def test_where_the_stated_rate_is_not_that_of_the_rows_infer_takes_the_measured_one(apart, tmp_path) -> None:
     twice = as_v21(apart, tmp_path / "twice")
     for keeps in (True, False):
         info = json.loads((twice / "meta/info.json").read_text()) | {"fps": 2 * FPS}

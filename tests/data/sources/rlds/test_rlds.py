@@ -21,17 +21,7 @@ from hma_data.sources.detect import detect
 from hma_data.sources.rlds.example import Example
 from hma_data.sources.rlds.folder import Shard, open_folder
 from tests.data import rlds_files
-from tests.data.rlds_files import (
-    PROTO,
-    TEXT,
-    encode,
-    features_dict,
-    frame,
-    image,
-    png,
-    sequence,
-    tensor,
-)
+from tests.data.rlds_files import PROTO, TEXT, encode, features_dict, frame, image, png, sequence, tensor
 
 STEPS = {
     "observation": features_dict({"image": image((8, 10, 3)), "state": tensor((3,), "float64")}),
