@@ -51,6 +51,7 @@ FINDER = ".DS_Store"  # macOS writes it into any folder that somebody looks at
 FILES_BESIDE = {"README.md", ".gitattributes", FINDER}  # not of the set: a hub adds the first two
 HASHERS = 4  # threads; hashing releases the interpreter lock
 SHARD_NAME = re.compile(r"(train|val)/shard-([0-9]{5,9})\.parquet")
+_SHA256 = re.compile(r"([0-9a-f]{64})?")  # a part of a LeRobotDataset has none
 _SEAL = re.compile(rb'"manifest_sha256": "([0-9a-f]{64})"')
 _UNSEALED = "0" * 64
 
@@ -87,6 +88,8 @@ class ShardFile:
         named = SHARD_NAME.fullmatch(self.path)  # keeps paths inside the folder, even in a forged manifest
         if not named or named[1] != self.split:
             raise ValueError(f"{self.path!r} is not the name of a shard of split {self.split!r}")
+        if not _SHA256.fullmatch(self.sha256):  # it names the shard's copy in this machine's cache
+            raise ValueError(f"{self.sha256[:80]!r} is not the sha256 of a shard")
 
 
 @dataclass(frozen=True)
@@ -201,7 +204,7 @@ class Manifest:
                 shards=tuple(
                     ShardFile(**{**s, "row_groups": tuple(s["row_groups"])}) for s in values["shards"]
                 ),
-                splits=values["splits"],
+                splits={split: dict(values["splits"][split]) for split in SPLITS},
                 stats=values["stats"],
                 quarantined=int(values["totals"]["quarantined"]),
                 source=str(values["source"]),

@@ -99,9 +99,13 @@ class ShardSet:
         path = self.folder / EPISODES
         try:
             with parquet_file(path, **options) as file:
-                return file.read(columns=columns)
+                table = file.read(columns=columns)
         except (OSError, pa.ArrowException) as fault:
             raise ShardError(path, f"cannot be read: {fault}", "run the same hma convert again") from fault
+        if other := set(table["shard"].unique().to_pylist()) - self.listed.keys():
+            fault = f"names {min(map(str, other))!r}, which is no shard of the manifest"
+            raise ShardError(path, fault, restat_remedy(self.folder))
+        return table
 
     def refused(self) -> list[dict[str, Any]]:
         """Read quarantine.jsonl; return one mapping for each refused episode."""
@@ -145,6 +149,9 @@ class ShardSet:
         mine = np.array([word == split for word in splits[1]], np.bool_)[splits[0]]
         order = {name: i for i, name in enumerate(self.shards(split))}
         shard = np.array([order.get(word, -1) for word in names[1]], np.int64)[names[0][mine]]
+        if (shard < 0).any():
+            fault = f"puts an episode of split {split} into a shard of another"
+            raise ShardError(self.folder / EPISODES, fault, restat_remedy(self.folder))
         start, length, index = (
             to_numpy(table[name]).astype(np.int64)[mine] for name in ("row_start", "length", "episode_index")
         )

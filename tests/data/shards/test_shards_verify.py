@@ -17,7 +17,8 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import restat
 from hma_data.errors import ShardError
-from hma_data.shards.manifest import EMBODIMENT, MANIFEST, Manifest, derive, plan_hash, seal_problem
+from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, Manifest, derive, plan_hash, seal_problem
+from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from tests.conftest import toy_shards, write_toy
 from tests.hostile import Edit, cut, flip, whole
@@ -138,6 +139,31 @@ def test_a_manifest_that_names_files_outside_is_refused(sound: Path, name: str) 
     (sound / MANIFEST).write_text(text.replace("train/shard-00000.parquet", name))
     with pytest.raises(ShardError, match="not the name of a shard"):
         Manifest.load(sound)
+
+
+@pytest.mark.parametrize("key, other", [('"train": {', '"../../x": {'), ('"val": {', '"../../x": {')])
+def test_a_manifest_of_other_splits_is_refused(sound: Path, key: str, other: str) -> None:
+    text = (sound / MANIFEST).read_text()
+    (sound / MANIFEST).write_text(text.replace(key, other, 1))
+    with pytest.raises(ShardError, match="is damaged: it lacks"):
+        Manifest.load(sound)
+
+
+def test_a_hash_that_is_a_path_is_refused(sound: Path) -> None:
+    text = (sound / MANIFEST).read_text()
+    sha256 = Manifest.load(sound).shards[0].sha256
+    (sound / MANIFEST).write_text(text.replace(sha256, "/../../../uv"))
+    with pytest.raises(ShardError, match=r"'/../../../uv' is not the sha256 of a shard"):
+        Manifest.load(sound)
+
+
+@pytest.mark.parametrize("name", ["train/../../shard-00000.parquet", "val/shard-00000.parquet"])
+def test_an_episode_in_a_shard_of_no_or_another_split_is_refused(sound: Path, name: str) -> None:
+    table = pq.read_table(sound / EPISODES)
+    moved = [name if split == "train" else "val/shard-00000.parquet" for split in table["split"].to_pylist()]
+    pq.write_table(table.set_column(table.column_names.index("shard"), "shard", [moved]), sound / EPISODES)
+    with pytest.raises(ShardError, match=r"episodes\.parquet: .*shard.*hma shards restat"):
+        ShardSet(sound).index("train")
 
 
 def test_a_manifest_of_another_run_is_found(sound: Path, tmp_path: Path, toy_arm, block_tokenizer) -> None:
