@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_281, 10_980, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_554, 19_646, 11),
-    "hma_data/sources": (12_626, 105_574, 50),
+    "hma_data/sources": (12_627, 105_615, 50),
     "hma_data/storage": (1_690, 11_059, 11),
     "hma_data/tokenizers": (3_516, 26_105, 18),
     "hma_model": (532, 3_311, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_719, 30_560, 20),
     "hma_model/worlds": (1_561, 11_848, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 66_015, 524_298
-TEST_LINES = 49_182
+PRODUCT_LINES, PRODUCT_NODES = 66_016, 524_339
+TEST_LINES = 49_221
 DOC_WORDS = 41_990
 
 

@@ -103,8 +103,8 @@ class ShardSet:
         except (OSError, pa.ArrowException) as fault:
             raise ShardError(path, f"cannot be read: {fault}", "run the same hma convert again") from fault
         if other := set(table["shard"].unique().to_pylist()) - self.listed.keys():
-            fault = f"names {min(map(str, other))!r}, which is no shard of the manifest"
-            raise ShardError(path, fault, restat_remedy(self.folder))
+            text = f"names {min(map(str, other))!r}, which is no shard of the manifest"
+            raise ShardError(path, text, restat_remedy(self.folder))
         return table
 
     def refused(self) -> list[dict[str, Any]]:

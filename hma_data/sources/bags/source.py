@@ -167,7 +167,7 @@ class _EpisodeReading:
         self._where = str(bag.path) if table is None else f"{bag.path}, episode {number}"
         self._counts = bag.topics()
         self._tracks: dict[str, TopicTrack] = {}
-        self._said: list[tuple[int, str]] = []  # instructions and when they were received
+        self._said: tuple[int, str] | None = None  # the instruction, and when it was received
 
     def episode(self) -> Episode:
         """Make the pass; return the episode.
@@ -204,7 +204,7 @@ class _EpisodeReading:
             actions=action_signals,
             states=tuple(self._signal(column, shown) for column in states),
             rate_stamped=False,
-            instruction=self._instruction() or notes.get("instruction", ""),
+            instruction=(self._said and self._said[1]) or notes.get("instruction", ""),
             success=None if parted else {"true": True, "false": False}.get(notes.get("success", "").lower()),
             source=str(self._bag.path),
             metadata={"clocks": clocks, "notes": notes} | ({"flags": flags} if flags else {}) | self._about(),
@@ -247,9 +247,7 @@ class _EpisodeReading:
             topic = record.channel.topic
             message = decode(record.channel, record.data, self._where)
             if instruction and topic == instruction.topic:
-                text = str(instruction.value(message, self._where))
-                if self._segment is None or (text and record.log_ns <= self._segment.last_ns):
-                    self._said.append((record.log_ns, text))
+                self._hear(record.log_ns, str(instruction.value(message, self._where)))
             if topic in self._tracks:
                 self._tracks[topic].add(record.channel, record.log_ns, place, message)
         for topic, track in self._tracks.items():
@@ -278,16 +276,16 @@ class _EpisodeReading:
             parts.append(self._bag.records(wanted))
         return chain.from_iterable(parts)
 
-    # -- results
-
-    def _instruction(self) -> str:
-        """Return the first instruction; in an episode inside a bag, the one nearest to its beginning."""
-        if not self._said:
-            return ""
+    def _hear(self, log_ns: int, text: str) -> None:
+        """Keep the first instruction; in an episode inside a bag, the one nearest to its beginning."""
         if self._segment is None:
-            return self._said[0][1]
-        begins = self._segment.first_ns
-        return min(self._said, key=lambda said: abs(said[0] - begins))[1]
+            self._said = self._said or (log_ns, text)
+        elif text and log_ns <= self._segment.last_ns:
+            begins, before = self._segment.first_ns, self._said
+            if before is None or abs(log_ns - begins) < abs(before[0] - begins):
+                self._said = log_ns, text
+
+    # -- results
 
     def _stream(self, camera: Camera, shown: Floats | None = None) -> Stream:
         """Return a camera; for an episode in a bag, its own frames, or those around the times `shown`."""

@@ -267,7 +267,7 @@ class Ego4dFho:
         try:
             videos = json.loads(path.read_bytes(), object_hook=_compact)["videos"]
             labels = {str(item["uid"]): _labels_of_actions(item["actions"], layout) for item in videos}
-        except (AttributeError, KeyError, TypeError, ValueError) as fault:
+        except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as fault:
             raise SourceError(path, f"is not Ego4D's fho_main.json: {fault!r}", _FHO) from fault
         self._videos = {uid: found for uid, found in labels.items() if found}
         if not self._videos:
@@ -333,8 +333,8 @@ class EgoExoHands:
         for path in (root.parent / "takes.json", root / "takes.json"):
             try:
                 takes = json.loads(path.read_bytes()) if path.is_file() else []
-                names |= {take["take_uid"]: take["take_name"] for take in takes}
-            except (KeyError, TypeError, ValueError) as fault:
+                names |= {str(take["take_uid"]): str(take["take_name"]) for take in takes}
+            except (KeyError, RecursionError, TypeError, ValueError) as fault:
                 raise SourceError(path, f"is not Ego-Exo4D's takes.json: {fault!r}") from fault
         self._uids = {uid: uid for uid in self._files}
         for uid, path in self._files.items():
@@ -369,7 +369,7 @@ def _joints_of(path: Path, layout: HandsLayout) -> HandLabels:
                     sides.append(side)
                     joints.append([(at["x"], at["y"]) if at else (np.nan, np.nan) for at in mine])
         points = np.array(joints, np.float64).reshape(-1, 21, 2)
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as fault:
+    except (AttributeError, IndexError, KeyError, OSError, RecursionError, TypeError, ValueError) as fault:
         raise EpisodeError(path, f"is not Ego-Exo4D's hand pose: {fault!r}") from fault
     if not frames:
         remedy = f"its cameras: {', '.join(sorted(cameras)) or 'none'}"

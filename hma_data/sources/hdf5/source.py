@@ -45,6 +45,7 @@ from hma_data.sources.hdf5.file import (
     RecordedRows,
     dataset,
     explained,
+    inside,
     is_elsewhere,
     json_of,
     masks_of,
@@ -264,7 +265,7 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
         return text(found[()] if found.size == 1 else found[0] if found.shape else "")
     for holder in (group, group.parent, group.file):
         for name in TEXT_KEYS:
-            if said := text(holder.attrs.get(name)) or _single_text(holder.get(name), group):
+            if said := text(holder.attrs.get(name)) or _single_text(inside(holder, name), group):
                 return said
         stated = json_of(holder, "problem_info").get("language_instruction", "")
         if said := text("".join(map(str, stated)) if isinstance(stated, list) else stated):
@@ -286,8 +287,10 @@ def _success(group: h5py.Group) -> bool | None:
     if "success" in group.attrs:
         return bool(np.all(group.attrs["success"]))
     for key in ("success", "rewards", "dones"):
-        found = group.get(key)
-        if isinstance(found, h5py.Dataset) and found.ndim == 1 and len(found) and found.dtype.kind in "fiub":
+        found = inside(group, key)
+        if not isinstance(found, h5py.Dataset) or is_elsewhere(found, group):
+            continue
+        if found.ndim == 1 and len(found) and found.dtype.kind in "fiub":
             return bool(found[-1] > 0)
     return None
 

@@ -1,5 +1,6 @@
 """Several episodes in one bag: by pauses, by messages."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -161,6 +162,19 @@ def test_each_episode_has_the_instruction_said_nearest_to_its_beginning(tmp_path
     refs = SOURCE.index(str(path), embodiment)
     told = [SOURCE.read(str(path), ref.id, embodiment).instruction for ref in refs]
     assert told == ["reach", "push", "pull"]
+
+
+@pytest.mark.parametrize("episode_id, first", [("run", "0 "), ("run/0001", "1201 ")])
+def test_memory_does_not_grow_with_what_is_said(tmp_path: Path, episode_id: str, first: str) -> None:
+    said = [Said(TASK, 0.005 * i, f"{i} {'push ' * 4000}") for i in range(1600)]
+    path = ros1(tmp_path, make_run(60, pause_after=(30,), said=said), chunk=1 << 16)
+    embodiment = parted(GAP, ", instruction: /task.data")
+    SOURCE.read(str(path), episode_id, embodiment)  # what is kept of the bag is in memory now
+    tracemalloc.start()
+    told = SOURCE.read(str(path), episode_id, embodiment).instruction
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert told.startswith(first) and peak < 0.4 * sum(len(one.value) for one in said)
 
 
 def read_bytes() -> int:

@@ -99,6 +99,7 @@ ONE: dict[str, Row] = {  # one video is refused
     "a take of a list": (of("a.json", whole("[]")), POSE, TAKE),
     "a take of numbers": (of("a.json", whole('{"1": {"annotation2D": 3}}')), POSE, TAKE),
     "a take cut short": (of("a.json", cut(500)), POSE, TAKE),
+    "a take of lists in lists": (of("a.json", whole("[" * 200_000)), POSE, TAKE),
     "a take of another camera": (
         of("a.json", whole(made.egoexo(3, camera="cam05"))), "no hands in camera a.*cam05", TAKE,
     ),
@@ -124,6 +125,11 @@ ALL: dict[str, Row] = {  # no video can be used
     "Ego4D: other": (of("fho_main.json", whole('{"clips": []}')), "is not Ego4D's fho_", of_format(EGO4D)),
     "Ego4D: cut": (of("fho_main.json", cut(30)), "fho_main.json: JSONDecodeError", of_format(EGO4D)),
     "Ego4D: empty": (of("fho_main.json", whole(NO_INTERVAL)), "no boxes of hands", of_format(EGO4D)),
+    "Ego4D: lists in lists": (
+        of("fho_main.json", whole("[" * 200_000)),
+        "fho_main.json: RecursionError",
+        of_format(EGO4D),
+    ),
     "Ego-Exo4D: none": (untouched, "holds no labels", of_format(EXO)),
     "another rate": (untouched, "labelled at 10 Hz, embodiment test_hands says frequency_hz 30", {"hz": 30}),
     "no such part": (untouched, "no label has left/wrist — labels have left/center", {"part": "wrist"}),
@@ -158,3 +164,10 @@ def test_cameras_and_ids_that_are_not_there_are_named(folder: Path) -> None:
             source.read(str(folder), wrong, robot)
     with pytest.raises(EpisodeError, match="has 1 runs, no run 4"):
         source.read(str(folder), "a.mp4#4", robot)
+
+
+def test_a_take_whose_name_is_a_list_is_found_by_its_uid(folder: Path) -> None:
+    write_labels(folder, EXO, ["a"])
+    (folder / "takes.json").write_text('[{"take_uid": "a", "take_name": ["cook"]}]')
+    robot = made.hand_video(EXO, part="wrist", camera="a")
+    assert [ref.id for ref in open_source("hands").index(str(folder), robot)] == ["a.mp4#0"]

@@ -109,6 +109,18 @@ def test_success_is_the_last_reward_then_the_last_done(demos: Path) -> None:
     assert found == [False, True, True, None]
 
 
+def test_success_and_instruction_are_not_read_from_another_file(demos: Path) -> None:
+    with h5py.File(demos.parent / "other.bin", "w") as other:
+        other["rewards"], other["instruction"] = np.ones(3), "of another file"
+    with h5py.File(demos, "a") as file:
+        demo = file["data/demo_0"]
+        del demo["rewards"], demo["dones"]
+        for name in ("rewards", "instruction"):
+            demo[name] = h5py.ExternalLink("other.bin", f"/{name}")
+    episode = open_source("hdf5").read(str(demos), "demo_0", embodiment())
+    assert episode.success is None and episode.instruction != "of another file"
+
+
 @pytest.fixture(params=["raw", "padded", "vlen"])
 def aloha(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """Two ACT episodes, one a file; pictures raw, as padded rows of JPEG, or as JPEGs of their own length."""
