@@ -15,17 +15,17 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (701, 3_999, 7),
     "hma_data/cli": (1_549, 11_105, 8),
-    "hma_data/conversion": (4_239, 31_586, 15),
-    "hma_data/episodes": (1_688, 14_874, 9),
+    "hma_data/conversion": (4_207, 31_382, 15),
+    "hma_data/episodes": (1_692, 14_884, 9),
     "hma_data/hub": (517, 3_861, 3),
     "hma_data/inspection": (2_136, 20_030, 8),
     "hma_data/lab": (3_313, 30_478, 16),
     "hma_data/loading": (1_281, 10_980, 6),
     "hma_data/registry": (1_287, 8_311, 6),
-    "hma_data/shards": (2_554, 19_646, 11),
-    "hma_data/sources": (12_627, 105_615, 50),
-    "hma_data/storage": (1_690, 11_059, 11),
-    "hma_data/tokenizers": (3_516, 26_105, 18),
+    "hma_data/shards": (2_554, 19_635, 11),
+    "hma_data/sources": (12_611, 105_391, 50),
+    "hma_data/storage": (1_702, 11_126, 11),
+    "hma_data/tokenizers": (3_512, 25_984, 18),
     "hma_model": (532, 3_311, 4),
     "hma_model/benchmark": (841, 7_246, 5),
     "hma_model/checkpoint": (936, 7_099, 5),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_719, 30_560, 20),
     "hma_model/worlds": (1_561, 11_848, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 66_016, 524_339
+PRODUCT_LINES, PRODUCT_NODES = 65_980, 523_856
 TEST_LINES = 49_221
 DOC_WORDS = 41_990
 

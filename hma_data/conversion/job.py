@@ -21,7 +21,7 @@ from hma_data.conversion.engines.local import end_worker_that_starts_workers
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.extend import content_of, extended
 from hma_data.conversion.lerobot import AS_RECORDED, LeRobotHolder, as_dataset, dataset_plan, with_dataset
-from hma_data.conversion.output import Holder, Made, ShardHolder, Share, known_hashes, refuse_other
+from hma_data.conversion.output import Made, ShardHolder, Share, known_hashes, refuse_other
 from hma_data.conversion.plan import Plan, ShardUnit, idle_workers, make_plan
 from hma_data.conversion.publish import HubOutput
 from hma_data.conversion.reading import Job
@@ -246,7 +246,7 @@ class _Run:
         else:
             self.whole, self.uri = given.plan(self._spec)
         if given.to == "lerobot":
-            self.holder: Holder = LeRobotHolder(self.out, given.embodiment, self.uri)
+            self.holder: ShardHolder | LeRobotHolder = LeRobotHolder(self.out, given.embodiment, self.uri)
         else:
             folder = self.hub.staging if self.hub else self.out
             self.holder = ShardHolder(folder, given.embodiment, self._spec, self.uri)

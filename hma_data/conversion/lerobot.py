@@ -47,7 +47,7 @@ from hma_data.errors import EpisodeError, HMAError, OutputError, ShardError, Sou
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment
 from hma_data.registry.export import lerobot_features, packed_components
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, QUARANTINE, Derived, Manifest, ShardFile
-from hma_data.shards.schema import FOOTER_KEY, Footer, Refused, RowLayout, flag_totals, mask_columns, to_numpy
+from hma_data.shards.schema import FOOTER_KEY, Footer, Refused, RowLayout, mask_columns, to_numpy
 from hma_data.sources.base import open_source
 from hma_data.sources.lerobot.language import on_rows, write_language
 from hma_data.sources.lerobot.writer import ORIGIN, DatasetWriter, join_datasets, load_lerobot, set_splits
@@ -242,7 +242,7 @@ class LeRobotOutput:
         self.batch = min(MOST_FRAMES, max(1, BATCH_BYTES // (3 * pixels)))
 
     def frames(self, episode: ReadEpisode, report: Report | None) -> Iterator[Frames]:
-        """Yield upright frames (n, H, W, 3)."""
+        """Yield the frames of an episode, upright (n, H, W, 3); add what they show to its flags."""
         clip, facts = episode.clip, self._job.facts["dataset"]
 
         def show(name: str, start: int, rows: NDArray[np.int64]) -> tuple[Pictures, Pictures]:
@@ -367,7 +367,7 @@ def _bytes(folder: Path) -> int:
 
 
 class LeRobotHolder:
-    """The LeRobotDataset that a conversion makes, and the parts it is joined of; see `Holder`.
+    """The LeRobotDataset that a conversion makes, and the parts it is joined of; as `ShardHolder`.
 
     Args:
         out: the dataset's folder.
@@ -434,9 +434,7 @@ class LeRobotHolder:
             finally:
                 shutil.rmtree(self.folder / DATASET, ignore_errors=True)
         shutil.rmtree(self.folder, ignore_errors=True)
-        refused = [json.loads(line) for line in (self.out / QUARANTINE).read_text("utf-8").splitlines()]
-        flags = flag_totals(pq.read_table(self.out / EPISODES, columns=["flags"])["flags"])
-        return Finished(dataset, refused=refused, flags=flags, bytes=_bytes(self.out))
+        return Finished.of(self.out, dataset, _bytes(self.out))
 
     def _derived(self, plan: Plan) -> Derived:
         derived = Derived(plan.facts, self._robot, AS_RECORDED, self._uri)

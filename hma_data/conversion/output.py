@@ -8,10 +8,10 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from hma_data.conversion.extend import ways
 from hma_data.conversion.plan import Plan, differences
@@ -73,34 +73,22 @@ class Finished:
     flags: Mapping[str, int] = field(default_factory=dict)
     bytes: int = 0
 
+    @classmethod
+    def of(cls, folder: Path, manifest: Manifest, size: int, news: str = "") -> "Finished":
+        """Return what was made in a folder, of `size` bytes."""
+        refused = [json.loads(line) for line in (folder / QUARANTINE).read_text("utf-8").splitlines()]
+        flags = flag_totals(parquet_file(folder / EPISODES).read(columns=["flags"])["flags"])
+        return cls(manifest, news, refused, flags, size)
 
-class Holder(Protocol):
-    """What a conversion makes: where its units are kept while it runs, and what they become at the end.
+
+class ShardHolder:
+    """The shard set that a conversion makes: its units while the conversion runs, and what they become.
+
+    `hma_data.conversion.lerobot.LeRobotHolder` does the same for a LeRobotDataset.
 
     Attributes:
         folder: of the units; one job at a time writes it.
     """
-
-    folder: Path
-
-    def clear(self) -> None:
-        """Delete what an earlier conversion made; refuse what is not one's."""
-
-    def base(self) -> Manifest | None:
-        """Return the manifest of a set that may be extended; None where there is none."""
-
-    def finished(self, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
-        """Return the names of the plan's units that are there and whole; see `finished_shards`."""
-
-    def noting(self, share: "Share | None") -> AbstractContextManager[Callable[["Made"], None]]:
-        """Give what notes each unit when it is made."""
-
-    def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Finished:
-        """Complete what is made; all units are there, and `changed` says whether some may be new."""
-
-
-class ShardHolder:
-    """A shard set; see `Holder`."""
 
     def __init__(self, folder: Path, embodiment: Embodiment, spec: TokenizerSpec, uri: str) -> None:
         self.folder = folder
@@ -122,12 +110,12 @@ class ShardHolder:
                 shutil.rmtree(item) if item.is_dir() else item.unlink()
 
     def base(self) -> Manifest | None:
-        """Return the set's manifest."""
+        """Return the set's manifest; None where there is none."""
         _refuse_foreign(self.folder)
         return Manifest.load(self.folder) if (self.folder / MANIFEST).is_file() else None
 
     def finished(self, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
-        """Return the names of the shards that are there."""
+        """Return the names of the plan's shards that are there and whole; see `finished_shards`."""
         return finished_shards(self.folder, plan, base, shared)
 
     @contextmanager
@@ -137,12 +125,9 @@ class ShardHolder:
             yield journal.add
 
     def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Finished:
-        """Write what is derived from the shards."""
+        """Write what is derived from the shards, all of which are there; `changed`: some may be new."""
         manifest, news = self._derived(plan, base, changed)
-        lines = (self.folder / QUARANTINE).read_text("utf-8").splitlines()
-        flags = flag_totals(parquet_file(self.folder / EPISODES).read(columns=["flags"])["flags"])
-        size = sum(shard.bytes for shard in manifest.shards)
-        return Finished(manifest, news, [json.loads(line) for line in lines], flags, size)
+        return Finished.of(self.folder, manifest, sum(shard.bytes for shard in manifest.shards), news)
 
     def _derived(self, plan: Plan, base: Manifest | None, changed: bool) -> tuple[Manifest, str]:
         """Return the manifest, and in words what of the YAML a finished set did not say yet.

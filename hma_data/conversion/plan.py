@@ -34,7 +34,7 @@ from hma_data.shards.manifest import SPLITS, digest_of_texts, json_list, plan_ha
 from hma_data.shards.schema import RowLayout, to_numpy
 from hma_data.sources.base import EpisodeRef, Source, open_source
 from hma_data.storage.paths import StrPath, as_text
-from hma_data.storage.records import BATCH_RECORDS, Records, schema_of, values_of
+from hma_data.storage.records import BATCH_RECORDS, Records, schema_of, values_of, with_columns
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 
 FRAMES_TOKENIZED, EPISODES_TRIED = 64, 5  # of an estimate
@@ -115,7 +115,7 @@ class Plan:
         """Return all episodes in the order of their numbers: the fields of EpisodeRef, `split` as planned."""
         if not self.units:
             return schema_of(EpisodeRef).empty_table()
-        tables = [unit.refs.with_columns(split=pa.repeat(unit.split, len(unit))).table for unit in self.units]
+        tables = [with_columns(u.refs.table, split=pa.repeat(u.split, len(u))) for u in self.units]
         numbers = np.concatenate([to_numpy(unit.numbers) for unit in self.units])
         return pa.concat_tables(tables).take(pa.array(np.argsort(numbers)))
 

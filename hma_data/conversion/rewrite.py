@@ -54,7 +54,7 @@ from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath
-from hma_data.storage.records import Records
+from hma_data.storage.records import Records, with_columns
 from hma_data.storage.remote import parquet_input, place
 from hma_data.tokenizers.base import TokenizerSpec
 
@@ -242,7 +242,7 @@ def _joined(
             "group": pc.if_else(named, _numbered(number, groups), groups),
             "set": pa.repeat(number, len(table)),
         }
-        found.append(_with_columns(table, **own))
+        found.append(with_columns(table, **own))
     twice = set(again.to_pylist())
     listed = [
         replace(item, id=f"{number + 1}/{item.id}") if item.id in twice else item
@@ -283,7 +283,7 @@ def split(
     if settings.limit is not None and settings.limit < len(rows):
         settings = replace(settings, limit=None)  # the set was extended beyond its limit
     together = rows["group"] if by == "episode" else _together(rows, by)
-    episodes = _with_columns(rows, split=pa.repeat("", len(rows)), set=pa.repeat(0, len(rows)))
+    episodes = with_columns(rows, split=pa.repeat("", len(rows)), set=pa.repeat(0, len(rows)))
     made_by = {} if by == "episode" else {"split_by": by}
     refused, source = _refused(shards), shards.manifest.source
     job = _NewSet([shards], shards.embodiment, settings, episodes, together, source, refused, made_by)
@@ -363,11 +363,6 @@ def _rows(shards: ShardSet) -> pa.Table:
 def _numbered(number: int, names: pa.ChunkedArray) -> pa.ChunkedArray:
     """Return the names, each after the number of its set: `2/demo_0`."""
     return pc.binary_join_element_wise(str(number + 1), names, "/")
-
-
-def _with_columns(table: pa.Table, **columns: Any) -> pa.Table:
-    """Return a table with these columns instead of its own, or after them."""
-    return pa.table({name: table[name] for name in table.column_names} | columns)
 
 
 def _refused(shards: ShardSet) -> list[Refused]:

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,16 +42,6 @@ from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
 FRAMES_A_BATCH = 32  # decoded and tokenized together
-
-
-class Output(Protocol):
-    """What a unit's episodes become: a shard, or a part of a LeRobotDataset."""
-
-    def frames(self, episode: ReadEpisode, report: Report | None) -> Iterator[Frames]:
-        """Yield the frames of an episode as this output takes them; add what they show to its flags."""
-
-    def make(self, unit: ShardUnit, items: Iterator[Item], report: Report) -> Made:
-        """Write the unit, whole or not at all."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +82,7 @@ class MakeWork:
 
         return work
 
-    def _output(self, batch: int) -> Output:
+    def _output(self, batch: int) -> "ShardOutput | LeRobotOutput":
         if self.job.facts.get("to") == "lerobot":
             return LeRobotOutput(self.job)
         tokenizer = self.tokenizer
@@ -121,7 +111,7 @@ class ShardOutput:
         self._job, self._tokenizer, self._batch = job, tokenizer, batch
 
     def frames(self, episode: ReadEpisode, report: Report | None) -> Iterator[Frames]:
-        """Yield squares (n, S, S, 3)."""
+        """Yield the frames of an episode as squares (n, S, S, 3); add what they show to its flags."""
         clip, spec = episode.clip, self._job.layout.tokenizer
         content = Content(clip, episode.kept)
 
@@ -136,7 +126,7 @@ class ShardOutput:
         episode.content = content.text()
 
     def make(self, unit: ShardUnit, items: Iterator[Item], report: Report) -> Made:
-        """Tokenize and write the episodes of one shard."""
+        """Tokenize and write the episodes of one shard, whole or not at all."""
         layout = self._job.layout
         noted = UnitNotes(self._job, unit)
         with ExitStack() as committing:

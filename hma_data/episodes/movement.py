@@ -157,6 +157,11 @@ def framing(camera: Camera, box: Box | None, height: int, width: int) -> Framing
 # -- what a tokenizer keeps of it
 
 
+def bounded_psnr_db(error: float) -> float:
+    """Return the peak signal-to-noise ratio of a mean square error of uint8, at most 99 dB."""
+    return min(10 * math.log10(255.0**2 / error), 99.0) if error else 99.0
+
+
 @dataclass
 class Kept:
     """How much of what moves in recorded frames is in the frames decoded from their tokens.
@@ -187,8 +192,7 @@ class Kept:
     @property
     def psnr_db(self) -> float:
         """Return the peak signal-to-noise ratio of the pixels that move, at most 99."""
-        error = self.error / (3 * max(self.moved, 1))
-        return min(10 * math.log10(255.0**2 / error), 99.0) if error else 99.0
+        return bounded_psnr_db(self.error / (3 * max(self.moved, 1)))
 
     @property
     def share(self) -> float:

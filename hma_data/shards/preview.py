@@ -258,7 +258,7 @@ class _Seen:
 
     def sheet(self, columns: int) -> Images:
         """Return (H, W, 3): the label, two rows of frames a camera, and the actions at these frames."""
-        picks = np.unique(np.linspace(0, self._length - 1, columns).astype(int))
+        picks = np.array(sampled(self._length, columns))
         shown = {name: _resized(images, THUMB_SIDE) for name, images in self._images(picks).items()}
         labels = list(shown)
         labels[0] += f"   {self.label}"

@@ -110,10 +110,10 @@ class Records[T](Sequence[T]):
         chosen = np.flatnonzero(places) if places.dtype == bool else places
         return Records(self.kind, self.table.take(pa.array(chosen, pa.int64())))
 
-    def with_columns(self, **columns: Any) -> "Records[T]":
-        """Return the records with other values in some fields."""
-        changed = {name: columns.get(name, self.table[name]) for name in self.table.column_names}
-        return Records(self.kind, pa.table(changed, schema=self.table.schema))
+
+def with_columns(table: pa.Table, **columns: Any) -> pa.Table:
+    """Return a table with these columns instead of its own, or after them."""
+    return pa.table({name: table[name] for name in table.column_names} | columns)
 
 
 def values_of(column: pa.ChunkedArray | pa.Array) -> Iterator[Any]:

@@ -7,12 +7,15 @@ times as fast); the rules for what is accepted are the same either way.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from hma_data.errors import HMAError, RegistryError
 from hma_data.storage.kinds import misplaced
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
 
 try:
     from yaml._yaml import CParser as _Events  # only its events: its own composer would build aliases
@@ -139,6 +142,15 @@ def plain_fault(item: Mapping[str, Any]) -> str:
     kind, said = str(item["type"]), str(item["msg"]).removeprefix("Value error, ")
     text = _PLAIN.get(kind) or _PLAIN.get(kind.partition("_")[0]) or said
     return text.replace("Input should be", "must be")
+
+
+def first_fault(fault: "ValidationError") -> str:
+    """Return the first of pydantic's errors: the key, its value, and what is wrong with it."""
+    first = fault.errors()[0]
+    key = ".".join(map(str, first["loc"]))
+    if first["type"] == "missing":  # the input would be all values
+        return f"lacks {key}"
+    return f"{key} is {first['input']!r:.60}: {plain_fault(first)}" if key else plain_fault(first)
 
 
 def write_yaml(values: Any) -> str:

@@ -21,7 +21,6 @@ from typing import Any
 
 import torch
 from pydantic import BaseModel
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
@@ -30,7 +29,7 @@ from hma_data.storage.files import file_sha256, read_json, write_atomic
 from hma_data.storage.kinds import unreadable
 from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.catalog import Entry, find_entry
-from hma_data.tokenizers.shapes import read_shape
+from hma_data.tokenizers.shapes import one_line, opened_weights, read_shape
 
 FOLDER = "HMA_WEIGHTS"  # environment variable: a folder of weights, named after the tokenizers
 SUFFIXES = (".safetensors", ".ckpt", ".pt", ".pth")
@@ -108,7 +107,7 @@ def _from_hub(name: str, entry: Entry) -> Path:
         remedy = "get the file elsewhere and give its path: --weights PATH (weights=PATH)"
         if isinstance(fault, GatedRepoError):
             remedy = f"accept its licence on the repository's page and log in, or {remedy}"
-        text = f"{wanted}, which could not be downloaded: {type(fault).__name__}: {_one_line(fault)}"
+        text = f"{wanted}, which could not be downloaded: {type(fault).__name__}: {one_line(fault)}"
         raise TokenizerError(name, text, remedy) from fault
     if entry.sha256 and file_sha256(Path(found)) != entry.sha256:
         text = f"is not the file that was pinned for {name} (SHA-256 {entry.sha256[:12]}…)"
@@ -170,7 +169,7 @@ def read_tensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
         raise
     except Exception as fault:  # torch raises many kinds of errors on a damaged file
         text = f"is not a complete safetensors file or torch checkpoint: {type(fault).__name__}"
-        raise error(path, *unreadable(path, f"{text}: {_one_line(fault)}", "download it again")) from fault
+        raise error(path, *unreadable(path, f"{text}: {one_line(fault)}", "download it again")) from fault
     for key in NESTED:
         if isinstance(values, Mapping) and isinstance(values.get(key), Mapping):
             values = values[key]
@@ -181,14 +180,10 @@ def read_tensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
     return tensors
 
 
-def _read_safetensors(path: Path, error: type[HMAError]) -> Tensors:
+def _read_safetensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
     """Return the tensors of a safetensors file."""
-    try:
-        with safe_open(path, "pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as fault:
-        text = f"is not a complete safetensors file: {_one_line(fault)}"
-        raise error(path, *unreadable(path, text, "name another file, or download it again")) from fault
+    with opened_weights(path, "pt", error) as file:
+        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
 
 
 def stated_scale(folder: Path, default: float) -> float:
@@ -213,7 +208,7 @@ def fill(network: nn.Module, tensors: Mapping[str, Tensor], where: object) -> No
     try:
         network.load_state_dict(state, assign=True)
     except RuntimeError as fault:
-        raise TokenizerError(where, f"does not fit the network: {_one_line(fault, 300)}", OTHER) from fault
+        raise TokenizerError(where, f"does not fit the network: {one_line(fault, 300)}", OTHER) from fault
 
 
 @contextmanager
@@ -222,7 +217,7 @@ def shapes_of(where: object, what: str) -> Iterator[None]:
     try:
         yield
     except (KeyError, IndexError, ValueError, TypeError, RuntimeError, ZeroDivisionError) as fault:
-        text = f"lacks {fault.args[0]}" if isinstance(fault, KeyError) else _one_line(fault)
+        text = f"lacks {fault.args[0]}" if isinstance(fault, KeyError) else one_line(fault)
         raise TokenizerError(where, f"does not hold the weights of {what}: {text}", OTHER) from fault
 
 
@@ -230,10 +225,6 @@ def numbers(names: Iterable[str], prefix: str) -> list[int]:
     """Return the numbers n of `<prefix>n.…` among names, ascending."""
     found = {name[len(prefix) :].split(".", 1)[0] for name in names if name.startswith(prefix)}
     return sorted(int(number) for number in found if number.isdecimal())
-
-
-def _one_line(fault: object, length: int = 160) -> str:
-    return " ".join(str(fault).split())[:length]
 
 
 # -- the embedded tokenizers' files
@@ -272,4 +263,4 @@ def read_weights[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[
         TokenizerError: there is no such file, or it is not safetensors, truncated, or of another network.
     """
     shape, sha256 = read_shape(path, form, config)
-    return shape, _read_safetensors(path, TokenizerError), sha256
+    return shape, _read_safetensors(path), sha256

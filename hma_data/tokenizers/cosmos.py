@@ -21,6 +21,7 @@ from hma_data.errors import TokenizerError
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.checkpoints import digest_of, find_weights, pair_of
 from hma_data.tokenizers.network import NetworkTokenizer, open_device
+from hma_data.tokenizers.shapes import one_line
 
 VERSION = 1
 IMAGE_SIZE = 256
@@ -35,8 +36,8 @@ def _read_program(path: Path) -> torch.jit.ScriptModule:
     try:
         return torch.jit.load(str(path), map_location="cpu")
     except (RuntimeError, ValueError, EOFError) as fault:
-        text = " ".join(str(fault).split())[:160]
-        raise TokenizerError(path, f"cannot be loaded as TorchScript: {text}", REMEDY) from fault
+        text = f"cannot be loaded as TorchScript: {one_line(fault)}"
+        raise TokenizerError(path, text, REMEDY) from fault
 
 
 def _output(made: object, shape: tuple[int, ...]) -> Tensor:

@@ -16,7 +16,7 @@ import json
 import re
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,21 +33,11 @@ JOINTS = ("wrist", *(f"{finger}_{i}" for finger in _FINGERS for i in (1, 2, 3, 4
 _FHO = "give fho_main.json of the annotations that Ego4D's command fetches (benchmark FHO)"
 
 
-class LabelSet(Protocol):
-    """The labels of a set of videos."""
-
-    known: list[str]  # the names that the labels use for their videos
-
-    def of(self, video: Video) -> HandLabels | None:
-        """Return the labels of a video; None where it has none.
-
-        Raises:
-            EpisodeError: they are damaged.
-        """
-
-
-def open_labels(layout: HandsLayout, uri: str) -> LabelSet:
+def open_labels(layout: HandsLayout, uri: str) -> "LabelSet":
     """Return the labels that belong to the videos of `uri`.
+
+    The result has `known`, the names that the labels use for their videos, and `of`, the labels of a video;
+    that raises EpisodeError where they are damaged.
 
     Raises:
         SourceError: there are none, or they have another form.
@@ -163,7 +153,7 @@ class HandTable:
         self.known = list(self._rows)
 
     def of(self, video: Video) -> HandLabels | None:
-        """See LabelSet."""
+        """Return the labels of a video; None where it has none."""
         name = next((alias for alias in video.aliases if alias in self._rows), None)
         if name is None:
             return None
@@ -211,7 +201,7 @@ class EpicHands:
         self.known = list(files)
 
     def of(self, video: Video) -> HandLabels | None:
-        """See LabelSet."""
+        """Return the labels of a video; None where it has none."""
         path = self._files.get(PurePosixPath(video.name).stem)
         if path is None:
             return None
@@ -275,7 +265,7 @@ class Ego4dFho:
         self.known = list(self._videos)
 
     def of(self, video: Video) -> HandLabels | None:
-        """See LabelSet."""
+        """Return the labels of a video; None where it has none."""
         return self._videos.get(PurePosixPath(video.name).stem)
 
 
@@ -345,7 +335,7 @@ class EgoExoHands:
         self.known = list(self._uids)
 
     def of(self, video: Video) -> HandLabels | None:
-        """See LabelSet."""
+        """Return the labels of a video; None where it has none."""
         place = PurePosixPath(video.name)
         called = next((part for part in (place.stem, *place.parts[:-1]) if part in self._uids), None)
         if called is None or (called != place.stem and place.stem != self._layout.camera):
@@ -378,3 +368,6 @@ def _joints_of(path: Path, layout: HandsLayout) -> HandLabels:
     parts = {"wrist": points[:, 0], "center": center, "landmarks": points.reshape(-1, 42)}
     scores = np.ones(len(frames))
     return labels_from_rows(np.array(frames), np.array(sides), scores, parts, looked_at, pixels=True)
+
+
+LabelSet = HandTable | EpicHands | Ego4dFho | EgoExoHands

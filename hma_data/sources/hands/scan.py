@@ -21,7 +21,7 @@ from hma_data.registry.components import HandsLayout
 from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.places import file_fingerprint, local_path, unfollowed
-from hma_data.sources.common.survey import Series, Survey
+from hma_data.sources.common.survey import Series, Survey, sampled
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.detect import VERSION, Hand, HandModels, MediaPipeHands
 from hma_data.sources.hands.runs import (
@@ -168,9 +168,9 @@ def _hands_in(videos: dict[str, Video], chosen: list[str], survey: Survey) -> di
     for name in chosen:
         try:
             file = VideoFile(videos[name].path)
-            frames = np.unique(np.linspace(0, len(file) - 1, FRAMES_PER_VIDEO).astype(np.int64))
+            frames = sampled(len(file), FRAMES_PER_VIDEO)
             # The frames are far apart, so each is scanned alone and no hand is tracked between them.
-            seen = [scan(name, file, detector, [index])["side"].to_pylist() for index in frames.tolist()]
+            seen = [scan(name, file, detector, [index])["side"].to_pylist() for index in frames]
         except EpisodeError as fault:
             survey.fault(name, fault)
             continue

@@ -28,7 +28,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hma_data.episodes.episode import Episode, Floats, Signal
+from hma_data.episodes.align import measured_hz
+from hma_data.episodes.episode import Episode, Signal
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import HandsLayout, Vector
 from hma_data.registry.embodiment import Embodiment
@@ -114,7 +115,7 @@ class HandsSource:
         labels = self._labels_of(uri, video, layout)
         file = VideoFile(video.path)
         table = file.table
-        hz = table.hz or _measured_hz(table.times)
+        hz = table.hz or measured_hz(np.diff(table.times)) or 0.0
         header = Header(len(table), hz, table.width, table.height, table.codec)
         runs = cut_into_runs(labels, needed, layout, header, str(video.path))
         if not runs.spans:
@@ -205,11 +206,6 @@ def _digest(*parts: bytes) -> str:
     return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
 
-def _measured_hz(times: Floats) -> float:
-    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-    return 1 / step if step > 0 else 0.0
-
-
 def _episode(
     episode_id: str, file: VideoFile, runs: Runs, number: int | None, embodiment: Embodiment
 ) -> Episode:
@@ -227,7 +223,7 @@ def _episode(
     regular = bool((np.abs(steps - usual) <= INTERVAL_TOLERANCE * usual).all())
     steady = regular and not every and embodiment.sync.rate_hz is None
     if steady and not labels.irregular:
-        _check_rate(file.path, _measured_hz(file.timestamps[marks[:-1]]), embodiment)
+        _check_rate(file.path, measured_hz(steps), embodiment)
     text = "; ".join(dict.fromkeys(words for frame, words in labels.texts if marks[0] <= frame < marks[-1]))
     state = [_signal(embodiment.state, file, labels, span, not steady)] if embodiment.state else []
     # Frames in no run count in the first run, or in the only one that is read.
@@ -269,7 +265,7 @@ def _signal(
     return Signal(times, np.where(known[:, None], values, np.float32(0)), known)
 
 
-def _check_rate(path: Path, measured: float, embodiment: Embodiment) -> None:
+def _check_rate(path: Path, measured: float | None, embodiment: Embodiment) -> None:
     stated = embodiment.frequency_hz
     if isinstance(stated, float) and measured and abs(stated - measured) > RATE_TOLERANCE * measured:
         fault = f"is labelled at {measured:.4g} Hz, embodiment {embodiment.id} says frequency_hz {stated:g}"

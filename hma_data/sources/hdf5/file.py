@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.sources.common.places import local_path, natural, nothing_there
+from hma_data.sources.common.survey import sampled
 from hma_data.storage.kinds import unreadable
 
 SUFFIXES = (".h5", ".hdf5", ".hdf")
@@ -309,7 +310,7 @@ def _numbered(group: h5py.Group, depth: int = 0) -> str | None:
     if deeper := _numbered(groups[family[0]], depth + 1):  # day_1/t000
         return f"{pattern}/{deeper}"
     # Walking thousands of groups takes minutes on a slow disk, so a spread sample decides.
-    spread = np.unique(np.linspace(0, count - 1, MAX_GROUPS_SAMPLED).astype(int))
+    spread = sampled(count, MAX_GROUPS_SAMPLED)
     episodes = sum(_is_episode(groups[family[i]]) for i in spread)
     return pattern if episodes >= 2 and 2 * episodes > len(spread) else None
 

@@ -19,6 +19,7 @@ from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveIn
 
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.storage.kinds import unreadable
+from hma_data.storage.yaml_io import first_fault
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 _DATA_PATHS = {
@@ -318,14 +319,8 @@ def _info(path: Path) -> Info:
     try:
         info = Info.model_validate_json(_content(path))
     except ValidationError as fault:
-        first = fault.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        value = repr(first["input"])  # of a missing key it would be the whole file
-        said = f"{key} is {value[:60]}: {first['msg']}" if key else first["msg"]
-        if first["type"] == "missing":
-            said = f"lacks {key}"
         remedy = "the dataset is damaged or not complete"
-        raise SourceError(path, *unreadable(path, said, remedy)) from fault
+        raise SourceError(path, *unreadable(path, first_fault(fault), remedy)) from fault
     if info.codebase_version not in VERSIONS:
         said = f"is of version {info.codebase_version!r}; {', '.join(VERSIONS)} are read"
         raise SourceError(path, said, "convert it with lerobot's own scripts")

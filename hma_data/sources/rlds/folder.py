@@ -27,6 +27,7 @@ from hma_data.sources.rlds.features import RldsFeature, read_features
 from hma_data.sources.rlds.records import RecordFile, RecordFraming, open_records
 from hma_data.storage.blocks import Blocks
 from hma_data.storage.fetch import attempt, fetch_whole, file_system, is_listless, is_local
+from hma_data.storage.yaml_io import first_fault
 
 LONGEST_JSON = 64 << 20  # most bytes of a description; more is an error
 _roots: dict[str, tuple[str, tuple[int, ...]]] = {}  # folder -> the version folder below it, and `_dates`
@@ -291,10 +292,8 @@ def _dataset_info(files: Any, path: str) -> _DatasetInfo:
     try:
         return _DatasetInfo() if data is None else _DatasetInfo.model_validate_json(data)
     except ValidationError as fault:
-        first = fault.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        said = f"{key} is {first['input']!r}: {first['msg']}" if key else first["msg"]
-        raise SourceError(path, said, "write it again with tensorflow_datasets, or remove it") from fault
+        remedy = "write it again with tensorflow_datasets, or remove it"
+        raise SourceError(path, first_fault(fault), remedy) from fault
 
 
 def _counted(shards: list[Shard]) -> tuple[Shard, ...]:

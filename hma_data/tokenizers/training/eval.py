@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hma_data.episodes.movement import moving
+from hma_data.episodes.movement import bounded_psnr_db, moving
 from hma_data.episodes.sheets import grid, write_png
 from hma_data.errors import MissingDependencyError, TokenizerError
 from hma_data.storage.files import write_atomic
@@ -246,17 +246,13 @@ def evaluate(
         **use.result(),
     }
     if moved:
-        result["psnr_moving_db"] = round(_moving_db(moving_error / moved), 3)
+        result["psnr_moving_db"] = round(bounded_psnr_db(moving_error / moved), 3)
         result["moving_share"] = round(moved / (len(psnr) * spec.image_size**2), 4)
     if distance:
         result["lpips"] = round(float(np.mean(distance)), 4)
     if worst:
         result["worst_frames"] = lowest
     return result
-
-
-def _moving_db(error: float) -> float:
-    return min(10 * math.log10(255.0**2 / error), 99.0) if error else 99.0
 
 
 def _batches(frames_iter: Iterable[Frames]) -> Iterator[tuple[Frames, NDArray[np.bool_]]]:

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationErr
 
 from hma_data.errors import RecipeError
 from hma_data.storage.paths import StrPath, as_path
-from hma_data.storage.yaml_io import plain_fault, read_yaml
+from hma_data.storage.yaml_io import first_fault, read_yaml
 from hma_data.tokenizers.shapes import PATCH, FsqConfig, VaeConfig
 
 LOCAL: dict[str, Any] = {"corpus": True, "network": {"latent_scale"}}  # a place, and a measured value
@@ -191,6 +191,4 @@ def load_recipe(path: StrPath, overrides: dict[str, Any] | None = None) -> Token
     try:
         return TokenizerRecipe.model_validate(values)
     except ValidationError as fault:
-        first = fault.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise RecipeError(path, f"{place}: {plain_fault(first)}, got {first['input']!r:.80}") from fault
+        raise RecipeError(path, first_fault(fault)) from fault
