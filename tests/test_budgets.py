@@ -23,8 +23,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_281, 10_980, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_554, 19_635, 11),
-    "hma_data/sources": (12_611, 105_391, 50),
-    "hma_data/storage": (1_702, 11_126, 11),
+    "hma_data/sources": (12_633, 105_389, 50),
+    "hma_data/storage": (1_649, 10_810, 11),
     "hma_data/tokenizers": (3_512, 25_984, 18),
     "hma_model": (532, 3_311, 4),
     "hma_model/benchmark": (841, 7_246, 5),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_719, 30_560, 20),
     "hma_model/worlds": (1_561, 11_848, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_980, 523_856
-TEST_LINES = 49_221
+PRODUCT_LINES, PRODUCT_NODES = 65_949, 523_538
+TEST_LINES = 49_218
 DOC_WORDS = 41_990
 
 

@@ -1,4 +1,4 @@
-"""Read bytes of files wherever fsspec finds them: by ranges, again when the network fails.
+"""Find the file system of a URI, and tell faults that pass from those that stay.
 
 File systems raise many kinds of exceptions. Faults that may pass by themselves (a lost connection, a busy
 server) are tried again; faults of the data are not.
@@ -11,11 +11,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from hma_data.errors import HMAError, MissingDependencyError, SourceError, StorageAwayError, install_command
+from hma_data.errors import HMAError, MissingDependencyError, StorageAwayError, install_command
 
 CONNECT_S = 3.0  # seconds to wait for a server to answer
-WAITS_S = (0.2, 0.6, 1.8)  # before the second, third and fourth try
-EPISODE_WAITS_S = (0.5, 3.0, 15.0)  # the same, before an episode is read again
+EPISODE_WAITS_S = (0.5, 3.0, 15.0)  # before the second, third and fourth try of an episode
 ABSENT = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
 PACKAGES = {
     "gs": "gcsfs", "gcs": "gcsfs", "s3": "s3fs", "s3a": "s3fs", "http": "aiohttp", "https": "aiohttp",
@@ -153,7 +152,7 @@ def disk_is_full(fault: BaseException) -> bool:
 def file_system(uri: str) -> tuple[Any, str]:
     """Return the fsspec file system of a URI, and the path on it.
 
-    Its driver soon gives up on an address where nobody answers; `attempt` makes the further tries.
+    Its driver soon gives up on an address where nobody answers; `retried` makes the further tries.
 
     Raises:
         MissingDependencyError: the file system's package is not installed.
@@ -180,69 +179,6 @@ def file_system(uri: str) -> tuple[Any, str]:
     return files, path
 
 
-def is_local(files: Any) -> bool:
-    """Check whether a file system's paths are on this machine."""
-    return "file" in files.protocol
-
-
-def is_listless(files: Any) -> bool:
-    """Check whether a file system's folders cannot be listed."""
-    return "http" in files.protocol
-
-
-# -- reading
-
-
-def attempt[T](files: Any, path: str, action: Callable[[], T]) -> T:
-    """Return what `action` returns; read again as `retried` does where the file system is remote.
-
-    Raises:
-        SourceError: it fails for good; StorageAwayError: as `retried` does.
-    """
-    try:
-        return retried(action, path, "read", () if is_local(files) else WAITS_S)
-    except HMAError:
-        raise
-    except Exception as fault:  # file systems raise exceptions of any kind
-        text = f"cannot be read: {said(fault)}"
-        raise SourceError(path, text, "check the path and your access to it") from without_secrets(fault)
-
-
-def info(files: Any, path: str) -> dict[str, Any]:
-    """Return what the file system says of a file; at least `size`."""
-    found: dict[str, Any] = attempt(files, path, lambda: files.info(path))
-    if found.get("size") is None:
-        remedy = "copy the files here, or name a server that states it"
-        raise SourceError(path, "its server does not state its length", remedy)
-    return found
-
-
 def mark(found: dict[str, Any]) -> str:
-    """Return a text that changes when the file does, made from what `info` found."""
+    """Return a text that changes when the file does, made from what its file system says of it."""
     return " ".join(f"{key}={found[key]}" for key in ("size", *MARKS) if found.get(key) is not None)
-
-
-def fetch(files: Any, path: str, start: int, end: int) -> bytes:
-    """Return the bytes from `start` up to `end`; fewer where the file ends before."""
-    data: bytes = attempt(files, path, lambda: files.cat_file(path, start=start, end=end))
-    if len(data) > end - start:
-        fault = f"its server sent {len(data)} bytes, {end - start} were requested"
-        raise SourceError(path, fault, "the server ignores range requests: copy the files here")
-    return data
-
-
-def fetch_whole(files: Any, path: str, limit: int) -> bytes | None:
-    """Return all bytes of a small file; None when there is no such file."""
-
-    def whole() -> Any:
-        try:
-            return files.cat_file(path)
-        except ABSENT:
-            return None
-
-    if is_local(files):
-        size = attempt(files, path, lambda: files.size(path) if files.isfile(path) else 0)
-        if size > limit:
-            fault = f"has {size:,} bytes, more than {limit:,}"
-            raise SourceError(path, fault, "a description by TFDS is smaller: check the file")
-    return attempt(files, path, whole)

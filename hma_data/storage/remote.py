@@ -20,7 +20,7 @@ from pathlib import Path, PosixPath, PurePosixPath
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from hma_data.errors import HMAError, StorageAwayError, StorageError
-from hma_data.storage.fetch import ABSENT, file_system, retried, said
+from hma_data.storage.fetch import ABSENT, NO_LISTING, file_system, retried, said, without_secrets
 from hma_data.storage.paths import StrPath, as_text
 
 if TYPE_CHECKING:  # blocks need numpy, which verbs that read no store answer without
@@ -94,7 +94,7 @@ def attempt[T](where: object, doing: str, action: Callable[[], T]) -> T:
             remedy = "give credentials, in the way its driver reads them (environment or configuration file)"
         elif isinstance(fault, PermissionError) or "401" in said(fault) or "403" in said(fault):
             remedy = "check the credentials, and what they allow"
-        raise StorageError(where, f"cannot be {doing}: {said(fault)}", remedy) from fault
+        raise StorageError(where, f"cannot be {doing}: {said(fault)}", remedy) from without_secrets(fault)
 
 
 class RemotePath(PosixPath):
@@ -123,6 +123,11 @@ class RemotePath(PosixPath):
     def scheme(self) -> str:
         """Return the scheme: s3, gs, hf, memory, …"""
         return self.parts[0].removesuffix(":")
+
+    @property
+    def lists(self) -> bool:
+        """Check whether the store can list its folders."""
+        return self.scheme not in NO_LISTING
 
     @property
     def files(self) -> Any:
@@ -163,12 +168,15 @@ class RemotePath(PosixPath):
 
         return attempt(self, "read", ask)
 
-    def listing(self) -> dict[str, int]:
-        """Return name below this folder -> bytes of every file, sorted by name; empty where there is none."""
+    def listing(self, depth: int | None = None) -> dict[str, int]:
+        """Return name below this folder -> bytes of every file, sorted by name; empty where there is none.
+
+        `depth` is how many levels below it are listed; None for all.
+        """
 
         def ask() -> dict[str, Any]:
             self._forget()
-            return dict(self.files.find(self.key, detail=True))
+            return dict(self.files.find(self.key, maxdepth=depth, detail=True))
 
         try:
             found = attempt(self, "listed", ask)
@@ -220,7 +228,7 @@ class RemotePath(PosixPath):
     def glob(self, pattern: str, **_: Any) -> Generator["RemotePath"]:
         """Yield the files below whose path matches the pattern, part by part; folders are not listed."""
         wanted = pattern.split("/")
-        for name in self.listing():
+        for name in self.listing(len(wanted)):
             parts = name.split("/")
             if len(parts) == len(wanted) and all(map(fnmatchcase, parts, wanted)):
                 yield self / name
@@ -346,7 +354,10 @@ def fetch_range(path: RemotePath, start: int, stop: int) -> bytes:
 
     def ask() -> bytes:
         data = bytes(path.files.cat_file(path.key, start=start, end=stop, **known))
-        if len(data) != stop - start:
+        if len(data) > stop - start:
+            fault = f"its server sent {len(data)} bytes, {stop - start} were requested"
+            raise StorageError(path, fault, "the server ignores range requests: copy the files here")
+        if len(data) < stop - start:
             raise ConnectionError(f"{len(data)} bytes arrived, {stop - start} were requested")
         return data
 

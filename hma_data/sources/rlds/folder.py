@@ -2,7 +2,7 @@
 
 `dataset_info.json` names the shards of each split by a template and gives the number of records of each, so
 an episode is found without opening the other shards. Shards that it does not list are found by name and
-counted. Paths are of an fsspec file system, which is local unless the URI names another.
+counted. Paths are of this machine or of a store.
 """
 
 import math
@@ -14,23 +14,22 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
 
-import fsspec
 from pydantic import BaseModel, ConfigDict, NonNegativeInt, ValidationError
 from pydantic.alias_generators import to_camel
 
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources.common.places import local_path
+from hma_data.sources.common.places import is_away, local_path
 from hma_data.sources.rlds.example import Example
 from hma_data.sources.rlds.features import RldsFeature, read_features
-from hma_data.sources.rlds.records import RecordFile, RecordFraming, open_records
+from hma_data.sources.rlds.records import RecordFile, RecordFraming, explained, open_records
 from hma_data.storage.blocks import Blocks
-from hma_data.storage.fetch import attempt, fetch_whole, file_system, is_listless, is_local
+from hma_data.storage.fetch import ABSENT
+from hma_data.storage.remote import RemotePath, is_remote, place
 from hma_data.storage.yaml_io import first_fault
 
 LONGEST_JSON = 64 << 20  # most bytes of a description; more is an error
-_roots: dict[str, tuple[str, tuple[int, ...]]] = {}  # folder -> the version folder below it, and `_dates`
+_roots: dict[Path, tuple[Path, tuple[int, ...]]] = {}  # folder -> the version folder below it, and `_dates`
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 NUMBER = r"-(?P<shard>\d{5,})(?:-of-(?P<shards>\d{5,}))?"
 NAMED = (  # forms of file names: the suffix after the number, or before it as TFDS writes it
@@ -75,8 +74,7 @@ class _DatasetInfo(BaseModel):
 class Shard:
     """One TFRecord or ArrayRecord file of a split."""
 
-    files: Any  # fsspec file system of the path
-    path: str
+    path: Path
     number: int  # its place in the split
     stated: int | None  # how many records dataset_info.json states; None where it states none
     first: int = 0  # index within the split of its first record
@@ -88,7 +86,7 @@ class Shard:
         Raises:
             SourceError: it is not there, or the file system does not answer.
         """
-        return open_records(self.files, self.path)
+        return open_records(self.path)
 
     def framing(self, limit: int = -1) -> RecordFraming:
         """Return where the shard's records lie; see `RecordFile.framing`.
@@ -137,7 +135,7 @@ class RldsFolder:
             EpisodeError: there is no such episode, or its bytes are damaged or missing.
         """
         shard, position = self._place(episode_id)
-        return Example(shard.records.read(position, episode_id), episode_id), shard.path
+        return Example(shard.records.read(position, episode_id), episode_id), str(shard.path)
 
     def expect(self, episode_ids: Iterable[str]) -> None:
         """State which episodes will be read next, in that order; remote shards are then fetched ahead.
@@ -148,7 +146,7 @@ class RldsFolder:
         Raises:
             HMAError: there is no such episode, or a shard cannot be found.
         """
-        wanted: dict[str, tuple[Shard, list[int]]] = {}
+        wanted: dict[Path, tuple[Shard, list[int]]] = {}
         for name in episode_ids if self.remote else ():
             shard, position = self._place(name)
             wanted.setdefault(shard.path, (shard, []))[1].append(position)
@@ -194,101 +192,109 @@ def open_folder(uri: str) -> RldsFolder:
         SourceError: there is none, or its description cannot be read.
         MissingDependencyError: the URI's file system needs a package that is not installed.
     """
-    if "://" in uri and not uri.startswith("file://"):
+    if is_away(uri):
         return _open_remote(uri, os.getpid())
-    files, path = fsspec.filesystem("file"), local_path(uri).absolute()
-    root = _local_root(uri, files, str(path.parent if path.is_file() else path))
-    described = [Path(root, name) for name in ("", "features.json", "dataset_info.json")]
+    path = local_path(uri).absolute()
+    root = _local_root(uri, path.parent if path.is_file() else path)
+    described = [root / name for name in ("", "features.json", "dataset_info.json")]
     changed = tuple(item.stat().st_mtime_ns if item.exists() else 0 for item in described)
-    return _open(uri, files, root, str(path) if path.is_file() else "", changed)
+    return _open(uri, root, path if path.is_file() else None, changed)
 
 
 @lru_cache(maxsize=64)
 def _open_remote(uri: str, pid: int) -> RldsFolder:
-    try:
-        files, path = file_system(uri)
-    except ValueError as fault:
-        raise SourceError(uri, str(fault), "give a path or an fsspec URI such as gs://bucket/path") from fault
-    path = path.rstrip("/")
-    is_file = not is_listless(files) and attempt(files, uri, lambda: files.isfile(path))
-    above = files._parent(path) if is_file else path
-    root = attempt(files, uri, lambda: _version_folder(uri, files, above))
-    return _open(uri, files, root, path if is_file else "", ())
+    path = place(uri)
+    only = path if _lists(path) and path.is_file() else None
+    return _open(uri, _version_folder(uri, path.parent if only else path), only, ())
 
 
-def _local_root(uri: str, files: Any, path: str) -> str:
+def _lists(path: Path) -> bool:
+    return not isinstance(path, RemotePath) or path.lists
+
+
+def _local_root(uri: str, path: Path) -> Path:
     """Return `_version_folder`; the thousands of shards there are not listed again for each episode.
 
     A second dataset or version changes the date of a folder above the first. What stays unnoticed in this
     process is a features.json that comes later into a folder that lay beside the dataset all the time.
     """
     root, dates = _roots.get(path, (path, ()))
-    if not Path(root, "features.json").is_file() or dates != _dates(path, root):
-        root = _version_folder(uri, files, path)
+    if not (root / "features.json").is_file() or dates != _dates(path, root):
+        root = _version_folder(uri, path)
         _roots[path] = root, _dates(path, root)
     return root
 
 
-def _dates(path: str, root: str) -> tuple[int, ...]:
-    return tuple(folder.stat().st_mtime_ns for folder in (Path(path), Path(root).parent))
+def _dates(path: Path, root: Path) -> tuple[int, ...]:
+    return tuple(folder.stat().st_mtime_ns for folder in (path, root.parent))
 
 
-def _version_folder(uri: str, files: Any, path: str) -> str:
+def _version_folder(uri: str, path: Path) -> Path:
     """Return the folder with features.json: `path`, or one at most two levels below it."""
-    if is_listless(files) or files.isfile(f"{path}/features.json"):
+    if not _lists(path) or (path / "features.json").is_file():
         return path
-    try:
-        files.info(path)  # `exists` of fsspec says no where access is refused, too
-    except FileNotFoundError as fault:
-        remedy = "check the path, or source.uri in the embodiment's YAML"
-        raise SourceError(uri, "does not exist", remedy) from fault
-    found: list[Any] = []
-    for pattern in ("*/features.json", "*/*/features.json"):
-        if is_local(files):  # its name may contain the wildcards of patterns
-            found += sorted(Path(path).glob(pattern))
-        else:
-            found += files.glob(f"{path}/{pattern}")
-    folders = [files._parent(str(item)) for item in found]
+    if not path.exists():
+        raise SourceError(uri, "does not exist", "check the path, or source.uri in the embodiment's YAML")
+    patterns = ("*/features.json", "*/*/features.json")
+    folders = [found.parent for pattern in patterns for found in path.glob(pattern)]
     if len(folders) > 1:
-        names = ", ".join(sorted(folder[len(path) + 1 :] for folder in folders))
+        names = ", ".join(sorted(folder.relative_to(path).as_posix() for folder in folders))
         raise SourceError(uri, f"holds several datasets or versions: {names}", "give the folder of one")
     return folders[0] if folders else path
 
 
 @lru_cache(maxsize=64)
-def _open(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) -> RldsFolder:
-    """Make the folder of `open_folder`; `only` is the path of the one shard that the user chose, or empty."""
-    described = fetch_whole(files, f"{root}/features.json", LONGEST_JSON)
+def _open(uri: str, root: Path, only: Path | None, changed: tuple[int, ...]) -> RldsFolder:
+    """Make the folder of `open_folder`; `only` is the one shard that the user chose."""
+    described = _description(root / "features.json")
     if described is None:
         fault = "has no features.json, without which its records cannot be understood"
         raise SourceError(uri, fault, "copy it from where the records are from, or write it with TFDS")
-    info = _dataset_info(files, f"{root}/dataset_info.json")
+    info = _dataset_info(root / "dataset_info.json")
     if info.file_format not in ("tfrecord", "array_record"):
         fault = f"holds {info.file_format} files; TFRecord and ArrayRecord files can be read"
         raise SourceError(uri, fault, "write it again with TFDS, as file_format tfrecord")
-    listing = [only] if only else None
-    if not only and not is_listless(files):
-        listing = attempt(files, uri, lambda: sorted(files.find(root, maxdepth=2)))
-    shards, problems = _stated_shards(files, root, info, listing)
+    listing = [only] if only else _files_in(root) if _lists(root) else None
+    shards, problems = _stated_shards(root, info, listing)
     if not shards:
-        shards, more = _named_shards(files, root, info, listing or [])
+        shards, more = _named_shards(root, info, listing or [])
         problems += more
     if not shards:
         fault = "holds no TFRecord file"
         raise SourceError(uri, fault, "names are like name-train.tfrecord-00000-of-00001")
     return RldsFolder(
         uri=uri,
-        features=read_features(described, f"{root}/features.json"),
+        features=read_features(described, str(root / "features.json")),
         splits={split: _counted(items) for split, items in shards.items()},
-        remote=not is_local(files),
+        remote=is_remote(root),
         name=info.name,
         version=info.version,
         problems=() if only else tuple(problems),  # the user chose one shard: the others are not missing
     )
 
 
-def _dataset_info(files: Any, path: str) -> _DatasetInfo:
-    data = fetch_whole(files, path, LONGEST_JSON)
+def _files_in(root: Path) -> list[Path]:
+    """Return the files of a folder and of those directly below it, sorted."""
+    if isinstance(root, RemotePath):
+        return [root / name for name in root.listing(2)]
+    with explained(root):
+        return sorted(path for pattern in ("*", "*/*") for path in root.glob(pattern) if path.is_file())
+
+
+def _description(path: Path) -> bytes | None:
+    """Return the bytes of a description; None where there is none."""
+    with explained(path):
+        if not is_remote(path) and path.is_file() and (size := path.stat().st_size) > LONGEST_JSON:
+            fault = f"has {size:,} bytes, more than {LONGEST_JSON:,}"
+            raise SourceError(path, fault, "a description by TFDS is smaller: check the file")
+        try:
+            return path.read_bytes()
+        except ABSENT:
+            return None
+
+
+def _dataset_info(path: Path) -> _DatasetInfo:
+    data = _description(path)
     try:
         return _DatasetInfo() if data is None else _DatasetInfo.model_validate_json(data)
     except ValidationError as fault:
@@ -305,7 +311,7 @@ def _counted(shards: list[Shard]) -> tuple[Shard, ...]:
 
 
 def _stated_shards(
-    files: Any, root: str, info: _DatasetInfo, listing: list[str] | None
+    root: Path, info: _DatasetInfo, listing: list[Path] | None
 ) -> tuple[dict[str, list[Shard]], list[str]]:
     """Return the existing shards that dataset_info.json names, and what is missing."""
     there = None if listing is None else set(listing)
@@ -315,7 +321,7 @@ def _stated_shards(
         counts = split.shard_lengths
         firsts = accumulate(counts, initial=0)
         items = [
-            Shard(files, f"{root}/{info.shard_path(split, number)}", number, records, first)
+            Shard(root / info.shard_path(split, number), number, records, first)
             for number, (records, first) in enumerate(zip(counts, firsts))
         ]
         present = [item for item in items if there is None or item.path in there]
@@ -328,24 +334,24 @@ def _stated_shards(
 
 
 def _named_shards(
-    files: Any, root: str, info: _DatasetInfo, listing: Iterable[str]
+    root: Path, info: _DatasetInfo, listing: Iterable[Path]
 ) -> tuple[dict[str, list[Shard]], list[str]]:
     """Return the same for a renamed dataset, or one without dataset_info.json, by the shards' names alone."""
     stated = {split.name: split.shard_lengths for split in info.splits}
     shards: dict[str, list[Shard]] = {}
     totals: dict[str, int] = {}
     for path in listing:
-        inside = path[len(root) + 1 :]
-        match = next((found for form in NAMED if (found := form.fullmatch(inside.rsplit("/", 1)[-1]))), None)
+        match = next((found for form in NAMED if (found := form.fullmatch(path.name))), None)
         if not match:
             continue
-        split = inside.rsplit("/", 1)[0] if "/" in inside else _split_of(match["stem"], info.name, stated)
+        above = path.parent.relative_to(root).as_posix()
+        split = _split_of(match["stem"], info.name, stated) if above == "." else above
         parts = match.groupdict()
         number = int(parts["shard"] or len(shards.get(split, ())))
         totals[split] = max(totals.get(split, 0), int(parts["shards"] or 0))
         counts = stated.get(split, ())
         records = counts[number] if number < len(counts) else None
-        shards.setdefault(split, []).append(Shard(files, path, number, records, sum(counts[:number])))
+        shards.setdefault(split, []).append(Shard(path, number, records, sum(counts[:number])))
     problems = []
     for split, items in shards.items():
         items.sort(key=lambda item: item.number)

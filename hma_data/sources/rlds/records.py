@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError, install_command
 from hma_data.storage.blocks import Blocks
-from hma_data.storage.fetch import attempt, fetch, info, is_local, mark
+from hma_data.storage.fetch import mark, said
 from hma_data.storage.kinds import LFS, unreadable
+from hma_data.storage.remote import RemotePath, attempt, fetch_range
 
 HEADER = struct.Struct("<QI")
 FOOTER = struct.Struct("<I")
@@ -56,14 +57,24 @@ class RecordFraming:
 EMPTY = RecordFraming(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.uint32), whole=False)
 
 
-class RecordFile:
-    """One TFRecord file of `size` bytes, on an fsspec file system."""
+@contextmanager
+def explained(path: Path) -> Iterator[None]:
+    """Raise SourceError where a file of a dataset cannot be read."""
+    try:
+        yield
+    except OSError as fault:
+        text = f"cannot be read: {said(fault)}"
+        raise SourceError(path, text, "check the path and your access to it") from fault
 
-    def __init__(self, files: Any, path: str, size: int) -> None:
-        self._files, self._path, self._size = files, path, size
+
+class RecordFile:
+    """One TFRecord file of `size` bytes, on this machine or in a store."""
+
+    def __init__(self, path: Path, size: int) -> None:
+        self._path, self._size = path, size
         self._frames = EMPTY
         self._lock = Lock()
-        self.blocks = None if is_local(files) else Blocks(partial(fetch, files, path), size)
+        self.blocks = Blocks(partial(fetch_range, path), size) if isinstance(path, RemotePath) else None
 
     def framing(self, limit: int = -1) -> RecordFraming:
         """Return where the records lie; for a remote file at least the first `limit`, -1 for all.
@@ -77,26 +88,26 @@ class RecordFile:
             return self._frames
 
     def _scanned(self, limit: int) -> RecordFraming:
-        stop = -1 if is_local(self._files) else limit
         with self._parts() as read:
-            return scan_tfrecord(read, self._path, self._size, self._frames, stop)
+            return scan_tfrecord(read, self._path, self._size, self._frames, limit if self.blocks else -1)
 
     @contextmanager
     def _parts(self) -> Iterator[Read]:
         """Yield a function that reads parts: of a local file directly, of a remote one with read-ahead."""
-        if not is_local(self._files):
+        if self.blocks:
             yield _Window(self._bytes, self._size)
             return
-        handle = attempt(self._files, self._path, lambda: os.open(self._path, os.O_RDONLY))
-        try:
-            yield lambda start, end: os.pread(handle, end - start, start)
-        finally:
-            os.close(handle)
+        with explained(self._path), self._path.open("rb", buffering=0) as file:
+            yield lambda start, end: os.pread(file.fileno(), end - start, start)
 
     def _bytes(self, start: int, end: int) -> bytes:
-        if self.blocks and self.blocks.expects(start):
-            return self.blocks.read(start, end)
-        return fetch(self._files, self._path, start, end)
+        """Return a part of a remote file."""
+        if not isinstance(self._path, RemotePath) or not self.blocks or start >= end:
+            return b""
+        with explained(self._path):
+            if self.blocks.expects(start):
+                return self.blocks.read(start, end)
+            return fetch_range(self._path, start, end)
 
     def read(self, index: int, where: str) -> bytes:
         """Return the data of a record, with its checksum verified; `where` is the episode, for the error.
@@ -112,7 +123,8 @@ class RecordFile:
 
     def _picked(self, frames: RecordFraming, index: int, where: str) -> bytes:
         offset, length = int(frames.offsets[index]), int(frames.lengths[index])
-        data = self._bytes(offset, offset + length)
+        with self._parts() as read:
+            data = read(offset, offset + length)
         if masked_crc(data) != frames.checks[index]:
             fault = f"the {length} bytes at byte {offset} of {self._path} fail their checksum"
             raise EpisodeError(where, fault)
@@ -131,7 +143,7 @@ class ArrayRecordFile(RecordFile):
                 reader.read([0])  # its error says why
             except RuntimeError as error:
                 why = str(error)
-            fault, _ = unreadable(Path(self._path), why, "")
+            fault, _ = unreadable(self._path, why, "")
             return replace(EMPTY, fault=fault, whole=True)
         count = reader.num_records()
         lengths, checks = np.zeros(count, np.int64), np.zeros(count, np.uint32)
@@ -151,17 +163,17 @@ class ArrayRecordFile(RecordFile):
         return bytes(data)
 
     def _reader(self) -> Any:
-        if not is_local(self._files):
+        if self.blocks:
             raise SourceError(self._path, "ArrayRecord is read from local disks only", "copy it here")
         try:
             from array_record.python.array_record_module import ArrayRecordReader
         except ImportError as fault:
             said = "ArrayRecord files need the package array-record"
             raise MissingDependencyError(self._path, said, install_command("arrayrecord")) from fault
-        return ArrayRecordReader(self._path, RANDOM_ACCESS)
+        return ArrayRecordReader(str(self._path), RANDOM_ACCESS)
 
 
-def open_records(files: Any, path: str) -> RecordFile:
+def open_records(path: Path) -> RecordFile:
     """Return the record file at a path.
 
     It is cached for the process: a local file while its size and date stay the same, a remote one for good.
@@ -169,23 +181,27 @@ def open_records(files: Any, path: str) -> RecordFile:
     Raises:
         SourceError: it is not there, or the file system does not answer.
     """
-    size, state = (_state if is_local(files) else _remote_state)(files, path)
-    return _opened(files, path, size, state, os.getpid())
-
-
-def _state(files: Any, path: str) -> tuple[int, str]:
-    found = info(files, path)
-    return found["size"], mark(found)
-
-
-_remote_state = lru_cache(maxsize=4096)(_state)
+    if isinstance(path, RemotePath):
+        return _opened(path, *remote_state(path), os.getpid())
+    with explained(path):
+        found = path.stat()
+    return _opened(path, found.st_size, str(found.st_mtime_ns), os.getpid())
 
 
 @lru_cache(maxsize=4096)
-def _opened(files: Any, path: str, size: int, state: str, pid: int) -> RecordFile:
-    if ".array_record" in path.rsplit("/", 1)[-1]:
-        return ArrayRecordFile(files, path, size)
-    return RecordFile(files, path, size)
+def remote_state(path: RemotePath) -> tuple[int, str]:
+    """Return the size of a file in a store, and a text that changes when the file does."""
+    with explained(path):
+        found = attempt(path, "read", lambda: dict(path.files.info(path.key)))
+    if found.get("size") is None:
+        remedy = "copy the files here, or name a server that states it"
+        raise SourceError(path, "its server does not state its length", remedy)
+    return int(found["size"]), mark(found)
+
+
+@lru_cache(maxsize=4096)
+def _opened(path: Path, size: int, state: str, pid: int) -> RecordFile:
+    return ArrayRecordFile(path, size) if ".array_record" in path.name else RecordFile(path, size)
 
 
 # -- TFRecord
@@ -198,7 +214,7 @@ def masked_crc(data: Any) -> int:
 
 
 def scan_tfrecord(
-    read: Read, path: str, size: int, known: RecordFraming = EMPTY, limit: int = -1
+    read: Read, path: Path, size: int, known: RecordFraming = EMPTY, limit: int = -1
 ) -> RecordFraming:
     """Return the framing of a TFRecord file: begin where `known` ends, stop after `limit` records (-1: none).
 
@@ -211,7 +227,7 @@ def scan_tfrecord(
     if not position and header[:2] == b"\x1f\x8b":
         raise SourceError(path, "is gzip-compressed", "decompress it: gunzip")
     if not position and header == LFS[: HEADER.size]:
-        raise SourceError(path, *unreadable(Path(path), "is a Git LFS pointer", "run git lfs pull"))
+        raise SourceError(path, *unreadable(path, "is a Git LFS pointer", "run git lfs pull"))
     while position < size and len(known) + len(rows) != limit:
         end, fault = _data_end(header, position, size)
         if fault:

@@ -30,7 +30,7 @@ from hma_data.sources.common.survey import Series, Survey
 from hma_data.sources.rlds.example import Example
 from hma_data.sources.rlds.features import RldsFeature, Steps, scalar
 from hma_data.sources.rlds.folder import RldsFolder, Shard, episode_id, open_folder
-from hma_data.storage.fetch import info, mark
+from hma_data.sources.rlds.records import remote_state
 from hma_data.storage.paths import StrPath, as_text
 
 SAMPLED_SHARDS, SAMPLED_REMOTE = 16, 2  # shards whose first record is read to estimate lengths
@@ -137,10 +137,10 @@ def _refs(split: str, shard: Shard, own: str | None, rate: float) -> list[Episod
 
 def _remote_refs(split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:
     """Return the episodes of a remote shard from its size and mark alone; no record is read."""
-    found = info(shard.files, shard.path)
-    fingerprint = hashlib.sha256(mark(found).encode()).hexdigest()[:24]
+    size, state = remote_state(shard.path)
+    fingerprint = hashlib.sha256(state.encode()).hexdigest()[:24]
     records = shard.stated or 1
-    frames = max(1, round(rate * found["size"] / records))
+    frames = max(1, round(rate * size / records))
     ids = (episode_id(split, shard.first + position) for position in range(records))
     return [EpisodeRef(name, frames, own, fingerprint) for name in ids]
 

@@ -10,7 +10,6 @@ import s3fs
 from hma_data.errors import SourceError, StorageAwayError, StorageError
 from hma_data.sources.base import open_source
 from hma_data.sources.common.places import existing_path
-from hma_data.storage import fetch as fetching
 from hma_data.storage import remote as store
 from hma_data.storage.fetch import CONNECT_S, file_system
 from hma_data.storage.remote import place
@@ -32,7 +31,6 @@ def requests(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(s3fs.S3FileSystem, "_call_s3", request)
     monkeypatch.setattr(store, "WAITS_S", (0.0, 0.0, 0.0))
-    monkeypatch.setattr(fetching, "WAITS_S", (0.0, 0.0, 0.0))
     s3fs.S3FileSystem.clear_instance_cache()
     yield asked
     s3fs.S3FileSystem.clear_instance_cache()

@@ -16,7 +16,6 @@ from hma_data.sources.rlds.records import open_records
 from tests.data import rlds_files
 from tests.data.rlds_files import encode, tensor
 
-FILES = fsspec.filesystem("file")
 SIZES = {"none": [], "empty": [0], "even": [10] * 30, "blocks": [200_000, 3, 0, 70_000, 65_512, 65_472] * 2}
 
 
@@ -34,7 +33,7 @@ def write(path, records, options="group_size:1"):
 
 
 def read_all(path) -> list[bytes]:
-    records = open_records(FILES, str(path))
+    records = open_records(path)
     assert not records.framing().fault
     return [records.read(i, "e") for i in range(len(records.framing()))]
 
