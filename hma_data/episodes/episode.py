@@ -29,13 +29,20 @@ class Stream(Protocol):
 
 @runtime_checkable
 class OneByOne(Protocol):
-    """A Stream that can give its pictures one by one, so that large ones are not in memory together."""
+    """A Stream that can give its pictures one by one, so that large ones are not in memory together.
+
+    A class that inherits it has `Stream.frames` by its `each`.
+    """
 
     def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[NDArray[np.uint8]]:
         """Yield (H, W, 3) RGB of each of those indices in order; each is valid until the next request.
 
         With `least`, JPEG is decoded at a reduced size, as `hma_data.episodes.images.decode_image` does.
         """
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Return pictures by index; see Stream."""
+        return all_of(self, indices)
 
 
 @dataclass(frozen=True)
@@ -144,7 +151,7 @@ class Clip:
         return self.episode.streams[camera].frames(self.frame_indices[camera][grid])
 
 
-class Pictures:
+class Pictures(OneByOne):
     """A Stream over pictures that are decoded one by one.
 
     Args:
@@ -156,10 +163,6 @@ class Pictures:
     def __init__(self, timestamps: Floats, decode: Decode, reduces: bool = False) -> None:
         self.timestamps = timestamps
         self._decode, self._reduces = decode, reduces
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return pictures by index; see Stream."""
-        return stacked(self.each(indices), len(indices))
 
     def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[NDArray[np.uint8]]:
         """Yield pictures one by one; see OneByOne."""

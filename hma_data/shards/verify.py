@@ -46,10 +46,6 @@ from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import parquet_file, parquet_input, place
 
 REMAKE = "delete it and run the same hma convert again"
-MASK_COLUMNS = {
-    "action": "action_known",
-    "state": "state_known",
-}  # bool columns of sets whose values can be missing
 OnProgress = Callable[[int, int], None]
 
 
@@ -212,7 +208,7 @@ def _row_problems(columns: dict[str, NDArray[Any]], footer: Footer) -> list[str]
         found.append("column frame_index does not count up from 0 in every episode")
     if (np.diff(columns["timestamp"])[np.diff(columns["frame_index"]) > 0] < 0).any():
         found.append("timestamps go back within an episode")
-    for name, mask in MASK_COLUMNS.items():
+    for name, mask in (("action", "action_known"), ("state", "state_known")):
         if mask in columns and columns[name][~columns[mask]].any():
             found.append(f"column {name} is not 0 where {mask} is false")
     return found
@@ -241,8 +237,9 @@ def _stats_problems(columns: dict[str, NDArray[Any]], footer: Footer, manifest: 
         said = footer.stats.get(name)
         if said is None or len(said.mean) != len(own.mean):
             found.append(f"its footer has no statistics of {name}")
-        elif manifest.layout.frame_stride > 1:
-            masked = int((~columns[MASK_COLUMNS[name]]).sum()) if MASK_COLUMNS[name] in columns else 0
+        elif stride > 1:
+            known = columns.get(f"{name}_known", np.ones(0, np.bool_))
+            masked = int((~known).sum())
             if not own.count <= said.count <= stride * (own.count + len(footer.episodes) + masked):
                 counted = f"count {said.count} steps, its rows {own.count}"
                 found.append(f"{name} statistics in its footer {counted}")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats, all_of, of_one_size
+from hma_data.episodes.episode import Floats, OneByOne, of_one_size
 from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images, decode_image, image_codec, opencv
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.bag import Bag
@@ -494,7 +494,7 @@ class Messages:
             yield decode(self._channels[row[3]], data, self.where)
 
 
-class StillStream:
+class StillStream(OneByOne):
     """A camera of raw or still images; see episode.Stream."""
 
     def __init__(
@@ -503,17 +503,13 @@ class StillStream:
         self.timestamps = timestamps
         self._messages, self._kind, self._levels = messages, kind, levels
 
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
-        """See episode.Stream."""
-        return all_of(self, indices)
-
     def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""
         where, read = self._messages.where, self._messages.read(indices)
         return of_one_size((picture(m, self._kind, where, self._levels, least) for m in read), where)
 
 
-class VideoStream:
+class VideoStream(OneByOne):
     """A camera of video; see episode.Stream.
 
     Args:
@@ -535,10 +531,6 @@ class VideoStream:
         self.timestamps = timestamps
         self._messages, self._count, self._lead = messages, len(keyframes), lead
         self._decoder = VideoDecoder(codec, keyframes, self._from, messages.where, reorders)
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
-        """See episode.Stream."""
-        return all_of(self, indices)
 
     def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""

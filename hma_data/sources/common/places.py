@@ -58,6 +58,27 @@ def natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
+def named_files(uri: str, suffixes: Collection[str], what: str) -> dict[str, Path]:
+    """Return the files with these endings at or below a local path, by their names there, in natural order.
+
+    Hidden files are left out: macOS writes one beside each file that it copies.
+
+    Raises:
+        SourceError: there are none.
+    """
+    root = local_path(uri)
+    folder = root.parent if root.is_file() else root
+    files = [root] if root.is_file() else sorted(root.rglob("*"), key=lambda path: natural(str(path)))
+    found = {
+        path.relative_to(folder).as_posix(): path
+        for path in files
+        if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file()
+    }
+    if not found:
+        raise nothing_there(uri, root, f"holds no {what}", f"looked for {', '.join(suffixes)}")
+    return found
+
+
 def leaves(path: Path, folder: Path) -> bool:
     """Check whether a path leads out of its folder by a link or `..`.
 

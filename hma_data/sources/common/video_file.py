@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats, all_of, of_one_size
+from hma_data.episodes.episode import Floats, OneByOne, all_of, of_one_size
 from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images
 from hma_data.errors import EpisodeError
 from hma_data.storage.kinds import unreadable
@@ -276,7 +276,7 @@ class VideoFile:
         raise EpisodeError(self.path, f"gives a frame at {frame.pts} ticks, which no packet states")
 
 
-class FilmRows:
+class FilmRows(OneByOne):
     """A camera's Stream: `rows` frames of a video file, at times (T,) of the recording's own.
 
     Args:
@@ -287,10 +287,6 @@ class FilmRows:
         self.timestamps = times
         self._file, self._indices = file, np.arange(len(file)) if indices is None else indices
         self.rows = len(self._indices)
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """See episode.Stream."""
-        return self._file.frames(self._indices[np.asarray(indices, np.int64)])
 
     def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""

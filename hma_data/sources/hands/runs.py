@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import HandsLayout
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.common.places import local_path, natural, nothing_there
+from hma_data.sources.common.places import named_files
 from hma_data.sources.common.video_file import decoded_size, opened
 from hma_data.sources.hands import VIDEO_SUFFIXES
 
@@ -58,16 +58,7 @@ def videos_of(uri: str) -> dict[str, Video]:
     Raises:
         SourceError: there are none.
     """
-    root = local_path(uri)
-    files = [root] if root.is_file() else sorted(root.rglob("*"), key=lambda path: natural(str(path)))
-    folder = root.parent if root.is_file() else root
-    paths = {
-        path.relative_to(folder).as_posix(): path
-        for path in files
-        if path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".") and path.is_file()
-    }
-    if not paths:
-        raise nothing_there(uri, root, "holds no videos", f"looked for {', '.join(VIDEO_SUFFIXES)}")
+    paths = named_files(uri, VIDEO_SUFFIXES, "videos")
     short = {name: sorted({PurePosixPath(name).name, PurePosixPath(name).stem}) for name in paths}
     uses = Counter(alias for aliases in short.values() for alias in aliases)
     videos = {}

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import h5py
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.sources.common.places import local_path, natural, nothing_there
+from hma_data.sources.common.places import local_path, named_files, natural
 from hma_data.sources.common.survey import sampled
 from hma_data.storage.kinds import unreadable
 
@@ -250,15 +250,11 @@ def _stems(uri: str) -> dict[str, Path]:
     if path.is_file():
         return {_safe(path.stem): path}
     found: dict[str, Path] = {}
-    for file in sorted(path.rglob("*"), key=lambda item: natural(str(item.relative_to(path)))):
-        if file.suffix.lower() not in SUFFIXES or not file.is_file():
-            continue
-        stem = "/".join(map(_safe, file.relative_to(path).with_suffix("").parts))
+    for name, file in named_files(uri, SUFFIXES, "HDF5 files").items():
+        stem = "/".join(map(_safe, PurePosixPath(name).with_suffix("").parts))
         if stem in found:
             raise SourceError(file, f"differs from {found[stem].name} in its suffix only", "rename one")
         found[stem] = file
-    if not found:
-        raise nothing_there(uri, path, "holds no HDF5 files", f"looked for {', '.join(SUFFIXES)}")
     return found
 
 

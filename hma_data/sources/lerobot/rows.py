@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats, of_one_size, rate_times, stacked
+from hma_data.episodes.episode import Floats, OneByOne, of_one_size, rate_times
 from hma_data.episodes.images import Images, decode_image, image_codec
 from hma_data.errors import EpisodeError
 from hma_data.sources.lerobot.metadata import Folder, Metadata, parquet_explained
@@ -218,7 +218,7 @@ def tasks_of(meta: Metadata, index: int, rows: Rows) -> list[str]:
     return found if len(found) == len(numbers) or not own else own
 
 
-class StillImages:
+class StillImages(OneByOne):
     """A Stream of images stored in a parquet column, as bytes or as the path of a file."""
 
     def __init__(self, rows: Rows, key: str, timestamps: Floats, folder: Folder) -> None:
@@ -226,10 +226,6 @@ class StillImages:
         self.timestamps = timestamps
         self._rows, self._key, self._folder = rows, key, folder
         self._held: tuple[int, pa.Array] | None = None
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """See Stream."""
-        return stacked(self.each(indices), len(indices))
 
     def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""

@@ -109,6 +109,12 @@ def test_success_is_the_last_reward_then_the_last_done(demos: Path) -> None:
     assert found == [False, True, True, None]
 
 
+def test_the_file_that_macos_writes_beside_each_is_no_recording(demos: Path) -> None:
+    before = open_source("hdf5").episode_ids(str(demos.parent))
+    (demos.parent / f"._{demos.name}").write_bytes(b"\x00\x05\x16\x07 Mac OS X")
+    assert open_source("hdf5").episode_ids(str(demos.parent)) == before
+
+
 def test_success_and_instruction_are_not_read_from_another_file(demos: Path) -> None:
     with h5py.File(demos.parent / "other.bin", "w") as other:
         other["rewards"], other["instruction"] = np.ones(3), "of another file"
