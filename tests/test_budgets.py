@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (701, 3_999, 7),
     "hma_data/cli": (1_549, 11_105, 8),
-    "hma_data/conversion": (4_207, 31_382, 15),
+    "hma_data/conversion": (4_216, 31_495, 15),
     "hma_data/episodes": (1_695, 14_878, 9),
     "hma_data/hub": (517, 3_861, 3),
     "hma_data/inspection": (2_136, 20_030, 8),
@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_281, 10_980, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_551, 19_631, 11),
-    "hma_data/sources": (12_625, 105_219, 50),
+    "hma_data/sources": (12_627, 105_243, 50),
     "hma_data/storage": (1_649, 10_810, 11),
     "hma_data/tokenizers": (3_512, 25_984, 18),
     "hma_model": (532, 3_311, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_719, 30_560, 20),
     "hma_model/worlds": (1_561, 11_848, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_941, 523_358
-TEST_LINES = 49_224
+PRODUCT_LINES, PRODUCT_NODES = 65_952, 523_495
+TEST_LINES = 49_236
 DOC_WORDS = 41_990
 
 

@@ -62,6 +62,7 @@ from hma_data.tokenizers.shapes import get_spec
 
 MERGE = "convert some episodes (--only) into a dataset of their own; lerobot-edit-dataset merges datasets"
 BOTH_ANEW = "choose another --out and another --lerobot, or --overwrite to start both over"
+MAX_FRAMES = 1_000_000_000  # of an episode
 OnProgress = Callable[[Progress], None]
 
 
@@ -143,8 +144,7 @@ class Conversion(Options):
             raise
         except SourceError as fault:
             raise of_another_format(uri, form, fault) from fault
-        refs = Records.of(EpisodeRef, refs)
-        chosen = refs
+        chosen = refs = _records(refs, uri)
         if robot.source.only or robot.source.exclude or settings.only or settings.exclude:
             ids = ids_for_robot(refs.column("id").to_pylist(), robot)
             kept = pa.array(chosen_ids(ids, settings.only, settings.exclude), pa.string())
@@ -215,6 +215,15 @@ class Conversion(Options):
                     # A journal shows that some share has made shards since the manifest was written.
                     return run.finish(plan, base, bool(run.made or known_hashes(run.out)))
         return UnfinishedShare(run.out, run.kept, run.made, missing, time.monotonic() - run.begun)
+
+
+def _records(refs: Sequence[EpisodeRef], uri: str) -> Records[EpisodeRef]:
+    """Return the episodes as records; raise SourceError where damage claims more frames than can be."""
+    frames = refs.column("frames").to_pylist() if isinstance(refs, Records) else [ref.frames for ref in refs]
+    if frames and max(frames) > MAX_FRAMES:
+        name = refs[frames.index(max(frames))].id
+        raise SourceError(uri, f"states {max(frames):,} frames for episode {name}", "it may be damaged")
+    return Records.of(EpisodeRef, refs)
 
 
 @contextmanager

@@ -178,7 +178,7 @@ class Survey:
                 if series.frames and first and series.count:
                     self._frames(name, key, series.frames, series)
                     if first.times is not None and times is not None and series is not first:
-                        period_s = float(np.median(np.diff(first.times)))
+                        period_s = checks.measure(first.times).period_s
                         self.skew(key, checks.skew(times, first.times), period_s)
         return first.count if first else 0
 

@@ -342,7 +342,7 @@ def _lines(folder: Folder, name: str) -> Iterator[Row]:
     path = folder.root / "meta" / name
     content = _content(path).decode("utf-8-sig", errors="replace")
     found: list[tuple[str, Any]] = []
-    with suppress(ValueError):
+    with suppress(ValueError, RecursionError):
         found = [(str(path), json.loads(content))]
     lines = [] if found else enumerate(content.splitlines(), 1)
     for i, line in lines:
@@ -351,7 +351,7 @@ def _lines(folder: Folder, name: str) -> Iterator[Row]:
         where = f"{path} line {i}"
         try:
             found.append((where, json.loads(line)))
-        except ValueError as fault:
+        except (ValueError, RecursionError) as fault:
             reason = unreadable(path, f"is not JSON: {fault}", "the dataset is damaged")
             raise SourceError(where, *reason) from fault
     for where, value in found:

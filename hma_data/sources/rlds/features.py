@@ -68,7 +68,7 @@ def read_features(text: bytes, where: str) -> dict[str, RldsFeature]:
     """
     try:
         return {leaf.name: leaf for leaf in _leaves(json.loads(text), "", ())}
-    except (ValueError, KeyError, TypeError, AttributeError) as fault:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as fault:
         said = f"is not a TFDS features.json: {fault!r}"
         raise SourceError(where, said, "write it again with tensorflow_datasets") from fault
 

@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import accumulate
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, NonNegativeInt, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
 
 from hma_data.errors import EpisodeError, SourceError
@@ -29,6 +30,7 @@ from hma_data.storage.remote import RemotePath, is_remote, place
 from hma_data.storage.yaml_io import first_fault
 
 LONGEST_JSON = 64 << 20  # most bytes of a description; more is an error
+MAX_RECORDS = 1_000_000  # that a shard may state
 _roots: dict[Path, tuple[Path, tuple[int, ...]]] = {}  # folder -> the version folder below it, and `_dates`
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 NUMBER = r"-(?P<shard>\d{5,})(?:-of-(?P<shards>\d{5,}))?"
@@ -43,7 +45,7 @@ class _StatedSplit(BaseModel):
 
     name: str = ""
     filepath_template: str = TEMPLATE
-    shard_lengths: tuple[NonNegativeInt, ...] = ()
+    shard_lengths: tuple[Annotated[int, Field(ge=0, le=MAX_RECORDS)], ...] = ()
 
 
 class _DatasetInfo(BaseModel):

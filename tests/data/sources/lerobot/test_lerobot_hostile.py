@@ -10,7 +10,7 @@ import pytest
 
 from tests.data.sources.lerobot.test_lerobot import embodiment
 from tests.data.videos import CAMERA, STILL, encode, make_v2, make_v3
-from tests.hostile import Edit, Row, check_refused, cut, of, untouched, values, whole
+from tests.hostile import Edit, Row, check_refused, cut, of, swap, untouched, values, whole
 
 INFO, LISTED, TASKS = "meta/info.json", "meta/episodes.jsonl", "meta/tasks.jsonl"
 ROWS, FILM = "data/chunk-000/episode_000000.parquet", f"videos/chunk-000/{CAMERA}/episode_000000.mp4"
@@ -81,6 +81,11 @@ ALL: dict[str, Row] = {  # no episode can be used
     "info without fps": (of(INFO, whole('{"codebase_version": "v2.1"}')), r"info\.json: lacks .*fps"),
     "deep brackets": (of(INFO, whole("[" * 100_000)), r"info\.json.*Invalid JSON"),
     "a line cut short": (of(LISTED, whole(FIRST + '{"epi')), r"episodes\.jsonl line 2: is not JSON"),
+    "lines nested too deeply": (of(LISTED, whole("[" * 100_000)), r"episodes\.jsonl line 1: is not JSON"),
+    "more rows than can be": (
+        of(LISTED, swap('"length": 12', f'"length": {2**63}')),
+        "states 9,223,372,036,854,775,808 frames",
+    ),
     "episode -1": (of(LISTED, whole(FIRST.replace("0", "-1"))), "whole number from 0, is -1"),
     "an episode twice": (of(LISTED, whole(FIRST * 2)), "lists episode 0 a second time"),
     "no episodes": (of(LISTED, cut(0)), "has no episodes"),

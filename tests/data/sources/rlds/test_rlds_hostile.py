@@ -66,9 +66,16 @@ ONE: dict[str, Row] = {  # one episode is refused
     "a changed byte": (of(SHARD, flip(40)), "checksum"),
 }
 INSPECTED = {"actions of NaN": "action/move is not finite at step 1", "a record cut short": "cut off at byte"}
+INFINITE = '{"tensor": {"dtype": "float32", "shape": {"dimensions": [1e400]}}}'
 ALL: dict[str, Row] = {  # no episode can be used
     "no features": (of(FEATURES, Path.unlink), "has no features.json"),
     "features cut short": (of(FEATURES, cut(1)), "not a TFDS features.json"),
+    "features nested too deeply": (of(FEATURES, whole("[" * 100_000)), "not a TFDS features.json"),
+    "a size of infinity": (of(FEATURES, whole(INFINITE)), "not a TFDS features.json"),
+    "more records than can be": (
+        of(INFO, swap('"3"', '"3000000000"')),
+        r"shardLengths\.0 is '3000000000': must",
+    ),
     "info cut short": (of(INFO, cut(1)), "Invalid JSON"),
     "another container": (of(INFO, whole('{"fileFormat": "riegeli"}')), "riegeli files"),
     "records left out": (of(INFO, swap('"3"', '"2"')), r"has 3 records, dataset_info\.json says 2"),
