@@ -240,14 +240,10 @@ def _opened(checkpoint: str, data: Path, device: str) -> tuple[Any, Any, Any]:
     shards = ShardSet(data)  # it and the checkpoint are refused before torch is imported
     require_checkpoint(checkpoint)
     from hma_data.shards.preview import tokenizer_of
-    from hma_model.checkpoint.folder import EMBEDDED_NAME, resolve
-    from hma_model.network.model import HMA
+    from hma_model.generation.decode import model_for
 
-    robots, there = [shards.embodiment.id], device_name(device)
-    if checkpoint == EMBEDDED_NAME:
-        checkpoint = str(resolve(checkpoint, robots, shards.spec.name))
-    model = HMA.from_pretrained(checkpoint, embodiments=robots, device=there)
-    return model.eval(), tokenizer_of(shards, device=there), shards
+    there = device_name(device)
+    return model_for(checkpoint, [shards], there), tokenizer_of(shards, device=there), shards
 
 
 app.command(rich_help_panel=MODELS)(export)

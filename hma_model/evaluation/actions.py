@@ -5,7 +5,7 @@ How much worse a model predicts with them shows how much it uses its actions.
 B batch, T frames, A action dims, K = stride·A.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,31 +14,33 @@ import torch
 from torch import Tensor
 
 from hma_data.loading.dataset import Batch
-
-
-def shuffled_actions(batch: Batch, begin: int = 0, seed: int = 0, draw: int = 0) -> Tensor:
-    """Replace each window's chunks from `begin` on by those of another window of the same embodiment.
-
-    Every `draw` pairs the windows anew. A window that is the only one of its embodiment gets its own chunks
-    in reverse. Return (B, T, K).
-    """
-    actions = batch.actions.clone()
-    source = batch.actions[:, begin:]
-    rng = np.random.default_rng([seed, 1 + draw])
-    for name in dict.fromkeys(batch.embodiment):
-        own = rng.permutation([i for i, other in enumerate(batch.embodiment) if other == name])
-        if len(own) == 1:  # there is no other window to take actions from
-            actions[own, begin:] = source[own].flip(1)
-        else:
-            actions[own, begin:] = source[np.roll(own, 1)]
-    return actions
+from hma_model.arrays import Ints
 
 
 def shuffled(batch: Batch, begin: int = 0, seed: int = 0, draw: int = 0) -> Batch:
-    """Return the windows with the chunks of `shuffled_actions`, which are known where they were."""
-    masks = replace(batch, actions=batch.action_mask)
-    known = shuffled_actions(masks, begin, seed, draw)
-    return replace(batch, actions=shuffled_actions(batch, begin, seed, draw), action_mask=known)
+    """Return the windows with another window's chunks from `begin` on, known where they were known there.
+
+    A window that is the only one of its embodiment gets its own chunks in reverse.
+    """
+    others = partners(batch.embodiment, seed, draw)
+    alone = others == np.arange(len(others))
+
+    def taken(values: Tensor) -> Tensor:
+        later = values[others, begin:]
+        later[alone] = later[alone].flip(1)
+        return torch.cat([values[:, :begin], later], dim=1)
+
+    return replace(batch, actions=taken(batch.actions), action_mask=taken(batch.action_mask))
+
+
+def partners(embodiments: Sequence[str], seed: int, draw: int) -> Ints:
+    """Return for each window (B,) another one of its embodiment, if there is one; each `draw` pairs anew."""
+    found = np.arange(len(embodiments))
+    rng = np.random.default_rng([seed, 1 + draw])
+    for name in dict.fromkeys(embodiments):
+        own = rng.permutation([i for i, other in enumerate(embodiments) if other == name])
+        found[own] = np.roll(own, 1)
+    return found
 
 
 def gaussian(batch: Batch, stats: Mapping[str, Any], seed: int = 0) -> Batch:

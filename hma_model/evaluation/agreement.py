@@ -209,10 +209,10 @@ def _balanced(right: tuple[int, int], each: tuple[int, int]) -> tuple[float, flo
 @lru_cache(maxsize=1024)
 def share_interval(successes: int, count: int) -> tuple[float, float]:
     """Return Clopper and Pearson's interval of a share: the shares under which the count is no surprise."""
-    failures = count - successes
-    low = stats.beta.ppf(TAIL, successes, failures + 1) if successes else 0.0
-    high = stats.beta.ppf(1 - TAIL, successes + 1, failures) if failures else 1.0
-    return float(low), float(high)
+    if not count:
+        return 0.0, 1.0
+    ends = stats.binomtest(successes, count).proportion_ci(1 - 2 * TAIL)
+    return float(ends.low), float(ends.high)
 
 
 def precision_recall(true: Bools, judged: Bools) -> tuple[Estimate, Estimate]:

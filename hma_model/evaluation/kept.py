@@ -6,12 +6,13 @@ and may be deleted.
 """
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
@@ -56,20 +57,32 @@ def kept(kind: str, tokenizer: Tokenizer, facts: Mapping[str, Any], make: Callab
     return made
 
 
-def weights_of(network: nn.Module) -> Arrays:
-    """Return a network's weights as arrays to keep."""
-    return {NETWORK + name: value.numpy() for name, value in network.state_dict().items()}
+def kept_reader(
+    kind: str,
+    tokenizer: Tokenizer,
+    facts: Mapping[str, Any],
+    make: Callable[[], Any],
+    values: Sequence[str],
+    network_of: Callable[[int], nn.Module],
+) -> dict[str, Any]:
+    """Return the `network` in eval mode and the named arrays of an object that `make` trains.
 
+    Args:
+        kind, tokenizer, facts: as of `kept`.
+        make: returns an object with the attributes `network`, `error` (n,) and `values`.
+        values: names of the arrays.
+        network_of: returns a network for n values.
+    """
 
-def filled[Network: nn.Module](network: Network, arrays: Arrays) -> Network:
-    """Return a network with the weights that `weights_of` gave."""
-    own = {
-        name.removeprefix(NETWORK): torch.from_numpy(value)
-        for name, value in arrays.items()
-        if name.startswith(NETWORK)
-    }
-    network.load_state_dict(own)
-    return network.eval()
+    def arrays() -> Arrays:
+        made = make()
+        weights = {NETWORK + name: value.numpy() for name, value in made.network.state_dict().items()}
+        return weights | {name: np.asarray(getattr(made, name)) for name in values}
+
+    found = kept(kind, tokenizer, facts, arrays)
+    network = network_of(len(found["error"]))
+    network.load_state_dict({name: torch.from_numpy(found[NETWORK + name]) for name in network.state_dict()})
+    return {"network": network.eval()} | {name: found[name] for name in values}
 
 
 def weights_sha256(network: nn.Module) -> str:

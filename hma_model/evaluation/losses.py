@@ -21,7 +21,7 @@ from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import FIRST_CAMERA, Cameras, Views
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
-from hma_model.arrays import Floats, Ints
+from hma_model.arrays import Floats, Ints, evenly
 from hma_model.config import OBJECTIVES, HMAConfig
 from hma_model.evaluation.metrics import teacher_forced
 from hma_model.network.model import HMA
@@ -64,7 +64,7 @@ def windows(
     A batch has a single window only if there is but one: windows take the actions of others in their batch.
     """
     dataset = WindowDataset(data, split, frames, cameras=cameras)
-    chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(np.int64))
+    chosen = evenly(len(dataset), count)
     if not len(dataset):
         return
     whole, rest = divmod(len(chosen), batch_size)

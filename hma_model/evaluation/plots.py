@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D")
+CURVE_POINTS = 2000  # of a loss curve, about; a run may have millions of steps
 Points = Sequence[tuple[int, float]] | NDArray[np.float64]  # (N, 2): training steps, and a value at each
 SIX_COLOURS = (*COLOURS, "#56b4e9", "#555555")  # of plots with more curves
 
@@ -33,26 +35,14 @@ def loss_curves(training: Mapping[str, Points], validation: Mapping[str, Points]
         colour, style = COLOURS[i % len(COLOURS)], STYLES[i // len(COLOURS) % len(STYLES)]
         steps, losses = np.array(training[name], float).T
         width = max(1, len(losses) // 40)  # of the running mean
-        mean = _running_mean(losses, width)
-        axes.plot(steps[width - 1 :], mean, color=colour, ls=style, lw=1.6, label=name)
+        every = max(1, len(losses) // CURVE_POINTS)
+        means = sliding_window_view(losses, width)[::every].mean(axis=1)
+        axes.plot(steps[width - 1 :: every], means, color=colour, ls=style, lw=1.6, label=name)
         if name in validation:
             steps, losses = np.array(validation[name], float).T
             axes.plot(steps, losses, MARKERS[i % len(MARKERS)], color=colour, ms=5)
     axes.legend(frameon=False, fontsize=9, ncols=1 + len(training) // 8)
     return svg_bytes(figure)
-
-
-def _running_mean(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Return the mean of every `width` values in a row, (N - width + 1,).
-
-    Each sums up the end of one block of `width` values and the beginning of the next. Differences of sums
-    over all values would be wrong after a huge one.
-    """
-    count = len(values) - width + 1
-    blocks = np.append(values, np.zeros(-len(values) % width)).reshape(-1, width)
-    ends = blocks[:, ::-1].cumsum(1)[:, ::-1].ravel()[:count]
-    beginnings = blocks.cumsum(1).ravel()[width - 1 : width - 1 + count]
-    return (ends + np.where(np.arange(count) % width, beginnings, 0)) / width
 
 
 def course(points: Points, label: str, log: bool = False) -> bytes:

@@ -19,7 +19,7 @@ from hma_data.lab import pusht, simulator, truth
 from hma_data.lab.pusher import Tee, rotation
 from hma_data.tokenizers.base import Tokenizer
 from hma_model.arrays import Bools, Floats, Images, Ints
-from hma_model.evaluation.kept import Arrays, filled, kept, weights_of
+from hma_model.evaluation.kept import kept_reader
 from hma_model.evaluation.state_reader import (
     INPUT_SIDE,
     UNREADABLE_SHARE,
@@ -39,7 +39,7 @@ ANGLES = 48  # of a T that are tried
 FARTHEST_PX = 20.0  # px of the arena; a pixel farther out of the T counts as that far
 FIRST_STEP, LAST_STEP = 8.0, 0.4  # px of the arena, of the search
 TURN_RADIUS = 50.0  # px of the arena by which an angle is as long as a step
-PROBE_VALUES = ("error", "spread", "background", "colors")  # of a probe, all arrays
+PROBE_VALUES = ("driven", "error", "spread", "background", "colors")  # of a probe, beside its network
 LEAST_AREA = 0.3  # share of the T's area; of fewer pixels no pose is found
 
 
@@ -214,17 +214,14 @@ def train_probe(
     """
     tee = TeeFinder.of(robot)
 
-    def make() -> Arrays:
+    def make() -> Probe:
         pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
         places, driven = np.concatenate([one.parts for one in made]), made[0].driven
-        probe = fit(pictures, places, driven, HELD_OUT_EPISODES / EPISODES, seed, tee=tee, tell=tell)
-        values = {name: getattr(probe, name) for name in PROBE_VALUES}
-        return weights_of(probe.network) | values | {"driven": np.array(probe.driven)}
+        return fit(pictures, places, driven, HELD_OUT_EPISODES / EPISODES, seed, tee=tee, tell=tell)
 
-    found = kept("probe", tokenizer, {"robot": robot, "stride": stride, "seed": seed}, make)
-    network = filled(PlaceNetwork(len(found["error"])), found)
-    values = {name: found[name] for name in PROBE_VALUES}
-    return Probe(network, found["driven"].item(), tee=tee, **values)
+    facts = {"robot": robot, "stride": stride, "seed": seed}
+    found = kept_reader("probe", tokenizer, facts, make, PROBE_VALUES, PlaceNetwork)
+    return Probe(**found | {"driven": int(found["driven"]), "tee": tee})
 
 
 def shown_episodes(

@@ -27,9 +27,9 @@ from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Floats, Images, Ints
+from hma_model.arrays import Floats, Images, Ints, evenly
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded
-from hma_model.evaluation.kept import Arrays, filled, kept, weights_of
+from hma_model.evaluation.kept import kept_reader
 from hma_model.evaluation.losses import episodes_of
 from hma_model.evaluation.probe import shown_episodes
 from hma_model.evaluation.state_reader import UNREADABLE_SHARE, StateNetwork, outputs, resized, trained
@@ -201,8 +201,7 @@ def recorded_reader(
         tell: called with how far it is.
     """
     dataset = WindowDataset(shards, "train", 1, cameras=cameras)
-    numbers = np.unique(np.linspace(0, len(dataset) - 1, min(IMAGE_LIMIT, len(dataset))).astype(np.int64))
-    seen = dataset.batch(numbers)
+    seen = dataset.batch(evenly(len(dataset), IMAGE_LIMIT))
     wanted = _States(shards).of(seen, 1)[:, 0]
     known = np.isfinite(wanted).all(axis=1)
     if not known.any():
@@ -212,7 +211,7 @@ def recorded_reader(
         return learn(decode(tokenizer, seen.stored)[known, 0], wanted[known], seed, tell=tell)
 
     told = hashlib.sha256((shards.folder / MANIFEST).read_bytes()).hexdigest()
-    return _kept("recorded", tokenizer, {"manifest": told, "cameras": cameras, "seed": seed}, make)
+    return _kept("recorded_reader", tokenizer, {"manifest": told, "cameras": cameras, "seed": seed}, make)
 
 
 _kept_reader = lru_cache(maxsize=16)(recorded_reader)  # several checkpoints share it
@@ -228,19 +227,12 @@ def simulated_reader(
         states = np.concatenate([one.states for one in made]).astype(np.float64)
         return learn(pictures, states, seed, tell=tell)
 
-    return _kept("simulated", tokenizer, {"robot": robot, "stride": stride, "seed": seed}, make)
+    return _kept("simulated_reader", tokenizer, {"robot": robot, "stride": stride, "seed": seed}, make)
 
 
 def _kept(kind: str, tokenizer: Tokenizer, facts: Mapping[str, Any], make: Callable[[], Reader]) -> Reader:
     """Return a reader, trained only if none is kept on disk (`hma_model.evaluation.kept`)."""
-
-    def arrays() -> Arrays:
-        reader = make()
-        return weights_of(reader.network) | {name: getattr(reader, name) for name in READER_VALUES}
-
-    found = kept(f"{kind}_reader", tokenizer, facts, arrays)
-    network = filled(StateNetwork(len(found["mean"])), found)
-    return Reader(network, *(found[name] for name in READER_VALUES))
+    return Reader(**kept_reader(kind, tokenizer, facts, make, READER_VALUES, StateNetwork))
 
 
 def _values(shards: ShardSet, reader: Reader, own: Ints, errors: dict[str, Floats]) -> list[dict[str, Any]]:

@@ -23,7 +23,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.recorded import Recorded
 from hma_data.storage.files import to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Images, Ints
+from hma_model.arrays import Images, Ints, evenly
 from hma_model.evaluation.losses import windows
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import over_horizon
@@ -36,6 +36,7 @@ from hma_model.evaluation.tables import (
     renamed,
     results,
     state,
+    state_unit,
     turned,
     value,
 )
@@ -176,17 +177,16 @@ def _curves(parts: Sequence[Part], name: str) -> dict[str, tuple[Any, Any]]:
 
 def _state(made: Page, part: Part, seconds: float) -> None:
     measured = part.found.get("state")
-    if not measured or "true" not in measured:
+    tables = state(measured)
+    if not tables:
         return
-    recorded = "values" in measured
-    key, unit = ("error_sd", "standard deviations") if recorded else ("error_px", "px of 128")
-    truth = "the recorded one" if recorded else "the simulator's"
+    key, unit = state_unit(measured)
+    truth = "the recorded one" if "values" in measured else "the simulator's"
     curves = {
         words: (measured[kind][f"{key}_by_frame"], measured[kind][f"{key}_by_frame_95"])
         for kind, words in ROLLOUTS.items()
         if None not in measured[kind][f"{key}_by_frame"]
     }
-    tables = state(measured)
     caption = f"{part.checkpoint}: distance of the state estimated from the images to {truth}; {tables[0][1]}"
     made.picture(over_horizon(curves, seconds, unit), "svg+xml", caption)
     for table, _ in tables[1:]:
@@ -211,7 +211,7 @@ def _strips(made: Page, parts: Sequence[Part]) -> None:
 
 def _rows(case: Showcase, i: int, parts: Sequence[Part]) -> list[tuple[str, bytes]]:
     truth, prompt = case.truth[i], parts[0].found["prompt"]
-    columns = np.unique(np.linspace(0, len(truth) - 1, min(len(truth), STRIP_FRAMES)).astype(int))
+    columns = evenly(len(truth), STRIP_FRAMES)
     films = {} if case.recorded is None else {"recorded": case.recorded[i]}
     films["from its tokens"] = truth
     for part in parts:

@@ -28,7 +28,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Bools, Float32s, Images
+from hma_model.arrays import Bools, Float32s, Images, evenly
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.actions import shuffled
 from hma_model.evaluation.losses import no_window, windows
@@ -156,7 +156,7 @@ def lively_windows(
         The numbers of the windows, and the numbers of those with other actions, for `rollout_video`.
     """
     dataset = WindowDataset(shards, split, length)
-    numbers = np.unique(np.linspace(0, len(dataset) - 1, candidates).astype(np.int64))
+    numbers = evenly(len(dataset), candidates)
     batch = dataset.batch(numbers)
     assert batch.tokens is not None and batch.episode is not None
     changed = (batch.tokens[:, prompt:] != batch.tokens[:, prompt - 1 : prompt]).float().mean(dim=(1, 2, 3))
@@ -272,7 +272,7 @@ def write_sheets(
         return f"no pictures: {fault}"
     training = model.training
     model.eval()
-    columns = np.unique(np.linspace(0, frames - 1, SHEET_COLUMNS).astype(int))
+    columns = evenly(frames, SHEET_COLUMNS)
     for name, shards in sets.items():
         (batch,) = windows(shards, "val", frames, count, count, cameras)
         true = rollout(model, tokenizer, batch, seed=seed)

@@ -34,13 +34,13 @@ from hma_data.storage.kept import KeptParts
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import Tokenizer
 from hma_model.arrays import Floats
-from hma_model.checkpoint.folder import EMBEDDED_NAME, resolve
 from hma_model.checkpoint.io import record_locally
 from hma_model.evaluation.evaluate import EvaluationSettings, WindowPlan, measure
 from hma_model.evaluation.perceptual import Networks
 from hma_model.evaluation.recorded_state import measure_recorded_state
 from hma_model.evaluation.simulated import measure_state
 from hma_model.evaluation.verdict import follows, verdict
+from hma_model.generation.decode import model_for
 from hma_model.network.model import HMA
 
 FIGURES_VERSION = 6  # raise it when the same part gives other figures
@@ -102,13 +102,9 @@ def evaluate_all(
     sets = [ShardSet(item) for item in data]
     _once([as_text(item) for item in checkpoints], "checkpoint")
     _once([shards.embodiment.id for shards in sets], "embodiment")
-    names = [shards.embodiment.id for shards in sets]
     work: list[_Work] = []
     for checkpoint in checkpoints:  # all are checked before the first is measured
-        named = checkpoint
-        if as_text(checkpoint) == EMBEDDED_NAME:
-            named = resolve(checkpoint, names, sets[0].spec.name)
-        model = HMA.from_pretrained(named, embodiments=names, device=device).eval()
+        model = model_for(checkpoint, sets, device)
         work += [_Work.of(as_text(checkpoint), model, shards, settings) for shards in sets]
     parts, done = [], 0
     shown = short_paths(list(dict.fromkeys(one.label for one in work)))

@@ -280,12 +280,16 @@ def single(part: Part) -> Table:
     return Table(["figure", "value", "95 %", "meaning"], rows)
 
 
+def state_unit(found: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the key of the errors of a measured state, and their unit: of a recorded or a simulated one."""
+    return ("error_sd", "standard deviations") if "values" in found else ("error_px", "px of 128")
+
+
 def state(found: Mapping[str, Any] | None) -> list[tuple[Table, str]]:
     """Return the tables of a part's state, each with a line below it; none if it was not measured."""
     if not found or "true" not in found:
         return []
-    recorded = "values" in found
-    key, unit = ("error_sd", "standard deviations") if recorded else ("error_px", "px of 128")
+    key, unit = state_unit(found)
     kinds = [kind for kind in ROLLOUTS if kind in found]
     errors = [
         [kind, _digits(found[kind][key], 2), _digits(found[kind][f"{key}_last"], 2),
@@ -293,7 +297,7 @@ def state(found: Mapping[str, Any] | None) -> list[tuple[Table, str]]:
         for kind in kinds
     ]  # fmt: skip
     first = Table(["state estimated from the images", f"error, {unit}", "last frame", "95 %"], errors)
-    if recorded:
+    if "values" in found:
         said = (
             f"{found['read']} of {found['of']} values can be estimated from the images; the estimator's own "
             f"error is {found['reader_sd']:.2f} standard deviations on recorded images of other episodes"

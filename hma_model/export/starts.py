@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from hma_data.lab.family.table import BlockTable
 from hma_data.tokenizers.network import NetworkTokenizer
+from hma_model.evaluation.metrics import PSNR_LIMIT, psnr
 from hma_model.export.files import rounded
 from hma_model.export.truth import table_values
-from hma_model.play.session import psnr
 from hma_model.worlds.scenes import Drivable, LabScene
 from hma_model.worlds.world import World
 
@@ -108,6 +108,7 @@ def _one_step_psnr(model: "HMA", tokenizer: "Tokenizer", starts: Mapping[str, Se
         for start in some:
             session = world.open(name, start.frames[:-1], start.chunks[:-1])
             truth = world.shown(start.frames[-1:])[0]
-            scores.append(psnr(world.step({session: start.chunks[-1]})[session], truth))
+            made = world.step({session: start.chunks[-1]})[session]
+            scores.append(psnr(truth, made, limit=PSNR_LIMIT))
             world.close(session)
     return float(np.mean(scores))

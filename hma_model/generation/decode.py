@@ -1,7 +1,9 @@
-"""Decode generated frames to images, and choose the cameras and the prompt that a model takes.
+"""Decode generated frames to images, and choose the model, cameras and prompt for shards.
 
 B batch, T frames, h,w grid, S pixels a side, C cameras.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -10,10 +12,24 @@ from torch import Tensor
 from hma_data.errors import UsageError
 from hma_data.loading.views import FIRST_CAMERA, Cameras, view_count
 from hma_data.shards.reader import ShardSet
+from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.base import Tokenizer
 from hma_data.tokenizers.network import NetworkTokenizer
 from hma_model.arrays import Images
+from hma_model.checkpoint.folder import EMBEDDED_NAME, resolve
+from hma_model.network.model import HMA
 from hma_model.network.network import Network
+
+
+def model_for(checkpoint: StrPath, sets: Sequence[ShardSet], device: str = "cpu") -> HMA:
+    """Return the model of a checkpoint in eval mode, with the robots of shard sets.
+
+    `embedded` stands for the bundled checkpoint of these robots and of the first set's tokenizer.
+    """
+    robots = [shards.embodiment.id for shards in sets]
+    if as_text(checkpoint) == EMBEDDED_NAME:
+        checkpoint = resolve(checkpoint, robots, sets[0].spec.name)
+    return HMA.from_pretrained(checkpoint, embodiments=robots, device=device).eval()
 
 
 def default_prompt(length: int) -> int:

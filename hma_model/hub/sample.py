@@ -4,12 +4,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from hma_data.errors import CheckpointError, UsageError
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RemotePath
+from hma_model.arrays import evenly
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import FILM, SAMPLE, Checkpoint, require_tokenizer
 
@@ -79,7 +78,7 @@ def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
     middle, tokenizer = len(windows) // 2, tokenizer_of(shards)
     batch = windows.batch([middle])
     true = rollout(model, tokenizer, batch)
-    picks = np.unique(np.linspace(0, true.truth.shape[1] - 1, COLUMNS).astype(int))
+    picks = evenly(true.truth.shape[1], COLUMNS)
     rows = {
         "recorded, decoded from tokens": true.truth[0],
         f"predicted from frame {true.prompt} on": true.predicted[0],

@@ -17,6 +17,7 @@ from hma_data.episodes.images import opencv, resize
 from hma_data.errors import UsageError
 from hma_model.arrays import Float32s, Images
 from hma_model.evaluation.calibration import POWER
+from hma_model.evaluation.metrics import PSNR_LIMIT, psnr
 from hma_model.generation.unmask import Decoding
 from hma_model.play.pads import describe
 from hma_model.worlds.scenes import Drivable, LabScene
@@ -144,7 +145,7 @@ class Session:
         self._divergence = DivergenceDetector(true, shown, round(rate))
         self._stated = 0.0
         self._still = true
-        return replace(frame, model=jpeg(shown), true=jpeg(true), psnr=psnr(shown, true), still=60.0)
+        return replace(frame, model=jpeg(shown), true=jpeg(true), psnr=_score(shown, true), still=PSNR_LIMIT)
 
     @property
     def parted(self) -> int | None:
@@ -203,8 +204,8 @@ class Session:
         self._stated = (self._stated**POWER + unsure**POWER) ** (1 / POWER)
         score = still = None
         if self._truth is not None:
-            score = psnr(image, self._truth)
-            still = psnr(self._still, self._truth)
+            score = _score(image, self._truth)
+            still = _score(self._still, self._truth)
             self._divergence.look(self.count, image, self._truth)
         stride = self.robot.embodiment.stride
         actions: Float32s = self._chunks[-1].reshape(stride, -1)
@@ -279,10 +280,9 @@ def jpeg(image: Images) -> bytes:
     return data
 
 
-def psnr(one: Images, other: Images) -> float:
-    """Return the peak signal-to-noise ratio of two images in dB, 60 at most."""
-    error = float(np.mean((one.astype(np.float32) - other.astype(np.float32)) ** 2))
-    return 60.0 if error < 0.065 else round(10 * math.log10(255**2 / error), 2)
+def _score(image: Images, true: Images) -> float:
+    """Return the PSNR of an image as the page shows it."""
+    return round(float(psnr(true, image, limit=PSNR_LIMIT)), 2)
 
 
 # -- divergence

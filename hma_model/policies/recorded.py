@@ -26,7 +26,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Bools, Floats, Images
+from hma_model.arrays import Bools, Floats, Images, evenly
 from hma_model.evaluation.agreement import alike_pairs, share_interval
 from hma_model.evaluation.pages import Page
 from hma_model.generation.decode import cameras_for
@@ -224,7 +224,7 @@ def _play(
     """Return what comes of one policy in the model: the arrays of `Played`."""
     with closing(ModelArena(world, begun, None)) as arena:
         images, _ = run(name, policy, arena, frames, tell)
-    shown = np.unique(np.linspace(0, frames, SHOWN_FRAMES).round().astype(int))
+    shown = evenly(frames + 1, SHOWN_FRAMES)
     # the frames of an episode are scored together, so that memory does not grow with N
     scores = np.concatenate([judge.model.score(np.stack(one)[None]) for one in zip(*images, strict=True)])
     return {

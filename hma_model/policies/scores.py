@@ -33,7 +33,7 @@ from hma_data.errors import HMAError, UsageError
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Bools, Float32s, Floats, Images, Ints
+from hma_model.arrays import Bools, Float32s, Floats, Images, Ints, evenly
 from hma_model.evaluation.agreement import (
     Accuracy,
     Estimate,
@@ -421,7 +421,7 @@ def score_policy(
     """
     size = world.image_shape[0]
     limit = judge.task.limit
-    shown = np.unique(np.linspace(0, frames, SHOWN_FRAMES).round().astype(int))
+    shown = evenly(frames + 1, SHOWN_FRAMES)
     true = TrueArena(scenes, size)
     true_images, acted = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
     model = ModelArena(world, true, judge.probe)

@@ -15,7 +15,7 @@ from hma_data.errors import CheckpointError, UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.shards.reader import ShardSet
 from hma_model.evaluation import actions, tables
-from hma_model.evaluation.actions import gaussian, shuffled, shuffled_actions, without_actions
+from hma_model.evaluation.actions import gaussian, shuffled, without_actions
 from hma_model.evaluation.evaluate import EvaluationSettings, measure
 from hma_model.evaluation.intervals import interval, over_datasets
 from hma_model.evaluation.losses import (
@@ -250,26 +250,24 @@ def test_a_rollout_longer_than_the_window_is_refused(model, batch):
 def test_shuffled_actions_are_another_windows_of_the_same_embodiment(batch):
     mixed = replace(batch, embodiment=["arm", "hand", "arm", "hand", "arm"])
     mixed.actions[:, 0, 0] = torch.arange(5.0)
-    other = shuffled_actions(mixed)[:, 0, 0].long().tolist()
+    other = shuffled(mixed).actions[:, 0, 0].long().tolist()
     assert sorted(other) == [0, 1, 2, 3, 4]
     assert all(a != b and (a - b) % 2 == 0 for a, b in enumerate(other))
 
 
 def test_every_draw_shuffles_anew(batch):
     batch.actions[:, 0, 0] = torch.arange(5.0)
-    draws = [tuple(shuffled_actions(batch, draw=draw)[:, 0, 0].tolist()) for draw in range(5)]
-    assert len(set(draws)) > 1 and draws[0] == tuple(shuffled_actions(batch)[:, 0, 0].tolist())
+    draws = [tuple(shuffled(batch, draw=draw).actions[:, 0, 0].tolist()) for draw in range(5)]
+    assert len(set(draws)) > 1 and draws[0] == tuple(shuffled(batch).actions[:, 0, 0].tolist())
 
 
 def test_figures_of_shuffled_actions_are_means_over_the_draws(data, model, monkeypatch):
-    real = actions.shuffled_actions
+    real = actions.partners
     one = []
     for draw in range(3):
-        monkeypatch.setattr(
-            actions, "shuffled_actions", lambda *a, draw=0, only=draw: real(*a[:3], draw=only)
-        )
+        monkeypatch.setattr(actions, "partners", lambda names, seed, draw, only=draw: real(names, seed, only))
         one.append(evaluate(model, Blocks(), data, windows=5, prompt=1, batch_size=2, draws=1))
-    monkeypatch.setattr(actions, "shuffled_actions", real)
+    monkeypatch.setattr(actions, "partners", real)
     found = evaluate(model, Blocks(), data, windows=5, prompt=1, batch_size=2, draws=3)
     assert found["true"] == one[0]["true"] and found["draws"] == 3
     for key in ("psnr_last", "ssim"):
@@ -278,7 +276,7 @@ def test_figures_of_shuffled_actions_are_means_over_the_draws(data, model, monke
 
 
 def test_shuffling_keeps_the_actions_among_the_prompt(batch):
-    other = shuffled_actions(batch, begin=2)
+    other = shuffled(batch, begin=2).actions
     assert torch.equal(other[:, :2], batch.actions[:, :2])
     assert not torch.equal(other[:, 2:], batch.actions[:, 2:])
 

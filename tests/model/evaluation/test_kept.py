@@ -1,7 +1,9 @@
 """Trained readers are kept on disk: made once, and again where anything differs that they depend on."""
 
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from torch import nn
 
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.evaluation import probe
-from hma_model.evaluation.kept import filled, kept, weights_of
+from hma_model.evaluation.kept import kept, kept_reader
 from hma_model.evaluation.probe import train_probe
 
 
@@ -98,11 +100,20 @@ def test_a_cache_that_cannot_be_written_costs_only_time(folder: Path) -> None:
     assert kept("probe", tokenizer(), {}, Maker())["values"].shape == (3, 2)
 
 
-def test_a_network_comes_back_with_its_weights() -> None:
+def test_a_reader_comes_back_with_its_weights_and_values(folder: Path) -> None:
     network = nn.Sequential(nn.Linear(3, 4), nn.GELU(), nn.Linear(4, 2))
-    other = filled(nn.Sequential(nn.Linear(3, 4), nn.GELU(), nn.Linear(4, 2)), weights_of(network))
-    x = torch.randn(5, 3)
-    assert torch.equal(network(x), other(x)) and not other.training
+    trained = SimpleNamespace(network=network, error=np.array([0.5, 2.0]), driven=1)
+
+    def read(make: Callable[[], Any]) -> dict[str, Any]:
+        return kept_reader("probe", tokenizer(), {}, make, ("error", "driven"), fresh)
+
+    def fresh(count: int) -> nn.Module:
+        return nn.Sequential(nn.Linear(3, 4), nn.GELU(), nn.Linear(4, count))
+
+    read(lambda: trained)
+    found, x = read(lambda: pytest.fail("it is kept")), torch.randn(5, 3)
+    assert torch.equal(network(x), found["network"](x)) and not found["network"].training
+    assert found["error"].tolist() == [0.5, 2.0] and found["driven"] == 1
 
 
 def test_a_kept_probe_reads_as_the_trained_one(monkeypatch: pytest.MonkeyPatch) -> None:

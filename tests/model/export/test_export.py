@@ -21,12 +21,12 @@ from hma_data.tokenizers.base import reopened
 from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.checkpoint.io import load
 from hma_model.cli.export import export_checkpoint
+from hma_model.evaluation.metrics import psnr
 from hma_model.export.files import rounded
 from hma_model.export.graphs import require_exportable
 from hma_model.export.truth import table_values
 from hma_model.generation.decode import decode
 from hma_model.generation.rollout import Rollout
-from hma_model.play.session import psnr
 from hma_model.worlds.scenes import LabRobot
 from tests.command import hma
 from tests.model.export.checkpoints import ROBOT, Driver, drawn_as_torch

@@ -12,8 +12,8 @@ import pytest
 from hma_data.lab import family
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.table import start
+from hma_model.evaluation.metrics import psnr
 from hma_model.export.truth import body_values, table_values
-from hma_model.play.session import psnr
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

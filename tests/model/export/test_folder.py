@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hma_data.errors import OutputError
+from hma_model.evaluation.metrics import psnr
 from hma_model.export import folder
 from hma_model.export.starts import Start
-from hma_model.play.session import psnr
 from tests.conftest import contents
 
 

@@ -19,10 +19,10 @@ import pytest
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.table import BlockTable
+from hma_model.evaluation.metrics import psnr
 from hma_model.export.folder import write_replays
 from hma_model.export.page import VERSION, write_page
 from hma_model.export.starts import Start
-from hma_model.play.session import psnr
 from recipes.bench.page import run, served
 from tests.browser_fixtures import EMULATED_GPU, FLAGS
 from tests.model.export.checkpoints import ROBOT, Driver
