@@ -13,6 +13,7 @@ from hma_model.benchmark.run import NAME, RESULTS
 from hma_model.evaluation.intervals import interval, rounded
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
+from hma_model.evaluation.tables import value
 
 CARD, PAGE = "benchmark.md", "benchmark.html"
 COLUMNS = ("robot", "measure", "value (95 % interval)", "reference")
@@ -57,12 +58,12 @@ ABSENT = {  # why a figure is absent though its part was measured
     "calibration.false_alarms": "no warnings",
 }
 AGREEMENT = (  # path in the results of hma policy-eval, measure
-    (("correlation", "success", "pearson"), "policies: Pearson of success rates"),
-    (("correlation", "success", "spearman"), "policies: rank correlation"),
-    (("correlation", "success", "mmrv"), "policies: MMRV, 0 is best"),
-    (("judge", "precision"), "policies: precision per episode"),
-    (("judge", "recall"), "policies: recall per episode"),
-    (("judge", "auroc"), "policies: AUROC of scores"),
+    ("correlation.success.pearson", "policies: Pearson of success rates"),
+    ("correlation.success.spearman", "policies: rank correlation"),
+    ("correlation.success.mmrv", "policies: MMRV, 0 is best"),
+    ("judge.precision", "policies: precision per episode"),
+    ("judge.recall", "policies: recall per episode"),
+    ("judge.auroc", "policies: AUROC of scores"),
 )
 
 
@@ -71,17 +72,17 @@ def rows(found: dict[str, Any]) -> list[list[str]]:
     made = []
     for robot, one in found["measures"].items():
         for key, measure, reference, about in PLAIN:
-            value, ends = figure(one, key)
-            if value is None and "." in key:
+            number, ends = figure(one, key)
+            if number is None and "." in key:
                 part = one.get(key.split(".")[0], {})
                 made.append([robot, measure, _absent(part.get("missing") or ABSENT[key]), ""])
                 continue
             beside = figure(one, reference)[0] if reference else None
-            made.append([robot, measure, _shown(value, ends), _beside(beside, about)])
+            made.append([robot, measure, _shown(number, ends), _beside(beside, about)])
         policies = one["policies"]
         for path, measure in AGREEMENT:
-            value, ends, reason = agreement(policies, path)
-            made.append([robot, measure, _shown(value, ends) if value is not None else _absent(reason), ""])
+            number, ends, reason = agreement(policies, path)
+            made.append([robot, measure, _absent(reason) if number is None else _shown(number, ends), ""])
         if said := policies.get("refused"):
             made.append([robot, "policies: verdict", f"none: {said}", ""])
     return made
@@ -89,39 +90,32 @@ def rows(found: dict[str, Any]) -> list[list[str]]:
 
 def figure(one: dict[str, Any], key: str) -> tuple[Any, list[float] | None]:
     """Return a figure of a robot by its key, such as `inverse.return_px`, and its interval."""
-    *path, name = key.split(".")
-    for part in path:
-        one = one.get(part, {})
-    return one.get(name), one.get(f"{name}_95")
+    return value(one, key), value(one, f"{key}_95")
 
 
-def agreement(
-    policies: dict[str, Any], path: tuple[str, ...]
-) -> tuple[float | None, list[float] | None, str]:
+def agreement(policies: dict[str, Any], path: str) -> tuple[float | None, list[float] | None, str]:
     """Return a measure of hma policy-eval, its interval, and why it is absent."""
     if "missing" in policies:
         return None, None, policies["missing"]
-    found: Any = policies
-    for part in path:
-        found = found[part]
+    found = value(policies, path)
     ends = None if found["low"] is None else [found["low"], found["high"]]
     return found["value"], ends, found["reason"]
 
 
-def _beside(value: float | str | None, about: str) -> str:
-    if value is None:
+def _beside(reference: float | str | None, about: str) -> str:
+    if reference is None:
         return ""
-    return about.format(value) if isinstance(value, str) else f"{value:.2f} {about}"
+    return about.format(reference) if isinstance(reference, str) else f"{reference:.2f} {about}"
 
 
 def _absent(reason: str) -> str:
     return f"not measured: {reason}"
 
 
-def _shown(value: float | None, ends: list[float] | None) -> str:
-    if value is None:
+def _shown(number: float | None, ends: list[float] | None) -> str:
+    if number is None:
         return "not measured"
-    return f"{value:.2f}" if ends is None else f"{value:.2f} ({ends[0]:.2f} to {ends[1]:.2f})"
+    return f"{number:.2f}" if ends is None else f"{number:.2f} ({ends[0]:.2f} to {ends[1]:.2f})"
 
 
 def title(found: dict[str, Any]) -> str:

@@ -25,6 +25,7 @@ from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Bools
 from hma_model.benchmark.measures import (
+    Arrays,
     choice_figures,
     choose,
     frame_errors,
@@ -188,9 +189,8 @@ class _Robot:
         """Return the figures, those of each scene, and those of each frame of the action sequences."""
         frames = self.protocol.frames
         self.tell("action sequences")
-        arrays = self.kept.part(
-            f"choices-{self.robot}",
-            lambda: choose(self.world, self.scenes, self.probe, Scripted(NOISE), frames),
+        arrays = self._part(
+            "choices", lambda: choose(self.world, self.scenes, self.probe, Scripted(NOISE), frames)
         )
         found, by_scene = choice_figures(arrays, self.seed)
         by_frame = frame_errors(arrays)
@@ -203,26 +203,27 @@ class _Robot:
         if missing := no_inverse(self.scenes.dimensions):
             found["inverse"] = {"missing": missing}
         else:
-            turned = self.kept.part(
-                f"inverse-{self.robot}", lambda: turn_back(self.world, self.scenes, self.probe, frames)
-            )
+            turned = self._part("inverse", lambda: turn_back(self.world, self.scenes, self.probe, frames))
             found["inverse"] = {}
             for name, values in turned.items():
                 within = PSNR_RANGE if name.endswith("psnr") else NATURAL
                 found["inverse"] |= summary(name, values, self.seed, within=within)
                 by_scene[f"inverse.{name}"] = rounded(values)
         if len(self.probe.own):
-            goals = self.kept.part(f"planning-{self.robot}", self._planned)
+            goals = self._part("planning", self._planned)
             found["planning"] = planning_figures(goals)
             by_scene |= {f"planning.{way}": rounded(goals[way].astype(float)) for way in WAYS}
         else:
             found["planning"] = {"missing": "no part of the robot is read, so no goal can be reached"}
-        text = self.kept.part(f"policies-{self.robot}", lambda: {"json": np.array(self._policies())})["json"]
+        text = self._part("policies", lambda: {"json": np.array(self._policies())})["json"]
         found["policies"] = json.loads(str(text))
         self.tell("speed")
-        timed = self.kept.part(f"speed-{self.robot}", lambda: speed(self.world, self.scenes))
+        timed = self._part("speed", lambda: speed(self.world, self.scenes))
         found |= {name: rounded(value, 2) for name, value in timed.items()}
         return found, by_scene, {name: rounded(values) for name, values in by_frame.items()}
+
+    def _part(self, name: str, make: Callable[[], Arrays]) -> Arrays:
+        return self.kept.part(f"{name}-{self.robot}", make)
 
     def _planned(self) -> dict[str, Bools]:
         """Return which goals are reached in each of WAYS."""

@@ -244,8 +244,11 @@ def _by_bin(stated: Floats, values: Floats, seed: int = 0) -> tuple[Floats, Floa
     ranks[np.argsort(stated, axis=None, kind="stable")] = np.arange(stated.size)
     own = (ranks * BINS // stated.size).reshape(len(stated), -1)
     inside = own[..., None] == np.arange(BINS)
-    sums = (inside * values.reshape(len(values), -1, 1)).sum(axis=1)
-    counts = inside.sum(axis=1)
+    return _means_of((inside * values.reshape(len(values), -1, 1)).sum(axis=1), inside.sum(axis=1), seed)
+
+
+def _means_of(sums: Floats, counts: Ints, seed: int) -> tuple[Floats, Floats]:
+    """Return the means (…) of values with sums and counts (N, …) by scene, and those of resamples (R, …)."""
     drawn = resampled_means(sums, seed) / np.maximum(resampled_means(counts, seed), 1e-12)
     return sums.sum(axis=0) / counts.sum(axis=0), drawn
 
@@ -291,11 +294,9 @@ def _half_gain(unsure: Floats, values: Floats, seed: int) -> dict[str, Any]:
     kept = np.zeros(unsure.size, bool)
     kept[np.argsort(unsure, axis=None, kind="stable")[: max(1, round(0.5 * unsure.size))]] = True
     among = kept.reshape(unsure.shape)
-    sums, counts = (among * values).sum(axis=1), among.sum(axis=1)
-    gain = values.mean() - sums.sum() / counts.sum()
-    halves = resampled_means(sums, seed) / np.maximum(resampled_means(counts, seed), 1e-12)
+    half, halves = _means_of((among * values).sum(axis=1), among.sum(axis=1), seed)
     ends = np.percentile(resampled_means(values.mean(axis=1), seed) - halves, LEVELS)
-    return {"half_gain_px": rounded(gain), "half_gain_px_95": rounded(ends)}
+    return {"half_gain_px": rounded(values.mean() - half), "half_gain_px_95": rounded(ends)}
 
 
 def _warnings(warned: Ints, clock: Ints, doubled: Ints, frames: int, seed: int) -> dict[str, Any]:

@@ -11,7 +11,7 @@ before it, once with the true actions and in several draws with Gaussian ones.
 B batch, T frames, P predicted frames, N windows.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -32,7 +32,6 @@ from hma_model.evaluation.actions import gaussian, shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, SHARE, rounded, summary
 from hma_model.evaluation.losses import (
     episodes_of,
-    masked_val_loss,
     no_window,
     unconditional_baseline,
     validation_losses,
@@ -48,7 +47,7 @@ from hma_model.evaluation.metrics import (
 )
 from hma_model.evaluation.perceptual import FeatureCollector, Networks
 from hma_model.evaluation.rollouts import RolloutImages, rollout
-from hma_model.evaluation.scores import ROLLOUT_KINDS, Rolled, Scores
+from hma_model.evaluation.scores import ROLLOUT_KINDS, Rolled, Scores, combined, figures_of, scores_of
 from hma_model.generation.decode import cameras_for, default_prompt
 from hma_model.network.model import HMA
 
@@ -153,7 +152,7 @@ def measure(
 
     `found` has `loss` (nats a token); for discrete models also `shuffled_loss` (given another window's
     actions), `baseline_loss`, `perplexity`, `accuracy`, and both of `masked_scores`. For the rollouts `true`,
-    `shuffled`, `none` and `copy` it has what `Scores.figures` gives. `psnr_action_gain_last` is `psnr_last`
+    `shuffled`, `none` and `copy` it has what `figures_of` gives. `psnr_action_gain_last` is `psnr_last`
     of true minus that of shuffled. `unmoved_windows` counts those whose true images never change. `notes`
     says what else must be known, and `missing` why a metric is absent.
 
@@ -192,12 +191,16 @@ def measure(
     rolled = Rolled(first, FeatureCollector(networks or Networks()))
     for number, batch in enumerate(batches):
         rolled.add(batch, partial(roll, prompt=first, seed=seed + number), draws, seed)
-    joined = {name: Scores.join(parts) for name, parts in rolled.scores.items()}
-    by_window |= {key: value for name, part in joined.items() for key, value in part.by_window(name).items()}
+    joined = {kind: combined(parts) for kind, parts in rolled.scores.items()}
+    for kind, scores in joined.items():
+        by_window |= {f"{kind}.{name}": values.mean(axis=1) for name, values in scores.items()}
+        by_window[f"{kind}.psnr_last"] = scores["psnr"][:, -1]
     gain = by_window["true.psnr_last"] - by_window["shuffled.psnr_last"]
     by_window["psnr_action_gain_last"] = gain
     frechet, missing = rolled.judge.figures(plan.frames - first)
-    figures = {name: joined[name].figures(seed, episodes) | frechet.get(name, {}) for name in ROLLOUT_KINDS}
+    figures = {
+        kind: figures_of(joined[kind], seed, episodes) | frechet.get(kind, {}) for kind in ROLLOUT_KINDS
+    }
     extra: dict[str, Any] = {}
     if settings.paper:
         extra["paper"] = _paper(roll, batches, episodes, shards, by_window, draws, seed)
@@ -241,16 +244,17 @@ def _losses(
     if model.config.kind == "continuous":
         loss = np.array(validation_losses(model, batches)[0].samples)
         return summary("loss", loss, digits=6, episodes=episodes, within=NATURAL), {"loss": loss}
-    forced = [teacher_forced(model, batch.to(model.device)) for batch in batches]
-    nats, hits = (torch.cat(part).double().cpu().numpy() for part in zip(*forced, strict=True))
+    nats, hits = _joined(teacher_forced(model, batch.to(model.device)) for batch in batches)
+    masked = []
+    for number, batch in enumerate(batches):
+        drawn = torch.Generator().manual_seed(seed * 1_000_003 + number)
+        masked.append(masked_scores(model, batch.to(model.device), drawn))
+    masked_nats, masked_hits = _joined(masked)
     other = (shuffled(batch, seed=seed, draw=draw) for draw in range(draws) for batch in batches)
-    drawn = [torch.Generator().manual_seed(seed * 1_000_003 + number) for number in range(len(batches))]
-    masked = [masked_scores(model, batch.to(model.device), g) for batch, g in zip(batches, drawn)]
-    masked_nats, masked_hits = (torch.cat(part).double().cpu().numpy() for part in zip(*masked, strict=True))
     by_window = {"loss": nats.mean(axis=1), "accuracy": hits.mean(axis=1)}
     by_window |= {"masked_loss": masked_nats, "masked_accuracy": masked_hits}
     table: dict[str, Any] = summary("loss", by_window["loss"], seed, 6, episodes, NATURAL) | {
-        "shuffled_loss": masked_val_loss(model, other),
+        "shuffled_loss": validation_losses(model, other)[0].mean(),
         "baseline_loss": unconditional_baseline([shards], batches, model.config, cameras).mean(),
     }
     if table["loss"] is not None:  # a model that takes squares of tokens as one has a loss of squares
@@ -262,6 +266,12 @@ def _losses(
     table |= summary("masked_accuracy", masked_hits[finite], seed, 6, episodes[finite], SHARE)
     table |= {"loss_by_frame": rounded(nats.mean(axis=0)), "accuracy_by_frame": rounded(hits.mean(axis=0))}
     return table, by_window
+
+
+def _joined(pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> tuple[Floats, Floats]:
+    """Return the nats and hits of batches as those of all windows."""
+    nats, hits = (torch.cat(part).double().numpy(force=True) for part in zip(*pairs, strict=True))
+    return nats, hits
 
 
 def _paper(
@@ -278,13 +288,14 @@ def _paper(
     for number, batch in enumerate(batches):
         last = partial(roll, prompt=batch.actions.shape[1] - 1, seed=seed + number)
         true = last(batch)
-        scores["true"].append(Scores.of(true))
+        scores["true"].append(scores_of(true))
         drawn = (
             gaussian(batch, shards.manifest.stats["action"], (seed * 1_009 + number) * 101 + draw)
             for draw in range(draws)
         )
-        scores["gaussian"].append(Scores.mean([Scores.of(last(other, truth=true.truth)) for other in drawn]))
-    true_db, gaussian_db = (Scores.join(scores[name]).psnr[:, 0] for name in ("true", "gaussian"))
+        others = [scores_of(last(other, truth=true.truth)) for other in drawn]
+        scores["gaussian"].append(combined(others, partial(np.mean, axis=0)))
+    true_db, gaussian_db = (combined(parts)["psnr"][:, 0] for parts in scores.values())
     by_window["paper.delta_psnr"] = true_db - gaussian_db
     mean = partial(summary, seed=seed, episodes=episodes)
     found = mean("psnr_last", true_db, within=PSNR_RANGE)
@@ -315,7 +326,7 @@ def _notes(
         )
     if not config.sees_actions:
         notes.append("it was trained without action inputs, so all rollouts ignore actions")
-    finite = np.isfinite(np.concatenate([part.psnr.ravel() for part in joined.values()]))
+    finite = np.isfinite(np.concatenate([part["psnr"].ravel() for part in joined.values()]))
     if wrong := int((~finite).sum()):
         notes.append(
             f"{wrong} of {finite.size} predicted frames are NaN or infinite: the checkpoint has diverged"

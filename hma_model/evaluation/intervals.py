@@ -128,12 +128,12 @@ def over_datasets(
     Each dataset counts once; its windows, or episodes, are resampled within it. Values that are not finite
     are left out. There is no interval where a dataset has but one.
     """
-    kept = [np.isfinite(values) for values in sets]
-    own = [
-        None if one is None else np.asarray(one)[k] for one, k in zip(episodes or [None] * len(sets), kept)
-    ]
-    sets = [values[k] for values, k in zip(sets, kept)]
-    means = [resampled_means(v, n, e) for n, (v, e) in enumerate(zip(sets, own))]
-    low, high = np.percentile(np.mean(means, axis=0), LEVELS).clip(*within)
+    means, resampled = [], []
+    for number, values in enumerate(sets):
+        kept = np.isfinite(values)
+        own = None if episodes is None else np.asarray(episodes[number])[kept]
+        means.append(values[kept].mean())
+        resampled.append(resampled_means(values[kept], number, own))
+    low, high = np.percentile(np.mean(resampled, axis=0), LEVELS).clip(*within)
     ends = [float(low), float(high)] if np.isfinite(low) else None
-    return float(np.mean([values.mean() for values in sets])), ends
+    return float(np.mean(means)), ends

@@ -118,11 +118,6 @@ def validation_losses(
     return losses, accuracy
 
 
-def masked_val_loss(model: HMA, batches: Iterable[Batch]) -> float:
-    """Return the mean loss over windows: nats a token of each fully masked frame given the true past."""
-    return validation_losses(model, batches)[0].mean()
-
-
 def digit_frequencies(
     shards: ShardSet,
     factored: Sequence[int],
@@ -165,7 +160,7 @@ def unconditional_baseline(
         cameras: as `WindowDataset` takes them.
 
     Returns:
-        Nats a token by embodiment, over the frames from the second on, as in `masked_val_loss`.
+        Nats a token by embodiment, over the frames from the second on, as in `validation_losses`.
     """
     scores = {
         shards.embodiment.id: [np.log(p) for p in digit_frequencies(shards, config.factored, cameras)]

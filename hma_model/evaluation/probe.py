@@ -146,7 +146,7 @@ class Probe:
 
     def read(self, pictures: Images) -> Floats:
         """Return the places (…, P, 2) of the parts in pictures (…, S, S, 3)."""
-        flat = resized(pictures.reshape(-1, *pictures.shape[-3:]))
+        flat = resized(pictures)
         places = (outputs(self.network, flat).reshape(len(flat), -1, 2) + 1) * (truth.SIZE / 2)
         if self.tee is not None:
             for row, mask in enumerate(self._colored(flat)[..., -1]):
@@ -156,7 +156,7 @@ class Probe:
 
     def areas(self, pictures: Images) -> Floats:
         """Return (…, P), how many pixels of (…, S, S, 3) have a part's colour and not the background's."""
-        flat = resized(pictures.reshape(-1, *pictures.shape[-3:]))
+        flat = resized(pictures)
         stands = np.linalg.norm(flat - self.background, axis=-1) > COLOUR_DISTANCE
         counts: Floats = (stands[..., None] & self._colored(flat)).sum(axis=(1, 2), dtype=np.float64)
         return counts.reshape(*pictures.shape[:-3], len(self.colors))

@@ -32,6 +32,7 @@ from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded
 from hma_model.evaluation.kept import kept_reader
 from hma_model.evaluation.losses import episodes_of
 from hma_model.evaluation.probe import shown_episodes
+from hma_model.evaluation.rollouts import finite_frames
 from hma_model.evaluation.state_reader import UNREADABLE_SHARE, StateNetwork, outputs, resized, trained
 from hma_model.generation.decode import decode
 
@@ -69,7 +70,7 @@ class Reader:
 
     def errors(self, pictures: Images, states: Floats) -> Floats:
         """Return (…, S), how far from states (…, S) it reads pictures (…, H, W, 3), in std."""
-        found = outputs(self.network, resized(pictures.reshape(-1, *pictures.shape[-3:])))
+        found = outputs(self.network, resized(pictures))
         true = (states - self.mean) / np.maximum(self.std, LEAST_STD)
         return np.abs(found.reshape(states.shape) - true)
 
@@ -138,16 +139,18 @@ def measure_recorded_state(
         reader's own error, `spread_sd` what knows nothing would have. `values` has them by value, in its own
         unit. Also the error (N,) of each window at the last step, NaN where a state is unknown.
     """
-    count, nothing = sum(map(len, batches)), {"windows": 0}
-    unknown = np.full(count, np.nan)
+
+    def missing(reason: str) -> tuple[dict[str, Any], Floats]:
+        return {"windows": 0, "missing": reason}, np.full(sum(map(len, batches)), np.nan)
+
     if (episodes := shards.manifest.splits["train"]["episodes"]) < EPISODES_NEEDED:
         few = f"{episodes} training episodes are too few to read their states, {EPISODES_NEEDED} are needed"
-        return nothing | {"missing": few}, unknown
+        return missing(few)
     states = _States(shards)
     hashable: Any = tokenizer
     reader = _kept_reader(hashable, shards, cameras if isinstance(cameras, str) else tuple(cameras), seed)
     if reader is None:
-        return nothing | {"missing": "the states of the training split are unknown in part"}, unknown
+        return missing("the states of the training split are unknown in part")
     errors: dict[str, list[Floats]] = {}
     for number, batch in enumerate(batches):
         truth = decode(tokenizer, batch.stored)
@@ -155,24 +158,23 @@ def measure_recorded_state(
         films = {"copy": truth[:, prompt - 1 : prompt].repeat(true.shape[1], axis=1)}
         films["reconstruction"] = truth[:, prompt:]
         for kind, made in predicted.items():
-            films[kind] = decode(tokenizer, made[number].nan_to_num(0, 0, 0))
+            films[kind] = decode(tokenizer, made[number])
         for kind, film in films.items():
             found_errors = reader.errors(film, true)
             if kind in predicted:
-                found_errors[~predicted[kind][number].isfinite().flatten(2).all(dim=2).numpy()] = np.nan
+                found_errors[~finite_frames(predicted[kind][number])] = np.nan
             errors.setdefault(kind, []).append(found_errors)
     joined = {kind: np.concatenate(parts) for kind, parts in errors.items()}
     kept = np.isfinite(joined["copy"]).all(axis=(1, 2))
     whose = episodes_of(batches)
     if not kept.any():
-        return nothing | {"missing": "the states of all windows are unknown in part"}, unknown
+        return missing("the states of all windows are unknown in part")
     here = joined["reconstruction"][kept].mean(axis=(0, 1))  # the windows may be unlike what it learned from
     own = np.array([n for n in reader.readable if here[n] <= UNREADABLE_SHARE * reader.spread[n]], np.int64)
     if not len(own):
-        cannot = (
+        return missing(
             "no recorded state can be estimated from the recorded images; more training episodes may help"
         )
-        return nothing | {"missing": cannot}, unknown
     joined = {kind: part[..., own] for kind, part in joined.items()}
     found: dict[str, Any] = {
         "windows": int(kept.sum()),

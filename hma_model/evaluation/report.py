@@ -8,7 +8,6 @@ T frames, S pixels a side.
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,29 +46,6 @@ GAP_COLOUR = (128, 128, 128)
 GAP_PX, MARK_PX = 3, 4  # between frames, and of the line below them
 STRIP_FRAMES = 12  # at most
 BRIGHTEST = 96.0  # mean difference of a pixel's channels that is shown brightest
-
-
-@dataclass(frozen=True)
-class Showcase:
-    """Some windows of a shard set, as several checkpoints predict them.
-
-    Attributes:
-        names: of the windows: best, median, worst.
-        numbers: of the windows, among those that were evaluated.
-        titles: where each window is from.
-        truth: (W, T, S, S, 3), decoded from the true tokens.
-        recorded: the same as recorded; None where the recording is not at hand.
-        made: (W, T, S, S, 3) by checkpoint and kind of rollout; the prompt is true.
-        unread: why the recording is not shown; empty if it is.
-    """
-
-    names: tuple[str, ...]
-    numbers: tuple[int, ...]
-    titles: tuple[str, ...]
-    truth: Images
-    recorded: Images | None
-    made: dict[tuple[str, str], Images]
-    unread: str
 
 
 def write_results(parts: Sequence[Part], out: StrPath, command: str) -> Path:
@@ -176,9 +152,8 @@ def _curves(parts: Sequence[Part], name: str) -> dict[str, tuple[Any, Any]]:
 
 
 def _state(made: Page, part: Part, seconds: float) -> None:
-    measured = part.found.get("state")
-    tables = state(measured)
-    if not tables:
+    measured = part.found.get("state", {})
+    if not (tables := state(measured)):
         return
     key, unit = state_unit(measured)
     truth = "the recorded one" if "values" in measured else "the simulator's"
@@ -198,29 +173,41 @@ def _state(made: Page, part: Part, seconds: float) -> None:
 
 def _strips(made: Page, parts: Sequence[Part]) -> None:
     """Add the best, the median and the worst window of the first checkpoint, as all predict them."""
-    case = choose(parts)
-    for i, name in enumerate(case.names):
-        said = [part.by_window["true.psnr_last"][case.numbers[i]] for part in parts]
-        figures = ", ".join(f"{db:.1f} dB" for db in said)
+    found, shards = parts[0].found, ShardSet(parts[0].data)
+    names, count, prompt = found["cameras"].split(", "), found["windows"], found["prompt"]
+    cameras = names if len(names) > 1 else names[0]
+    (batch,) = windows(shards, found["split"], found["frames"], count, count, cameras)
+    tokenizer, dtype = tokenizer_of(shards), batch.stored.numpy().dtype
+    assert batch.episode is not None and batch.frame is not None
+    last = np.nan_to_num(parts[0].by_window["true.psnr_last"], nan=-1.0)
+    order = np.argsort(last, kind="stable")[::-1].tolist()
+    columns = evenly(found["frames"], STRIP_FRAMES)
+    unread = "the model sees several cameras" if len(names) > 1 else ""
+    for number, name in {order[0]: "best", order[count // 2]: "median", order[-1]: "worst"}.items():
+        films = {}
+        if len(names) == 1:
+            try:
+                films["recorded"] = recorded_frames(shards, batch, number)
+            except (HMAError, OSError, ImportError) as fault:
+                unread = " ".join(str(fault).split())
+        films["from its tokens"] = truth = decode(tokenizer, batch.stored[[number]])[0]
+        for part in parts:
+            mark = f", {part.checkpoint}" if len(parts) > 1 else ""
+            predicted = (part.predicted[kind][[number]] for kind in ("true", "shuffled"))
+            own, other = (
+                np.concatenate([truth[:prompt], decode(tokenizer, torch.from_numpy(one.astype(dtype)))[0]])
+                for one in predicted
+            )
+            films[f"prediction{mark}"] = own
+            films[f"difference{mark}"] = difference(truth, own)
+            films[f"other actions{mark}"] = other
+        figures = ", ".join(f"{part.by_window['true.psnr_last'][number]:.1f} dB" for part in parts)
         whose = f" of {parts[0].checkpoint}" if len(parts) > 1 else ""
-        title = f"The {name} window{whose}"
-        made.strips(title, f"{figures} on the last frame; {case.titles[i]}", _rows(case, i, parts))
-    if case.unread:
-        made.text(f"The recorded images are not shown: {case.unread}. Strips begin with the decoded tokens.")
-
-
-def _rows(case: Showcase, i: int, parts: Sequence[Part]) -> list[tuple[str, bytes]]:
-    truth, prompt = case.truth[i], parts[0].found["prompt"]
-    columns = evenly(len(truth), STRIP_FRAMES)
-    films = {} if case.recorded is None else {"recorded": case.recorded[i]}
-    films["from its tokens"] = truth
-    for part in parts:
-        mark = f", {part.checkpoint}" if len(parts) > 1 else ""
-        made = case.made[part.checkpoint, "true"][i]
-        films[f"prediction{mark}"] = made
-        films[f"difference{mark}"] = difference(truth, made)
-        films[f"other actions{mark}"] = case.made[part.checkpoint, "shuffled"][i]
-    return [(name, strip(film[columns], columns, prompt)) for name, film in films.items()]
+        where = f"episode {int(batch.episode[number])}, frame {int(batch.frame[number])}"
+        rows = [(label, strip(film[columns], columns, prompt)) for label, film in films.items()]
+        made.strips(f"The {name} window{whose}", f"{figures} on the last frame; {where}", rows)
+    if unread:
+        made.text(f"The recorded images are not shown: {unread}. Strips begin with the decoded tokens.")
 
 
 def difference(one: Images, other: Images) -> Images:
@@ -245,43 +232,6 @@ def strip(film: Images, columns: Ints, prompt: int) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(np.concatenate(parts[:-1], axis=1)).save(buffer, "WEBP", quality=88, method=4)
     return buffer.getvalue()
-
-
-# -- the windows that are shown
-
-
-def choose(parts: Sequence[Part]) -> Showcase:
-    """Return the best, the median and the worst window of the first part, as all parts predict them.
-
-    Args:
-        parts: of one shard set.
-    """
-    found, shards = parts[0].found, ShardSet(parts[0].data)
-    names = found["cameras"].split(", ")
-    cameras = names if len(names) > 1 else names[0]
-    batches = windows(shards, found["split"], found["frames"], found["windows"], found["windows"], cameras)
-    (batch,), tokenizer = batches, tokenizer_of(shards)
-    order = np.argsort(np.nan_to_num(parts[0].by_window["true.psnr_last"], nan=-1.0), kind="stable")[::-1]
-    places = {int(order[at]): name for at, name in ((0, "best"), (len(order) // 2, "median"), (-1, "worst"))}
-    numbers = list(places)
-    assert batch.episode is not None and batch.frame is not None
-    stored = batch.stored
-    truth = decode(tokenizer, stored[numbers])
-    made: dict[tuple[str, str], Images] = {}
-    for part in parts:
-        for kind, predicted in part.predicted.items():
-            values = torch.from_numpy(predicted[numbers].astype(stored.numpy().dtype)).nan_to_num(0, 0, 0)
-            frames = decode(tokenizer, values)
-            made[part.checkpoint, kind] = np.concatenate([truth[:, : found["prompt"]], frames], axis=1)
-    titles = tuple(f"episode {int(batch.episode[n])}, frame {int(batch.frame[n])}" for n in numbers)
-    recorded, unread = None, ""
-    try:
-        recorded = np.stack([recorded_frames(shards, batch, number) for number in numbers])
-    except (HMAError, OSError, ImportError) as fault:
-        unread = " ".join(str(fault).split())
-    if recorded is not None and recorded.shape != truth.shape:
-        recorded, unread = None, "the model sees several cameras"
-    return Showcase(tuple(places.values()), tuple(numbers), titles, truth, recorded, made, unread)
 
 
 def recorded_frames(shards: ShardSet, batch: Batch, row: int) -> Images:

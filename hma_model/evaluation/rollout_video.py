@@ -178,10 +178,9 @@ def _column(name: str, film: Images, actions: Float32s, shards: ShardSet, given:
     scale = _scale(film.shape[2])
     edge_px = (BORDER_PX, BORDER_PX)
     large = np.pad(film.repeat(scale, 1).repeat(scale, 2), ((0, 0), edge_px, edge_px, (0, 0)))
-    for t in range(len(large)):
-        edge = np.array(GIVEN_COLOUR if t < given else PREDICTED_COLOUR, np.uint8)
-        large[t, :4] = large[t, -4:] = edge
-        large[t, :, :4] = large[t, :, -4:] = edge
+    for frames, colour in ((large[:given], GIVEN_COLOUR), (large[given:], PREDICTED_COLOUR)):
+        frames[:, :BORDER_PX] = frames[:, -BORDER_PX:] = colour
+        frames[:, :, :BORDER_PX] = frames[:, :, -BORDER_PX:] = colour
     stats = shards.manifest.stats["action"]
     low, high = np.array(stats["min"]), np.array(stats["max"])
     barred = with_actions(large, actions[:, : len(low)], low, high, shards.embodiment.action.names())
@@ -216,8 +215,7 @@ def _with_time(film: Images, prompt: int) -> Images:
     out = np.pad(film, ((0, 0), (0, 8), (0, 0), (0, 0)), constant_values=250)
     edges = np.linspace(6, width - 6, count + 1).astype(int)
     for t in range(count):
-        for past in range(t + 1):
-            out[t, -6:-2, edges[past] : edges[past + 1]] = GIVEN_COLOUR if past < prompt else PREDICTED_COLOUR
+        out[t:, -6:-2, edges[t] : edges[t + 1]] = GIVEN_COLOUR if t < prompt else PREDICTED_COLOUR
     return out
 
 

@@ -91,9 +91,12 @@ def rollout(
         ).cpu()  # fmt: skip
     if truth is None:
         truth = decode(tokenizer, batch.stored[:, : first + count])
-    finite = np.ones(predicted.shape[:2], np.bool_)
-    if predicted.is_floating_point():
-        finite = predicted.isfinite().flatten(2).all(dim=2).cpu().numpy()
-    made = decode(tokenizer, predicted.nan_to_num(0, 0, 0))
+    finite = finite_frames(predicted)
+    made = decode(tokenizer, predicted)
     made[~finite] = 0  # black, so that a page shows that there is no prediction
     return RolloutImages(first, np.concatenate([truth[:, :first], made], axis=1), truth, predicted, finite)
+
+
+def finite_frames(stored: Tensor) -> Bools:
+    """Return which frames (B, T) of predicted tokens or latents are free of NaN and infinity."""
+    return stored.isfinite().flatten(2).all(dim=2).numpy(force=True)

@@ -3,7 +3,7 @@
 B batch, P predicted frames, N windows.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -16,67 +16,36 @@ from hma_model.arrays import Floats
 from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, Episodes, horizon_summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, SSIM_RANGE, psnr, ssim
-from hma_model.evaluation.perceptual import FeatureCollector
+from hma_model.evaluation.perceptual import FeatureCollector, Networks
 from hma_model.evaluation.rollouts import RolloutImages
 
 ROLLOUT_KINDS = ("true", "shuffled", "none", "copy")
+RANGES = {"psnr": PSNR_RANGE, "ssim": SSIM_RANGE, "lpips": NATURAL}
+
+Scores = dict[str, Floats]  # by the names of RANGES, (B, P); NaN where a frame is not finite
 
 
-@dataclass(frozen=True)
-class Scores:
-    """PSNR (B, P) in dB, SSIM (B, P) and LPIPS (B, P) of predicted frames; NaN where one is not finite."""
+def scores_of(pictures: RolloutImages, networks: Networks | None = None) -> Scores:
+    """Return the scores of rollouts; LPIPS if there is a network for it."""
+    truth = pictures.truth[:, pictures.prompt :]
+    predicted = pictures.predicted[:, pictures.prompt :]
+    found = {"psnr": psnr(truth, predicted, limit=PSNR_LIMIT), "ssim": ssim(truth, predicted)}
+    if networks and networks.lpips:
+        found["lpips"] = networks.lpips_of(truth, predicted)
+    return {name: np.where(pictures.finite, values, np.nan) for name, values in found.items()}
 
-    psnr: Floats
-    ssim: Floats
-    lpips: Floats | None
 
-    @classmethod
-    def of(cls, pictures: RolloutImages, judge: FeatureCollector | None = None) -> "Scores":
-        """Return the scores of rollouts; LPIPS where the judge has a network for it."""
-        truth = pictures.truth[:, pictures.prompt :]
-        predicted = pictures.predicted[:, pictures.prompt :]
+def combined(parts: Sequence[Scores], rule: Callable[..., Any] = np.concatenate) -> Scores:
+    """Return the scores of several batches as those of one; with another rule, such as a mean of draws."""
+    return {name: rule([part[name] for part in parts]) for name in parts[0]}
 
-        def known(values: Floats) -> Floats:
-            return np.where(pictures.finite, values, np.nan)
 
-        lpips = None
-        if judge and judge.networks.lpips:
-            lpips = known(judge.networks.lpips_of(truth, predicted))
-        signal = psnr(truth, predicted, limit=PSNR_LIMIT)
-        return cls(known(signal), known(ssim(truth, predicted)), lpips)
-
-    @classmethod
-    def mean(cls, draws: "list[Scores]") -> "Scores":
-        """Return the means over draws."""
-        return cls._combined(draws, partial(np.mean, axis=0))
-
-    @classmethod
-    def join(cls, batches: "list[Scores]") -> "Scores":
-        return cls._combined(batches, np.concatenate)
-
-    @classmethod
-    def _combined(cls, parts: "list[Scores]", rule: Callable[..., Any]) -> "Scores":
-        lpips = None if parts[0].lpips is None else rule([part.lpips for part in parts])
-        return cls(rule([part.psnr for part in parts]), rule([part.ssim for part in parts]), lpips)
-
-    def figures(self, seed: int, episodes: Episodes = None) -> dict[str, Any]:
-        """Return the means over windows, with their intervals; `episodes` are the windows' own."""
-        found = horizon_summary("psnr", self.psnr, seed, 6, episodes, PSNR_RANGE)
-        found |= horizon_summary("ssim", self.ssim, seed, 6, episodes, SSIM_RANGE)
-        if self.lpips is not None:
-            found |= horizon_summary("lpips", self.lpips, seed, episodes=episodes, within=NATURAL)
-        return found
-
-    def by_window(self, rollout: str) -> dict[str, Floats]:
-        """Return values (N,) of the windows, by the rollout's and the figure's name."""
-        found = {
-            f"{rollout}.psnr": self.psnr.mean(axis=1),
-            f"{rollout}.psnr_last": self.psnr[:, -1],
-            f"{rollout}.ssim": self.ssim.mean(axis=1),
-        }
-        if self.lpips is not None:
-            found[f"{rollout}.lpips"] = self.lpips.mean(axis=1)
-        return found
+def figures_of(scores: Scores, seed: int, episodes: Episodes) -> dict[str, Any]:
+    """Return the means over windows, with their intervals; `episodes` are the windows' own."""
+    found: dict[str, Any] = {}
+    for name, values in scores.items():
+        found |= horizon_summary(name, values, seed, 6, episodes, RANGES[name])
+    return found
 
 
 @dataclass
@@ -119,6 +88,7 @@ class Rolled:
 
     def _keep(self, kind: str, draws: list[RolloutImages]) -> None:
         self.judge.add(kind, draws[0].predicted[:, self.first :])
-        self.scores[kind].append(Scores.mean([Scores.of(pictures, self.judge) for pictures in draws]))
+        scores = [scores_of(pictures, self.judge.networks) for pictures in draws]
+        self.scores[kind].append(combined(scores, partial(np.mean, axis=0)))
         if kind in self.predicted:
             self.predicted[kind].append(draws[0].stored)

@@ -103,9 +103,8 @@ def _batch(model: HMA, tokenizer: Tokenizer, robot: str, made: list[truth.TrueEp
     stored = np.stack([tokenizer.encode(as_seen(robot, tokenizer, one.pictures)) for one in made])
     actions = torch.from_numpy(np.stack([one.chunks for one in made]))
     known = torch.ones(actions.shape[:2], dtype=torch.bool)
-    if model.config.kind == "discrete":
-        return Batch([robot] * len(made), actions, known, tokens=torch.from_numpy(stored.astype(np.int64)))
-    return Batch([robot] * len(made), actions, known, latents=torch.from_numpy(stored.astype(np.float32)))
+    kind, dtype = ("tokens", np.int64) if model.config.kind == "discrete" else ("latents", np.float32)
+    return Batch([robot] * len(made), actions, known, **{kind: torch.from_numpy(stored.astype(dtype))})
 
 
 def _controllability(probe: Probe, ways: dict[str, Images], parts: Floats, seed: int) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hma_data.episodes.images import opencv
+from hma_data.episodes.images import resize
 from hma_model.arrays import Floats, Images
 
 INPUT_SIDE, MAP_SIDE = 64, 32  # pixels of the images that a network sees, and cells of its maps
@@ -123,11 +123,8 @@ def outputs(network: nn.Module, small: Images) -> Floats:
 
 
 def resized(pictures: Images) -> Images:
-    """Return pictures (N, 64, 64, 3) of pictures (N, H, W, 3)."""
-    cv2 = opencv()
-    return np.stack(
-        [cv2.resize(one, (INPUT_SIDE, INPUT_SIDE), interpolation=cv2.INTER_AREA) for one in pictures]
-    )
+    """Return pictures (N, 64, 64, 3) of pictures (…, H, W, 3)."""
+    return resize(pictures.reshape(-1, *pictures.shape[-3:]), INPUT_SIDE, "stretch")
 
 
 def pixels(small: Images) -> Tensor:

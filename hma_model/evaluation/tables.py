@@ -112,7 +112,9 @@ def renamed(parts: Sequence[Part]) -> tuple[list[Part], list[tuple[str, str]]]:
 
 
 def value(found: Mapping[str, Any], path: str) -> Any:
-    """Return a figure by its path, such as `true.psnr`; None where it is absent."""
+    """Return a figure by its path, such as `true.psnr`; None where it is absent. Means have paths as keys."""
+    if path in found:
+        return found[path]
     item: Any = found
     for key in path.split("."):
         item = item.get(key) if isinstance(item, Mapping) else None
@@ -147,7 +149,7 @@ def means(parts: Sequence[Part]) -> list[dict[str, Any]]:
             if not figure.by_window:
                 row[figure.path] = round(sum(of_sets) / len(of_sets), 4)
                 continue
-            episodes = [part.by_window.get("episode") for part in own]
+            episodes = [part.by_window["episode"] for part in own]
             values = [part.by_window[figure.by_window] for part in own]
             mean, ends = over_datasets(values, episodes=episodes, within=figure.within)
             scaled = math.exp if figure.exponential else float
@@ -169,15 +171,9 @@ def comparison(parts: Sequence[Part], intervals: bool = True) -> Table:
     for average in means(parts):
         label = average["checkpoint"]
         own = [part.found for part in parts if part.checkpoint == label]
-        for found in own:
+        for found in [*own, average] if len(own) > 1 else own:
             cells = [_cell(*_estimate(found, figure, intervals), figure.digits) for figure in figures]
             rows.append([label, found["embodiment"], found["windows"], found["episodes"], *cells])
-        if len(own) > 1:
-            cells = []
-            for figure in figures:  # the keys of a mean are whole paths
-                ends = average.get(f"{figure.path}_95") if intervals else None
-                cells.append(_cell(average.get(figure.path), ends, figure.digits))
-            rows.append([label, MEAN, average["windows"], average["episodes"], *cells])
     return Table(["checkpoint", "robot", "windows", "episodes", *(figure.name for figure in figures)], rows)
 
 

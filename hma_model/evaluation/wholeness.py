@@ -7,21 +7,21 @@ B rollouts, T frames, S pixels a side, P parts, C colours.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from hma_data.episodes.images import opencv, prepare
+from hma_data.episodes.images import opencv
 from hma_data.lab import truth
-from hma_data.lab.simulator import embodiment
 from hma_data.lab.truth import TrueEpisode
+from hma_data.tokenizers.base import Tokenizer
 from hma_model.arrays import Bools, Float32s, Floats, Images
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-    from hma_model.network.model import HMA
-
+from hma_model.evaluation.probe import as_seen
+from hma_model.generation.decode import decode
+from hma_model.generation.rollout import Rollout
+from hma_model.network.model import HMA
 
 NEAR = 60.0  # distance of RGB within which a pixel has an object's colour
 FEWEST = 12  # pixels of an object below which it is hidden, and not judged
@@ -48,8 +48,8 @@ class Found:
 
 
 def continued(
-    model: "HMA",
-    tokenizer: "Tokenizer",
+    model: HMA,
+    tokenizer: Tokenizer,
     robot: str,
     episodes: Sequence[TrueEpisode],
     prompt: int,
@@ -64,8 +64,7 @@ def continued(
         decoded: take the truth as the tokens show it, so that what they lose does not count.
         options: of the `Rollout`.
     """
-    size, (camera, *_) = tokenizer.spec.image_size, embodiment(robot).cameras
-    seen = np.stack([prepare(one.pictures, camera, size, tokenizer.spec.resize_filter) for one in episodes])
+    seen = np.stack([as_seen(robot, tokenizer, one.pictures) for one in episodes])
     tokens = np.stack([tokenizer.encode(images if decoded else images[:prompt]) for images in seen])
     given = tokens[:, :prompt]
     chunks, frames = np.stack([one.chunks for one in episodes]), range(1, seen.shape[1] - prompt + 1)
@@ -77,8 +76,8 @@ def continued(
 
 
 def rolled(
-    model: "HMA",
-    tokenizer: "Tokenizer",
+    model: HMA,
+    tokenizer: Tokenizer,
     robot: str,
     stored: NDArray[Any],
     chunks: Float32s,
@@ -88,11 +87,6 @@ def rolled(
     seed: int,
 ) -> Images:
     """Continue prompts (B, P, …) under chunks (B, T, K); return the images (B, W, S, S, 3) of W frames."""
-    import torch
-
-    from hma_model.generation.decode import decode
-    from hma_model.generation.rollout import Rollout
-
     discrete, begin = model.config.kind == "discrete", stored.shape[1] - 1
     known = torch.from_numpy(stored.astype(np.int64 if discrete else np.float32)).to(model.device)
     commands = torch.from_numpy(chunks).to(model.device)

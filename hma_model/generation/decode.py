@@ -38,8 +38,11 @@ def default_prompt(length: int) -> int:
 
 
 def decode(tokenizer: Tokenizer, stored: Tensor) -> Images:
-    """Decode ids (B, T, C·h, w) or latents (B, T, c, C·H, W) to pictures (B, T, S, C·S, 3), side by side."""
-    views, rows = stored.flatten(0, 1), tokenizer.spec.grid[0]
+    """Decode ids (B, T, C·h, w) or latents (B, T, c, C·H, W) to pictures (B, T, S, C·S, 3), side by side.
+
+    Latents that are NaN or infinite are decoded as 0.
+    """
+    views, rows = stored.flatten(0, 1).nan_to_num(0, 0, 0), tokenizer.spec.grid[0]
     if isinstance(tokenizer, NetworkTokenizer) and not stored.is_cpu:  # tokens stay on the GPU
         kept = views if tokenizer.spec.kind == "discrete" else views.half()
         pictures = torch.cat([tokenizer.pictures(view) for view in kept.split(rows, -2)], 2).numpy(force=True)

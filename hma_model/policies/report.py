@@ -156,24 +156,19 @@ def html(found: PolicyEvaluation) -> str:
     )
     page = Page("Policies inside the world model", lead)
     figures = [
-        (
-            _value(found.precision),
-            f"of the model's successes are confirmed by the simulator{_ends(found.precision)}",
-        ),
-        (_value(found.recall), f"of the simulator's successes are shown by the model{_ends(found.recall)}"),
-        (_value(found.followed), f"correlation of per-episode scores{_ends(found.followed)}"),
-        (_value(found.auroc), f"AUROC of per-episode scores{_ends(found.auroc)}"),
+        (found.precision, "of the model's successes are confirmed by the simulator"),
+        (found.recall, "of the simulator's successes are shown by the model"),
+        (found.followed, "correlation of per-episode scores"),
+        (found.auroc, "AUROC of per-episode scores"),
     ]
     if not found.refusal:
-        pearson = found.success["pearson"]
-        ranks = found.success["spearman"]
         figures = [
-            (_value(pearson), f"correlation of success rates{_ends(pearson)}"),
-            (_value(ranks), f"correlation of their ranks{_ends(ranks)}"),
-            (_value(found.success["mmrv"]), f"mean maximum rank violation{_ends(found.success['mmrv'])}"),
+            (found.success["pearson"], "correlation of success rates"),
+            (found.success["spearman"], "correlation of their ranks"),
+            (found.success["mmrv"], "mean maximum rank violation"),
             *figures,
         ]
-    page.figures(figures)
+    page.figures([(_value(one), f"{words}{_ends(one)}") for one, words in figures])
     if found.refusal:  # before anybody reads the rates
         sentence = refused(found)
         page.section("Do not rely on the model's rates", sentence[:1].upper() + sentence[1:] + ".")

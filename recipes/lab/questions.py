@@ -208,10 +208,10 @@ def _baseline(shards: ShardSet, cpu_seconds: float, seed: int) -> tuple[Any, int
 def _scores(model: Any, shards: ShardSet, row: Row) -> dict[str, Any]:
     """Return the figures of a trained model; None where one is not measured."""
     from hma_data.tokenizers.base import reopened
-    from hma_model.evaluation.losses import masked_val_loss, windows
+    from hma_model.evaluation.losses import validation_losses, windows
     from hma_model.evaluation.perceptual import FeatureCollector, Networks
     from hma_model.evaluation.rollouts import rollout
-    from hma_model.evaluation.scores import Rolled, Scores
+    from hma_model.evaluation.scores import Rolled, combined
     from hma_model.evaluation.simulated import measure_state
 
     tokenizer = reopened(shards.spec.to_json())
@@ -219,9 +219,9 @@ def _scores(model: Any, shards: ShardSet, row: Row) -> dict[str, Any]:
     rolled = Rolled(PROMPT, FeatureCollector(Networks()))
     for number, batch in enumerate(batches):
         rolled.add(batch, partial(rollout, model, tokenizer, prompt=PROMPT, seed=number), DRAWS, seed=0)
-    last = {kind: float(Scores.join(parts).psnr[:, -1].mean()) for kind, parts in rolled.scores.items()}
+    last = {kind: float(combined(parts)["psnr"][:, -1].mean()) for kind, parts in rolled.scores.items()}
     found: dict[str, Any] = {
-        "loss": masked_val_loss(model, iter(batches)) if row.kind == "hma" else None,
+        "loss": validation_losses(model, batches)[0].mean() if row.kind == "hma" else None,
         "psnr_last": last["true"],
         "gain": last["true"] - last["shuffled"],
         "copy": last["copy"],
