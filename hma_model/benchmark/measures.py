@@ -45,14 +45,13 @@ def played(world: World, true: TrueArena, actions: Sequence[Float32s]) -> tuple[
     With them comes how unsure the model was of the generated ones, (N, T) as of `Rollout`.
     """
     model = ModelArena(world, true, None)
-    images, unsure = [model.made], []
+    images = [model.made]
     with closing(model), world.drawing(measure=True):
         for action in actions:
             model.step(action)
             if model.fresh:
                 images.append(model.made)
-                unsure.append(model.uncertainty())
-    return np.stack(images, axis=1), np.stack(unsure, axis=1)
+    return np.stack(images, axis=1), np.stack(model.unsure, axis=1)
 
 
 def choose(

@@ -178,6 +178,14 @@ def described(model: Network, embodiment: str) -> Embodiment | None:
         return None
 
 
+def yaml_of(model: Network, embodiment: str) -> Embodiment:
+    """Return the YAML of an embodiment of a model; raise HMAError if there is none."""
+    robot = described(model, embodiment)
+    if robot is None:
+        raise HMAError(embodiment, "has no YAML that describes its actions", "load a checkpoint")
+    return robot
+
+
 def card(model: Network, embodiment: str) -> dict[str, Any]:
     """Return the card of an embodiment of a model; empty if the model is not from a checkpoint."""
     kept = _checkpoint(model, embodiment)

@@ -21,11 +21,9 @@ from hma_model.network.trunks.transformer import MLP
 _OPS: Any = torch.ops.mkldnn
 
 
-def packs(device: torch.device, dtype: torch.dtype = torch.float32) -> bool:
-    """Check whether packing pays on this device, for products in float32 or bfloat16."""
-    if device.type != "cpu" or not has_kernels():
-        return False
-    return dtype == torch.float32 or has_bfloat16()
+def packs(device: torch.device) -> bool:
+    """Check whether packing pays on this device."""
+    return device.type == "cpu" and has_kernels()
 
 
 def has_bfloat16() -> bool:

@@ -224,14 +224,16 @@ class ModelArena:
         probe: reads places for policies that ask for a state.
 
     Attributes:
+        world: the model's.
         images: what policies see; with simulators, their images until the model makes its first one.
         made: the newest images of the model; at the start, the last one of the prompt as it decodes it.
+        unsure: how unsure the model was of each of its frames (N,); NaN where that is not measured.
     """
 
     def __init__(self, world: World, true: Beginning | TrueArena, probe: Probe | None) -> None:
         self.scenes = true.scenes
         self.held = true.held
-        self._world = world
+        self.world = world
         self._told = true.told
         self._probe = probe
         self.prompts: Sequence[Prompt] = [Prompt(world.shown(one.frames), one.chunks) for one in true.prompts]
@@ -246,12 +248,13 @@ class ModelArena:
         if isinstance(true, TrueArena):
             self.images = true.first_images
             self._first_states = true.first_states
+        self.unsure: list[Floats] = []
         self._steps = 0
         self._seen: list[SeenState] | None = None
 
     def outside(self, actions: Float32s) -> str:
         """Say which of the actions (N, A) leave the range seen in training; "" for none."""
-        return self._world.action_spec(self.scenes.name).outside(actions)
+        return self.world.action_spec(self.scenes.name).outside(actions)
 
     @property
     def fresh(self) -> bool:
@@ -291,6 +294,8 @@ class ModelArena:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", OutsideRangeWarning)  # `run` says which policy leaves the range
             self.made, *_ = self._envs.step(actions)
+        if self.fresh:
+            self.unsure.append(np.array([self.world.uncertainty.get(one, np.nan) for one in self._sessions]))
         if self._steps >= self.scenes.stride:
             self.images = self.made
         if self._seen is None or self._probe is None:
@@ -303,11 +308,7 @@ class ModelArena:
 
     def stored(self) -> NDArray[Any]:
         """Return the newest frames (N, …) as shards store them."""
-        return np.stack([self._world.stored(session) for session in self._sessions])
-
-    def uncertainty(self) -> Floats:
-        """Return how unsure the model was of the newest frames (N,); NaN where it is not measured."""
-        return np.array([self._world.uncertainty.get(session, np.nan) for session in self._sessions])
+        return np.stack([self.world.stored(session) for session in self._sessions])
 
     @property
     def _sessions(self) -> list[int]:

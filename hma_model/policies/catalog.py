@@ -21,17 +21,19 @@ POLICY_FORMS = (
 )
 
 
-def read_policy(words: str, scenes: Scenes, world: World | None = None) -> Policy:
+def read_policy(words: str | tuple[str, Policy], scenes: Scenes, world: World | None = None) -> Policy:
     """Return the policy of words such as `scripted:noise=0.5`, for the robot of scenes.
 
     Args:
-        words: as `hma policy-eval` takes them.
+        words: as `hma policy-eval` takes them; of a name and a policy, the policy is returned.
         scenes: in which it is to act.
         world: for policies that plan; networks act on its device.
 
     Raises:
         HMAError: there is no such policy, or it does not fit the robot.
     """
+    if not isinstance(words, str):
+        return words[1]
     device = "cpu" if world is None else str(world.model.device)
     kind, _, rest = words.partition(":")
     if kind == "lerobot" and rest:

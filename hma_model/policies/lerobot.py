@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
 
 from hma_data.errors import HMAError
 from hma_data.hub.repository import Repository
 from hma_data.lab import imported
 from hma_data.storage.paths import REPOSITORY
-from hma_model.arrays import Float32s
+from hma_model.arrays import Float32s, Images
 from hma_model.policies.arenas import Arena, Scenes
 
 STATE, TASK = "observation.state", "task"
@@ -67,7 +70,7 @@ class LeRobotPolicy:
             wanted = ", ".join([*cameras, *others]) or "no camera"
             raise HMAError(self.name, f"takes {wanted}", "a world model gives the image of one camera")
         self._camera = cameras[0]
-        self._size = config.input_features[self._camera].shape[1:]
+        self._size: tuple[int, ...] = tuple(config.input_features[self._camera].shape[1:])
         state = config.input_features.get(STATE)
         action = config.action_feature
         self._state = None if state is None else int(state.shape[0])
@@ -82,12 +85,7 @@ class LeRobotPolicy:
         self._policy.reset()
 
     def act(self, arena: Arena) -> Float32s:
-        import torch
-        from torch.nn.functional import interpolate
-
-        images = torch.from_numpy(arena.images).permute(0, 3, 1, 2).float() / 255
-        if images.shape[2:] != self._size:
-            images = interpolate(images, tuple(self._size), mode="bilinear", antialias=True)
+        images = network_images(arena.images, self._size)
         batch: dict[str, Any] = {self._camera: images, TASK: [arena.scenes.name] * len(images)}
         if self._state is not None:
             batch[STATE] = torch.from_numpy(self._observed(arena))
@@ -104,6 +102,12 @@ class LeRobotPolicy:
             )
             raise HMAError(self.name, fault, "give a policy that acts from images alone")
         return state
+
+
+def network_images(images: Images, size: tuple[int, ...]) -> Tensor:
+    """Return images (N, H, W, 3) as networks of lerobot take them: (N, 3, *size) of 0 to 1."""
+    made = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
+    return made if made.shape[2:] == size else interpolate(made, size, mode="bilinear", antialias=True)
 
 
 def hub_repository(source: str, where: str, what: str) -> Repository | None:

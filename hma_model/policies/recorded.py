@@ -23,7 +23,6 @@ from hma_data.console import print_table
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.errors import UsageError
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.windows import episode_pieces
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Bools, Floats, Images, evenly
@@ -48,7 +47,7 @@ from hma_model.policies.scores import (
     run,
     sampling_of,
 )
-from hma_model.worlds.prompts import SeenShards, default_frames
+from hma_model.worlds.prompts import SeenShards, default_frames, long_pieces
 from hma_model.worlds.scenes import at_rest
 from hma_model.worlds.world import World, load_world
 
@@ -163,7 +162,7 @@ def evaluate_recorded(
     with locked(folder) if folder else nullcontext():
         world = world or load_world(checkpoint, [embodiment], **settings)
         scenes = Scenes.of(world, embodiment, episodes, seed, simulator=False)
-        made = [read_policy(one, scenes, world) if isinstance(one, str) else one[1] for one in policies]
+        made = [read_policy(one, scenes, world) for one in policies]
         if planner := next((name for name, one in zip(names, made) if isinstance(one, Judged)), None):
             raise UsageError(f"policy {planner}", "needs a simulated robot's task", "give another policy")
         labelled = labelled_shards(world, embodiment, shards, judge)
@@ -191,16 +190,13 @@ def recorded_beginnings(world: World, scenes: Scenes, shards: ShardSet) -> tuple
         UsageError: no held-out episode is long enough.
     """
     count = default_frames(world.model)
-    span = (count - 1) * shards.row_stride
-    rows = []
-    for row in shards.episodes.to_pylist():
-        if row["split"] == "val" and len(episode_pieces(shards, row)[0]) > span:
-            rows.append(row)
+    pieces = long_pieces(shards, count)
+    rows = [row for row, part in pieces if row["split"] == "val" and part.start == 0]
     if not rows:
         fault = f"has no held-out episode of {count} frames without a pause"
         raise UsageError(shards.folder, fault, "give other shards")
     seen = SeenShards(shards, cameras_for(world.model, shards))
-    at = np.arange(0, span + 1, shards.row_stride)
+    at = np.arange(count) * shards.row_stride
     kept = [seen.window(row, at) for row in rows[: len(scenes.numbers)]]
     prompts = [kept[number % len(kept)] for number in range(len(scenes.numbers))]
     dims = len(scenes.dimensions)

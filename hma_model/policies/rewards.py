@@ -19,6 +19,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+import torch
 
 from hma_data.errors import HMAError, MissingDependencyError, UsageError
 from hma_data.lab import imported
@@ -26,7 +27,7 @@ from hma_data.shards.reader import ShardSet
 from hma_model.arrays import Bools, Floats, Images
 from hma_model.evaluation.agreement import Accuracy, accuracy, share_interval
 from hma_model.generation.decode import cameras_for
-from hma_model.policies.lerobot import CONFIG, TASK, hub_repository
+from hma_model.policies.lerobot import CONFIG, TASK, hub_repository, network_images
 from hma_model.worlds.env import Judge
 from hma_model.worlds.prompts import SeenShards, require_fit
 from hma_model.worlds.world import World
@@ -116,16 +117,10 @@ class RewardModel:
 
     def rewards(self, images: Images) -> Floats:
         """Return the rewards (N,) of images (N, S, V·S, 3)."""
-        import torch
-        from torch.nn.functional import interpolate
-
         views = np.split(images, self._views, axis=2)
         batch: dict[str, Any] = {TASK: [self._task] * len(images)}
         for key, (place, shape) in self._keys.items():
-            view = torch.from_numpy(np.ascontiguousarray(views[place])).permute(0, 3, 1, 2).float() / 255
-            if view.shape[2:] != shape:
-                view = interpolate(view, shape, mode="bilinear", antialias=True)
-            batch[key] = view.to(self._device)
+            batch[key] = network_images(views[place], shape).to(self._device)
         with torch.inference_mode():
             found = self._model.compute_reward(self._before(batch))
         return np.asarray(found.float().cpu(), np.float64).reshape(len(images))

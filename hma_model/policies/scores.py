@@ -274,7 +274,7 @@ def evaluate_policies(
         sampling = sampling_of(world)
         scenes = Scenes.of(world, embodiment, episodes, seed)
         meter = None if max_error is None else choosing_meter(world, embodiment)
-        made = [read_policy(one, scenes, world) if isinstance(one, str) else one[1] for one in policies]
+        made = [read_policy(one, scenes, world) for one in policies]
         keys = part_keys(policies, world, embodiment, judge) if folder else names
         for name, policy in zip(names, made, strict=True):
             if not isinstance(policy, Judged):
@@ -425,14 +425,8 @@ def score_policy(
     true = TrueArena(scenes, size)
     true_images, acted = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
     model = ModelArena(world, true, judge.probe)
-    unsure = []
-
-    def look(done: float) -> None:
-        unsure.append(model.uncertainty())
-        tell(done, "in the model")
-
     with closing(model), world.drawing(measure=True):
-        model_images, actions = run(name, policy, model, frames, look)
+        model_images, actions = run(name, policy, model, frames, lambda done: tell(done, "in the model"))
     _require_paired(name, acted[: scenes.stride], actions[: scenes.stride])
     again = TrueArena(scenes, size, drawn=False)
     for action in actions:
@@ -443,7 +437,7 @@ def score_policy(
         "scores": np.stack([there, read, replayed]),
         "success": np.stack([there >= limit, judge.success(read), replayed >= limit]),
         "shown": shown,
-        "stated": accumulated(np.stack(unsure, axis=1))[:, -1],
+        "stated": accumulated(np.stack(model.unsure, axis=1))[:, -1],
         "true_images": np.stack([true_images[frame] for frame in shown], axis=1),
         "model_images": np.stack([model_images[frame] for frame in shown], axis=1),
     }

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,6 @@ from hma_data.lab.simulator import embodiment, simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.windows import episode_pieces
 from hma_data.storage.kept import KeptParts, remove_kept
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
@@ -50,7 +50,7 @@ from hma_model.synthetic.recorder import (
     write_shards,
 )
 from hma_model.worlds.images import Prompt
-from hma_model.worlds.prompts import SeenShards, default_frames, require_fit
+from hma_model.worlds.prompts import SeenShards, default_frames, long_pieces, require_fit
 from hma_model.worlds.scenes import at_rest
 from hma_model.worlds.world import World, load_world
 
@@ -299,22 +299,12 @@ class _Maker:
             raise UsageError("--commands", f"{commands!r} is unknown", "give replay, or perturb=0.3")
         return ReplayPolicy(share, self.world.model.embodiments[self.robot.id].std)
 
-    def _long_enough(self, shards: ShardSet) -> list[dict[str, Any]]:
-        """Return the pieces of episodes that are long enough: rows, where they begin, and the room to start.
-
-        `begin` and `room` are recorded frames. No episode starts before a pause and goes on after it.
-        """
+    def _long_enough(self, shards: ShardSet) -> list[tuple[dict[str, Any], range]]:
+        """Return the pieces of episodes that are long enough, as of `long_pieces`."""
         if shards.embodiment.id != self.settings.embodiment:
             fault = f"is of {shards.embodiment.id}, not of {self.settings.embodiment}"
             raise UsageError(shards.folder, fault, "name shards of the robot")
-        every = shards.manifest.frame_stride
-        span = (self.prompt_frames + self.settings.frames - 1) * shards.embodiment.stride
-        found = [
-            row | {"begin": part.start * every, "room": len(part) * every - span}
-            for row in shards.episodes.to_pylist()
-            for part in episode_pieces(shards, row)
-            if len(part) * every > span
-        ]
+        found = long_pieces(shards, self.prompt_frames + self.settings.frames)
         if not found:
             fault = f"has no episode of {self.prompt_frames} + {self.settings.frames} frames without a pause"
             raise UsageError(shards.folder, fault, "give fewer --frames")
@@ -364,15 +354,14 @@ class _Maker:
         begun = self._simulated(numbers) if self.shards is None else self._recorded(self.shards, numbers)
         arena = ModelArena(self.world, begun, self.probe)
         kept = []
-        uncertainty = []
 
         def look(done: float) -> None:
             kept.append(arena.stored())
-            uncertainty.append(arena.uncertainty())
             tell(done)
 
+        commands, frames = self.settings.commands, self.settings.frames
         with closing(arena), self.world.drawing(measure=True):
-            images, actions = run(self.settings.commands, self.policy, arena, self.settings.frames, look)
+            images, actions = run(commands, self.policy, arena, frames, look)
         success: Bools = np.ones(len(numbers), np.bool_)
         if self.judge is not None:
             success = self.judge.success(self.judge.score(np.stack(images, axis=1)))
@@ -387,7 +376,7 @@ class _Maker:
         return SyntheticBatch(
             np.concatenate([first, generated], axis=1),
             np.concatenate([before, own], axis=1),
-            accumulated(np.stack(uncertainty, axis=1))[:, -1],
+            accumulated(np.stack(arena.unsure, axis=1))[:, -1],
             success,
             np.array(begun.groups),
         )
@@ -426,12 +415,12 @@ class _Maker:
         """
         rng = np.random.default_rng((self.settings.seed, 5, number))
         length = self.prompt_frames + self.settings.frames
-        every = shards.manifest.frame_stride
+        every, span = shards.manifest.frame_stride, (length - 1) * self.robot.stride
         needed = None if self.settings.recorded else self.prompt_frames
         for draw in range(MAX_DRAWS):
-            row = self._long[(number + draw) % len(self._long)]
-            start = row["begin"] + int(rng.integers(row["room"])) // every * every
-            at = start // every + shards.row_stride * np.arange(length)
+            row, part = self._long[(number + draw) % len(self._long)]
+            start = part.start + int(rng.integers(len(part) * every - span)) // every
+            at = start + shards.row_stride * np.arange(length)
             window = self._seen.window(row, at)
             if np.isfinite(window.chunks[:needed]).all():
                 return row, window
@@ -466,19 +455,17 @@ def _chosen(
         raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")
     chosen &= success
     judged = True if settings.judge else None
+    made = chain.from_iterable(zip(one.stored, one.chunks, one.groups, strict=True) for one in batches)
     found = []
-    number = 0
-    for batch in batches:
-        for stored, chunks, group in zip(batch.stored, batch.chunks, batch.groups, strict=True):
-            if chosen[number]:
-                counts = {
-                    "prompt_frames": len(stored) - settings.frames,
-                    "generated_frames": settings.frames - 1,  # the last one has no actions after it
-                }
-                if measured:
-                    counts[measure] = round(1000 * float(unsure[number]))
-                found.append(
-                    SyntheticEpisode(f"synthetic_{number:06d}", stored, chunks, counts, str(group), judged)
-                )
-            number += 1
+    for number, (stored, chunks, group) in enumerate(made):
+        if not chosen[number]:
+            continue
+        counts = {
+            "prompt_frames": len(stored) - settings.frames,
+            "generated_frames": settings.frames - 1,  # the last one has no actions after it
+        }
+        if measured:
+            counts[measure] = round(1000 * float(unsure[number]))
+        name = f"synthetic_{number:06d}"
+        found.append(SyntheticEpisode(name, stored, chunks, counts, str(group), judged))
     return found

@@ -29,7 +29,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Float32s
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import INVERSE
-from hma_model.generation.commands import Commands, card, described
+from hma_model.generation.commands import Commands, card, yaml_of
 from hma_model.network.model import HMA
 from hma_model.policies.fingerprints import device_facts, world_digests
 from hma_model.synthetic.film import FilmEpisode, ShardFilm, find_film, read_film
@@ -118,9 +118,7 @@ def label_actions(
     model = world.model
     model.require_readout(INVERSE, checkpoint)
     spec = world.action_spec(embodiment)
-    robot = described(model, embodiment)
-    if robot is None:
-        raise HMAError(embodiment, "has no YAML that describes its actions", "load a checkpoint")
+    robot = yaml_of(model, embodiment)
     with locked(folder):
         episodes = read_film(world, film, embodiment, robot.effective_hz)
         error = measure(world, spec, _check_set(model, embodiment, check), on_progress)
@@ -205,8 +203,7 @@ def measure(
         raise HMAError(shards.folder, "has no known actions to compare with", "name labelled shards")
     values = np.concatenate(true).astype(np.float64)
     rmse = np.sqrt(np.square(np.concatenate(misses).astype(np.float64)).mean(axis=0))
-    robot = described(world.model, spec.embodiment)
-    assert robot is not None
+    robot = yaml_of(world.model, spec.embodiment)
     units = [part.unit or "" for part in robot.action.components for _ in range(part.dims)]
     names = tuple(f"{name} {unit}".strip() for name, unit in zip(spec.names, units, strict=True))
     spread = tuple(values.std(axis=0).tolist())

@@ -28,7 +28,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.arrays import Bools, Float32s, Ints
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.generation.commands import card, described
+from hma_model.generation.commands import card, described, yaml_of
 from hma_model.generation.decode import cameras_for
 from hma_model.network.model import HMA
 from hma_model.worlds.images import Prompt, read_image, recorded_cameras, seen_cameras, trained_cameras
@@ -151,13 +151,22 @@ def starting_window(model: HMA, embodiment: str, seed: int = 0) -> Prompt:
             return _of_recording(model, robot, record(embodiment, folder, 1, seed), EpisodePart())
     for shards in model.source.shards() if model.source else ():
         if shards.embodiment.id == embodiment:
-            span = (default_frames(model) - 1) * shards.row_stride
-            rows = shards.episodes.to_pylist()
-            fit = [n for n, row in enumerate(rows) if max(map(len, episode_pieces(shards, row))) > span]
-            held = [n for n in fit if rows[n]["split"] == "val"] or fit or [0]  # the first one says the fault
-            return _of_shards(model, embodiment, shards.folder, EpisodePart(held[seed % len(held)]))
+            fit = {row["id"]: row["split"] for row, _ in long_pieces(shards, default_frames(model))}
+            held = [name for name, split in fit.items() if split == "val"] or list(fit)
+            episode = held[seed % len(held)] if held else None  # the first one says the fault
+            return _of_shards(model, embodiment, shards.folder, EpisodePart(episode))
     fault = "none is included: it has no simulator here, and the shards of its training are not here"
     raise HMAError(f"prompt of {embodiment}", fault, PROMPT_FORMS)
+
+
+def long_pieces(shards: ShardSet, frames: int) -> list[tuple[dict[str, Any], range]]:
+    """Return the pieces of episodes without a pause that hold so many frames: the episode's row, and rows."""
+    return [
+        (row, part)
+        for row in shards.episodes.to_pylist()
+        for part in episode_pieces(shards, row)
+        if len(part) > (frames - 1) * shards.row_stride
+    ]
 
 
 def _of_mapping(model: HMA, embodiment: str, prompt: Mapping[str, Any]) -> Prompt:
@@ -250,9 +259,7 @@ class SeenShards:
 
 
 def _of_lerobot(model: HMA, embodiment: str, folder: StrPath, part: EpisodePart) -> Prompt:
-    robot = described(model, embodiment)
-    if robot is None:
-        raise HMAError(embodiment, "has no YAML, which says how its recordings are read", "load a checkpoint")
+    robot = yaml_of(model, embodiment)
     if robot.source.format != "lerobot":
         robot = _as_lerobot(robot, folder)
     return _of_recording(model, robot, as_path(folder), part)

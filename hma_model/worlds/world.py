@@ -204,7 +204,7 @@ class World:
         """
         order, rows = self._ordered(images)
         chunks, known = self._chunks(order, actions)
-        stored = self._encoded(self._at(order[0]).embodiment, np.stack([images[one] for one in order]))
+        stored = self.encoded(self._at(order[0]).embodiment, np.stack([images[one] for one in order]))
         self._running().observe(torch.from_numpy(stored), chunks, known=known, rows=rows)
 
     def image(self, session: int) -> Images:
@@ -224,9 +224,11 @@ class World:
         Images are encoded, those of another size resized as in a conversion of the embodiment.
         """
         config = self.model.config
-        if len(frames) and frames.shape[1:] == config.frame_shape:
-            return frames.astype(np.int64 if config.kind == "discrete" else np.float32)
-        return self._encoded(embodiment, frames)
+        if not len(frames) or frames.shape[1:] != config.frame_shape:
+            images = fitted(frames, config, described(self.model, embodiment))
+            views = [self.tokenizer.encode(view) for view in np.split(images, config.views, axis=2)]
+            frames = np.concatenate(views, axis=-2)
+        return frames.astype(np.int64 if config.kind == "discrete" else np.float32)
 
     def stored(self, session: int) -> NDArray[Any]:
         """Return the newest frame of a session as shards store it: tokens (h, w) or latents (c, h, w)."""
@@ -323,13 +325,6 @@ class World:
         known = torch.tensor([known for _, known in read], dtype=torch.bool)
         values = np.stack([chunk for chunk, _ in read]) if read else np.zeros((0, 1), np.float32)
         return torch.from_numpy(stored), torch.from_numpy(values), known
-
-    def _encoded(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:
-        """Return images (n, H, W, 3) as the model stores them."""
-        config = self.model.config
-        frames = fitted(frames, config, described(self.model, embodiment))
-        views = [self.tokenizer.encode(view) for view in np.split(frames, config.views, axis=2)]
-        return np.concatenate(views, axis=-2).astype(np.int64 if config.kind == "discrete" else np.float32)
 
 
 def load_world(

@@ -68,14 +68,14 @@ def _seconds(m: int, k: int, n: int, device: "torch.device", precision: str) -> 
     import torch
 
     from hma_data.tokenizers.network import one_thread
-    from hma_model.generation.packed import PackedLinear, QuantizedLinear, packs
+    from hma_model.generation.packed import PackedLinear, QuantizedLinear, has_bfloat16, packs
 
     dtype = torch.bfloat16 if precision == "bf16" else torch.float32
     linear = torch.nn.Linear(k, n, device=device, dtype=dtype)
     x = torch.randn(m, k, device=device, dtype=dtype)
     with torch.inference_mode():
         kinds: list[Callable[[torch.Tensor], torch.Tensor]] = [linear]
-        if packs(device, dtype):
+        if packs(device) and (dtype == torch.float32 or has_bfloat16()):
             kinds.append(QuantizedLinear(linear) if precision == "int8" else PackedLinear(linear, dtype))
         seconds = min(_best(kind, x) for kind in kinds)
         if device.type == "cpu":

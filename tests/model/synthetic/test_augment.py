@@ -228,8 +228,9 @@ def real(world: World, tmp_path: Path) -> Path:
 def test_episodes_of_the_same_beginning_differ(world, real, tmp_path, monkeypatch) -> None:
     long_enough = augment_module._Maker._long_enough
 
-    def one_beginning(maker: Any, shards: ShardSet) -> list[dict[str, Any]]:
-        return [row | {"room": 1} for row in long_enough(maker, shards)]
+    def one_beginning(maker: Any, shards: ShardSet) -> list[tuple[dict[str, Any], range]]:
+        span = (maker.prompt_frames + maker.settings.frames - 1) * shards.row_stride
+        return [(row, part[: span + 1]) for row, part in long_enough(maker, shards)]
 
     monkeypatch.setattr(augment_module._Maker, "_long_enough", one_beginning)
     augment(tmp_path / "out", asked(source="real"), world=world, shards=real)
