@@ -159,8 +159,7 @@ def turn_back(world: World, scenes: Scenes, probe: Probe, frames: int) -> Arrays
         if not len(probe.own):
             return np.full(len(places), np.nan)
         moved = np.linalg.norm(places[:, 1] - places[:, 0], axis=-1)
-        found: NDArray[Any] = moved[:, probe.own].mean(axis=-1)
-        return found
+        return moved[:, probe.own].mean(axis=-1)
 
     ends, turn = made[:, [0, -1]], made[:, [0, there]]
     return {

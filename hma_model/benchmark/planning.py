@@ -93,8 +93,7 @@ def reached(world: World, scenes: Scenes, probe: Probe, way: str) -> Bools:
         for action in actions.reshape(-1, actions.shape[-1]):
             scene.simulator.advance(action)
     ends, wanted = (_places(some, probe) for some in (begun, driven))
-    near: Bools = np.linalg.norm(ends - wanted, axis=-1).max(axis=-1) <= NEAR_PX
-    return near
+    return np.linalg.norm(ends - wanted, axis=-1).max(axis=-1) <= NEAR_PX
 
 
 def _after(scene: LabScene, actions: Float32s) -> Images:

@@ -144,8 +144,7 @@ def rank_violation(true: ArrayLike, made: ArrayLike) -> Floats:
     true, made = np.asarray(true), np.asarray(made)
     gaps = true[..., :, None] - true[..., None, :]
     wrong = (gaps > 0) != (made[..., :, None] > made[..., None, :])
-    found: Floats = np.where(wrong, np.abs(gaps), 0.0).max(axis=-1).mean(axis=-1)
-    return found
+    return np.where(wrong, np.abs(gaps), 0.0).max(axis=-1).mean(axis=-1)
 
 
 def mmrv(true: Floats, made: Floats, seed: int = 0) -> Estimate:

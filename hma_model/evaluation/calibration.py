@@ -78,13 +78,11 @@ class Meter:
 
     def expected(self, stated: Floats) -> Floats:
         """Return the state error in px to expect at stated uncertainties (…); beyond the last, it is more."""
-        found: Floats = np.interp(stated, self.stated, self.error_px)
-        return found
+        return np.interp(stated, self.stated, self.error_px)
 
     def warns(self, stated: Floats) -> Bools:
         """Return whether stated uncertainties (…) are worth a warning."""
-        warned: Bools = np.asarray(stated) >= self.limit
-        return warned
+        return np.asarray(stated) >= self.limit
 
     @property
     def verdict(self) -> str:
@@ -122,8 +120,7 @@ def meter_of(
 
 def accumulated(uncertainty: Floats) -> Floats:
     """Return the uncertainty (…, T) since the last true frame, of that (…, T) of single frames."""
-    found: Floats = np.cumsum(uncertainty**POWER, axis=-1) ** (1 / POWER)
-    return found
+    return np.cumsum(uncertainty**POWER, axis=-1) ** (1 / POWER)
 
 
 def missing(uncertainty: Floats) -> str:
@@ -147,15 +144,13 @@ def fit(stated: Floats, errors: Floats) -> tuple[Floats, Floats]:
 
 def first_frame(seen: Bools) -> Ints:
     """Return the first frame (…) at which something is seen (…, T); T if it never is."""
-    found: Ints = np.where(seen.any(axis=-1), seen.argmax(axis=-1), seen.shape[-1])
-    return found
+    return np.where(seen.any(axis=-1), seen.argmax(axis=-1), seen.shape[-1])
 
 
 def warned_rightly(warned: Ints, doubled: Ints, frames: int) -> Bools:
     """Return which warnings at frames (…) are right; errors double at frames (…), `frames` means never."""
     early = doubled - warned
-    right: Bools = np.where(doubled < frames, (early >= 0) & (early <= LEAD_FRAMES), warned >= frames)
-    return right
+    return np.where(doubled < frames, (early >= 0) & (early <= LEAD_FRAMES), warned >= frames)
 
 
 def best_limit(stated: Floats, doubled: Ints) -> float:

@@ -111,8 +111,7 @@ def _features(script: Any) -> Network:
     options = {name: value for name, value in wanted.items() if name in known}
 
     def features(x: Tensor) -> Tensor:
-        found: Tensor = script(x, **options)
-        return found
+        return script(x, **options)
 
     return features
 
@@ -190,8 +189,7 @@ def frechet_distance(one: Moments, other: Moments) -> float:
 def _root(matrix: Floats) -> Floats:
     """Return the square root of a symmetric matrix without negative eigenvalues."""
     values, vectors = np.linalg.eigh(matrix)
-    root: Floats = (vectors * np.sqrt(values.clip(min=0))) @ vectors.T
-    return root
+    return (vectors * np.sqrt(values.clip(min=0))) @ vectors.T
 
 
 # -- the judge

@@ -103,8 +103,7 @@ class TeeFinder:
         cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
         x, y = points[:, 0] - poses[:, :1], points[:, 1] - poses[:, 1:2]
         local = np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
-        far: Floats = np.clip(self.shape.distance(local), 0, FARTHEST_PX).mean(axis=1)
-        return far
+        return np.clip(self.shape.distance(local), 0, FARTHEST_PX).mean(axis=1)
 
 
 @dataclass(frozen=True)
@@ -179,8 +178,7 @@ def state_errors(probe: Probe, pictures: Images, parts: Floats) -> Floats:
     Returns:
         (…, P) in px of 128.
     """
-    errors: Floats = np.linalg.norm(probe.read(pictures) - parts, axis=-1)
-    return errors
+    return np.linalg.norm(probe.read(pictures) - parts, axis=-1)
 
 
 def as_seen(robot: str, tokenizer: Tokenizer, pictures: Images) -> Images:
@@ -282,5 +280,4 @@ def fit(
 def _colors(small: Images, parts: Floats) -> Floats:
     """Return the (P, 3) median colours of pictures at places within the parts."""
     x, y = np.clip(parts * (INPUT_SIDE / truth.SIZE), 0, INPUT_SIDE - 1).astype(int).transpose(2, 0, 1)
-    found: Floats = np.median(small[np.arange(len(small))[:, None], y, x], axis=0).astype(np.float32)
-    return found
+    return np.median(small[np.arange(len(small))[:, None], y, x], axis=0).astype(np.float32)

@@ -215,8 +215,7 @@ def difference(one: Images, other: Images) -> Images:
     from matplotlib import colormaps
 
     share = np.abs(one.astype(np.float32) - other).mean(axis=-1) / BRIGHTEST
-    shown: Images = (colormaps["inferno"](share.clip(0, 1))[..., :3] * 255).astype(np.uint8)
-    return shown
+    return (colormaps["inferno"](share.clip(0, 1))[..., :3] * 255).astype(np.uint8)
 
 
 def strip(film: Images, columns: Ints, prompt: int) -> bytes:

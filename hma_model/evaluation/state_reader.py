@@ -63,8 +63,7 @@ class PlaceNetwork(MapNetwork):
         nn.init.zeros_(self.correct.bias)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        found: Tensor = self.correct(self.points(pictures)[0])
-        return found
+        return self.correct(self.points(pictures)[0])
 
 
 class StateNetwork(MapNetwork):
@@ -77,8 +76,7 @@ class StateNetwork(MapNetwork):
         )
 
     def forward(self, pictures: Tensor) -> Tensor:
-        found: Tensor = self.head(torch.cat(self.points(pictures), dim=1))
-        return found
+        return self.head(torch.cat(self.points(pictures), dim=1))
 
 
 def trained(
@@ -118,8 +116,7 @@ def trained(
 def outputs(network: nn.Module, small: Images) -> Floats:
     """Return what a network reads off pictures."""
     parts = np.array_split(small, len(small) // 64 + 1)
-    found: Floats = torch.cat([network(pixels(part)) for part in parts]).double().numpy()
-    return found
+    return torch.cat([network(pixels(part)) for part in parts]).double().numpy()
 
 
 def resized(pictures: Images) -> Images:

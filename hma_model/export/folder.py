@@ -236,8 +236,7 @@ def _webp(images: NDArray[np.uint8]) -> bytes:
     cells[:count] = images
     strip = cells.reshape(-1, COLUMNS, height, width, 3).swapaxes(1, 2).reshape(-1, COLUMNS * width, 3)
     settings = [cv2.IMWRITE_WEBP_QUALITY, QUALITY]
-    data: bytes = cv2.imencode(".webp", cv2.cvtColor(strip, cv2.COLOR_RGB2BGR), settings)[1].tobytes()
-    return data
+    return cv2.imencode(".webp", cv2.cvtColor(strip, cv2.COLOR_RGB2BGR), settings)[1].tobytes()
 
 
 def _save(path: Path, values: NDArray[Any]) -> None:

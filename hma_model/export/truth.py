@@ -32,8 +32,7 @@ def table_values(table: BlockTable) -> dict[str, Any]:
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
     """Return the same with arrays as lists and axes as dictionaries."""
-    made: dict[str, Any] = json.loads(json.dumps(values, default=_parts))
-    return made
+    return json.loads(json.dumps(values, default=_parts))
 
 
 def _parts(value: Any) -> Any:

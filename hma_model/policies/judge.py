@@ -44,8 +44,7 @@ def moved(parts: Floats, driven: int) -> Floats:
         (N,) px.
     """
     ends = np.median(parts[:, -END_FRAMES:, driven:], axis=1)
-    far: Floats = np.linalg.norm(ends - parts[:, 0, driven:], axis=-1).max(axis=-1)
-    return far
+    return np.linalg.norm(ends - parts[:, 0, driven:], axis=-1).max(axis=-1)
 
 
 def reached(parts: Floats, driven: int) -> Floats:
@@ -149,8 +148,7 @@ class StateJudge:
 
     def success(self, scores: Floats) -> Bools:
         """Return which scores are judged a success."""
-        judged: Bools = scores >= self.limit
-        return judged
+        return scores >= self.limit
 
     def begun(self) -> Judge:
         """Return the judge of one episode, which reads each of its images once."""

@@ -129,13 +129,11 @@ class RewardModel:
         """Return the highest reward (N,) of the frames of episodes (N, T, S, V·S, 3)."""
         flat = images.reshape(-1, *images.shape[2:])
         parts = [self.rewards(flat[i : i + FRAMES_AT_ONCE]) for i in range(0, len(flat), FRAMES_AT_ONCE)]
-        highest: Floats = np.concatenate(parts).reshape(images.shape[:2]).max(axis=1)
-        return highest
+        return np.concatenate(parts).reshape(images.shape[:2]).max(axis=1)
 
     def success(self, scores: Floats) -> Bools:
         """Return which scores (N,) are a success."""
-        judged: Bools = scores > LIMIT
-        return judged
+        return scores > LIMIT
 
     def begun(self) -> Judge:
         """Return the judge of one episode: its highest reward so far; it never ends the episode."""

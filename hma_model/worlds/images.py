@@ -64,8 +64,7 @@ def image_shape(config: HMAConfig) -> tuple[int, int, int]:
 
 def trained_cameras(card: Mapping[str, Any]) -> Cameras:
     """Return the cameras that a robot's stem was trained on, by its card."""
-    found: Cameras = card.get("data", {}).get("cameras") or FIRST_CAMERA
-    return found
+    return card.get("data", {}).get("cameras") or FIRST_CAMERA
 
 
 def seen_cameras(cameras: Cameras, stored: Sequence[str]) -> list[str]:
