@@ -126,7 +126,7 @@ def difference(one: Bools, other: Bools) -> tuple[float, list[float]]:
 
 def planning_figures(found: dict[str, Bools]) -> dict[str, Any]:
     """Return successes, gap and verdict of the goals (N,) that were reached in each of WAYS."""
-    figures: dict[str, Any] = {"near_px": NEAR_PX}
+    figures = {"near_px": NEAR_PX}
     for way in WAYS:
         figures[way] = rounded(found[way].mean())
         figures[f"{way}_95"] = rounded(np.array(share_interval(int(found[way].sum()), len(found[way]))))

@@ -178,7 +178,7 @@ def _curves(curve: dict[str, Any], risk: dict[str, Any]) -> bytes:
     left.plot([0, top], [0, top], color="#999999", ls=":", lw=1)
     ends = np.array(curve["measured_px_95"], float).T
     bars = np.abs(ends - np.array(curve["measured_px"]))
-    look: dict[str, Any] = {"fmt": MARKERS[0], "color": COLOURS[0], "ms": 5, "lw": 1}
+    look = {"fmt": MARKERS[0], "color": COLOURS[0], "ms": 5, "lw": 1}
     left.errorbar(curve["expected_px"], curve["measured_px"], yerr=bars, **look)
     label_axes(left, "expected state error, px", "measured, px")
     for number, kind in enumerate(("episodes", "frames")):

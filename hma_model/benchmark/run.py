@@ -151,7 +151,7 @@ def read_results(path: Path) -> dict[str, Any]:
         OutputError: it is missing or damaged.
     """
     try:
-        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(path.read_text(encoding="utf-8"))
         if found["benchmark"] != NAME:
             raise ValueError
     except (OSError, ValueError, TypeError, KeyError, RecursionError):

@@ -89,8 +89,7 @@ def pearson(one: ArrayLike, other: ArrayLike) -> Floats:
     """Return the correlation over the last axis (…, M) of two series; NaN where one is constant."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", (stats.ConstantInputWarning, stats.NearConstantInputWarning))
-        found: Floats = stats.pearsonr(np.asarray(one), np.asarray(other), axis=-1).statistic
-    return found
+        return stats.pearsonr(np.asarray(one), np.asarray(other), axis=-1).statistic
 
 
 def spearman(one: ArrayLike, other: ArrayLike) -> Floats:

@@ -209,7 +209,7 @@ def calibration(
         clock[tested] = best_clock(doubled[~tested], frames)
         for name, values in measured.items():
             expected[name][tested] = np.interp(stated[tested], *fit(stated[~tested], values[~tested]))
-    found: dict[str, Any] = {"first_px": rounded(base), "doubled_px": rounded(2 * base)}
+    found = {"first_px": rounded(base), "doubled_px": rounded(2 * base)}
     found["reliability"] = {"stated": rounded(_by_bin(stated, stated)[0])}
     for name, values in measured.items():
         found |= _reliability(name, stated, expected[name], values, found["reliability"], seed)

@@ -253,7 +253,7 @@ def _losses(
     other = (shuffled(batch, seed=seed, draw=draw) for draw in range(draws) for batch in batches)
     by_window = {"loss": nats.mean(axis=1), "accuracy": hits.mean(axis=1)}
     by_window |= {"masked_loss": masked_nats, "masked_accuracy": masked_hits}
-    table: dict[str, Any] = summary("loss", by_window["loss"], seed, 6, episodes, NATURAL) | {
+    table = summary("loss", by_window["loss"], seed, 6, episodes, NATURAL) | {
         "shuffled_loss": validation_losses(model, other)[0].mean(),
         "baseline_loss": unconditional_baseline([shards], batches, model.config, cameras).mean(),
     }

@@ -36,7 +36,7 @@ def resampled_means(values: NDArray[Any], seed: int = 0, episodes: Episodes = No
         count = len(names)
         shares = _shares(count, seed)[:, own]
         shares /= shares.sum(axis=1, keepdims=True)  # episodes have unequal numbers of windows
-    means: Floats = (shares @ flat).reshape(RESAMPLES, *values.shape[1:])
+    means = (shares @ flat).reshape(RESAMPLES, *values.shape[1:])
     if count < 2:
         return np.full_like(means, np.nan)
     mean = values.mean(axis=0, dtype=np.float64)

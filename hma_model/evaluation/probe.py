@@ -157,7 +157,7 @@ class Probe:
         """Return (…, P), how many pixels of (…, S, S, 3) have a part's colour and not the background's."""
         flat = resized(pictures)
         stands = np.linalg.norm(flat - self.background, axis=-1) > COLOUR_DISTANCE
-        counts: Floats = (stands[..., None] & self._colored(flat)).sum(axis=(1, 2), dtype=np.float64)
+        counts = (stands[..., None] & self._colored(flat)).sum(axis=(1, 2), dtype=np.float64)
         return counts.reshape(*pictures.shape[:-3], len(self.colors))
 
     def _colored(self, small: Images) -> Bools:

@@ -95,7 +95,7 @@ def page(parts: Sequence[Part], command: str) -> str:
 
 def _whose(part: Part, parts: Sequence[Part]) -> str:
     """Return the robot of a part, and its checkpoint where there are several."""
-    robot: str = part.found["embodiment"]
+    robot = part.found["embodiment"]
     return robot if len({each.checkpoint for each in parts}) == 1 else f"{part.checkpoint}, {robot}"
 
 

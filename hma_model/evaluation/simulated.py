@@ -81,7 +81,7 @@ def measure_state(
         "reconstruction": true.truth[:, prompt:],
     }
     parts = np.stack([one.parts[prompt:] for one in made])
-    found: dict[str, Any] = {"episodes": episodes, "picture_px": truth.SIZE}
+    found = {"episodes": episodes, "picture_px": truth.SIZE}
     found |= _controllability(probe, ways, parts, seed)
     wish = perturbed(chunks, model.embodiments[robot].action_dim, prompt, seed)
     commands = wish.reshape(episodes, -1, model.embodiments[robot].action_dim)
@@ -112,7 +112,7 @@ def _controllability(probe: Probe, ways: dict[str, Images], parts: Floats, seed:
     own = probe.own
     if not len(own):
         return {"missing": "no part of the robot can be located in images of this tokenizer"}
-    found: dict[str, Any] = {
+    found = {
         "probe_px": rounded(probe.error[own].mean()),
         "spread_px": rounded(probe.spread[own].mean()),
     }
@@ -126,7 +126,7 @@ def _perturbed(
     model: HMA, true: RolloutImages, made: RolloutImages, batch: Batch, other: Batch, seed: int
 ) -> dict[str, Any]:
     """Return PSNR and perplexity under the true actions, and under the perturbed ones."""
-    found: dict[str, Any] = {"scale": PERTURBATION}
+    found = {"scale": PERTURBATION}
     for mark, pictures, windows in (("", true, batch), ("_star", made, other)):
         given = pictures.truth[:, pictures.prompt :]
         signal = psnr(given, pictures.predicted[:, pictures.prompt :], limit=PSNR_LIMIT)

@@ -196,7 +196,7 @@ def _measured(
         )  # fmt: skip
     elif settings.state:
         tell(work.frames, "its state, in new episodes")
-        sampling: Any = dict(settings.sampling)
+        sampling = dict(settings.sampling)
         found["state"] = measure_state(
             model, tokenizer, robot, frames=found["frames"], prompt=found["prompt"],
             episodes=settings.state, seed=settings.seed, **sampling,

@@ -139,7 +139,7 @@ def means(parts: Sequence[Part]) -> list[dict[str, Any]]:
     found = []
     for label in dict.fromkeys(part.checkpoint for part in parts):
         own = [part for part in parts if part.checkpoint == label]
-        row: dict[str, Any] = {"checkpoint": label, "embodiment": MEAN, "sets": len(own)}
+        row = {"checkpoint": label, "embodiment": MEAN, "sets": len(own)}
         row["windows"] = sum(part.found["windows"] for part in own)
         row["episodes"] = sum(part.found["episodes"] for part in own)
         for figure in present(own):

@@ -80,7 +80,7 @@ class StemGraph(nn.Module):
         known = ~torch.isnan(chunks).any(1)
         given = ActionConditioning(torch.nan_to_num(chunks).unsqueeze(0), known.unsqueeze(0))
         # The modulation that robots share belongs to the step.
-        trunk: Any = SimpleNamespace(config=self.config, absent=self.absent, modulation=None)
+        trunk = SimpleNamespace(config=self.config, absent=self.absent, modulation=None)
         made = condition(trunk, lambda _: self.stem, given, self.groups, torch.arange(2))
         assert made.embedding is not None
         parts = [made.embedding[0]]

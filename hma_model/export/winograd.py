@@ -108,7 +108,7 @@ def _both(matrix: Sequence[Sequence[float]]) -> Any:
 def _suits(node: Any, kernel: list[int], taken: list[int]) -> bool:
     if node.op_type != "Conv" or kernel[2:] != [3, 3] or len(taken) != 4 or kernel[1] < LEAST:
         return False
-    stated: dict[str, Any] = {"pads": [0] * 4, "strides": [1, 1], "dilations": [1, 1], "group": 1}
+    stated = {"pads": [0] * 4, "strides": [1, 1], "dilations": [1, 1], "group": 1}
     stated |= {one.name: list(one.ints) or one.i for one in node.attribute}
     plain = stated["pads"] == [1] * 4 and stated["strides"] == stated["dilations"] == [1, 1]
     return plain and stated["group"] == 1 and all(side and side % TILE == 0 for side in taken[2:])

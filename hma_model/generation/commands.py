@@ -53,7 +53,7 @@ class Commands:
         space = model.embodiments[embodiment]
         seen = _seen(model, embodiment)
         low, high = np.full((space.action_dim, 2), (-np.inf, np.inf), np.float32).T if seen is None else seen
-        names: list[str] = [f"action_{i}" for i in range(space.action_dim)]
+        names = [f"action_{i}" for i in range(space.action_dim)]
         if robot is not None:
             names = robot.action.names()
             low, high = low.copy(), high.copy()
@@ -139,7 +139,7 @@ def warn_outside(
         return
     if known is not None:
         actions = actions.masked_fill(~known[..., None], math.nan)
-    watched: dict[str, Commands | None] = vars(model).setdefault("watched_commands", {})
+    watched = vars(model).setdefault("watched_commands", {})
     names = [embodiments] * len(actions) if isinstance(embodiments, str) else list(embodiments)
     for name in sorted(set(names)):
         own = watched[name] if name in watched else _known(model, name)

@@ -110,7 +110,6 @@ def _compiled(function: Callable[..., Tensor], device: torch.device) -> Callable
     def call(*arguments: object) -> Tensor:
         torch.compiler.cudagraph_mark_step_begin()
         with torch._dynamo.config.patch(recompile_limit=MOST_GRAPHS):  # beyond it, code runs uncompiled
-            made: Tensor = compiled(*arguments)
-        return made
+            return compiled(*arguments)
 
     return call

@@ -60,7 +60,7 @@ class PackedLinear(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (..., in) to (..., out) float32."""
         x = x.to(self.dtype).contiguous()  # views of other strides take a path a thousand times slower
-        made: Tensor = _OPS._linear_pointwise(x, self.weight, self.bias, self.activation, [], "none")
+        made = _OPS._linear_pointwise(x, self.weight, self.bias, self.activation, [], "none")
         return made.float()
 
 
@@ -84,7 +84,7 @@ class QuantizedLinear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (..., in) to (..., out) float32."""
-        made: Tensor = torch.ops.quantized.linear_dynamic(x.contiguous(), self.weight, False)
+        made = torch.ops.quantized.linear_dynamic(x.contiguous(), self.weight, False)
         return nn.functional.gelu(made) if self.activation == "gelu" else made
 
 

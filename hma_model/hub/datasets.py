@@ -197,7 +197,7 @@ def _present(manifest: Manifest) -> list[str]:
 def _front(manifest: Manifest) -> dict[str, Any]:
     rows = sum(shard.rows for shard in manifest.shards)
     frames = [{"split": _SPLITS[split], "path": f"{split}/*.parquet"} for split in _present(manifest)]
-    configs: list[dict[str, Any]] = [{"config_name": "frames", "data_files": frames, "default": True}]
+    configs = [{"config_name": "frames", "data_files": frames, "default": True}]
     episodes = {"split": "train", "path": EPISODES}  # of both splits; datasets reserves the name "all"
     configs.append({"config_name": "episodes", "data_files": [episodes]})
     return {

@@ -116,7 +116,7 @@ def _arm(mechanism: Arm, found: list[Pad]) -> list[Pad]:
 def driving_keys(robot: Drivable) -> list[list[str]]:
     """Return the keys of each value, as browsers name them: down and up, one for a switch, or none."""
     across, along = list(ACROSS), list(ALONG)
-    found: list[list[str]] = [[" "] if dim.kind == "switch" else [] for dim in robot.dimensions]
+    found = [[" "] if dim.kind == "switch" else [] for dim in robot.dimensions]
 
     def turned(pair: tuple[str, str], flips: bool) -> list[str]:
         return list(pair[::-1] if flips else pair)

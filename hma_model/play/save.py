@@ -184,7 +184,7 @@ def embodiment_of(
     hz = max(1, round(robot.rate_hz))
     rate = "" if hz == robot.rate_hz else f"; the robot runs at {robot.rate_hz:g} Hz"
     kept = {key: values[key] for key in ("id", "description", "robot", "license") if key in values}
-    own: dict[str, Any] = kept | {
+    own = kept | {
         "kind": "simulation",
         "frequency_hz": hz,
         "stride": robot.stride,

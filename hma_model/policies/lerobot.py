@@ -86,7 +86,7 @@ class LeRobotPolicy:
 
     def act(self, arena: Arena) -> Float32s:
         images = network_images(arena.images, self._size)
-        batch: dict[str, Any] = {self._camera: images, TASK: [arena.scenes.name] * len(images)}
+        batch = {self._camera: images, TASK: [arena.scenes.name] * len(images)}
         if self._state is not None:
             batch[STATE] = torch.from_numpy(self._observed(arena))
         with torch.inference_mode():

@@ -202,7 +202,7 @@ def augment(
         fault = f"the simulator shows one camera, and the model sees {views}"
         remedy = "name shards with --from, and leave out --judge and policies that read the robot's state"
         raise UsageError("augment", fault, remedy)
-    made_by: dict[str, Any] = {"by": "hma augment", "synthetic": True, **asdict(settings)}
+    made_by = {"by": "hma augment", "synthetic": True, **asdict(settings)}
     made_by |= {"precision": world.precision} | world_digests(world, settings.embodiment)
     begins = None if shards is None else ShardSet(shards)
     if begins is not None:

@@ -122,7 +122,7 @@ def label_actions(
     with locked(folder):
         episodes = read_film(world, film, embodiment, robot.effective_hz)
         error = measure(world, spec, _check_set(model, embodiment, check), on_progress)
-        made_by: dict[str, Any] = {
+        made_by = {
             "by": "hma label-actions",
             "inferred_actions": True,
             "embodiment": embodiment,

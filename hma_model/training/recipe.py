@@ -334,13 +334,13 @@ def parse_overrides(overrides: Sequence[str], base: Mapping[str, Any] | None = N
     Raises:
         UsageError: an override is not key=value.
     """
-    values: dict[str, Any] = dict(base or {})
+    values = dict(base or {})
     for override in overrides:
         key, equals, text = override.partition("=")
         parts = key.strip().split(".")
         if not equals or not all(parts):
             raise UsageError(f"override {override!r}", "is not key=value", "write for example model.layers=4")
-        nested: Any = parse_yaml(text, f"override {override!r}", UsageError)
+        nested = parse_yaml(text, f"override {override!r}", UsageError)
         for part in reversed(parts):
             nested = {part: nested}
         if parts[0] == "objectives" and len(parts) > 1:

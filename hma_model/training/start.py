@@ -102,7 +102,7 @@ class Start:
             RecipeError: the recipe asks for another network.
         """
         config = self.config
-        changes: dict[str, Any] = {"objectives": recipe.objectives}
+        changes = {"objectives": recipe.objectives}
         for key, value in recipe.model.items():
             if key in OF_THE_TRUNK and self.frozen:
                 continue  # for waves, `waves` looks after them: each stem may have its own

@@ -247,7 +247,7 @@ class World:
         Its sessions are numbered from 0, those of one side by side.
         """
         ones = [self._at(session) for session in sessions for _ in range(n)]
-        way: dict[str, Any] = {"compile": self.compile, "precision": self.precision, **vars(self.decoding)}
+        way = {"compile": self.compile, "precision": self.precision, **vars(self.decoding)}
         other = World(self.model, self.tokenizer, **way)
         other._rollout = self._running().fork(n, [self._at(session).row for session in sessions])
         other._opened = len(ones)
