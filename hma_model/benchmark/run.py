@@ -156,8 +156,7 @@ def read_results(path: Path) -> dict[str, Any]:
             raise ValueError
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         raise OutputError(path, "holds no results of the benchmark", REMEDY) from None
-    digest = found.pop("sha256", None)  # results of older versions have none
-    if digest not in (None, _digest(found)):
+    if found.pop("sha256", None) not in (None, _digest(found)):  # results of older versions have none
         raise OutputError(path, "is damaged or edited: its SHA-256 does not match", REMEDY)
     return found
 

@@ -278,8 +278,7 @@ def _risk(stated: Floats, errors: Floats, seed: int) -> dict[str, Any]:
         parts = [summary("px", values.ravel()[one], seed, episodes=own[one], within=NATURAL) for one in kept]
         risk[f"{name}_px"] = [part["px"] for part in parts]
         risk[f"{name}_px_95"] = [part["px_95"] for part in parts]
-    half = COVERAGES.index(0.5)
-    found = {f"half_px{end}": risk[f"episodes_px{end}"][half] for end in ("", "_95")}
+    found = {f"half_px{end}": risk[f"episodes_px{end}"][COVERAGES.index(0.5)] for end in ("", "_95")}
     found |= {"risk": risk, "all_px": risk["episodes_px"][0]}
     return found | _half_gain(stated[..., -1], errors.mean(axis=-1), seed)
 

@@ -93,8 +93,7 @@ def _similarity(truth: Floats, picture: Floats) -> float:
 def _window_means(values: Floats) -> Floats:
     """Return the mean over every 7x7 window inside (H, W, C)."""
     edge = SSIM_WINDOW // 2
-    means = uniform_filter(values, SSIM_WINDOW, axes=(0, 1))
-    return means[edge:-edge, edge:-edge]
+    return uniform_filter(values, SSIM_WINDOW, axes=(0, 1))[edge:-edge, edge:-edge]
 
 
 def _require_pair(truth: Values, pictures: Values) -> None:

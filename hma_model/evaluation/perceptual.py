@@ -207,8 +207,7 @@ class FeatureCollector:
         """Add the predicted or true frames (B, T, S, S, 3) of some windows."""
         for metric, network in self.networks.features.items():
             if metric == "fid":
-                flat = _channels(pictures)
-                parts = flat.split(BATCH_SIZE)
+                parts = _channels(pictures).split(BATCH_SIZE)
             else:
                 chosen = pictures[:, stretched(pictures.shape[1])]
                 parts = tuple(as_video(_channels(video))[None] for video in chosen)

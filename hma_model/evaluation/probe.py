@@ -71,8 +71,7 @@ class TeeFinder:
 
     def find(self, pixels: Bools) -> Floats | None:
         """Return the places (2, 2) of the T that has the pixels (S, S); None if they are too few."""
-        side = len(pixels)
-        size = truth.SIZE / pusht.PX / side  # px of the arena
+        size = truth.SIZE / pusht.PX / len(pixels)  # px of the arena
         y, x = np.nonzero(pixels)
         boxes = self.shape.boxes
         areas = (boxes[:, 1] - boxes[:, 0]).prod(axis=1)

@@ -60,8 +60,7 @@ class PackedLinear(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (..., in) to (..., out) float32."""
         x = x.to(self.dtype).contiguous()  # views of other strides take a path a thousand times slower
-        made = _OPS._linear_pointwise(x, self.weight, self.bias, self.activation, [], "none")
-        return made.float()
+        return _OPS._linear_pointwise(x, self.weight, self.bias, self.activation, [], "none").float()
 
 
 class QuantizedLinear(nn.Module):

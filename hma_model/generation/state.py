@@ -240,8 +240,7 @@ class RowState:
         for row in rows:
             generator = self.generators[row]
             if generator is None:
-                device = device_of(self.shared)
-                seed = torch.randint(2**62, (), generator=self.shared, device=device)
+                seed = torch.randint(2**62, (), generator=self.shared, device=device_of(self.shared))
                 generator = self.generators[row] = self._seeded(int(seed))
             found.append(generator)
         return found

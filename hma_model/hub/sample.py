@@ -76,8 +76,7 @@ def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
         raise UsageError(shards.folder, fault, "give shards with longer episodes")
     windows = found[split]
     middle, tokenizer = len(windows) // 2, tokenizer_of(shards)
-    batch = windows.batch([middle])
-    true = rollout(model, tokenizer, batch)
+    true = rollout(model, tokenizer, windows.batch([middle]))
     picks = evenly(true.truth.shape[1], COLUMNS)
     rows = {
         "recorded, decoded from tokens": true.truth[0],

@@ -160,8 +160,7 @@ class _Views(Sequence[Images]):
         return len(self._images)
 
     def __getitem__(self, index: Any) -> Any:
-        image = decode_image(self._images[index], "a frame")
-        return np.split(image, self._views, axis=1)[self._view]
+        return np.split(decode_image(self._images[index], "a frame"), self._views, axis=1)[self._view]
 
 
 def embodiment_of(

@@ -157,8 +157,7 @@ class Server:
     async def save(self, request: Request) -> Response:
         """Return what was driven in a session as a file."""
         kind = request.query_params.get("kind", "")
-        name = request.query_params.get("session", "")
-        session = self.stepper.sessions.get(name)
+        session = self.stepper.sessions.get(request.query_params.get("session", ""))
         if session is None or kind not in FILE_KINDS:
             return PlainTextResponse("there is no such session, or no such kind of file\n", 404)
         frames = await asyncio.wrap_future(self.stepper.call(session.film))
@@ -467,8 +466,7 @@ async def serve(
     stepper = Stepper(worlds, robots, orders=("random", *confidence))
     stepper.start()
     try:
-        server = Server(stepper, name, host, token, first, held)
-        await run(server.app, listener, lambda server: ready())
+        await run(Server(stepper, name, host, token, first, held).app, listener, lambda server: ready())
     finally:
         stepper.stop()
 

@@ -51,15 +51,13 @@ def reached(parts: Floats, driven: int) -> Floats:
     """Return how near an own part comes to the first place of a loose part, negative; (N,) px."""
     later = parts[:, 1:] if parts.shape[1] > 1 else parts  # of one frame, nobody has moved yet
     gap = later[..., :driven, None, :] - parts[:, :1, None, driven:]
-    near = np.linalg.norm(gap, axis=-1).min(axis=(1, 2, 3))
-    return -near
+    return -np.linalg.norm(gap, axis=-1).min(axis=(1, 2, 3))
 
 
 def placed(parts: Floats, driven: int) -> Floats:
     """Return how far the T of a pusher ends from its goal (the further of its two places), negative; (N,)."""
     ends = np.median(parts[:, -END_FRAMES:, driven:], axis=1)
-    far = np.linalg.norm(ends - truth.goal_of(truth.PUSHERS[0]), axis=-1).max(axis=-1)
-    return -far
+    return -np.linalg.norm(ends - truth.goal_of(truth.PUSHERS[0]), axis=-1).max(axis=-1)
 
 
 @dataclass(frozen=True)

@@ -157,8 +157,7 @@ def infer(model: HMA, spec: Commands, stored: NDArray[Any]) -> Float32s:
     """
     count = len(stored)
     width = min(model.config.frames, len(stored))
-    hop = max(1, width // 2)
-    starts = sorted({*range(0, count - width, hop), count - width})
+    starts = sorted({*range(0, count - width, max(1, width // 2)), count - width})
     frames = torch.from_numpy(stored.astype(np.int64 if model.config.kind == "discrete" else np.float32))
     made = np.empty((count - 1, spec.stride * len(spec.names)), np.float32)
     for begin in range(0, len(starts), BATCH_WINDOWS):

@@ -122,8 +122,7 @@ class EventFile:
         self._records.close()
 
     def _write(self, **fields: Any) -> None:
-        event = self._protos.Event(wall_time=time.time(), **fields)
-        self._records.write(event.SerializeToString())
+        self._records.write(self._protos.Event(wall_time=time.time(), **fields).SerializeToString())
         self._records.flush()
 
 

@@ -59,8 +59,7 @@ def activation_bytes(config: HMAConfig, recipe: Recipe, windows: int, device: to
     if config.kind == "discrete":
         read = _score_values(config, recipe, device)
     else:
-        layers = config.diffusion_depth
-        read = int(DIFFUSION_VALUES * layers * config.diffusion_width)
+        read = int(DIFFUSION_VALUES * config.diffusion_depth * config.diffusion_width)
     return 4.0 * (values * (kept + PASS_VALUES) + hidden * read)
 
 
