@@ -139,7 +139,7 @@ def rollout_video(
 
 
 def lively_windows(
-    shards: ShardSet, length: int, prompt: int, *, count: int = 3, split: str = "val", candidates: int = 48
+    shards: ShardSet, length: int, prompt: int, *, count: int = 3, candidates: int = 48
 ) -> tuple[list[int], list[int]]:
     """Choose windows in which much moves, and for each the window whose actions differ most from its own.
 
@@ -149,13 +149,13 @@ def lively_windows(
     Args:
         shards: a shard set of discrete tokens.
         length, prompt: frames of a window, and those of its prompt.
-        count, split: how many windows of which split.
+        count: how many held-out windows.
         candidates: number of windows to choose from.
 
     Returns:
         The numbers of the windows, and the numbers of those with other actions, for `rollout_video`.
     """
-    dataset = WindowDataset(shards, split, length)
+    dataset = WindowDataset(shards, "val", length)
     numbers = evenly(len(dataset), candidates)
     batch = dataset.batch(numbers)
     assert batch.tokens is not None and batch.episode is not None

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,20 +32,18 @@ from hma_data.episodes.sheets import png_bytes
 from hma_data.errors import OutputError
 from hma_data.lab.family.bodies import Body
 from hma_data.storage.files import new_folder, read_json, to_json, write_atomic
+from hma_data.tokenizers.base import Tokenizer
 from hma_model.export import require_onnx
 from hma_model.export.files import facts, write_graph, write_part
 from hma_model.export.graphs import Port, StemGraph, StepGraph, require_exportable
 from hma_model.export.page import page_names, require_runtime, write_page
 from hma_model.export.starts import Start, round_weights, take_starts
 from hma_model.export.truth import body_values
+from hma_model.network.model import HMA
 from hma_model.play.holding import UNKNOWN, holdings
 from hma_model.play.pads import describe
 from hma_model.worlds.scenes import Drivable
 from hma_model.worlds.world import World
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-    from hma_model.network.model import HMA
 
 FORMAT, FORMAT_VERSION = "hma-export", 1
 MANIFEST, STEP, ROBOTS = "manifest.json", "step.onnx", "robots"
@@ -55,8 +53,8 @@ QUALITY = 90  # of WebP
 
 
 def export_folder(
-    model: "HMA",
-    tokenizer: "Tokenizer",
+    model: HMA,
+    tokenizer: Tokenizer,
     robots: Sequence[Drivable],
     out: Path,
     *,
@@ -174,7 +172,7 @@ def _require_own(out: Path) -> None:
         raise OutputError(out, fault, "it would be replaced: move them out, or choose another --out")
 
 
-def _write_robot(folder: Path, model: "HMA", robot: Drivable, starts: Sequence[Start]) -> dict[str, Any]:
+def _write_robot(folder: Path, model: HMA, robot: Drivable, starts: Sequence[Start]) -> dict[str, Any]:
     """Write the files of a robot; return what the manifest says of them."""
     name = robot.embodiment.id
     home = folder / ROBOTS / name

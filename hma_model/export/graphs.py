@@ -17,13 +17,14 @@ C values of a patch, k tokens unmasked in a pass.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hma_data.errors import CheckpointError
+from hma_data.tokenizers.base import Tokenizer
 from hma_data.tokenizers.network import NetworkTokenizer
 from hma_model.generation.unmask import masked_after
 from hma_model.network.conditioning import ActionConditioning, Groups, condition
@@ -31,9 +32,6 @@ from hma_model.network.head import sampling_levels
 from hma_model.network.network import Network
 from hma_model.network.stem import from_digits, patchify, to_digits, unpatchify
 from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions, ring_times
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ class Port:
     law: str = ""
 
 
-def require_exportable(model: Network, tokenizer: "Tokenizer") -> None:
+def require_exportable(model: Network, tokenizer: Tokenizer) -> None:
     """Raise CheckpointError for a model or tokenizer whose graphs are not written."""
     config, where = model.config, model.source.name if model.source else "the model"
     if not config.predicts_video:
@@ -103,7 +101,7 @@ class StepGraph(nn.Module):
         draws: the other inputs.
     """
 
-    def __init__(self, model: Network, tokenizer: "Tokenizer", unmask_steps: int = 2) -> None:
+    def __init__(self, model: Network, tokenizer: Tokenizer, unmask_steps: int = 2) -> None:
         super().__init__()
         self.trunk, self.readout, self.config = model.trunk, model.readout, model.config
         self.decoder = tokenizer.network if isinstance(tokenizer, NetworkTokenizer) else None

@@ -5,23 +5,21 @@ P frames of a start, H×W pixels, A action dims, K = stride * A.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from hma_data.lab.family.table import BlockTable
+from hma_data.tokenizers.base import Tokenizer
 from hma_data.tokenizers.network import NetworkTokenizer
 from hma_model.evaluation.metrics import PSNR_LIMIT, psnr
 from hma_model.export.files import rounded
 from hma_model.export.truth import table_values
+from hma_model.network.model import HMA
 from hma_model.worlds.scenes import Drivable, LabScene
 from hma_model.worlds.world import World
-
-if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
-    from hma_model.network.model import HMA
 
 REPLAY_FRAMES = 60  # true images of a replay, that of the start included
 MOST_LOSS_DB = 0.1  # that weights in float16 may cost
@@ -80,7 +78,7 @@ def _with_truth(start: Start, scene: LabScene) -> Start:
 
 
 def round_weights(
-    model: "HMA", tokenizer: "Tokenizer", starts: Mapping[str, Sequence[Start]]
+    model: HMA, tokenizer: Tokenizer, starts: Mapping[str, Sequence[Start]]
 ) -> tuple[float, bool]:
     """Round the weights to float16 unless that costs too much; return the loss in dB, and whether they are.
 
@@ -101,7 +99,7 @@ def round_weights(
     return loss, False
 
 
-def _one_step_psnr(model: "HMA", tokenizer: "Tokenizer", starts: Mapping[str, Sequence[Start]]) -> float:
+def _one_step_psnr(model: HMA, tokenizer: Tokenizer, starts: Mapping[str, Sequence[Start]]) -> float:
     world = World(model, tokenizer, temperature=0.0)
     scores = []
     for name, some in starts.items():

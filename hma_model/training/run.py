@@ -297,7 +297,7 @@ class Run:
     def _pass(self, number: int, batch: Batch, last: bool) -> Any:
         """Run a forward and backward pass; the loss of a step is the mean over the passes of all ranks."""
         recipe = self.recipe
-        generator = torch.Generator().manual_seed(seed_for(recipe.seed, "masks", self.step, number))
+        generator = self._generator("masks", number)
         with self.parallel_model.passing(last):
             with self._autocast():
                 # not compiled: each number of windows would be compiled anew
@@ -311,19 +311,22 @@ class Run:
             (output.loss / len(self.train_data.own)).backward()
         return output
 
+    def _generator(self, what: str, number: int) -> torch.Generator:
+        """Return the generator of a pass of this step for one purpose."""
+        return torch.Generator().manual_seed(seed_for(self.recipe.seed, what, self.step, number))
+
     def _cropped(self, number: int, batch: Batch) -> Batch:
         """Return the batch, cut to squares if the model is trained on parts of frames."""
         if not self.model.config.crop:
             return batch
-        draws = torch.Generator().manual_seed(seed_for(self.recipe.seed, "crops", self.step, number))
-        return cropped(self.model.config, batch, draws)
+        return cropped(self.model.config, batch, self._generator("crops", number))
 
     def _with_own_past(self, number: int, batch: Batch) -> Batch:
         """Return the batch, in which the past of some windows is the model's own, as the recipe has it."""
         recipe = self.recipe
         if not recipe.self_forward or self.step < recipe.self_forward_from:
             return batch
-        draws = torch.Generator().manual_seed(seed_for(recipe.seed, "self_forward", self.step, number))
+        draws = self._generator("self_forward", number)
         return forwarded(self.model, batch, recipe.self_forward, recipe.self_forward_frames, draws)
 
     def _autocast(self) -> AbstractContextManager[Any]:

@@ -1,8 +1,14 @@
 """Offer robots to drive, and scenes in which to begin.
 
-A scene gives the prompt of a world model, and then tells what truly happens under further actions. The
-laboratory's simulators know it for any actions; a recording knows it for its own actions alone; nobody
+A scene gives the prompt of a world model, and the action (A,) that leaves the robot as it is after it. It
+then tells what truly happens under further actions: `advance` takes a chunk (K,), or None for the recorded
+one, and returns it with the true image (H, W, 3) after it if that is known; None at a recording's end. The
+laboratory's simulators know the truth for any actions; a recording knows it for its own actions alone; nobody
 knows it for a robot that begins from images.
+
+A robot has a `key` of letters, digits, `_`, `-`, `.` and `:`, which tells it from others, the A `dimensions`
+of an action, and the names of the `cameras` that its images show side by side. Its `scene(number)` is there
+for every number from 0 on.
 
 P frames of a prompt, H×W pixels, A action dims, K = stride * A values of a chunk.
 """
@@ -11,7 +17,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,48 +67,6 @@ class Dimension:
     low: float
     high: float
     kind: str
-
-
-class DrivenScene(Protocol):
-    """The scene of a robot, and what truly happens there.
-
-    Attributes:
-        prompt: the beginning.
-        action: (A,) the action that leaves the robot as it is after the prompt.
-    """
-
-    prompt: Prompt
-    action: Float32s
-
-    def advance(self, chunk: Float32s | None) -> tuple[Float32s, Images | None] | None:
-        """Take the next chunk.
-
-        Args:
-            chunk: (K,) actions; None for the recorded ones.
-
-        Returns:
-            The chunk, and the true image (H, W, 3) after it if it is known; None at a recording's end.
-        """
-
-
-class Drivable(Protocol):
-    """A robot with scenes to begin in.
-
-    Attributes:
-        key: tells it from others; letters, digits, `_`, `-`, `.` and `:`.
-        dimensions: A of them.
-        cameras: the names of those that its images show, side by side.
-        source: "simulator", "recordings" or "images".
-    """
-
-    key: str
-    embodiment: Embodiment
-    dimensions: tuple[Dimension, ...]
-    cameras: list[str]
-    source: str
-
-    def scene(self, number: int) -> DrivenScene:
-        """Return the scene of that number; there is one for every number from 0 on."""
 
 
 # -- the laboratory
@@ -296,6 +260,8 @@ class ImageRobot:
 
 
 # -- what can be driven
+
+Drivable = LabRobot | RecordedRobot | ImageRobot
 
 
 def drivable(

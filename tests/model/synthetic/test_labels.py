@@ -34,7 +34,7 @@ ROBOT = "rails_03"
 @pytest.fixture(autouse=True)
 def yaml(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the model, which is of no checkpoint, have the YAML of its robot."""
-    monkeypatch.setattr(labels, "described", lambda model, name: family.embodiment(name))
+    monkeypatch.setattr(labels, "yaml_of", lambda model, name: family.embodiment(name))
 
 
 @pytest.fixture(scope="module")
@@ -274,7 +274,7 @@ def test_film_shows_the_cameras_that_the_model_was_trained_on(three, views, seen
 def test_labelled_shards_name_the_cameras_that_their_images_are_of(
     three: ShardSet, views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(labels, "described", generation_commands.described)
+    monkeypatch.setattr(labels, "yaml_of", generation_commands.yaml_of)
     known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
     monkeypatch.setattr(labels, "measure", lambda *_: known)
     world: Any = World(trained_on(views, three, tmp_path / "model", "inverse").model, BlockTokenizer())

@@ -155,7 +155,7 @@ def test_a_session_that_cannot_begin_leaves_its_place(monkeypatch: pytest.Monkey
     (robot,) = lab_robots("mover_04").values()
     world = TrueWorld()
     monkeypatch.setattr(world, "image", lambda row: np.zeros((3, 3, 3), np.uint8))
-    with pytest.raises(ValueError, match="broadcast"):
+    with pytest.raises(UsageError, match="images must both be"):
         Session("s", robot, 0, world, Decoding(2, 0.0), 0.0)
     assert not world.rows
 
