@@ -35,39 +35,28 @@ RATES = {  # key of a line -> what it is, and whether its axis is logarithmic
 Line = dict[str, Any]  # of metrics.jsonl
 
 
-class _Figures:
+class Figures:
     """Figures over training, of which a point takes 16 bytes: a run may have millions of steps."""
 
     def __init__(self) -> None:
         self._values: dict[str, array[float]] = {}
 
-    def add(self, line: Line, values: dict[str, float | None]) -> None:
-        """Add the values of a line by name, without those that are None."""
+    def add(self, line: Line) -> None:
+        """Add the losses by robot and the rates of a line; those that are None are left out."""
+        kind = "training" if line["kind"] == "train" else "held_out"
+        values = {f"{kind}/loss/{name}": loss for name, loss in line["loss_by_embodiment"].items()}
+        values |= {f"rates/{name}": line.get(name) for name in (*RATES, "data_seconds", "memory_mib")}
         for name, value in values.items():
             if value is not None:
                 self._values.setdefault(name, array("d")).extend((line["step"], value))
 
-    def points(self) -> dict[str, NDArray[np.float64]]:
-        """Return the points (N, 2) of each figure: steps and values."""
-        return {name: np.array(values).reshape(-1, 2) for name, values in self._values.items()}
-
-
-class _Steps:
-    """What the report shows of the steps of a run, whose lines are added one by one."""
-
-    def __init__(self) -> None:
-        self.recent: deque[Line] = deque(maxlen=RECENT)
-        self.of_robots: dict[str, deque[float | None]] = {}  # the last losses of each
-        self.losses, self.rates = _Figures(), _Figures()
-        self.memory_mib = 0.0
-
-    def add(self, line: Line) -> None:
-        self.recent.append(line)
-        for name, loss in line["loss_by_embodiment"].items():
-            self.of_robots.setdefault(name, deque(maxlen=RECENT)).append(loss)
-        self.losses.add(line, line["loss_by_embodiment"])
-        self.rates.add(line, {key: line.get(key) for key in RATES})
-        self.memory_mib = max(self.memory_mib, line.get("memory_mib") or 0)
+    def points(self, home: str = "") -> dict[str, NDArray[np.float64]]:
+        """Return the points (N, 2), steps and values, of each figure whose name begins with `home`."""
+        return {
+            name.removeprefix(home): np.array(values).reshape(-1, 2)
+            for name, values in self._values.items()
+            if name.startswith(home)
+        }
 
 
 def write_report(out: StrPath) -> None:
@@ -77,22 +66,23 @@ def write_report(out: StrPath) -> None:
         OSError: the file cannot be written.
     """
     out = as_path(out)
-    steps, evaluations = _Steps(), list[Line]()
+    figures, recent, evaluations = Figures(), deque[Line](maxlen=RECENT), list[Line]()
     for line in read_metrics(out):
-        (steps.add if line["kind"] == "train" else evaluations.append)(line)
+        figures.add(line)
+        (recent if line["kind"] == "train" else evaluations).append(line)
     recipe, ground = read_json(out / RECIPE), read_json(out / ENVIRONMENT)
     sets = human_count(len(recipe["data"]), "shard set")
     facts = [sets, ground["device"], f"torch {ground['torch']}"]
     if revision := ground["git_revision"]:
         facts.append(f"revision {revision[:10]}")
     page = Page(f"Training: {out.absolute().name}", ", ".join(facts))
-    if steps.recent:
-        _headline(page, recipe, steps, evaluations)
-        _robots(page, steps, evaluations)
-        _curves(page, out, recipe, steps, evaluations)
+    if recent:
+        _headline(page, recipe, recent, evaluations, figures)
+        _robots(page, recent, evaluations, figures)
+        _curves(page, out, recipe, evaluations, figures)
     _samples(page, out)
-    if steps.recent:
-        _course(page, steps)
+    if recent:
+        _course(page, figures)
     for title, columns, values in (
         ("Recipe", ["key", "value"], sorted(recipe.items())),
         ("Environment", ["what", "is"], ground.items()),
@@ -103,8 +93,10 @@ def write_report(out: StrPath) -> None:
     write_atomic(out / REPORT, page.html())
 
 
-def _headline(page: Page, recipe: dict[str, Any], steps: _Steps, evaluations: list[Line]) -> None:
-    recent, main = steps.recent, max(recipe["objectives"], key=recipe["objectives"].get)
+def _headline(
+    page: Page, recipe: dict[str, Any], recent: deque[Line], evaluations: list[Line], figures: Figures
+) -> None:
+    main, rates = max(recipe["objectives"], key=recipe["objectives"].get), figures.points("rates/")
     own = [s.get("loss_by_objective", {main: s["loss"]}).get(main) for s in recent]
     losses = [loss for loss in own if loss is not None]
     pace = sum(s["windows"] for s in recent) / max(sum(s["step_seconds"] for s in recent), 1e-9)
@@ -115,34 +107,32 @@ def _headline(page: Page, recipe: dict[str, Any], steps: _Steps, evaluations: li
         (_short(last.get("loss")), "held-out loss"),
         (_short(last.get("baseline")), "held-out loss of the token frequencies"),
         (f"{pace:.1f}", "windows a second"),
-        (human_seconds(steps.rates.points()["step_seconds"][:, 1].sum()), "spent in steps"),
-        (f"{steps.memory_mib:,.0f} MiB", "of memory at most"),
+        (human_seconds(rates["step_seconds"][:, 1].sum()), "spent in steps"),
+        (f"{rates['memory_mib'][:, 1].max():,.0f} MiB", "of memory at most"),
         (f"{recent[-1].get('skipped', 0)}", "steps skipped"),
     ]
     page.figures([tile for tile in tiles if tile[0]])
 
 
-def _robots(page: Page, steps: _Steps, evaluations: list[Line]) -> None:
-    held = evaluations[-1] if evaluations else {}
+def _robots(page: Page, recent: deque[Line], evaluations: list[Line], figures: Figures) -> None:
+    held, losses = evaluations[-1] if evaluations else {}, figures.points("training/loss/")
     rows = []
-    for name, losses in sorted(steps.of_robots.items()):
-        figures = (held.get(f"{key}_by_embodiment", {}).get(name) for key in ("loss", "baseline", "accuracy"))
-        rows.append([name, _mean(list(losses)), *figures])
+    for name in sorted({*losses, *recent[-1]["loss_by_embodiment"]}):
+        last = losses[name][-RECENT:, 1].tolist() if name in losses else []
+        others = (held.get(f"{key}_by_embodiment", {}).get(name) for key in ("loss", "baseline", "accuracy"))
+        rows.append([name, _mean(last), *others])
     page.section("Robots", "Losses of the last steps and the last evaluation.")
     page.table(["robot", "training loss", "held-out loss", "token frequencies", "accuracy"], rows)
 
 
-def _curves(page: Page, out: Path, recipe: dict[str, Any], steps: _Steps, evaluations: list[Line]) -> None:
-    held = _Figures()
-    for line in evaluations:
-        held.add(line, line["loss_by_embodiment"])
+def _curves(page: Page, out: Path, recipe: dict[str, Any], evaluations: list[Line], figures: Figures) -> None:
     video = any(OBJECTIVES[name].predicts_video for name in recipe["objectives"])
     discrete = any("perplexity" in line for line in evaluations)
     label, kept = "loss", training_checkpoints(out)
     if video and discrete:
         label = f"loss, nats a {token_words(Checkpoint.open(kept[-1]).config.merge) if kept else 'token'}"
     page.section("Losses")
-    plot = loss_curves(steps.losses.points(), held.points(), label)
+    plot = loss_curves(figures.points("training/loss/"), figures.points("held_out/loss/"), label)
     page.picture(plot, "svg+xml", "Training (lines) and held-out (markers) loss by robot")
 
 
@@ -154,11 +144,11 @@ def _samples(page: Page, out: Path) -> None:
         page.picture(path.read_bytes(), "png", f"{name}, after step {int(path.stem[5:13]):,}")
 
 
-def _course(page: Page, steps: _Steps) -> None:
+def _course(page: Page, figures: Figures) -> None:
     page.section("Course")
-    figures = steps.rates.points()
+    rates = figures.points("rates/")
     for key, (label, log) in RATES.items():
-        page.picture(course(figures.get(key, ()), label, log), "svg+xml", f"{label} over the run")
+        page.picture(course(rates.get(key, ()), label, log), "svg+xml", f"{label} over the run")
 
 
 def _mean(values: list[Any]) -> float:

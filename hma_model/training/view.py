@@ -1,9 +1,7 @@
 """Show a training run in Rerun: its losses and rates, and a held-out window beside its prediction."""
 
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,8 +13,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.training.logging import read_metrics
-
-RATES = ("lr", "grad_norm", "step_seconds", "data_seconds")
+from hma_model.training.report import Figures
 
 
 def view_run(out: StrPath, window: int = 0, data: Sequence[StrPath] = ()) -> View:
@@ -38,7 +35,10 @@ def view_run(out: StrPath, window: int = 0, data: Sequence[StrPath] = ()) -> Vie
     shards = next((one for one in sets if one.embodiment.id in checkpoint.embodiments), None)
     if not checkpoint.config.predicts_video:
         sets, shards = [], None
-    figures = _figures(read_metrics(out))
+    kept = Figures()
+    for line in read_metrics(out):
+        kept.add(line)
+    figures = kept.points()
     if data and shards is None:
         names = ", ".join(checkpoint.embodiments)
         raise UsageError(data[0], f"is of no robot of the checkpoint, which has: {names}")
@@ -49,21 +49,8 @@ def view_run(out: StrPath, window: int = 0, data: Sequence[StrPath] = ()) -> Vie
     else:
         view = _rolled(out, checkpoint, shards, window)
     for entity, points in figures.items():
-        view.steps(entity, [step for step, _ in points], [value for _, value in points])
+        view.steps(entity, points[:, 0].astype(int).tolist(), points[:, 1].tolist())
     return view
-
-
-def _figures(lines: Iterable[dict[str, Any]]) -> dict[str, list[tuple[int, float]]]:
-    """Return the points (step, value) of each figure by its entity."""
-    found: dict[str, list[tuple[int, float]]] = defaultdict(list)
-    for line in lines:
-        kind = "training" if line["kind"] == "train" else "held_out"
-        values = {f"{kind}/loss/{name}": loss for name, loss in line["loss_by_embodiment"].items()}
-        values |= {f"rates/{name}": line.get(name) for name in RATES}
-        for entity, value in values.items():
-            if value is not None:
-                found[entity].append((line["step"], value))
-    return found
 
 
 def _rolled(out: Path, checkpoint: Checkpoint, shards: ShardSet, window: int) -> View:
