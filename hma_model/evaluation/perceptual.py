@@ -147,17 +147,14 @@ class Moments:
     """The count, mean (D,) and sum of outer products of deviations (D, D) of features."""
 
     count: int = 0
-    mean: Floats | None = None
-    scatter: Floats | None = None
+    mean: Any = 0.0
+    scatter: Any = 0.0
 
     def add(self, features: NDArray[np.floating]) -> None:
         """Add features (N, D), as Chan et al. (1979) merge two sets."""
         values = features.astype(np.float64)
         mean = values.mean(axis=0)
         scatter = (values - mean).T @ (values - mean)
-        if self.mean is None or self.scatter is None:
-            self.count, self.mean, self.scatter = len(values), mean, scatter
-            return
         total, apart = self.count + len(values), mean - self.mean
         self.scatter = self.scatter + scatter + np.outer(apart, apart) * (self.count * len(values) / total)
         self.mean = self.mean + apart * (len(values) / total)
@@ -166,19 +163,16 @@ class Moments:
     @property
     def covariance(self) -> Floats:
         """Return the unbiased covariance (D, D)."""
-        assert self.scatter is not None
         return self.scatter / (self.count - 1)
 
     @property
     def needed(self) -> int:
         """Return the least number of features whose covariance can have full rank."""
-        assert self.mean is not None
         return len(self.mean) + 1
 
 
 def frechet_distance(one: Moments, other: Moments) -> float:
     """Return |m1 - m2|² + tr(C1 + C2 - 2 (C1 C2)^½) of two normal distributions."""
-    assert one.mean is not None and other.mean is not None
     root = _root(one.covariance)
     product = np.linalg.eigvalsh(root @ other.covariance @ root)
     apart = np.square(one.mean - other.mean).sum()

@@ -11,6 +11,7 @@ answers the perturbed actions, and the model is compared with that answer.
 B episodes, T frames, P predicted frames, S pixels a side, K = stride·A.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, Unpack
 
@@ -69,7 +70,7 @@ def measure_state(
     simulate = partial(truth.episode, robot, frames, stride, seed)
     made = [simulate(FIRST_EPISODE + number) for number in range(episodes)]
     chunks = np.stack([one.chunks for one in made])
-    batch = _batch(model, tokenizer, robot, made)
+    batch = as_batch(model, tokenizer, robot, made)
     roll = partial(rollout, model, tokenizer, prompt=prompt, seed=seed, **sampling)
     true = roll(batch)
     copied = true.truth[:, prompt - 1 : prompt].repeat(frames - prompt, axis=1)
@@ -86,7 +87,7 @@ def measure_state(
     wish = perturbed(chunks, model.embodiments[robot].action_dim, prompt, seed)
     commands = wish.reshape(episodes, -1, model.embodiments[robot].action_dim)
     answers = [simulate(FIRST_EPISODE + number, commands=commands[number]) for number in range(episodes)]
-    other = _batch(model, tokenizer, robot, answers)
+    other = as_batch(model, tokenizer, robot, answers)
     return found | {"perturbed": _perturbed(model, true, roll(other), batch, other, seed)}
 
 
@@ -98,7 +99,7 @@ def perturbed(chunks: Float32s, dims: int, prompt: int, seed: int) -> Float32s:
     return (steps + PERTURBATION * noise).reshape(chunks.shape).astype(np.float32)
 
 
-def _batch(model: HMA, tokenizer: Tokenizer, robot: str, made: list[truth.TrueEpisode]) -> Batch:
+def as_batch(model: HMA, tokenizer: Tokenizer, robot: str, made: Sequence[truth.TrueEpisode]) -> Batch:
     """Return simulated episodes as windows."""
     stored = np.stack([tokenizer.encode(as_seen(robot, tokenizer, one.pictures)) for one in made])
     actions = torch.from_numpy(np.stack([one.chunks for one in made]))

@@ -7,20 +7,17 @@ B rollouts, T frames, S pixels a side, P parts, C colours.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
 from hma_data.episodes.images import opencv
 from hma_data.lab import truth
 from hma_data.lab.truth import TrueEpisode
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Bools, Float32s, Floats, Images
+from hma_model.arrays import Bools, Floats, Images
 from hma_model.evaluation.probe import as_seen
-from hma_model.generation.decode import decode
-from hma_model.generation.rollout import Rollout
+from hma_model.evaluation.rollouts import rollout
+from hma_model.evaluation.simulated import as_batch
 from hma_model.network.model import HMA
 
 NEAR = 60.0  # distance of RGB within which a pixel has an object's colour
@@ -56,49 +53,16 @@ def continued(
     seed: int,
     *,
     decoded: bool = False,
-    **options: Any,
 ) -> Found:
     """Continue true episodes of one length in the model, from their first frames under the same actions.
 
     Args:
         decoded: take the truth as the tokens show it, so that what they lose does not count.
-        options: of the `Rollout`.
     """
-    seen = np.stack([as_seen(robot, tokenizer, one.pictures) for one in episodes])
-    tokens = np.stack([tokenizer.encode(images if decoded else images[:prompt]) for images in seen])
-    given = tokens[:, :prompt]
-    chunks, frames = np.stack([one.chunks for one in episodes]), range(1, seen.shape[1] - prompt + 1)
-    made = rolled(model, tokenizer, robot, given, chunks, options=options, frames=frames, seed=seed)
-    images = np.concatenate([tokenizer.decode(given[:, -1])[:, None], made], axis=1)
-    parts = np.stack([one.parts for one in episodes])[:, prompt - 1 :]
-    true = np.stack([tokenizer.decode(one) for one in tokens]) if decoded else seen
-    return Found(robot, true[:, prompt - 1 :], images, parts, episodes[0].driven)
-
-
-def rolled(
-    model: HMA,
-    tokenizer: Tokenizer,
-    robot: str,
-    stored: NDArray[Any],
-    chunks: Float32s,
-    *,
-    options: dict[str, Any],
-    frames: Sequence[int],
-    seed: int,
-) -> Images:
-    """Continue prompts (B, P, …) under chunks (B, T, K); return the images (B, W, S, S, 3) of W frames."""
-    discrete, begin = model.config.kind == "discrete", stored.shape[1] - 1
-    known = torch.from_numpy(stored.astype(np.int64 if discrete else np.float32)).to(model.device)
-    commands = torch.from_numpy(chunks).to(model.device)
-    generator = torch.Generator().manual_seed(seed)
-    rollout = Rollout(model, robot, len(known), generator=generator, **options)
-    rollout.prompt(known, commands)
-    kept = []
-    for frame in range(1, frames[-1] + 1):
-        made = rollout.step(commands[:, begin + frame - 1])
-        if frame in frames:
-            kept.append(made.cpu())
-    return decode(tokenizer, torch.stack(kept, dim=1))
+    made = rollout(model, tokenizer, as_batch(model, tokenizer, robot, episodes), prompt=prompt, seed=seed)
+    true = made.truth if decoded else np.stack([as_seen(robot, tokenizer, one.pictures) for one in episodes])
+    parts, begin = np.stack([one.parts for one in episodes]), prompt - 1
+    return Found(robot, true[:, begin:], made.predicted[:, begin:], parts[:, begin:], episodes[0].driven)
 
 
 def colors_of(found: Found) -> Floats:

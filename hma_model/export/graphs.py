@@ -103,7 +103,9 @@ class StepGraph(nn.Module):
 
     def __init__(self, model: Network, tokenizer: Tokenizer, unmask_steps: int = 2) -> None:
         super().__init__()
-        self.trunk, self.readout, self.config = model.trunk, model.readout, model.config
+        self.trunk: Any = model.trunk
+        self.readout: Any = model.readout
+        self.config = model.config
         self.decoder = tokenizer.network if isinstance(tokenizer, NetworkTokenizer) else None
         self.tokenizer, config = tokenizer, model.config
         self.steps = 1 if config.whole_frames else unmask_steps
@@ -125,8 +127,8 @@ class StepGraph(nn.Module):
         if self.discrete:
             for digits in (self.config.factored, self.config.digits):
                 to_digits(torch.zeros(1, dtype=torch.int64), digits)
-        elif self._readout.draws:
-            sampling_levels(len(self._readout.diffusion.alpha_bars), self.config.diffusion_sample_steps)
+        elif self.readout.draws:
+            sampling_levels(len(self.readout.diffusion.alpha_bars), self.config.diffusion_sample_steps)
 
     @property
     def inputs(self) -> list[Port]:
@@ -145,17 +147,8 @@ class StepGraph(nn.Module):
         if self.discrete:
             yield Port("noise", (1, len(config.digits), tokens, max(config.digits)), "float32", "uniform")
             yield Port("temperature", (), "float32")
-        elif self._readout.draws:
+        elif self.readout.draws:
             yield Port("noise", (tokens, config.patch_dim), "float32", "normal")
-
-    @property
-    def _readout(self) -> Any:
-        return self.readout
-
-    @property
-    def _embed(self) -> Any:
-        trunk: Any = self.trunk  # that of a discrete model embeds tokens
-        return trunk.embed
 
     def _carried(self) -> Carried:
         config = self.config
@@ -234,7 +227,7 @@ class StepGraph(nn.Module):
         values = max(self.config.digits)
 
         def embed(masked: Tensor) -> Tensor:
-            return self._embed.of_digits(
+            return self.trunk.embed.of_digits(
                 torch.stack([before, digits], 1), torch.stack([shown, masked], 1), [-1, 0]
             )
 
@@ -248,10 +241,10 @@ class StepGraph(nn.Module):
             ) -> Tensor:
                 unsure.append(scores)
                 drawn = scores + noise[:, first : first + scores.shape[1], :, : scores.shape[3]]
-                return self._readout.taken(drawn)
+                return self.readout.taken(drawn)
 
             copied = _at(before, places) if self.config.copy_previous else None
-            made = self._readout.decide(_at(features, places), choose, copied)
+            made = self.readout.decide(_at(features, places), choose, copied)
             digits = _put(digits, places, made.transpose(1, 2))
             likely = torch.cat([_widened(scores, values) for scores in unsure], dim=1).softmax(-1)
             nats = nats - (likely * likely.clamp_min(1e-30).log()).sum((1, 2, 3))
@@ -291,9 +284,9 @@ class StepGraph(nn.Module):
 
         kept = before.unsqueeze(1) if config.copy_previous else None
         for features, places, own in self._passes(conditioning, times, past, embed, draws.get("rank")):
-            conditions = self._readout(features.unsqueeze(1), times.positions[:, -1], kept)[:, 0]
+            conditions = self.readout(features.unsqueeze(1), times.positions[:, -1], kept)[:, 0]
             noise = draws["noise"][own] if "noise" in draws else None
-            made = self._readout.sample(_at(conditions, places)[0], None, 0.0, noise).unsqueeze(0)
+            made = self.readout.sample(_at(conditions, places)[0], None, 0.0, noise).unsqueeze(0)
             patches = _put(patches, places, made)
         latents = unpatchify(patches.unsqueeze(0), config.patch, config.token_grid)[0, 0]
         latents = latents / config.latent_scale

@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 from hma_data.errors import UsageError
 from hma_data.lab import simulator, truth
 from hma_data.storage.yaml_io import parse_yaml
-from hma_model.evaluation.wholeness import rolled
 from recipes.bench.harness import Bench
 
 if TYPE_CHECKING:
@@ -191,6 +190,37 @@ def measure(
     print(f"{robot}: {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
     parts = np.stack([one.parts[indices] for one in episodes])
     return Found(robot, probe, frames, true, parts, tuple(cases))
+
+
+def rolled(
+    model: "HMA",
+    tokenizer: "Tokenizer",
+    robot: str,
+    stored: NDArray[Any],
+    chunks: NDArray[np.float32],
+    *,
+    options: dict[str, Any],
+    frames: Sequence[int],
+    seed: int,
+) -> Images:
+    """Continue prompts (B, P, …) under chunks (B, T, K); return the images (B, W, S, S, 3) of W frames."""
+    import torch
+
+    from hma_model.generation.decode import decode
+    from hma_model.generation.rollout import Rollout
+
+    discrete, begin = model.config.kind == "discrete", stored.shape[1] - 1
+    known = torch.from_numpy(stored.astype(np.int64 if discrete else np.float32)).to(model.device)
+    commands = torch.from_numpy(chunks).to(model.device)
+    generator = torch.Generator().manual_seed(seed)
+    rollout = Rollout(model, robot, len(known), generator=generator, **options)
+    rollout.prompt(known, commands)
+    kept = []
+    for frame in range(1, frames[-1] + 1):
+        made = rollout.step(commands[:, begin + frame - 1])
+        if frame in frames:
+            kept.append(made.cpu())
+    return decode(tokenizer, torch.stack(kept, dim=1))
 
 
 # -- figures
