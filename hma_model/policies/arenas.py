@@ -11,7 +11,7 @@ import copy
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,31 +104,6 @@ def shows_state(robot: str) -> bool:
     return robot == PUSHER or FAMILY.fullmatch(robot) is not None
 
 
-class Arena(Protocol):
-    """A place where a policy acts."""
-
-    scenes: Scenes
-    prompts: Sequence[Prompt]  # of the scenes, at the rate of the model's frames
-    images: Images  # (N, S, S, 3), the newest ones
-    held: Float32s  # (N, A), the actions that leave the robot as it is after the prompt
-
-    @property
-    def fresh(self) -> bool:
-        """Return whether the images came with the last step."""
-
-    def states(self) -> list[SceneState]:
-        """Return the state of each scene; for robots that are steerable."""
-
-    def observed(self) -> Float32s | None:
-        """Return the robots' measurements of themselves (N, S'), as recorded; None if images tell none."""
-
-    def recorded(self) -> Float32s:
-        """Return the next actions (N, A) of the recorder's own driver; call it once a step."""
-
-    def step(self, actions: Float32s) -> None:
-        """Take an action (N, A)."""
-
-
 class TrueArena:
     """The simulators.
 
@@ -138,7 +113,9 @@ class TrueArena:
         drawn: whether there are images; else they are those of the prompts.
 
     Attributes:
-        prompts: of the scenes.
+        prompts: of the scenes, at the rate of the model's frames.
+        images: (N, S, S, 3), the newest ones.
+        held: (N, A), the actions that leave the robot as it is after the prompt.
         parts: the true places (N, P, 2) of the parts at each image.
         told: what `recorded` returned so far.
         first_images: (N, S, S, 3) of the start.
@@ -162,21 +139,26 @@ class TrueArena:
 
     @property
     def fresh(self) -> bool:
+        """Return whether the images came with the last step."""
         return self._steps % self.scenes.stride == 0
 
     def states(self) -> list[SceneState]:
+        """Return the state of each scene; for robots that are steerable."""
         return [state_of(scene.simulator.simulation) for scene in self._begun]
 
     def observed(self) -> Float32s | None:
+        """Return the robots' measurements of themselves (N, S'), as recorded; None if images tell none."""
         if not shows_state(self.scenes.name):
             return None
         return np.stack([scene.simulator.state for scene in self._begun])
 
     def recorded(self) -> Float32s:
+        """Return the next actions (N, A) of the recorder's own driver; call it once a step."""
         self.told.append(np.stack([scene.simulator.recorded() for scene in self._begun]))
         return self.told[-1]
 
     def step(self, actions: Float32s) -> None:
+        """Take an action (N, A)."""
         for scene, action in zip(self._begun, actions, strict=True):
             scene.simulator.advance(action)
         self._steps += 1
@@ -317,3 +299,6 @@ class ModelArena:
     def close(self) -> None:
         """End the sessions."""
         self._envs.close()
+
+
+Arena = TrueArena | ModelArena  # a place where a policy acts
