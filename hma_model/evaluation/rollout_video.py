@@ -24,6 +24,7 @@ from hma_data.episodes.sheets import (
 from hma_data.errors import HMAError, UsageError
 from hma_data.loading.dataset import WindowDataset
 from hma_data.loading.views import FIRST_CAMERA, Cameras
+from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
@@ -260,8 +261,6 @@ def write_sheets(
     Returns:
         The reason for no pictures if the tokenizer is not available here; else an empty string.
     """
-    from hma_data.shards.preview import tokenizer_of
-
     if not sets:
         return ""
     try:

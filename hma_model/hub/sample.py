@@ -2,18 +2,21 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from hma_data.episodes.sheets import cell_scale, gif_bytes, grid, png_bytes
 from hma_data.errors import CheckpointError, UsageError
+from hma_data.loading.dataset import WindowDataset
+from hma_data.shards.preview import tokenizer_of
+from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RemotePath
 from hma_model.arrays import evenly
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import FILM, SAMPLE, Checkpoint, require_tokenizer
-
-if TYPE_CHECKING:
-    from hma_data.shards.reader import ShardSet
+from hma_model.evaluation.rollout_video import rollout_video
+from hma_model.evaluation.rollouts import rollout
+from hma_model.generation.decode import cameras_for
 
 COLUMNS = 6  # frames in a row of the image
 
@@ -28,8 +31,6 @@ def add_samples(checkpoint: StrPath | Checkpoint, data: Iterable[StrPath]) -> li
     Returns:
         The paths of the images and films.
     """
-    from hma_data.shards.reader import ShardSet
-
     source, made = Checkpoint.open(checkpoint), []
     if source.bundled:
         remedy = "copy the folder and name the copy, or finetune it"
@@ -57,15 +58,8 @@ def at_hand(checkpoint: Checkpoint, embodiments: Iterable[str] | None = None) ->
     return [shards.folder for shards in sets if shards.embodiment.id in lacking]
 
 
-def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
+def _shown(checkpoint: Checkpoint, shards: ShardSet) -> tuple[bytes, bytes]:
     """Return a PNG of recorded and predicted frames, and a GIF of both with their actions."""
-    from hma_data.episodes.sheets import cell_scale, gif_bytes, grid, png_bytes
-    from hma_data.loading.dataset import WindowDataset
-    from hma_data.shards.preview import tokenizer_of
-    from hma_model.evaluation.rollout_video import rollout_video
-    from hma_model.evaluation.rollouts import rollout
-    from hma_model.generation.decode import cameras_for
-
     model = checkpoints.load(checkpoint, [shards.embodiment.id])
     require_tokenizer(model.config, shards.spec, shards.folder)
     cameras, length = cameras_for(model, shards), model.config.frames
@@ -84,8 +78,7 @@ def _shown(checkpoint: Checkpoint, shards: "ShardSet") -> tuple[bytes, bytes]:
     }
     scale, every = cell_scale(true.truth.shape[2])
     shown = [
-        [frame.repeat(scale, 0).repeat(scale, 1)[::every, ::every] for frame in frames[picks]]
-        for frames in rows.values()
+        list(frames[picks].repeat(scale, 1).repeat(scale, 2)[:, ::every, ::every]) for frames in rows.values()
     ]
     film = rollout_video(model, tokenizer, shards, split=split, window=middle, prompt=true.prompt)
     return png_bytes(grid(shown, list(rows))), gif_bytes(film.frames, film.fps)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.episodes.images import decode_image
+from hma_data.episodes.images import decode_image, opencv
 from hma_data.episodes.sheets import gif_bytes, write_mp4, write_text
 from hma_data.registry.embodiment import Embodiment
 from hma_data.registry.export import packed_components
@@ -106,8 +106,7 @@ def panels(frames: Sequence[Frame], side: int, truth: str) -> Iterator[Images]:
 
 
 def _panel(title: str, data: bytes, side: int) -> Images:
-    import cv2
-
+    cv2 = opencv()
     image = decode_image(data, "a frame")
     width = round(side * image.shape[1] / image.shape[0])
     large = cv2.resize(image, (width, side), interpolation=cv2.INTER_CUBIC)

@@ -32,6 +32,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from hma_data.errors import HMAError, UsageError
 from hma_data.tokenizers.base import Tokenizer
 from hma_model.checkpoint.folder import Checkpoint
+from hma_model.checkpoint.io import load
 from hma_model.play import messages
 from hma_model.play.holding import UNKNOWN, Holding, holdings
 from hma_model.play.pads import describe, labels
@@ -39,6 +40,7 @@ from hma_model.play.save import FILE_KINDS, film, told_by
 from hma_model.play.session import Frame, Session
 from hma_model.play.stepper import Stepper
 from hma_model.worlds.scenes import Drivable
+from hma_model.worlds.world import World
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 FIRST_ROBOT = "pusht_fast"  # the robot that a page opens with: its T stays whole, and it is easy to drive
@@ -420,7 +422,7 @@ class Part(NamedTuple):
     """A checkpoint, its tokenizer, and those of its robots that can be driven, by key."""
 
     checkpoint: Checkpoint
-    tokenizer: "Tokenizer"
+    tokenizer: Tokenizer
     robots: Mapping[str, Drivable]
 
 
@@ -449,9 +451,6 @@ async def serve(
     Raises:
         CheckpointError: a checkpoint is damaged.
     """
-    from hma_model.checkpoint.io import load
-    from hma_model.worlds.world import World
-
     worlds: dict[str, World] = {}
     robots: dict[str, Drivable] = {}
     held: dict[str, Holding] = {}
@@ -471,10 +470,8 @@ async def serve(
         stepper.stop()
 
 
-async def run(app: ASGIApp, listener: socket.socket, ready: Callable[["uvicorn.Server"], None]) -> None:
+async def run(app: ASGIApp, listener: socket.socket, ready: Callable[[uvicorn.Server], None]) -> None:
     """Serve an application at a socket that listens, until a signal or until `should_exit` is set."""
-    import uvicorn
-
     settings = uvicorn.Config(
         app,
         log_level="warning",

@@ -10,8 +10,11 @@ import numpy as np
 
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import FAMILY
+from hma_model.policies.acting import read_acting
 from hma_model.policies.arenas import Scenes
 from hma_model.policies.base import Policy
+from hma_model.policies.lerobot import LeRobotPolicy
+from hma_model.policies.planning import read_planning
 from hma_model.policies.scripted import Called, Random, Scripted, Still
 from hma_model.worlds.world import World
 
@@ -37,16 +40,10 @@ def read_policy(words: str | tuple[str, Policy], scenes: Scenes, world: World | 
     device = "cpu" if world is None else str(world.model.device)
     kind, _, rest = words.partition(":")
     if kind == "lerobot" and rest:
-        from hma_model.policies.lerobot import LeRobotPolicy
-
         return LeRobotPolicy(rest, scenes, device)
     if kind == "hma" and rest:
-        from hma_model.policies.acting import read_acting
-
         return read_acting(rest, scenes, device)
     if kind == "plan" and rest:
-        from hma_model.policies.planning import read_planning
-
         return read_planning(rest, scenes, world)
     if words in ("random", "still"):
         return Random() if words == "random" else Still()

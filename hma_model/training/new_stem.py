@@ -9,6 +9,7 @@ is higher.
 A action dims, D width.
 """
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -130,8 +131,7 @@ def _resampled(weight: Tensor, steps: int, own_steps: int) -> Tensor:
 
 
 def _states(model: HMA, name: str) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    stem, head = model.stem_state(name), model.head_state(name)
-    return {key: value.clone() for key, value in stem.items()}, {k: v.clone() for k, v in head.items()}
+    return copy.deepcopy((model.stem_state(name), model.head_state(name)))
 
 
 def _load(model: HMA, name: str, stem: State, head: State) -> None:

@@ -12,6 +12,10 @@ from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import Checkpoint
+from hma_model.checkpoint.io import load
+from hma_model.evaluation.actions import shuffled
+from hma_model.evaluation.rollouts import rollout
+from hma_model.generation.decode import cameras_for
 from hma_model.training.logging import read_metrics
 from hma_model.training.report import Figures
 
@@ -55,11 +59,6 @@ def view_run(out: StrPath, window: int = 0, data: Sequence[StrPath] = ()) -> Vie
 
 def _rolled(out: Path, checkpoint: Checkpoint, shards: ShardSet, window: int) -> View:
     """Return a view of one window: the truth, the prediction, and that with other actions."""
-    from hma_model.checkpoint.io import load
-    from hma_model.evaluation.actions import shuffled
-    from hma_model.evaluation.rollouts import rollout
-    from hma_model.generation.decode import cameras_for
-
     robot, frames = shards.embodiment, checkpoint.config.frames
     model = load(checkpoint, [robot.id]).eval()
     windows = WindowDataset(shards, "val", frames, cameras=cameras_for(model, shards))

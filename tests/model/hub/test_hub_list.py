@@ -28,7 +28,7 @@ ROBOTS = {"arm": 2, "hand": 3}
 
 @pytest.fixture
 def painted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Blocks())
+    monkeypatch.setattr("hma_model.hub.sample.tokenizer_of", lambda shards: Blocks())
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ SEEN = {"report": True, "pictures": 2, "track": ["tensorboard"]}
 
 @pytest.fixture
 def painter(monkeypatch):
-    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Blocks())
+    monkeypatch.setattr("hma_model.evaluation.rollout_video.tokenizer_of", lambda shards: Blocks())
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def seen(data, tmp_path_factory) -> Path:
     """The folder of a short run with everything to see."""
     out = tmp_path_factory.mktemp("seen") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Blocks())
+        patch.setattr("hma_model.evaluation.rollout_video.tokenizer_of", lambda shards: Blocks())
         train(make_recipe({**TINY, **SEEN, "data": data}), out=out, show=False)
     return out
 
