@@ -234,11 +234,11 @@ def _gather(features: Tensor, chosen: Tensor) -> Tensor:
 
 def check(decoding: Decoding, config: HMAConfig) -> None:
     """Raise HMAError for a setting that a model does not take."""
-    kind = config.kind
+    kind, warmth = config.kind, decoding.temperature
     orders = ("random", "confidence") if kind == "discrete" else ("random",)
     for name, value, allowed, remedy in (
         ("unmask_steps", decoding.unmask_steps, decoding.unmask_steps >= 1, "give at least 1"),
-        ("temperature", decoding.temperature, decoding.temperature >= 0, "give at least 0"),
+        ("temperature", warmth, 0 <= warmth < math.inf, "give a number of at least 0"),
         ("order", decoding.order, decoding.order in orders, f"a {kind} model takes {' or '.join(orders)}"),
     ):
         if not allowed:

@@ -31,8 +31,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from hma_data.errors import HMAError, UsageError
 from hma_data.tokenizers.base import Tokenizer
+from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import Checkpoint
-from hma_model.checkpoint.io import load
 from hma_model.play import messages
 from hma_model.play.holding import UNKNOWN, Holding, holdings
 from hma_model.play.pads import describe, labels
@@ -456,7 +456,7 @@ async def serve(
     held: dict[str, Holding] = {}
     for part in parts:
         names = sorted({robot.embodiment.id for robot in part.robots.values()})
-        world = World(load(part.checkpoint, names, device), part.tokenizer, **settings)
+        world = World(checkpoints.load(part.checkpoint, names, device), part.tokenizer, **settings)
         worlds |= dict.fromkeys(part.robots, world)
         robots |= part.robots
         known = holdings(part.checkpoint)

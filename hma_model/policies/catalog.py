@@ -62,8 +62,8 @@ def read_policy(words: str | tuple[str, Policy], scenes: Scenes, world: World | 
 
 def _named(words: str) -> Any:
     """Return the object that MODULE:NAME names; modules of the working folder are found."""
-    module = words.partition(":")[0]
-    sys.path.insert(0, str(Path.cwd()))
+    module, here = words.partition(":")[0], str(Path.cwd())
+    sys.path.insert(0, here)
     try:
         return pkgutil.resolve_name(words)
     except Exception as fault:
@@ -74,4 +74,4 @@ def _named(words: str) -> Any:
             f"policy {words}", f"cannot be imported: {type(fault).__name__}: {fault}", remedy
         ) from fault
     finally:
-        sys.path.pop(0)
+        sys.path.remove(here)  # the module may have put others before it

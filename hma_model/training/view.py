@@ -11,8 +11,8 @@ from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath, as_path
+from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import Checkpoint
-from hma_model.checkpoint.io import load
 from hma_model.evaluation.actions import shuffled
 from hma_model.evaluation.rollouts import rollout
 from hma_model.generation.decode import cameras_for
@@ -60,7 +60,7 @@ def view_run(out: StrPath, window: int = 0, data: Sequence[StrPath] = ()) -> Vie
 def _rolled(out: Path, checkpoint: Checkpoint, shards: ShardSet, window: int) -> View:
     """Return a view of one window: the truth, the prediction, and that with other actions."""
     robot, frames = shards.embodiment, checkpoint.config.frames
-    model = load(checkpoint, [robot.id]).eval()
+    model = checkpoints.load(checkpoint, [robot.id]).eval()
     windows = WindowDataset(shards, "val", frames, cameras=cameras_for(model, shards))
     if window >= len(windows):
         fault = f"{shards.folder} has {len(windows)} held-out windows of {frames} frames, the first is 0"

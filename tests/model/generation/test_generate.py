@@ -1,5 +1,6 @@
 """Rollouts: the cache against computing everything again, and what decoding promises."""
 
+import math
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ from hma_data.errors import HMAError
 from hma_model.config import CONDITIONINGS
 from hma_model.generation.passes import Passes
 from hma_model.generation.rollout import Rollout
+from hma_model.generation.unmask import Decoding
 from hma_model.network.model import HMA
 from tests.model.network_parts import ARM, seeded, small_batch, small_model
 
@@ -90,6 +92,12 @@ def test_every_pass_of_a_cached_rollout_has_the_features_of_full_recomputation(
 def test_every_token_is_unmasked(unmask_steps: int) -> None:
     made = _rollout(small_model(), True, 2, 3, unmask_steps=unmask_steps)
     assert made.shape == (3, 3, 4, 4) and made.min() >= 0 and made.max() < 24
+
+
+@pytest.mark.parametrize("temperature", [-0.1, math.inf, math.nan])
+def test_a_temperature_that_is_no_number_from_zero_on_is_refused(temperature: float) -> None:
+    with pytest.raises(HMAError, match="temperature: .* give a number of at least 0"):
+        Decoding.of(small_model().config, temperature=temperature)
 
 
 def test_temperature_flattens_what_is_drawn() -> None:

@@ -45,7 +45,7 @@ def test_robots_are_listed_by_how_long_they_hold(stepper: Stepper) -> None:
 def test_a_robot_of_two_checkpoints_holds_as_long_as_in_the_one_that_drives_it(monkeypatch) -> None:
     known, listed = {"one": Holding(1.0, False, True), "two": Holding(2.0, False, True)}, dict[str, Holding]()
     monkeypatch.setattr("hma_model.checkpoint.io.load", lambda *given: None)
-    monkeypatch.setattr("hma_model.worlds.world.World", lambda *given: TrueWorld())
+    monkeypatch.setattr(server, "World", lambda *given: TrueWorld())
     monkeypatch.setattr(server, "holdings", lambda part: {"mover_04": known[part.name]})
 
     def listing(stepper: Any, name: str, host: str, token: None, first: None, held: Any) -> Any:

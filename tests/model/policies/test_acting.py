@@ -1,5 +1,8 @@
 """A model acts in scenes: it gives what `predict_actions` says of all that it saw and did."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -88,3 +91,13 @@ def test_models_that_cannot_act_and_unknown_options_are_refused() -> None:
         read_policy("hma:runs/policy,speed=2", scenes)
     with pytest.raises(HMAError, match="no/such run"):
         read_policy("hma:no/such run", scenes)
+
+
+def test_a_policys_module_may_extend_the_path_of_modules(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_policy.py").write_text("import sys\nsys.path.insert(0, 'theirs')\nact = len\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    read_policy("own_policy:act", Scenes.of(actor("policy"), ROBOT, 1, 0))
+    assert sys.path[0] == "theirs" and str(Path.cwd()) not in sys.path
