@@ -198,6 +198,7 @@ def measure(
     gain = by_window["true.psnr_last"] - by_window["shuffled.psnr_last"]
     by_window["psnr_action_gain_last"] = gain
     frechet, missing = rolled.judge.figures(plan.frames - first)
+    count, distinct = len(gain), len(np.unique(episodes))
     figures = {
         kind: figures_of(joined[kind], seed, episodes) | frechet.get(kind, {}) for kind in ROLLOUT_KINDS
     }
@@ -209,9 +210,9 @@ def measure(
     found = {
         "embodiment": shards.embodiment.id,
         "split": settings.split,
-        "windows": len(gain),
+        "windows": count,
         "unmoved_windows": rolled.still,
-        "episodes": len(np.unique(episodes)),
+        "episodes": distinct,
         "frames": plan.frames,
         "prompt": first,
         "draws": draws,
@@ -224,7 +225,7 @@ def measure(
         **summary("psnr_action_gain_last", gain, seed, 6, episodes, PSNR_GAIN_RANGE),
         **extra,
         "missing": missing,
-        "notes": _notes(model, joined, table, rolled.still, len(gain), len(np.unique(episodes))),
+        "notes": _notes(model, joined, table, rolled.still, count, distinct),
         "seconds_a_frame": round(1 / shards.embodiment.effective_hz, 6),
     }
     by_window["episode"] = episodes.astype(np.float64)

@@ -128,12 +128,9 @@ def export_folder(
 def _write_parts(folder: Path, step: StepGraph) -> dict[str, Any]:
     """Write the graphs of the page, which makes an image while it computes the next frame."""
     image, *others = step.outputs
-    names, (of_step, of_image, on_gpu) = (
-        [port.name for port in step.inputs],
-        (folder / part for part in PARTS),
-    )
+    of_step, of_image, on_gpu = (folder / part for part in PARTS)
     return {
-        "step": write_part(folder / STEP, of_step, names, others),
+        "step": write_part(folder / STEP, of_step, [port.name for port in step.inputs], others),
         "image": write_part(folder / STEP, of_image, ["next_frame"], [image], winograd=True),
         "gpu_image": write_part(folder / STEP, on_gpu, ["next_frame"], [image]),
     }

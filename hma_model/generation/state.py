@@ -11,6 +11,7 @@ frame with its action tokens, T frames of a pass.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -47,17 +48,10 @@ class Snapshot:
     def take(self, rows: Sequence[int]) -> "Snapshot":
         """Return a copy of some of the rows, in this order; a row may be taken several times."""
         index = torch.tensor(rows, device=self.frames.device)
-        return replace(
-            self,
-            embodiments=tuple(self.embodiments[row] for row in rows),
-            times=tuple(self.times[row] for row in rows),
-            pending=tuple(self.pending[row] for row in rows),
-            generators=tuple(self.generators[row] for row in rows),
-            frames=self.frames[index],
-            chunks=self.chunks[index],
-            known=self.known[index],
-            carried=None if self.carried is None else self.carried.take(index),
-        )
+        kept: dict[str, Any] = {name: getattr(self, name)[index] for name in ("frames", "chunks", "known")}
+        for name in ("embodiments", "times", "pending", "generators"):
+            kept[name] = tuple(getattr(self, name)[row] for row in rows)
+        return replace(self, **kept, carried=None if self.carried is None else self.carried.take(index))
 
 
 @dataclass(frozen=True)
