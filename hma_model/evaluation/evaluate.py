@@ -310,12 +310,7 @@ def _paper(
 
 
 def _notes(
-    model: HMA,
-    joined: Mapping[str, Scores],
-    table: Mapping[str, Any],
-    still: int,
-    count: int,
-    episodes: int,
+    model: HMA, joined: Mapping[str, Scores], table: Mapping[str, Any], still: int, count: int, episodes: int
 ) -> list[str]:
     """Return what must be known to read the figures; `count` windows are of so many episodes."""
     notes, config = [], model.config

@@ -146,10 +146,7 @@ def digit_frequencies(
 
 
 def unconditional_baseline(
-    sets: Iterable[ShardSet],
-    batches: Iterable[Batch],
-    config: HMAConfig,
-    cameras: Cameras = FIRST_CAMERA,
+    sets: Iterable[ShardSet], batches: Iterable[Batch], config: HMAConfig, cameras: Cameras = FIRST_CAMERA
 ) -> Means:
     """Return the cross-entropy of each embodiment's training frequencies, which ignores all input.
 

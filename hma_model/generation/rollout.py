@@ -28,12 +28,7 @@ from hma_model.config import POLICY
 from hma_model.generation.engine import Engine
 from hma_model.generation.passes import Passes
 from hma_model.generation.state import RowState, Snapshot
-from hma_model.generation.unmask import (
-    Decoding,
-    PatchFrame,
-    TokenFrame,
-    masked_after,
-)
+from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, masked_after
 from hma_model.network.conditioning import ActionConditioning, Groups
 from hma_model.network.copying import known_digits
 from hma_model.network.network import Network

@@ -34,10 +34,7 @@ Told = Callable[[str, int, int], None]  # is told what is done, and how many fra
 
 
 def film(
-    kind: str,
-    robot: Drivable,
-    frames: Sequence[Frame],
-    on_progress: Told = lambda words, done, total: None,
+    kind: str, robot: Drivable, frames: Sequence[Frame], on_progress: Told = lambda words, done, total: None
 ) -> bytes:
     """Return a file of frames.
 
@@ -163,11 +160,7 @@ class _Views(Sequence[Images]):
 
 
 def embodiment_of(
-    robot: Embodiment,
-    recording: str,
-    size: tuple[int, ...],
-    cameras: Sequence[str],
-    with_state: bool = False,
+    robot: Embodiment, recording: str, size: tuple[int, ...], cameras: Sequence[str], with_state: bool = False
 ) -> Embodiment:
     """Return the embodiment of a dataset that is saved of a model; LeRobot's rates are whole numbers.
 

@@ -47,13 +47,7 @@ from hma_model.training.resume import (
     seed_for,
     write_state,
 )
-from hma_model.training.runtime import (
-    ENVIRONMENT,
-    RECIPE,
-    attention_form,
-    choose_precision,
-    environment,
-)
+from hma_model.training.runtime import ENVIRONMENT, RECIPE, attention_form, choose_precision, environment
 from hma_model.training.scheduled_sampling import forwarded
 from hma_model.training.start import Start
 

@@ -341,11 +341,7 @@ class WorldModelVectorEnv(VectorEnv[Images, Float32s, NDArray[Any]]):
             env.close()
 
     def _begin(
-        self,
-        i: int,
-        infos: dict[str, Any],
-        seed: int | None = None,
-        options: dict[str, Any] | None = None,
+        self, i: int, infos: dict[str, Any], seed: int | None = None, options: dict[str, Any] | None = None
     ) -> dict[str, Any]:
         self.observations[i], facts = self.envs[i].reset(seed=seed, options=options)
         return self._add_info(infos, facts, i)
